@@ -1,11 +1,14 @@
-"""Fit a synthetic impact of a million rows by the command; print wall time and peak memory.
+"""How long does the command take for a million rows, and how much memory?
 
-python experiments/million_rows.py            # --rows 600 for a small one
+Method. A synthetic impact (published foam-1/model-1 at 2 m/s, 1 % white noise) is fitted twice.
+
+Answer. 6.2 s once compiled, 384 MiB.
+
+    python experiments/million_rows.py            # --rows 600 for a small one
 """
 
 from __future__ import annotations
 
-import argparse
 import resource
 import subprocess
 import sys
@@ -16,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import foamfit as ff
+import studies
 
 TOML = """\
 name = "synthetic impact, {rows} rows"
@@ -46,9 +50,7 @@ def write(folder: Path, rows: int) -> Path:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rows", type=int, default=1_000_000)
-    options = parser.parse_args()
+    options = studies.arguments(__doc__, rows=1_000_000).parse_args()
     with tempfile.TemporaryDirectory() as folder:
         path = write(Path(folder), options.rows)
         command = [sys.executable, "-m", "foamfit", "fit", str(path), "--out", f"{folder}/result"]

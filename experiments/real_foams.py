@@ -1,34 +1,34 @@
-"""Fit the measurements of others, where they lie on disk; write experiments/real_foams.md.
+"""How well do the laws fit the measurements of others, and do twins get the same states?
 
-The measurements are not part of this repository. Give their folder:
+Method. Every uniaxial specimen of running-shoe foam (arXiv:2602.12694, LivingMatterLab/CANN) is
+fitted by four laws: misfit, values, their scatter between specimens of one foam, and whether these
+specimens get the same state. Beside them stand two impacts on cartilage (JoVE 64450). The
+measurements are not part of this repository; FOAMFIT_DATA holds shoe-foam/, shoe-foam-twins/ and
+cartilage-impact/.
 
-    FOAMFIT_DATA=path/to/data python experiments/real_foams.py
+Answer. Microscale springs with relaxation leave 0.43 to 0.93 % of the range: see real_foams.md.
+Beside it: real_foams.csv (every parameter of every fit) and real_foams.png (one loop, two laws).
 
-It holds shoe-foam/ and shoe-foam-twins/ (running-shoe foam, cycles of compression,
-arXiv:2602.12694, LivingMatterLab/CANN) and cartilage-impact/ (a striker dropped on cartilage, JoVE
-64450). Every uniaxial specimen is fitted by four laws: misfit, values, their scatter between
-specimens of one foam, and whether these specimens get the same state. Beside the page:
-real_foams.csv (every parameter of every fit) and real_foams.png (one loop, two laws). About two
-minutes of processor time.
+    FOAMFIT_DATA=path/to/data python experiments/real_foams.py     # two minutes of processor time
 """
 
 from __future__ import annotations
 
-import csv
-import os
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
 import foamfit as ff
+import studies
 from foamfit.data.measurement import Measurement
-from foamfit.report.figures import BLUE, GREY, VERMILION, drawing, save
+from foamfit.report.figures import BLUE, DPI, GREY, VERMILION
 from foamfit.report.readable import readable
 from foamfit.results import Fit, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE
@@ -36,20 +36,12 @@ from foamfit.text import number, percent
 
 HERE = Path(__file__).parent
 TABLE = HERE / "real_foams.csv"
-SHOE_FOAM = {  # diameter and height, mm, of specimens whose first cycle is a file of its own
-    "turbo-comp-1": (7.63, 10.53),
-    "turbo-comp-2": (7.68, 9.66),
-    "leap-comp-2": (7.62, 10.65),
-    "leap-comp-3": (7.80, 10.68),
-    "new-heel-comp-1": (7.67, 9.90),
+SHOE_FOAM = {  # height and diameter of specimens whose first cycle is a file of its own
+    "turbo-comp-1": ("10.53 mm", "7.63 mm"),
+    "turbo-comp-2": ("9.66 mm", "7.68 mm"),
+    "leap-comp-2": ("10.65 mm", "7.62 mm"),
+    "leap-comp-3": ("10.68 mm", "7.80 mm"),
 }
-SPECIMEN = """\
-name = "{name}"
-[specimen]
-height = "{height} mm"
-diameter = "{diameter} mm"
-{more}"""
-GAP = '[columns]\ndisplacement = { column = "Gap (um)", counts_down = true }\n'
 # Name of the law: model, relaxation terms, descents (None = as many as a fit makes).
 LAWS: dict[str, tuple[str, int, int | None]] = {
     "bistable": ("bistable", 0, None),
@@ -60,72 +52,22 @@ LAWS: dict[str, tuple[str, int, int | None]] = {
 BEST, PLAIN = "microscale, relaxation", "bistable"
 SHOWN = "new-heel-comp-1"  # in the picture
 SOURCE = "arXiv:2602.12694 (LivingMatterLab/CANN)"
-CARTILAGE = """\
-[specimen]
-height = "0.563 mm"
-diameter = "8.5 mm"
-[striker]
-mass = "358.39 g"
-velocity = "{velocity} m/s"
-"""
-PAGE = """\
-# Fits of measurements by others
-
-Made by `FOAMFIT_DATA=… python experiments/real_foams.py`; the data are not part of this repository.
-
-## Running-shoe foam
-
-Measurements: {source}. First cycles of {count} cylinders of four foams in
-compression to about 60 % and back at 0.25 1/s, displacement drive.
-Every parameter of every fit is in [real_foams.csv](real_foams.csv).
-
-![Measured loop of a running-shoe foam and its fits by two laws](real_foams.png)
-
-Misfit: RMS of the stress over its range, %.
-
-{misfits}
-
-Over all specimens: parameters that vary; median misfit; in how many tests more than one descent
-reached the best point; median run time of a fit with its intervals (two bistable springs by 12
-descents, the others by 16); parameters called determined, weak and not determined; and how often
-all specimens of a foam got the same state, of so many pairs of foam and parameter.
-
-{laws}
-
-### From specimen to specimen
-
-Standard deviation over mean of the specimens of one foam, % (a dash: the mean is within its
-standard error of zero); in brackets the state that most of them got, and how many did.
-
-{scatter}
-
-## Articular cartilage under a dropped striker (measurements: JoVE 64450)
-
-Impact drive, one bistable spring. The impulse of the force is not the striker's change of momentum:
-mass, load scale and motion do not agree, and no model can fit both curves.
-
-{cartilage}
-"""
+CARTILAGE = {"test_1_impact": 0.785, "test_3_impact": 0.905}  # velocity, m/s
+STRIKER = '[striker]\nmass = "358.39 g"\nvelocity = "{velocity} m/s"\n'
 
 
-def first_cycles(data: Path, folder: Path) -> Iterator[Measurement]:
-    """Give the first cycle of every specimen."""
-    named = {n: size for n, size in SHOE_FOAM.items() if not n.startswith("new-heel")}
-    files = [
-        (data / "shoe-foam" / f"{name}_cycle1.csv", name, *size, "") for name, size in named.items()
+def first_cycles(data: Path, folder: Path, foams: tuple[str, ...] = ()) -> Iterator[Measurement]:
+    """Give the first cycle of every specimen, or of those of some foams."""
+    own = [(name, *size, f"shoe-foam/{name}_cycle1.csv", "") for name, size in SHOE_FOAM.items()]
+    twins = [
+        (*one, f"shoe-foam-twins/{one[0]}_raw.txt", studies.GAP)
+        for one in studies.twins(data / "shoe-foam-twins")
     ]
-    with (data / "shoe-foam-twins" / "specimens.csv").open() as table:
-        files += [
-            (
-                data / "shoe-foam-twins" / f"{row['test']}_raw.txt", row["test"],
-                float(row["diameter_mm"]), float(row["height_mm"]), GAP,
-            )
-            for row in csv.DictReader(table)
-        ]  # fmt: skip
-    for file, name, diameter, height, more in files:
-        toml = folder / f"{name}.toml"
-        toml.write_text(SPECIMEN.format(name=name, height=height, diameter=diameter, more=more))
-        yield ff.read_test(file, toml)
+    for name, height, diameter, file, columns in (*own, *twins):
+        if not foams or name.rpartition("-")[0] in foams:
+            toml = studies.write_specimen(folder / f"{name}.toml", height, diameter, columns)
+            toml.write_text(f'name = "{name}"\n{toml.read_text()}')
+            yield ff.read_test(data / file, toml)
 
 
 def varied(result: Fit) -> dict[str, ParameterEstimate]:
@@ -148,18 +90,10 @@ def rows_of(test: str, law: str, result: Fit, seconds: float) -> Iterator[dict[s
         }  # fmt: skip
 
 
-def markdown(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
-
-
 def misfit_table(table: pd.DataFrame) -> str:
-    fits = table.drop_duplicates(["test", "law"])
-    rows = []
-    for test in fits["test"].unique():
-        own = fits[fits["test"] == test].set_index("law")["misfit"]
-        rows.append([test, *(f"{100.0 * own[law]:.2f}" for law in LAWS)])
-    return markdown(["specimen", *LAWS], rows)
+    wide = table.pivot_table(index="test", columns="law", values="misfit", sort=False)[list(LAWS)]
+    rows = ([test, *(f"{100.0 * x:.2f}" for x in own)] for test, own in wide.iterrows())
+    return studies.markdown(["specimen", *LAWS], rows)
 
 
 def law_table(table: pd.DataFrame) -> str:
@@ -168,32 +102,26 @@ def law_table(table: pd.DataFrame) -> str:
         own = table[table["law"] == law]
         fits = own.drop_duplicates("test")
         states = own["state"].value_counts()
-        groups = [len(set(group["state"])) == 1 for _, group in own.groupby(["foam", "parameter"])]
+        agree = own.groupby(["foam", "parameter"])["state"].nunique() == 1
         rows.append([
-            law, f"{len(own) // len(fits)}", f"{100.0 * fits['misfit'].median():.2f} %",
-            f"{(fits['agreeing'] > 1).sum()} of {len(fits)}",
-            f"{fits['seconds'].median():.1f} s",
+            law, len(own) // len(fits), f"{100.0 * fits['misfit'].median():.2f} %",
+            f"{(fits['agreeing'] > 1).sum()} of {len(fits)}", f"{fits['seconds'].median():.1f} s",
             " / ".join(str(states.get(s, 0)) for s in ("determined", "weak", "not determined")),
-            f"{sum(groups)} of {len(groups)}",
+            f"{agree.sum()} of {len(agree)}",
         ])  # fmt: skip
-    head = ["law", "parameters", "misfit", "best found again", "run time"]
-    head += ["determined / weak / not", "twins agree"]
-    return markdown(head, rows)
+    head = "law | parameters | misfit | best found again | run time | determined / weak / not"
+    return studies.markdown(f"{head} | twins agree", rows)
 
 
 def scatter_table(table: pd.DataFrame) -> str:
     rows = []
     foams = table.groupby("foam", sort=False)["test"].nunique()
     for law in (PLAIN, "microscale", BEST):
-        own = table[table["law"] == law]
-        for name in own["parameter"].unique():
-            cells = [f"{law}: {name}"]
-            for foam in foams.index:
-                group = own[(own["foam"] == foam) & (own["parameter"] == name)]
-                cells.append(_scatter(group))
-            rows.append(cells)
+        for name, own in table[table["law"] == law].groupby("parameter", sort=False):
+            groups = (own[own["foam"] == foam] for foam in foams.index)
+            rows.append([f"{law}: {name}", *map(_scatter, groups)])
     head = ["law and parameter", *(f"{foam}, {count}" for foam, count in foams.items())]
-    return markdown(head, rows)
+    return studies.markdown(head, rows)
 
 
 def _scatter(group: pd.DataFrame) -> str:
@@ -214,7 +142,7 @@ def draw(results: dict[str, Fit], path: Path) -> None:
         PLAIN: {"color": BLUE, "lw": 0.9, "alpha": 0.6},
         BEST: {"color": VERMILION, "lw": 1.3},
     }
-    with drawing(7.0, 3.5) as figure:
+    with studies.sheet(path, 7.0, 3.5, DPI) as figure:
         grid = figure.add_gridspec(2, 2, width_ratios=[4.0, 2.9], height_ratios=[4.0, 1.0])
         loop, off = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
         side = figure.add_subplot(grid[:, 1])
@@ -247,7 +175,6 @@ def draw(results: dict[str, Fit], path: Path) -> None:
             f"Running-shoe foam, {best.measurement.name}, first cycle", x=0.012, ha="left",
             fontsize=8.5, weight="bold",
         )  # fmt: skip
-        save(figure, path)
 
 
 def _write_values(side: Axes, result: Fit) -> None:
@@ -278,25 +205,21 @@ def _write_values(side: Axes, result: Fit) -> None:
 
 def cartilage_table(data: Path, toml: Path) -> str:
     rows = []
-    for name, velocity in (("test_1_impact", 0.785), ("test_3_impact", 0.905)):
-        toml.write_text(CARTILAGE.format(velocity=velocity))
+    for name, velocity in CARTILAGE.items():
+        studies.write_specimen(toml, "0.563 mm", "8.5 mm", "")
+        toml.write_text(toml.read_text() + STRIKER.format(velocity=velocity))
         result = ff.fit(ff.read_test(data / "cartilage-impact" / f"{name}.csv", toml))
-        misfits = (result.misfit[curve] for curve in ("stress_time", "displacement_time"))
-        rows.append([
-            name, *(f"{misfit:.3f}" for misfit in misfits),
-            f"{result.energy['impulse_ratio']:.2f}", result.status,
-        ])  # fmt: skip
-    head = ["test", "misfit of stress-time", "misfit of displacement-time", "impulse over momentum"]
-    return markdown([*head, "status"], rows)
+        misfits = (f"{result.misfit[c]:.3f}" for c in ("stress_time", "displacement_time"))
+        rows.append([name, *misfits, f"{result.energy['impulse_ratio']:.2f}", result.status])
+    head = "test | misfit of stress-time | misfit of displacement-time | impulse over momentum"
+    return studies.markdown(f"{head} | status", rows)
 
 
 def main() -> dict[str, Fit]:
     """Write page and table; return the fits of which the picture is drawn."""
-    data = Path(os.environ.get("FOAMFIT_DATA", ""))
-    if not (data / "shoe-foam-twins").is_dir():
-        raise SystemExit("set FOAMFIT_DATA to the folder that holds shoe-foam-twins/")
+    data = studies.measurements("shoe-foam", "shoe-foam-twins")
     ff.fit(ff.read_test(HERE / "foam-1" / "model-1-2.0mps-reconstruction.csv"))  # compiles
-    rows, shown = list[dict[str, object]](), dict[str, Fit]()
+    rows, shown = list[dict[str, Any]](), dict[str, Fit]()
     with tempfile.TemporaryDirectory() as folder:
         tests = list(first_cycles(data, Path(folder)))
         for test in tests:
@@ -311,8 +234,8 @@ def main() -> dict[str, Fit]:
                     shown[law] = result
         cartilage = cartilage_table(data, Path(folder) / "specimen.toml")
     table = pd.DataFrame(rows)
-    table.to_csv(TABLE, index=False, float_format="%.6g", lineterminator="\n")
-    page = PAGE.format(
+    studies.write_csv(table, TABLE, 6)
+    page = (HERE / "real_foams.template.md").read_text(encoding="utf-8").format(
         source=SOURCE, count=len(tests), misfits=misfit_table(table), laws=law_table(table),
         scatter=scatter_table(table), cartilage=cartilage,
     )  # fmt: skip
@@ -321,10 +244,9 @@ def main() -> dict[str, Fit]:
 
 
 if __name__ == "__main__":
-    from unchanged import keep_unchanged
-
+    studies.arguments(__doc__).parse_args()
     before = TABLE.read_bytes() if TABLE.exists() else b""
-    with keep_unchanged(HERE):
+    with studies.keep_unchanged(HERE):
         both = main()
     if TABLE.read_bytes() != before:  # its pixels would hardly tell: its numbers are small
         draw(both, HERE / "real_foams.png")

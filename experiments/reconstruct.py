@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import foamfit as ff
+import studies
 from foamfit.springs.published import PublishedSet
 
 HERE = Path(__file__).parent
@@ -109,7 +110,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    from unchanged import keep_unchanged
-
-    with keep_unchanged(HERE):
-        main()
+    studies.arguments(__doc__).parse_args()
+    studies.run(main, HERE)

@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 
 import fabricated
 import foamfit as ff
-from conftest import DATA, needs_data, synthetic_impact, synthetic_loop
+from conftest import needs_data, synthetic_impact, synthetic_loop
 from foamfit import auto, one_model
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers, Specimen, Striker
@@ -23,8 +23,9 @@ from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.problem import make_problem
 from foamfit.report.page import render_report
 from foamfit.report.summary import summary_text
+from foamfit.springs import laws
 from foamfit.springs.model import Model
-from foamfit.trust import evidence, prediction
+from foamfit.trust import evidence
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.residuals.residual_tests import find_structure, neighbours_test, runs_test
 
@@ -139,7 +140,7 @@ def test_a_bent_structure_is_found_where_it_is():
     strain = np.concatenate([np.linspace(0, 1, 200), np.linspace(1, 0, 200)])
     switches = np.array([[50, 1, 0, 1, 0], [150, 1, 1, 2, 0], [250, 1, 2, 3, 0]], dtype=float)
     problem = SimpleNamespace(
-        model=SimpleNamespace(kinds=("linear", "bistable")),
+        model=SimpleNamespace(laws=[laws.law("linear"), laws.law("bistable")]),
         objective=SimpleNamespace(time=np.arange(400.0)),
         measurement=SimpleNamespace(stress=strain),
     )
@@ -154,7 +155,6 @@ def test_a_bent_structure_is_found_where_it_is():
     assert found.bent > 0.99
     rms = 0.1 * np.sqrt(4 / 45) * 0.5  # of x² - 1/3 along a quarter of the samples
     assert found.size == pytest.approx(rms, rel=0.05)
-    assert found.noise == pytest.approx(1e-3, rel=0.15)
 
 
 # ---------------------------------------------------------------- known structures
@@ -322,8 +322,8 @@ def test_held_back_samples_are_predicted_by_a_fit_to_the_others():
         test, "microscale", None, one_model.Options(starts=4, relaxation=1), lambda *_: None
     )
     beside = BestPoint(found.problem, found.best().values * 1.02)
-    assert prediction.misfit_of(beside, beside.residual) > 3e-3
-    assert prediction.predicted_misfit(beside) < 3e-4
+    assert evidence.misfit_of(beside, beside.residual) > 3e-3
+    assert evidence.predicted_misfit(beside) < 3e-4
 
 
 def test_a_microscale_spring_that_relaxes_is_found():
@@ -375,10 +375,10 @@ def test_without_the_time_for_a_prediction_the_fitted_misfit_stands_in(given):
 
 
 @needs_data
-def test_a_running_shoe_foam_ends_below_one_percent(tmp_path, monkeypatch):
+def test_a_running_shoe_foam_ends_below_one_percent(thin_foams, tmp_path, monkeypatch):
     toml = tmp_path / "specimen.toml"
     toml.write_text('[specimen]\nheight = "10.53 mm"\ndiameter = "7.63 mm"\n')
-    test = ff.read_test(DATA / "shoe-foam" / "turbo-comp-1_cycle1.csv", toml)
+    test = ff.read_test(thin_foams / "shoe-foam" / "turbo-comp-1_cycle1.csv", toml)
     few = (*groups("bistable", "microscale"), *groups("microscale", relaxation=1))
     monkeypatch.setattr(auto, "LADDER", few)  # for time
     result = ff.fit(test, model="auto", starts=4, intervals="local")
@@ -391,7 +391,8 @@ def test_a_simpler_model_is_carried_into_its_relaxation():
     test = slow_loop()
     simple = ff.fit(test, model="microscale", starts=2)
     problem = make_problem(test, "microscale", None, None, None, False, relaxation=1)
-    auto._carry(problem.params, problem.model, simple)
+    tried = [SimpleNamespace(result=simple, chisqr=1.0)]
+    auto._carry(problem.params, problem.model, tried)
     assert problem.params["s1_g1"].value == 0.0
     there = problem.objective.simulate(problem.vector()).curves["stress_strain"]
     assert there == pytest.approx(simple.curves.stress_along, rel=1e-9)
@@ -456,7 +457,7 @@ def test_chains_of_microscale_springs_need_one_that_follows_the_curves(microscal
         ""
         if tried
         else "one microscale spring misses the curves by 2.3 % of the range, "
-        "one bistable spring by 2 %"
+        "one bistable spring misses the curves by 2 % of the range"
     )
     for model in (Model.parse("linear+bistable"), Model.parse("microscale", 1)):
         assert auto._hopeless(model, before) == ""

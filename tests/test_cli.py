@@ -635,7 +635,7 @@ DRIVE = '[drive]\nkind = "stress"\nfile = "drive.csv"\n'
         ('[chain]\narea = "1 mm^2"\n' + IMPACT, ("[[chain.springs]]",)),
         (OWN.replace("0.14", "0.4") + IMPACT, ("spring 1", "eps_a")),
         (OWN.replace('"5.5 MPa"', '"5.5 mm"') + IMPACT, ("spring 1", "k0", "another kind")),
-        (OWN.replace('"5.5 MPa"', "5.5") + IMPACT, ("spring 1", "k0 = 5.5", '"1 MPa"')),
+        (OWN.replace('"5.5 MPa"', "5.5") + IMPACT, ("spring 1", "k0 = 5.5", '"5.5 MPa"')),
         (OWN + 'eta = "1 Pa"\n' + IMPACT, ("spring 1", "eta", "another kind", "Pa*s")),
         (OWN.replace('"bistable"', '"rubber"') + IMPACT, ("spring 1", "'rubber'", "bistable")),
         (OWN.replace('"1.19 mm"', '"0 mm"') + IMPACT, ("[chain]", "heights", "greater than 0")),

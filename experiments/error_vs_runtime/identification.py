@@ -1,26 +1,27 @@
 """Misfit reached against seconds: the project's own search and eight methods of lmfit.
 
-Every method minimises the same residual (`fitting.objective.Objective`) of the same problems and
-is stopped after the same time. What is recorded is the lowest cost so far against the processor
-time of the one thread that runs, which on an idle machine is the elapsed time. A local method
-starts at a random point of the search's box (`fitting.search.box_starts`, drawn from the seed) and
-starts again from the next one until the time is up; a global method that ends does so too; and so
-does `foamfit.fit`, with another seed. A run also ends once its cost is within 0.1 % of the best
-known, where nothing is left to gain.
+Question. How many problems does a method solve in a few seconds, and how fast?
 
-The eight methods are run twice: in the `lmfit.Parameters` of `foamfit.make_params` (SI values and
-bounds, what a user of lmfit would write), and in the coordinates of the project's own search,
-lent to them as `lmfit.Parameters` too, in which every point is admissible.
+Method. Every method minimises the same residual (`fitting.objective.Objective`) of the same
+problems and is stopped after the same time. What is recorded is the lowest cost so far against the
+processor time of the one thread that runs, which on an idle machine is the elapsed time. A local
+method starts at a random point of the search's box (`fitting.search.box_starts`, drawn from the
+seed) and starts again from the next one until the time is up; a global method that ends does so
+too; and so does `foamfit.fit`, with another seed. A run also ends once its cost is within 0.1 % of
+the best known, where nothing is left to gain. The eight methods are run twice: in the
+`lmfit.Parameters` of `foamfit.make_params` (SI values and bounds, what a user of lmfit would
+write), and in the coordinates of the project's own search, in which every point is admissible.
+
+Answer. `foamfit.fit` solves all problems in 3 s; see identification.md.
 
     python experiments/error_vs_runtime/identification.py           # at most 35 min of one core
     python experiments/error_vs_runtime/identification.py --budget 1 --seeds 2
     python experiments/error_vs_runtime/identification.py --redraw  # figures and tables only
 
-Writes beside itself: identification_runs.csv.gz (every improvement by more than 2 %, and when a
-problem was solved) with identification_runs.json (machine, versions, arguments), after each
-problem; identification.csv, identification.md, identification_profiles.png, identification_si.png
-and identification_box.png. FOAMFIT_DATA names the folder of the measurements by others; without it
-the shoe foam is left out.
+Writes identification_runs.csv.gz (every improvement by more than 2 %, and when a problem was
+solved) and identification_runs.json (machine, versions, arguments) after each problem; then
+identification.csv, .md and figures. FOAMFIT_DATA names the folder of the measurements by others;
+without it the shoe foam is left out.
 """
 
 # ruff: noqa: E402  (the number of threads is read when NumPy is imported)
@@ -28,7 +29,6 @@ the shoe foam is left out.
 from __future__ import annotations
 
 import os
-import sys
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"  # one thread for all, so that processor time is elapsed time
@@ -38,26 +38,16 @@ import platform
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 
+import identification_report as told
 import lmfit
 import numpy as np
 import pandas as pd
-from identification_report import (
-    COLUMNS,
-    COORDINATES,
-    LEAST_SQUARES,
-    METHODS,
-    OWN,
-    SLOPES,
-    SOLVED,
-    Setup,
-    report,
-)
+from identification_report import METHODS, OWN, SOLVED, Array, Setup, studies
 from numpy.typing import NDArray
 
 import foamfit as ff
@@ -65,8 +55,6 @@ from foamfit.fitting.box import Space
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import box_starts
-
-Array = NDArray[np.float64]
 
 HERE = Path(__file__).parent
 GZIP = {"method": "gzip", "mtime": 0}
@@ -85,7 +73,7 @@ class Case:
     file: str  # from experiments/, or from FOAMFIT_DATA where `specimen` is given
     model: str
     drive: str
-    specimen: str | None = None
+    specimen: tuple[str, str] | None = None  # height and diameter
 
     def problem(self) -> Problem:
         """Read the test and make the problem ready, as `foamfit.fit` does."""
@@ -96,9 +84,8 @@ class Case:
         if self.specimen is None:
             return ff.read_test(HERE.parent / self.file)
         with tempfile.TemporaryDirectory() as folder:
-            toml = Path(folder) / "specimen.toml"
-            toml.write_text(self.specimen)
-            return ff.read_test(Path(os.environ["FOAMFIT_DATA"]) / self.file, toml)
+            toml = studies.write_specimen(Path(folder) / "specimen.toml", *self.specimen, "")
+            return ff.read_test(studies.measurements() / self.file, toml)
 
 
 CASES = {
@@ -117,7 +104,7 @@ CASES = {
     "shoe-foam": Case(
         "One spring, shoe foam (measurement: arXiv:2602.12694)",
         "shoe-foam/turbo-comp-1_cycle1.csv", "bistable", "displacement",
-        '[specimen]\nheight = "10.53 mm"\ndiameter = "7.63 mm"\n',
+        ("10.53 mm", "7.63 mm"),
     ),
 }  # fmt: skip
 
@@ -316,7 +303,7 @@ def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int, deriva
     rng = np.random.default_rng(seed)
     for point in random_points(variables.space, rng):
         options = _options(method, int(rng.integers(2**31)))
-        if method in LEAST_SQUARES and derivatives == "problem":
+        if method in told.LEAST_SQUARES and derivatives == "problem":
             options |= {"Dfun" if method == "leastsq" else "jac": variables.jacobian}
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # of lmfit's covariances, which nobody reads here
@@ -346,9 +333,9 @@ def _options(method: str, seed: int) -> dict[str, object]:
 def best_known(case: Case, problem: Problem) -> float:
     """Lowest cost of three long searches, which also compile whatever there is to compile."""
     costs = []
-    for seed in range(3):
+    for seed in range(9000, 9003):
         result = ff.fit(
-            problem.measurement, model=case.model, drive=case.drive, seed=9000 + seed, starts=96,
+            problem.measurement, model=case.model, drive=case.drive, seed=seed, starts=96,
             intervals="local",
         )  # fmt: skip
         residual = problem.objective.residual(problem.vector(result.params))
@@ -358,8 +345,12 @@ def best_known(case: Case, problem: Problem) -> float:
 
 def run_all(options: argparse.Namespace, log: Path, notes: Path) -> None:
     """Run every method on every problem and seed; writes what was run after each problem."""
-    setup = Setup(machine(), options.budget, options.seeds, options.derivatives, {}, {})
+    names = ("foamfit", "lmfit", "scipy", "numpy", "numba")
+    where = f"{studies.processor()}, {os.cpu_count()} cores, {platform.machine()}"
+    machine = {"processor": where, **studies.versions(*names)}
+    setup = Setup(machine, options.budget, options.seeds, options.derivatives, {}, {})
     frames: list[pd.DataFrame] = []
+    ways = [("own", OWN), *((c, m) for c in options.coordinates for m in options.methods)]
     for key in options.problems:
         case = CASES[key]
         if case.specimen is not None and not os.environ.get("FOAMFIT_DATA"):
@@ -368,93 +359,55 @@ def run_all(options: argparse.Namespace, log: Path, notes: Path) -> None:
         problem = case.problem()
         known = best_known(case, problem)
         print(f"{key}: best known cost {known:.6g} of {problem.objective.n_data} samples")
-        for coordinates, method in [
-            ("own", OWN), *((c, m) for c in options.coordinates for m in options.methods)
-        ]:  # fmt: skip
-            recorders = [
-                run(case, problem, coordinates, method, seed, known, options)
-                for seed in range(options.seeds)
-            ]
-            for seed, recorder in enumerate(recorders):
+        for coordinates, method in ways:
+            ended = []
+            for seed in range(options.seeds):
+                recorder = Recorder(problem.objective, options.budget, known)
+                with recorded(recorder):
+                    if method == OWN:
+                        run_own(case, problem, seed)
+                    else:
+                        run_lmfit(problem, method, coordinates, seed, options.derivatives)
+                recorder.ended = time.process_time() - recorder.began
                 rows = [(key, coordinates, method, seed, *row) for row in recorder.finished()]
-                frames.append(pd.DataFrame(rows, columns=COLUMNS))
-            ended = " ".join(f"{recorder.cost / known:.3g}" for recorder in recorders)
-            print(f"  {coordinates:4} {method:24} cost over best known: {ended}", flush=True)
+                frames.append(pd.DataFrame(rows, columns=told.COLUMNS))
+                ended.append(f"{recorder.cost / known:.3g}")
+            print(
+                f"  {coordinates:4} {method:24} cost over best known: {' '.join(ended)}", flush=True
+            )
         setup.titles[key], setup.known[key] = case.title, known
         pd.concat(frames).to_csv(log, index=False, float_format="%.5g", compression=GZIP)
         setup.write(notes)
 
 
-def run(
-    case: Case,
-    problem: Problem,
-    coordinates: str,
-    method: str,
-    seed: int,
-    known: float,
-    options: argparse.Namespace,
-) -> Recorder:
-    """Run one method on one problem from one seed until the time is up or it is solved."""
-    recorder = Recorder(problem.objective, options.budget, known)
-    with recorded(recorder):
-        if method == OWN:
-            run_own(case, problem, seed)
-        else:
-            run_lmfit(problem, method, coordinates, seed, options.derivatives)
-    recorder.ended = time.process_time() - recorder.began
-    return recorder
-
-
-def machine() -> dict[str, str]:
-    """Machine and versions, which times belong to."""
-    names = ("foamfit", "lmfit", "scipy", "numpy", "numba")
-    processor = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        lines = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
-        processor = lines[0].split(":", 1)[1].strip() if lines else processor
-    return {
-        "processor": f"{processor}, {os.cpu_count()} cores, {platform.machine()}",
-        "python": platform.python_version(),
-        **{name: version(name) for name in names},
-    }
-
-
-def _listed(choices: dict[str, object] | tuple[str, ...]) -> Callable[[str], list[str]]:
+def _listed(choices: Iterable[str]) -> Callable[[str], list[str]]:
     """Read a list like "impact,chain" for argparse."""
 
     def read(text: str) -> list[str]:
-        given = text.split(",")
-        for item in given:
+        for item in text.split(","):
             if item not in choices:
                 raise argparse.ArgumentTypeError(f"{item!r} is none of {', '.join(choices)}")
-        return given
+        return text.split(",")
 
     return read
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--budget", type=float, default=3.0, help="seconds of a run")
-    parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--problems", type=_listed({**CASES}), default=list(CASES))
-    parser.add_argument("--methods", type=_listed(METHODS), default=list(METHODS))
-    parser.add_argument("--coordinates", type=_listed({**COORDINATES}), default=list(COORDINATES))
-    parser.add_argument("--derivatives", choices=list(SLOPES), default="differences")
+    parser = studies.arguments(__doc__, HERE, budget=(3.0, "seconds of a run"), seeds=10)
+    for name, choices in {
+        "problems": CASES, "methods": METHODS, "coordinates": told.COORDINATES,
+    }.items():  # fmt: skip
+        parser.add_argument(f"--{name}", type=_listed(choices), default=list(choices))
+    parser.add_argument("--derivatives", choices=list(told.SLOPES), default="differences")
     parser.add_argument("--redraw", action="store_true", help="draw what was recorded")
-    parser.add_argument("--out", type=Path, default=HERE)
     options = parser.parse_args()
     log, notes = (options.out / f"identification_runs.{end}" for end in ("csv.gz", "json"))
     if not options.redraw:
         run_all(options, log, notes)
     if not log.exists():
         raise SystemExit(f"nothing was run: there is no {log}")
-    report(pd.read_csv(log), Setup.read(notes), options.out)
+    told.report(pd.read_csv(log), Setup.read(notes), options.out)
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(HERE.parent))
-    from unchanged import keep_unchanged
-
-    with keep_unchanged(HERE):
-        main()
+    studies.run(main, HERE)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -15,12 +15,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from foamfit.report.figures import STYLE
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+import studies  # noqa: E402
 
 Array = NDArray[np.float64]
 
 SOLVED = 1.05  # cost over the best known cost at which a problem counts as solved
-COLUMNS = ["problem", "coordinates", "method", "seed", "seconds", "evaluations", "cost"]
+RUN = ["problem", "coordinates", "method", "seed"]
+COLUMNS = [*RUN, "seconds", "evaluations", "cost"]
 OWN = "foamfit.fit"
 LEAST_SQUARES = ("leastsq", "least_squares")
 GROUPS = {
@@ -35,34 +38,30 @@ COORDINATES = {
 }
 # Colours that all can tell apart (Okabe & Ito, and two more); lines differ in their dashes too.
 STYLES: dict[str, tuple[str, str]] = {
-    OWN: ("#0072B2", "-"),
+    OWN: (studies.BLUE, "-"),
     "leastsq": ("black", "-"),
-    "least_squares": ("#56B4E9", "--"),
-    "nelder": ("#009E73", "-"),
+    "least_squares": (studies.SKY, "--"),
+    "nelder": (studies.GREEN, "-"),
     "powell": ("#999933", "--"),
-    "differential_evolution": ("#D55E00", "-"),
-    "basinhopping": ("#E69F00", "--"),
-    "dual_annealing": ("#CC79A7", "-."),
+    "differential_evolution": (studies.VERMILION, "-"),
+    "basinhopping": (studies.ORANGE, "--"),
+    "dual_annealing": (studies.PURPLE, "-."),
     "ampgo": ("#6b6b6b", ":"),
 }
+SLOPES = {
+    "differences": "`leastsq` and `least_squares` take forward differences with a step of 1e-5; "
+    "`least_squares` scales its variables by the Jacobian.",
+    "problem": "`leastsq` and `least_squares` are given the derivatives that the project's own "
+    "search uses (`Problem.slopes`); `least_squares` scales its variables by the Jacobian.",
+}
+SHOE = " Shoe foam: first cycle of turbo-comp-1, a measurement by others, arXiv:2602.12694."
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What was run, and where.
+    """What was run: processor and versions, longest time of a run, runs of each method.
 
-    Attributes
-    ----------
-    machine : dict of str
-        Processor and versions.
-    budget_s : float
-        Longest time of a run, s.
-    seeds : int
-        Runs of each method on each problem.
-    derivatives : str
-        Whose the derivatives of leastsq and least_squares were: a key of `SLOPES`.
-    titles, known : dict
-        Of each problem that was run: its title and its best known cost.
+    `derivatives` is a key of `SLOPES`; titles and best known costs are by problem.
     """
 
     machine: dict[str, str]
@@ -87,52 +86,35 @@ class Setup:
 
 def solved_after(runs: pd.DataFrame, known: dict[str, float]) -> pd.DataFrame:
     """One row for each run: seconds until it was solved (inf if never) and how it ended."""
-    rows = []
-    keys = ["problem", "coordinates", "method", "seed"]
-    for (problem, coordinates, method, seed), run in runs.groupby(keys, sort=False):
-        reached = run[run["cost"] <= SOLVED * known[str(problem)]]
-        rows.append(
-            {
-                "problem": problem,
-                "coordinates": coordinates,
-                "method": method,
-                "seed": seed,
-                "solved_after_s": reached["seconds"].iloc[0] if len(reached) else np.inf,
-                "misfit_ratio": (run["cost"].iloc[-1] / known[str(problem)]) ** 0.5,
-                "ended_after_s": run["seconds"].iloc[-1],
-                "evaluations": run["evaluations"].iloc[-1],
-            }
-        )
-    return pd.DataFrame(rows)
+    runs = runs.assign(ratio=runs["cost"] / runs["problem"].map(known))
+    ends = runs.groupby(RUN, sort=False).agg(
+        misfit_ratio=("ratio", lambda ratios: ratios.iloc[-1] ** 0.5),
+        ended_after_s=("seconds", "last"), evaluations=("evaluations", "last"),
+    )  # fmt: skip
+    reached = runs[runs["ratio"] <= SOLVED].groupby(RUN)["seconds"].first()
+    ends.insert(0, "solved_after_s", reached.reindex(ends.index).fillna(np.inf))
+    return ends.reset_index()
 
 
 def tabulate(ends: pd.DataFrame) -> pd.DataFrame:
     """One row for each problem and method: how many seeds it solved, how fast, how far it came."""
-    rows = []
-    keys = ["problem", "coordinates", "method"]
-    for (problem, coordinates, method), runs in ends.groupby(keys, sort=False):
+
+    def row(runs: pd.DataFrame) -> pd.Series:
+        after, misfit = runs["solved_after_s"], runs["misfit_ratio"]
+        pace = runs["evaluations"] / runs["ended_after_s"]
         # inf - inf is no number: quartiles of times by rank, not by interpolation
-        low, middle, high = np.quantile(
-            runs["solved_after_s"], (0.25, 0.5, 0.75), method="inverted_cdf"
-        )
-        rows.append(
-            {
-                "problem": problem,
-                "coordinates": coordinates,
-                "method": method,
-                "solved": int(np.isfinite(runs["solved_after_s"]).sum()),
-                "seeds": len(runs),
-                "solved after, quartile 1 (s)": low,
-                "solved after, median (s)": middle,
-                "solved after, quartile 3 (s)": high,
-                "misfit over best known at the end, median": runs["misfit_ratio"].median(),
-                "misfit over best known at the end, worst": runs["misfit_ratio"].max(),
-                "evaluations per second, median": (
-                    runs["evaluations"] / runs["ended_after_s"]
-                ).median(),
-            }
-        )
-    return pd.DataFrame(rows)
+        low, middle, high = np.quantile(after, (0.25, 0.5, 0.75), method="inverted_cdf")
+        return pd.Series({
+            "solved": int(np.isfinite(after).sum()), "seeds": len(runs),
+            "solved after, quartile 1 (s)": low, "solved after, median (s)": middle,
+            "solved after, quartile 3 (s)": high,
+            "misfit over best known at the end, median": misfit.median(),
+            "misfit over best known at the end, worst": misfit.max(),
+            "evaluations per second, median": pace.median(),
+        })  # fmt: skip
+
+    table = ends.groupby(RUN[:3], sort=False).apply(row, include_groups=False).reset_index()
+    return table.astype({"solved": int, "seeds": int})
 
 
 def profile(ends: pd.DataFrame, coordinates: str) -> dict[str, Array]:
@@ -155,23 +137,21 @@ def profile(ends: pd.DataFrame, coordinates: str) -> dict[str, Array]:
 
 def draw_profiles(ends: pd.DataFrame, setup: Setup, path: Path) -> None:
     """Share of problem-seeds solved within a factor of the shortest time."""
-    shown = [c for c in COORDINATES if c in set(ends["coordinates"])]
-    ratios = {coordinates: profile(ends, coordinates) for coordinates in shown}
+    ratios = {coordinates: profile(ends, coordinates) for coordinates in shown(ends)}
     finite = [r[np.isfinite(r)] for panel in ratios.values() for r in panel.values()]
     last = 10.0 ** np.ceil(np.log10(1.05 * np.concatenate([[5.0], *finite]).max()))
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(3.5 * len(shown), 3.6), layout="constrained")
-        panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-        for axes, coordinates in zip(panels, shown, strict=True):
-            for name in reversed(ratios[coordinates]):  # the project's own on top
-                mine = ratios[coordinates][name]
-                steps = np.sort(mine[np.isfinite(mine)])
-                share = np.arange(steps.size + 1) / mine.size
+    with studies.sheet(path, 3.5 * len(ratios), 3.6) as figure:
+        panels = figure.subplots(1, len(ratios), sharey=True, squeeze=False)[0]
+        for axes, (coordinates, by_method) in zip(panels, ratios.items(), strict=True):
+            for name in reversed(by_method):  # the project's own on top
+                steps = np.sort(by_method[name][np.isfinite(by_method[name])])
+                share = np.arange(steps.size + 1) / by_method[name].size
                 axes.step([1.0, *steps, last], [*share, share[-1]], where="post", **_line(name))
             axes.set(xscale="log", xlim=(1.0, last), ylim=(-0.02, 1.02))
-            axes.set_title(COORDINATES[coordinates])
-            axes.set_xlabel("processor time over the shortest, τ (–)")
-            _grid(axes)
+            axes.set(
+                title=COORDINATES[coordinates], xlabel="processor time over the shortest, τ (–)"
+            )
+            studies.gridlines(axes)
         panels[0].set_ylabel("share of problem-seeds solved within τ (–)")
         figure.suptitle(
             f"{setup.seeds * len(setup.known)} problem-seeds; solved: cost within 5 % of the best "
@@ -179,7 +159,6 @@ def draw_profiles(ends: pd.DataFrame, setup: Setup, path: Path) -> None:
             fontsize=8,
         )
         _legend(figure, set(ends["method"]))
-        figure.savefig(path, dpi=200)
 
 
 def draw_curves(runs: pd.DataFrame, coordinates: str, setup: Setup, path: Path) -> None:
@@ -187,29 +166,25 @@ def draw_curves(runs: pd.DataFrame, coordinates: str, setup: Setup, path: Path) 
     count = len(setup.known)
     elapsed = np.geomspace(0.01, setup.budget_s, 200)
     among = runs[runs["coordinates"].isin(("own", coordinates))]
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.0, 1.7 * count + 0.9), layout="constrained")
+    with studies.sheet(path, 7.0, 1.7 * count + 0.9) as figure:
         grid = figure.subplots(count, len(GROUPS), sharex=True, sharey=True, squeeze=False)
         for key, row in zip(setup.known, grid, strict=True):
-            for axes, (title, methods) in zip(row, GROUPS.items(), strict=True):
+            for axes, methods in zip(row, GROUPS.values(), strict=True):
                 for name in (*methods, OWN):
                     chosen = among[(among["problem"] == key) & (among["method"] == name)]
                     if len(chosen):
                         _band(axes, elapsed, chosen, setup.known[key], name)
-                axes.set(
-                    xscale="log", yscale="log", xlim=(elapsed[0], elapsed[-1]), ylim=(0.9, 300.0)
-                )
+                axes.set(xscale="log", yscale="log")
+                axes.set(xlim=(elapsed[0], elapsed[-1]), ylim=(0.9, 300.0))
                 axes.axhline(1.0, color="0.75", linewidth=0.8, zorder=0)
-                _grid(axes)
-                if key == list(setup.known)[-1]:
-                    axes.set_xlabel(f"processor time (s): {title}")
+                studies.gridlines(axes)
             row[0].set_ylabel("misfit over\nbest known (–)")
             row[len(GROUPS) // 2].set_title(setup.titles[key])
-        figure.suptitle(
-            f"{COORDINATES[coordinates]}: median and quartiles of {setup.seeds} seeds", fontsize=8
-        )
+        for axes, title in zip(grid[-1], GROUPS, strict=True):
+            axes.set_xlabel(f"processor time (s): {title}")
+        told = f"{COORDINATES[coordinates]}: median and quartiles of {setup.seeds} seeds"
+        figure.suptitle(told, fontsize=8)
         _legend(figure, set(among["method"]))
-        figure.savefig(path, dpi=200)
 
 
 def _band(axes: Axes, elapsed: Array, runs: pd.DataFrame, known: float, name: str) -> None:
@@ -220,11 +195,9 @@ def _band(axes: Axes, elapsed: Array, runs: pd.DataFrame, known: float, name: st
         misfit = np.sqrt(run["cost"].to_numpy() / known)
         reached.append(np.where(at >= 0, misfit[at], np.inf))
     low, middle, high = np.quantile(reached, (0.25, 0.5, 0.75), axis=0, method="inverted_cdf")
-    there = np.isfinite(high)  # from when on three quarters of the seeds have anything
+    there = list(np.isfinite(high))  # from when on three quarters of the seeds have anything
     line = _line(name)
-    axes.fill_between(
-        elapsed, low, high, where=list(there), color=line["color"], alpha=0.15, linewidth=0
-    )
+    axes.fill_between(elapsed, low, high, where=there, color=line["color"], alpha=0.15, linewidth=0)
     axes.plot(elapsed, middle, **line)
 
 
@@ -232,11 +205,6 @@ def _line(name: str) -> dict[str, Any]:
     """Colour, dashes and width of a method's line."""
     colour, dash = STYLES[name]
     return {"color": colour, "linestyle": dash, "linewidth": 2.0 if name == OWN else 1.1}
-
-
-def _grid(axes: Axes) -> None:
-    axes.grid(color="0.93", linewidth=0.5)
-    axes.set_axisbelow(True)
 
 
 def _legend(figure: Figure, methods: set[str]) -> None:
@@ -247,107 +215,43 @@ def _legend(figure: Figure, methods: set[str]) -> None:
 
 # ---------------------------------------------------------------- page
 
-PAGE = """\
-# Identification: misfit against run time
 
-Made by `python experiments/error_vs_runtime/identification.py`; `--redraw` draws the recorded runs
-again. {seeds} seeds for each of {problems} problems; a run takes at most {budget:g} s on one
-thread, in seconds of processor time (on an idle machine, of elapsed time).
-
-Machine: {machine}.
-
-Everyone minimises the same residual, is stopped after the same time, and starts again when it ends
-early: a method of lmfit from the next random point of the seed, `foamfit.fit` with another seed.
-`foamfit.fit` first descends on the measured loop, which is another residual; until that is done it
-has nothing to show here. A global method may need more time than this; `--budget` gives it.
-*Solved* is a cost (sum of squares) within 5 % of the best known, which is the lowest of three long
-searches of `foamfit.fit` and of all these runs. *si*: the `lmfit.Parameters` that
-`foamfit.make_params` gives. *box*: `lmfit.Parameters` in the coordinates of foamfit's own search,
-lent to all, where every point is an admissible chain. {slopes}
-
-{findings}
-
-![Performance profiles](identification_profiles.png)
-
-*Performance profiles (Dolan & Moré, Math. Program. 91, 201, 2002): the share of problem-seeds that
-a method solves within a factor τ of the shortest time. Left edge: how often it is the fastest;
-right edge: how often it solves at all.*
-
-Seeds solved, and seconds until then (median over all seeds; never: fewer than half were solved):
-
-{table}
-
-Quartiles, final misfits and evaluations per second are in
-[identification.csv](identification.csv).
-
-{curves}
-
-*Reconstruction: simulated from published parameters with 1 % noise, not measured.{shoe}*
-"""
-SLOPES = {
-    "differences": "`leastsq` and `least_squares` take forward differences with a step of 1e-5; "
-    "`least_squares` scales its variables by the Jacobian.",
-    "problem": "`leastsq` and `least_squares` are given the derivatives that the project's own "
-    "search uses (`Problem.slopes`); `least_squares` scales its variables by the Jacobian.",
-}
-SHOE = " Shoe foam: first cycle of turbo-comp-1, a measurement by others, arXiv:2602.12694."
+def shown(ends: pd.DataFrame) -> list[str]:
+    """Coordinates in which methods of lmfit were run."""
+    return [coordinates for coordinates in COORDINATES if coordinates in set(ends["coordinates"])]
 
 
 def findings(ends: pd.DataFrame) -> str:
     """Say in two sentences what the runs say."""
-    out = []
-    for coordinates in COORDINATES:
-        among = ends[ends["coordinates"] == coordinates]
-        if among.empty:
-            continue
-        own = ends[ends["coordinates"] == "own"]["solved_after_s"]
-        solved = among.groupby("method", sort=False)["solved_after_s"].agg(
-            lambda times: int(np.isfinite(times).sum())
-        )
-        best = solved.idxmax()
-        ratios = profile(ends, coordinates)
-        first = np.mean(ratios[OWN] == 1.0)
+    solved = np.isfinite(ends["solved_after_s"])
+    own, out = solved[ends["coordinates"] == "own"], []
+    for coordinates in shown(ends):
+        counts = solved.groupby([ends["coordinates"], ends["method"]], sort=False).sum()[
+            coordinates
+        ]
+        best = counts.idxmax()
+        first = np.mean(profile(ends, coordinates)[OWN] == 1.0)
         out.append(
-            f"In *{coordinates}*, `{OWN}` solves {int(np.isfinite(own).sum())} of {len(own)} "
-            f"problem-seeds and is the fastest in {first:.0%}; of lmfit's methods "
-            f"`{best}` solves most, {solved[best]} of {len(own)}."
+            f"In *{coordinates}*, `{OWN}` solves {own.sum()} of {len(own)} problem-seeds and is "
+            f"the fastest in {first:.0%}; of lmfit's methods `{best}` solves most, {counts[best]} "
+            f"of {len(own)}."
         )
     return " ".join(out)
 
 
-def page(ends: pd.DataFrame, table: pd.DataFrame, setup: Setup) -> str:
-    """The page: what was done, on what machine, what came out."""
-    shown = [c for c in COORDINATES if c in set(ends["coordinates"])]
-    curves = (f"![Misfit against seconds, {COORDINATES[c]}](identification_{c}.png)" for c in shown)
-    return PAGE.format(
-        seeds=setup.seeds,
-        problems=len(setup.known),
-        budget=setup.budget_s,
-        machine=", ".join(f"{k} {v}" for k, v in setup.machine.items()),
-        slopes=SLOPES[setup.derivatives],
-        findings=findings(ends),
-        table=_summary(table, setup),
-        curves="\n\n".join(curves),
-        shoe=SHOE if "shoe-foam" in setup.known else "",
-    )
-
-
-def _summary(table: pd.DataFrame, setup: Setup) -> str:
+def summary(table: pd.DataFrame, setup: Setup) -> str:
     """Markdown: one row for each method, one column for each problem."""
-    lines = [
-        f"| method | in | {' | '.join(setup.titles[key] for key in setup.known)} | all |",
-        f"| --- | --- |{' --- |' * (len(setup.known) + 1)}",
-    ]
-    for (coordinates, method), rows in table.groupby(["coordinates", "method"], sort=False):
+    rows = []
+    for (coordinates, method), own in table.groupby(["coordinates", "method"], sort=False):
         cells = []
         for key in setup.known:
-            row = rows[rows["problem"] == key].iloc[0]
+            row = own[own["problem"] == key].iloc[0]
             median = row["solved after, median (s)"]
             after = f"{median:.2f} s" if np.isfinite(median) else "never"
             cells.append(f"{row['solved']} of {row['seeds']}, {after}")
-        cells.append(f"{rows['solved'].sum()} of {rows['seeds'].sum()}")
-        lines.append(f"| {method} | {coordinates} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append([method, coordinates, *cells, f"{own['solved'].sum()} of {own['seeds'].sum()}"])
+    titles = [setup.titles[key] for key in setup.known]
+    return studies.markdown(["method", "in", *titles, "all"], rows)
 
 
 def report(runs: pd.DataFrame, setup: Setup, folder: Path) -> None:
@@ -357,10 +261,20 @@ def report(runs: pd.DataFrame, setup: Setup, folder: Path) -> None:
     setup = replace(setup, known=known)
     ends = solved_after(runs, known)
     table = tabulate(ends)
-    table.to_csv(folder / "identification.csv", index=False, float_format="%.4g")
-    (folder / "identification.md").write_text(page(ends, table, setup))
+    studies.write_csv(table, folder / "identification.csv")
     draw_profiles(ends, setup, folder / "identification_profiles.png")
-    for coordinates in COORDINATES:
-        if coordinates in set(ends["coordinates"]):
-            draw_curves(runs, coordinates, setup, folder / f"identification_{coordinates}.png")
+    for coordinates in shown(ends):
+        draw_curves(runs, coordinates, setup, folder / f"identification_{coordinates}.png")
+    template = (HERE / "identification.template.md").read_text(encoding="utf-8")
+    page = template.format(
+        seeds=setup.seeds, problems=len(known), budget=setup.budget_s,
+        machine=", ".join(f"{k} {v}" for k, v in setup.machine.items()),
+        slopes=SLOPES[setup.derivatives], findings=findings(ends), table=summary(table, setup),
+        curves="\n\n".join(
+            f"![Misfit against seconds, {COORDINATES[c]}](identification_{c}.png)"
+            for c in shown(ends)
+        ),
+        shoe=SHOE if "shoe-foam" in known else "",
+    )  # fmt: skip
+    (folder / "identification.md").write_text(page, encoding="utf-8")
     print(findings(ends))

@@ -18,31 +18,7 @@ from numba import njit
 from scipy.integrate import DOP853, LSODA, Radau
 from scipy.optimize import brentq
 
-from foamfit.springs.kernels import (
-    EPS_A,
-    EPS_C,
-    EPS_HAT_A,
-    EPS_HAT_C,
-    ETA,
-    K0,
-    KIND,
-    SIGMA_A,
-    SIGMA_C,
-    SIGMA_HAT_A,
-    SIGMA_HAT_C,
-    A,
-    C,
-    D,
-    E,
-    above,
-    below,
-    branch_shape,
-    first_branch,
-    interval,
-    slope_on,
-    strain_on,
-    stress_on,
-)
+from foamfit.springs import kernels as law
 from foamfit.springs.law import BISTABLE
 
 METHODS = {"DOP853": DOP853, "LSODA": LSODA, "Radau": Radau}
@@ -57,22 +33,22 @@ compiled = njit(cache=True, error_model="numpy")
 @compiled
 def at_rest(row):
     """Branch of a spring at rest."""
-    return first_branch(row)
+    return law.first_branch(row)
 
 
 @compiled
 def entered(branch, rising):
     """Branch that a spring enters when it leaves another."""
-    return above(branch) if rising else below(branch)
+    return law.above(branch) if rising else law.below(branch)
 
 
 @compiled
 def answer(row, branch, driven, by_stress):
     """Strain at a stress, or stress at a strain."""
-    return strain_on(row, branch, driven) if by_stress else stress_on(row, branch, driven)
+    return law.strain_on(row, branch, driven) if by_stress else law.stress_on(row, branch, driven)
 
 
-# ---------------------------------------------------------------- a mass above every spring
+# ---------------------------------------------------------------- a mass law.above every spring
 
 
 @compiled
@@ -86,7 +62,10 @@ def nodes_rate(y, rows, branches, heights, mass, drag):
         if i > 0:
             u -= y[i - 1]
             rate -= y[n + i - 1]
-        stress = stress_on(rows[i], branches[i], u / heights[i]) + rows[i, ETA] * rate / heights[i]
+        stress = (
+            law.stress_on(rows[i], branches[i], u / heights[i])
+            + rows[i, law.ETA] * rate / heights[i]
+        )
         out[i] = y[n + i]
         out[n + i] = (over - stress) / mass[i]
         over = stress
@@ -102,8 +81,8 @@ def nodes_jacobian(y, rows, branches, heights, mass, drag):
     for i in range(n):
         out[i, n + i] = 1.0
         u = y[i] - (y[i - 1] if i > 0 else 0.0)
-        stiff = slope_on(rows[i], branches[i], u / heights[i]) / heights[i]
-        dash = rows[i, ETA] / heights[i]
+        stiff = law.slope_on(rows[i], branches[i], u / heights[i]) / heights[i]
+        dash = rows[i, law.ETA] / heights[i]
         for by, part in ((0, stiff), (n, dash)):
             out[n + i, by + i] -= part / mass[i]
             if i > 0:
@@ -126,17 +105,17 @@ def nodes_room(states, rows, branches, heights, pressed):
         least = np.inf
         for i in range(n):
             eps = (states[i, j] - (states[i - 1, j] if i > 0 else 0.0)) / heights[i]
-            low, high = interval(rows[i], branches[i])
+            low, high = law.interval(rows[i], branches[i])
             if eps - low < least:
                 least, who, side = eps - low, i, -1
             if high - eps < least:
                 least, who, side = high - eps, i, 1
         if pressed:
             eps = states[0, j] / heights[0]
-            base = stress_on(rows[0], branches[0], eps)
-            base += rows[0, ETA] * states[n, j] / heights[0]
-            if base / rows[0, K0] < least:
-                least, who, side = base / rows[0, K0], -1, 0
+            base = law.stress_on(rows[0], branches[0], eps)
+            base += rows[0, law.ETA] * states[n, j] / heights[0]
+            if base / rows[0, law.K0] < least:
+                least, who, side = base / rows[0, law.K0], -1, 0
         if least < 0.0:
             return j, least, who, side
     return -1, least, who, side
@@ -149,8 +128,8 @@ def nodes_output(states, rows, branches, heights, out_w, out_s):
     for j in range(states.shape[1]):
         eps = states[0, j] / heights[0]
         out_w[j] = states[n - 1, j]
-        dash = rows[0, ETA] * states[n, j] / heights[0]
-        out_s[j] = stress_on(rows[0], branches[0], eps) + dash
+        dash = rows[0, law.ETA] * states[n, j] / heights[0]
+        out_s[j] = law.stress_on(rows[0], branches[0], eps) + dash
 
 
 # ---------------------------------------------------------------- massless springs in series
@@ -161,7 +140,7 @@ def series_compliance(s, rows, branches, heights):
     """C = Σ h_i dε_i/ds (m/Pa) of springs under one stress, and dC/ds; k/(k+s)² where curved."""
     soft, change = 0.0, 0.0
     for i in range(heights.size):
-        curved, k, _, _ = branch_shape(rows[i], branches[i])
+        curved, k, _, _ = law.branch_shape(rows[i], branches[i])
         part = heights[i] * (k / (k + s) ** 2 if curved else 1.0 / k)
         soft += part
         change -= 2.0 * part / (k + s) if curved else 0.0
@@ -195,14 +174,14 @@ def series_limits(rows, branches, pressed):
     """
     low, high, who_low, who_high = (0.0 if pressed else -np.inf), np.inf, -1, -1
     for i in range(branches.size):
-        if branches[i] == A:
-            down, up = -np.inf, rows[i, SIGMA_A]
-        elif branches[i] == D:
-            down, up = rows[i, SIGMA_A], rows[i, SIGMA_HAT_C]
-        elif branches[i] == C:
-            down, up = rows[i, SIGMA_C], np.inf
-        elif branches[i] == E:
-            down, up = rows[i, SIGMA_HAT_A], rows[i, SIGMA_C]
+        if branches[i] == law.A:
+            down, up = -np.inf, rows[i, law.SIGMA_A]
+        elif branches[i] == law.D:
+            down, up = rows[i, law.SIGMA_A], rows[i, law.SIGMA_HAT_C]
+        elif branches[i] == law.C:
+            down, up = rows[i, law.SIGMA_C], np.inf
+        elif branches[i] == law.E:
+            down, up = rows[i, law.SIGMA_HAT_A], rows[i, law.SIGMA_C]
         else:
             down, up = -np.inf, np.inf
         if down > low:
@@ -234,7 +213,7 @@ def series_output(states, rows, branches, heights, out_w, out_s):
         out_s[j] = states[0, j]
         out_w[j] = 0.0
         for i in range(heights.size):
-            out_w[j] += heights[i] * strain_on(rows[i], branches[i], states[0, j])
+            out_w[j] += heights[i] * law.strain_on(rows[i], branches[i], states[0, j])
 
 
 # ---------------------------------------------------------------- an impact
@@ -251,15 +230,15 @@ class System:
     speed: float
 
     def __post_init__(self) -> None:
-        """Choose the state: nodes where every spring has a mass above it, else the stress."""
+        """Choose the state: nodes where every spring has a mass law.above it, else the stress."""
         self.series = self.mass.size == 1 and self.heights.size > 1
         assert self.series or self.mass.size == self.heights.size
         self.branches = np.array([at_rest(row) for row in self.rows])
         self.pressed = False
-        self.unit = self.rows[0, K0]
+        self.unit = self.rows[0, law.K0]
         n = self.mass.size
         if self.series:
-            assert not self.rows[:, ETA].any()
+            assert not self.rows[:, law.ETA].any()
             self.y = np.array([0.0, self.speed])
             stiff = 1.0 / series_compliance(0.0, self.rows, self.branches, self.heights)[0]
             self.scale = np.array([self.speed * np.sqrt(stiff * self.mass[0]), self.speed])
@@ -415,36 +394,40 @@ def _root(gap: Callable[[float], float], low: float, high: float) -> float:
 @compiled
 def along_strain(x, y, row, branch):
     """dσ/dε."""
-    return slope_on(row, branch, x)
+    return law.slope_on(row, branch, x)
 
 
 @compiled
 def along_stress(x, y, row, branch):
     """dε/dσ."""
-    return 1.0 / slope_on(row, branch, y)
+    return 1.0 / law.slope_on(row, branch, y)
 
 
 @compiled
 def change_along_stress(y, row, branch):
     """Derivative of dε/dσ = (1-x)²/k by ε."""
-    curved, k, x0, _ = branch_shape(row, branch)
+    curved, k, x0, _ = law.branch_shape(row, branch)
     return -2.0 * (1.0 - (y - x0)) / k if curved else 0.0
 
 
 def _pieces(row: np.ndarray, driven: np.ndarray, by_stress: bool) -> list[tuple[int, float, float]]:
     """Cut a history at its turning points and switches: (branch, from, to), in order."""
     ends = {
-        A: (-np.inf, row[SIGMA_A if by_stress else EPS_A]),
-        D: (row[SIGMA_A], row[SIGMA_HAT_C]) if by_stress else (row[EPS_A], row[EPS_HAT_C]),
-        C: (row[SIGMA_C if by_stress else EPS_C], np.inf),
-        E: (row[SIGMA_HAT_A], row[SIGMA_C]) if by_stress else (row[EPS_HAT_A], row[EPS_C]),
+        law.A: (-np.inf, row[law.SIGMA_A if by_stress else law.EPS_A]),
+        law.D: (row[law.SIGMA_A], row[law.SIGMA_HAT_C])
+        if by_stress
+        else (row[law.EPS_A], row[law.EPS_HAT_C]),
+        law.C: (row[law.SIGMA_C if by_stress else law.EPS_C], np.inf),
+        law.E: (row[law.SIGMA_HAT_A], row[law.SIGMA_C])
+        if by_stress
+        else (row[law.EPS_HAT_A], row[law.EPS_C]),
     }
     turns = [0, *(np.flatnonzero(np.diff(np.sign(np.diff(driven)))) + 1), driven.size - 1]
     out, branch = [], at_rest(row)
     for a, b in pairwise(turns):
         here, there = driven[a], driven[b]
         while True:
-            low, high = ends[branch] if row[KIND] == BISTABLE else (-np.inf, np.inf)
+            low, high = ends[branch] if row[law.KIND] == BISTABLE else (-np.inf, np.inf)
             stop = min(there, high) if there > here else max(there, low)
             if stop != here:
                 out.append((branch, here, stop))
@@ -452,6 +435,27 @@ def _pieces(row: np.ndarray, driven: np.ndarray, by_stress: bool) -> list[tuple[
                 break
             branch, here = entered(branch, there > here), stop
     return out
+
+
+def along(
+    solver: Any, points: np.ndarray, done: int, out: np.ndarray, sense: float = 1.0
+) -> tuple[int, np.ndarray]:
+    """Step a solver to its end; fills `out` at the points from `done` on that it passes.
+
+    Returns how many points are done, and the last state.
+    """
+    start = solver.t
+    while solver.status == "running":
+        message = solver.step()
+        if solver.status == "failed":
+            raise RuntimeError(f"{type(solver).__name__}: {message}")
+        ahead = points[done:]
+        rest = (sense * (solver.t - ahead) >= 0.0) & (sense * (ahead - start) >= 0.0)
+        last = done + (rest.size if rest.all() else int(rest.argmin()))
+        if last > done:
+            out[done:last] = solver.dense_output()(points[done:last])[0]
+            done = last
+    return done, solver.y
 
 
 def quasi_static(
@@ -466,34 +470,16 @@ def quasi_static(
     function = along_stress if by_stress else along_strain
     branch = at_rest(row)
     y = np.array([answer(row, branch, driven[0], by_stress)])
-    atol = rtol * (1e-2 if by_stress else 1e-2 * row[K0])
+    atol = rtol * (1e-2 if by_stress else 1e-2 * row[law.K0])
     out[0], done = y[0], 1
     for branch, start, stop in _pieces(row, driven, by_stress):
-        options: dict[str, Any] = {}
-        if method != "DOP853":
 
-            def slope(x, y, branch=branch):  # type: ignore[no-untyped-def]
-                return np.array([[change_along_stress(y[0], row, branch) if by_stress else 0.0]])
+        def slope(x: float, y: np.ndarray, branch: int = branch) -> np.ndarray:
+            return np.array([[change_along_stress(y[0], row, branch) if by_stress else 0.0]])
 
-            options["jac"] = slope
         solver = METHODS[method](
-            lambda x, y, branch=branch: (function(x, y[0], row, branch),),
-            start, y, stop, rtol=rtol, atol=atol, **options,
+            lambda x, y, branch=branch: (function(x, y[0], row, branch),), start, y, stop,
+            rtol=rtol, atol=atol, **({} if method == "DOP853" else {"jac": slope}),
         )  # fmt: skip
-        while solver.status == "running":
-            message = solver.step()
-            if solver.status == "failed":
-                raise RuntimeError(f"{method}: {message}")
-            last = done
-            sense = 1.0 if stop > start else -1.0
-            while (
-                last < driven.size
-                and sense * (driven[last] - start) >= 0.0
-                and (sense * (solver.t - driven[last]) >= 0.0)
-            ):
-                last += 1
-            if last > done:
-                out[done:last] = solver.dense_output()(driven[done:last])[0]
-                done = last
-        y = solver.y
+        done, y = along(solver, driven, done, out, 1.0 if stop > start else -1.0)
     return out

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from restarted import METHODS
+from restarted import METHODS, along
 
 import foamfit as ff
 
@@ -66,6 +66,16 @@ def limits(row, rank):
     """Stresses between which a spring is held."""
     low = math.exp(row[LOG_MINUS] + row[WIDE_MINUS] * rank)
     return low, math.exp(row[LOG_PLUS] + row[WIDE_PLUS] * rank)
+
+
+@compiled
+def turned(row, branch, s):
+    """Rank at which a spring is held that turns at a stress."""
+    if s <= 0.0:
+        return -math.inf
+    if branch == SNAP:
+        return (math.log(s) - row[LOG_PLUS]) / row[WIDE_PLUS]
+    return (math.log(s) - row[LOG_MINUS]) / row[WIDE_MINUS]
 
 
 @compiled
@@ -152,8 +162,7 @@ class MemorySystem:
         if self.branch == HELD:
             self.branch = SNAP if side > 0 else BACK
             return
-        place, wide = (LOG_PLUS, WIDE_PLUS) if self.branch == SNAP else (LOG_MINUS, WIDE_MINUS)
-        self.rank = (math.log(self.y[0]) - self.row[place]) / self.row[wide]
+        self.rank = turned(self.row, self.branch, self.y[0])
         self.branch = HELD
 
     def room(self) -> Callable[[np.ndarray], tuple[int, float, int, int]]:
@@ -206,10 +215,7 @@ def runge_kutta(row, speed, t, substeps, out_w, out_s):
             else:
                 rising = y[0] > before[0]
                 if rising != (branch == SNAP):
-                    if branch == SNAP:
-                        rank = (math.log(before[0]) - row[LOG_PLUS]) / row[WIDE_PLUS]
-                    else:
-                        rank = (math.log(before[0]) - row[LOG_MINUS]) / row[WIDE_MINUS]
+                    rank = turned(row, branch, before[0])
                     branch = HELD
         output(y.reshape(3, 1), row, branch, rank, out_w[j : j + 1], out_s[j : j + 1])
 
@@ -242,16 +248,8 @@ def stress_at(row, branch, rank, eps, guess):
 def follow(row, state, eps):
     """Equilibrium stress at the next strain of a history; `state` is (branch, rank, strain, s)."""
     branch, rank, last, s = int(state[0]), state[1], state[2], state[3]
-    if branch == SNAP and eps < last:
-        branch, rank = (
-            HELD,
-            (math.log(s) - row[LOG_PLUS]) / row[WIDE_PLUS] if s > 0.0 else -math.inf,
-        )
-    elif branch == BACK and eps > last:
-        branch, rank = (
-            HELD,
-            (math.log(s) - row[LOG_MINUS]) / row[WIDE_MINUS] if s > 0.0 else -math.inf,
-        )
+    if (branch == SNAP and eps < last) or (branch == BACK and eps > last):
+        branch, rank = HELD, turned(row, branch, s)
     if branch == HELD:
         low, high = limits(row, rank)
         if eps > strain(row, HELD, rank, high)[0]:
@@ -301,16 +299,7 @@ def along_displacement(
             lambda now, y: (relaxing_rate(now, y[0], *given),), t[first], z[first : first + 1],
             t[last], rtol=rtol, atol=rtol * 1e-2 * row[K0], **options,
         )  # fmt: skip
-        done = first + 1
-        while solver.status == "running":
-            message = solver.step()
-            if solver.status == "failed":
-                raise RuntimeError(f"{method}: {message}")
-            till = int(np.searchsorted(t[: last + 1], solver.t, side="right"))
-            if till > done:
-                z[done:till] = solver.dense_output()(t[done:till])[0]
-                done = till
-        z[last] = solver.y[0]
+        z[last] = along(solver, t[: last + 1], first + 1, z)[1][0]
     return (1.0 + row[G]) * equilibrium + z
 
 

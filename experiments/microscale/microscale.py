@@ -1,32 +1,33 @@
 """Do discrete micro-springs converge to the microscale spring, and do their inner loops close?
 
-n micro-springs in series, at the ranks (j - 1/2)/n, each with branches a and c of one spring and
-snap stresses of its own, are followed from event to event: between events the stress alone says the
-strain, and at an event one micro-spring snaps. Stress is prescribed, with partial unloading and
-partial reloading. The law of `foamfit.MicroscaleSpring` is what they should come to.
+Method. n micro-springs in series, at the ranks (j - 1/2)/n, each with branches a and c of one
+spring and snap stresses of its own, are followed from event to event: between events the stress
+alone says the strain, and at an event one micro-spring snaps. Stress is prescribed, with partial
+unloading and partial reloading. The law of `foamfit.MicroscaleSpring` is what they should come to.
+
+Answer. Their largest difference in strain falls as 1/n, and inner loops close to 1e-15: README.md.
 
     python experiments/microscale/microscale.py
 """
 
 from __future__ import annotations
 
-import csv
 import sys
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
-import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import norm
 
 import foamfit as ff
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+import studies  # noqa: E402
+
 Array = NDArray[np.float64]
 
-HERE = Path(__file__).parent
 SPRING = ff.MicroscaleSpring(
     k0=5.5e5, kc=2.5e5, eps_star=0.08, sigma_plus=1.3e5, spread_plus=0.4, sigma_minus=5.5e4,
     spread_minus=0.77,
@@ -107,13 +108,8 @@ def rate(table: list[tuple[int, float, float]], column: int) -> float:
 
 def draw(table: list[tuple[int, float, float]], path: Path) -> None:
     """The loops of a few micro-springs on those of the law, and the error against their number."""
-    black, blue, vermilion, grey = "#000000", "#0072B2", "#D55E00", "#8c8c8c"
-    style: Any = {
-        "font.size": 8, "axes.spines.top": False, "axes.spines.right": False,
-        "legend.frameon": False, "axes.titlesize": 8, "axes.titlelocation": "left",
-    }  # fmt: skip
-    with matplotlib.rc_context(style):
-        figure = Figure(figsize=(7.0, 3.0), layout="constrained")
+    black, blue, vermilion, grey = studies.BLACK, studies.BLUE, studies.VERMILION, studies.GREY
+    with studies.sheet(path, 7.0, 3.0, 150) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.35, 1.0))
         _, strain, stress = Chain(SPRING, SHOWN).follow(np.array(TURNS))
 
@@ -129,32 +125,22 @@ def draw(table: list[tuple[int, float, float]], path: Path) -> None:
         right.loglog(n, 0.3 * table[0][1] * n[0] / n, "--", color=grey, lw=0.8, label="1/n")
         right.set(xlabel="micro-springs n", ylabel="difference in strain", title="(b) convergence")
         right.legend()
-        figure.savefig(path, dpi=150)
 
 
 def main() -> None:
     table = [(n, *errors(n)) for n in NUMBERS]
-    with (HERE / "microscale.csv").open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["micro-springs", "largest difference", "RMS difference"])
-        writer.writerows((n, f"{largest:.6g}", f"{rms:.6g}") for n, largest, rms in table)
+    names = ("micro-springs", "largest difference", "RMS difference")
+    rows = [dict(zip(names, row, strict=True)) for row in table]
+    studies.write_csv(rows, HERE / "microscale.csv", 6)
     draw(table, HERE / "microscale.png")
-    page = (HERE / "page.template.md").read_text(encoding="utf-8")
-    values = {
-        "rate_largest": -rate(table, 1),
-        "rate_rms": -rate(table, 2),
-        "last": table[-1][1],
-        "most": NUMBERS[-1],
-        "returns_law": returns(None),
-        "returns_chain": max(returns(n) for n in NUMBERS),
-        "table": "\n".join(f"| {n} | {a:.2e} | {b:.2e} | {a * n:.3f} |" for n, a, b in table),
-    }
-    (HERE / "README.md").write_text(page.format(**values), encoding="utf-8")
+    lines = ((n, f"{a:.2e}", f"{b:.2e}", f"{a * n:.3f}") for n, a, b in table)
+    studies.write_page(
+        HERE, rate_largest=-rate(table, 1), rate_rms=-rate(table, 2), last=table[-1][1],
+        most=NUMBERS[-1], returns_law=returns(None),
+        returns_chain=max(returns(n) for n in NUMBERS), table=studies.lines(lines),
+    )  # fmt: skip
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(HERE.parent))
-    from unchanged import keep_unchanged
-
-    with keep_unchanged(HERE):
-        main()
+    studies.arguments(__doc__).parse_args()
+    studies.run(main, HERE)

@@ -1,7 +1,10 @@
-"""How well the motion is found behind a noisy displacement, and how well its errors are known.
+"""How well is the motion found behind a noisy displacement, and how well are its errors known?
 
-Synthetic motions of known turns are sampled with white noise; `foamfit.data.motion.follow` gives
-the motion, its turns and its modes, which are compared with the truth.
+Method. Synthetic motions of known turns are sampled with white noise; `foamfit.data.motion.follow`
+gives the motion, its turns and its modes, which are compared with the truth.
+
+Answer. 95 % intervals hold the truth at 93 to 97 % of the samples of each kind of motion; no turn
+is invented. README.md has the tables.
 
     python experiments/motion/motion.py                # 225 draws a class, a minute; README.md
     python experiments/motion/motion.py --draws 4      # prints the tables only
@@ -9,8 +12,9 @@ the motion, its turns and its modes, which are compared with the truth.
 
 from __future__ import annotations
 
-import argparse
 import platform
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,6 +28,9 @@ from foamfit.data.measurement import NoiseLevel
 from foamfit.data.motion import follow
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+import studies  # noqa: E402
+
 ROWS, NOISE = (300, 1000, 5000), (0.0005, 0.001, 0.003)
 NEAR = 0.01  # of the duration, on both sides of a turn
 Z95 = 1.959964
@@ -127,15 +134,10 @@ def random_smooth(rng: np.random.Generator) -> Motion:
 
 
 CLASSES = {
-    "triangle": triangle,
-    "unequal speeds": asymmetric,
-    "half sine": sine,
-    "haversine": haversine,
-    "trapezoid": trapezoid,
-    "slow start": slow_start,
-    "inner loop": inner_loop,
+    "triangle": triangle, "unequal speeds": asymmetric, "half sine": sine, "haversine": haversine,
+    "trapezoid": trapezoid, "slow start": slow_start, "inner loop": inner_loop,
     "random smooth": random_smooth,
-}
+}  # fmt: skip
 
 
 def sampled(rng: np.random.Generator, rows: int) -> np.ndarray:
@@ -223,6 +225,9 @@ def table(data: pd.DataFrame, by: str) -> pd.DataFrame:
     def held(values: pd.Series) -> float:
         return 100.0 * float((values.dropna().abs() < Z95).mean())
 
+    def rms(values: pd.Series) -> float:
+        return float(np.sqrt(np.mean(values**2)))
+
     columns = {
         "draws": m.size(),
         "RMS (σ)": m.rms.mean() ** 0.5,
@@ -231,9 +236,9 @@ def table(data: pd.DataFrame, by: str) -> pd.DataFrame:
         "held (%)": 100.0 * m.held.mean(),
         "held near turns (%)": 100.0 * m.held_near.mean(),
         "height: bias (σ)": f.height.mean(),
-        "height: RMS (σ)": f.height.apply(lambda v: np.sqrt(np.mean(v**2))),
+        "height: RMS (σ)": f.height.apply(rms),
         "height held (%)": f.height_z.apply(held),
-        "instant: RMS (samples)": f.late.apply(lambda v: np.sqrt(np.mean(v**2))),
+        "instant: RMS (samples)": f.late.apply(rms),
         "instant held (%)": f.late_z.apply(held),
         "invented turns (%)": 100.0 * m.invented.apply(lambda v: np.mean(v > 0)),
         "largest reversal (σ)": m.back.max(),
@@ -247,30 +252,19 @@ def found_by_size(data: pd.DataFrame) -> pd.DataFrame:
     """Share of the turns of inner loops that are found, by how far they show above the noise."""
     turns = data[(data.what == "turn") & (data["class"] == "inner loop")]
     turns = turns[turns["size"] * turns.noise < 0.3]  # those of the triangle itself are larger
-    shows = pd.cut(turns["size"] * turns.samples**0.5, [0, 5, 10, 15, 20, 30, 1e9])
+    names = ["0 to 5", "5 to 10", "10 to 15", "15 to 20", "20 to 30", "above 30"]
+    shows = pd.cut(turns["size"] * turns.samples**0.5, [0, 5, 10, 15, 20, 30, 1e9], labels=names)
     long = turns.samples.gt(3.0).map({True: "of 3 samples and more", False: "of fewer"})
     seen = turns.found.astype(float)
     out = seen.groupby([shows, long], observed=True).agg(["mean", "size"]).unstack()
     out.columns = [f"{kind}: {'found (%)' if what == 'mean' else 'turns'}" for what, kind in out]
     share = [column for column in out if "found" in column]
     out[share] *= 100.0
-    out.index = ["0 to 5", "5 to 10", "10 to 15", "15 to 20", "20 to 30", "above 30"]
-    out.index.name = "drop (σ) × √samples"
-    return out
-
-
-def markdown(frame: pd.DataFrame) -> str:
-    head = [frame.index.name or "", *frame.columns]
-    rows = [[str(i), *(f"{v:.3g}" if v == v else "–" for v in row)] for i, row in
-            zip(frame.index, frame.to_numpy(dtype=float), strict=True)]  # fmt: skip
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return out.rename_axis(index="drop (σ) × √samples")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--draws", type=int, default=25, help="of each class, rows and noise")
-    parser.add_argument("--seed", type=int, default=0)
+    parser = studies.arguments(__doc__, draws=(25, "of each class, rows and noise"), seed=0)
     parser.add_argument("--estimated", action="store_true", help="the noise is not given")
     options = parser.parse_args()
     data = pd.DataFrame(
@@ -284,24 +278,21 @@ def main() -> None:
             given=not options.estimated,
         )
     )  # fmt: skip
-    motions = data[data.what == "motion"].assign(all="all")
-    data["cell"] = (
-        data.rows.astype(str) + " rows, " + (100.0 * data.noise).round(3).astype(str) + " %"
-    )
-    parts = {
-        "classes": markdown(table(data, "class")),
-        "cells": markdown(table(data, "cell")),
-        "found": markdown(found_by_size(data)),
+    sigma = data[data.what == "motion"].sigma
+    percents = (100.0 * data.noise).round(3).astype(str)
+    data["cell"] = data.rows.astype(str) + " rows, " + percents + " %"
+    tables = {"classes": table(data, "class"), "cells": table(data, "cell")}
+    tables["found"] = found_by_size(data)
+    values = {name: studies.shown(one.astype(float).reset_index()) for name, one in tables.items()}
+    values |= {
         "draws": str(options.draws * len(ROWS) * len(NOISE)),
-        "sigma": f"{motions.sigma.quantile(0.025):.2f} to {motions.sigma.quantile(0.975):.2f}",
-        "python": platform.python_version(),
-        "machine": platform.machine(),
+        "sigma": f"{sigma.quantile(0.025):.2f} to {sigma.quantile(0.975):.2f}",
+        "python": platform.python_version(), "machine": platform.machine(),
         "foamfit": ff.__version__,
-    }
-    text = (HERE / "page.template.md").read_text().format(**parts)
-    print(text)
-    if options.draws >= 25 and not options.estimated and options.seed == 0:
-        (HERE / "README.md").write_text(text)
+    }  # fmt: skip
+    whole = options.draws >= 25 and not options.estimated and options.seed == 0
+    with tempfile.TemporaryDirectory() as folder:
+        print(studies.write_page(HERE, out=HERE if whole else Path(folder), **values))
 
 
 if __name__ == "__main__":

@@ -1,165 +1,176 @@
-"""How often does a fit reach the noise floor from the curve alone?
+"""How often does a fit reach the noise floor from the curve alone? And do its intervals hold?
 
-Synthetic impacts: random bistable springs (with and without dashpot) struck fast enough to close
-the loop, 501 samples, 1 % white noise on stress and on displacement, time zero known. Each is
-fitted with the defaults of `foamfit.fit`. A fit has reached the noise floor when its chi-square is
-at most 1.02 times that of the true parameters.
+Method. A fit has reached the noise floor when its chi-square is at most 1.02 times that of the true
+parameters. Bistable: random springs (with and without dashpot) are struck fast enough to close the
+loop, 501 samples, 1 % white noise on stress and on displacement, time zero known, and fitted with
+the defaults of `foamfit.fit`. Microscale: random springs with one relaxation term are compressed at
+a constant rate until most of their micro-springs have snapped, and back; 600 samples, 1 % white
+noise on the stress; each goes by way of a CSV and its TOML. Beside their intervals stands what the
+same noise makes of a linear problem (see synthetic.py).
 
-    python experiments/noise_floor/noise_floor.py            # 100 cases, table and figure
-    python experiments/noise_floor/noise_floor.py --cases 10
+Answer. In 100 of 100 impacts and in 200 of 200 slow tests; see experiments/README.md.
+
+    python experiments/noise_floor/noise_floor.py                   # 100 impacts, table and figure
+    python experiments/noise_floor/noise_floor.py --law microscale --cases 200
 """
 
 from __future__ import annotations
 
-import argparse
-import platform
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from scipy.special import ndtri
 
 import foamfit as ff
-from foamfit.data.measurement import Measurement, Specimen, Striker
-from foamfit.fitting.objective import Objective
+from foamfit.fitting.problem import make_problem
+from foamfit.springs.law import least_eps_star
 from foamfit.springs.model import Model
+from foamfit.trust.best_point import BestPoint
 
 HERE = Path(__file__).parent
-NOISE = 0.01
-HEIGHT, AREA, MASS = 1.2e-3, 1.9635e-5, 7e-3
+sys.path.insert(0, str(HERE.parent))
+import studies  # noqa: E402
+from synthetic import NOISE, linear, random_case  # noqa: E402
+
+REACHED = 1.02
+SAMPLES, HEIGHT, DIAMETER, DURATION = 600, 10e-3, 7.6e-3, 4.0  # of a slow test; m, s
+MODEL = Model(("microscale",), 1)
 
 
-def white(rng: np.random.Generator, samples: int) -> np.ndarray:
-    """White noise of unit variance."""
-    return rng.standard_normal(samples)
+def impact(case: int, seed: int) -> dict[str, Any]:
+    """Fit one impact: a row of noise_floor.csv."""
+    spring, measurement = random_case(np.random.default_rng([seed, case]))
+    began = time.perf_counter()
+    result = ff.fit(measurement, seed=0)
+    seconds = time.perf_counter() - began
+    problem = make_problem(measurement, "bistable", "impact", None, None, False)
+    values = problem.vector()
+    values[:9] = *spring.seven, spring.eta, 0.0
+    truth = problem.objective.residual(values)
+    ratio = result.statistics["chisqr"] / float(truth @ truth)
+    return {
+        "case": case, "eta (Pa s)": spring.eta, "chi-square over true": ratio,
+        "noise floor reached": ratio <= REACHED, "seconds": seconds,
+        "evaluations": result.statistics["nfev"], "visited": "".join(result.visited["s1"]),
+    }  # fmt: skip
 
 
-def random_case(
-    rng: np.random.Generator,
-    samples: int = 501,
-    noise: Callable[[np.random.Generator, int], np.ndarray] = white,
-) -> tuple[ff.BistableSpring, Measurement]:
-    """A random spring and its synthetic impact, struck hard enough to use branch c."""
-    k0 = 10 ** rng.uniform(6, 7.5)
-    eps_a = rng.uniform(0.05, 0.35)
-    sigma_a = k0 * eps_a / (1 - eps_a)
-    eps_c = eps_a + rng.uniform(0.1, 0.45)
-    drop = rng.uniform(0.05, 0.8)
-    kh_plus = k0 * rng.uniform(0.1, 3)
-    sigma_c = sigma_a * (1 - drop)
-    spring = ff.BistableSpring(
-        k0=k0,
-        kc=k0 * 10 ** rng.uniform(0.7, 1.7),
-        dsigma=-drop * sigma_a,
-        eps_a=eps_a,
-        eps_c=eps_c,
-        kh_plus=kh_plus,
-        kh_minus=sigma_c / eps_c * rng.uniform(0.5, 1.1),
-    )
-    # work to C1, and a third to a factor of two more than that
-    strain = np.linspace(0, spring.eps_hat_c, 2000)
-    work = np.trapezoid(spring.stress(strain), strain) * AREA * HEIGHT
-    velocity = float(np.sqrt(2 * work * rng.uniform(1.3, 2.0) / MASS))
-    if rng.random() < 0.5:
-        eta = 10 ** rng.uniform(-2.5, -1) * spring.sigma_hat_c * HEIGHT / velocity
-        spring = ff.BistableSpring(*spring.seven, eta=eta)
-    chain = ff.Chain([spring], [HEIGHT], AREA)
-    drive = ff.Impact(MASS, velocity)
-    long = ff.simulate(chain, drive, np.linspace(0, 20 * HEIGHT / velocity, 4001))
-    end = long.contact_end or long.time[-1]
-    time_ = np.linspace(0, 1.05 * end, samples)
-    response = ff.simulate(chain, drive, time_)
-    stress, motion = response.base_stress, response.displacement[-1]
-    noisy = [x + NOISE * np.ptp(x) * noise(rng, x.size) for x in (stress, motion)]
-    measurement = Measurement(
-        name="synthetic impact",
-        path=None,
-        data_sha256="",
-        time=time_,
-        stress=noisy[0],
-        displacement=noisy[1],
-        specimen=Specimen(HEIGHT, AREA),
-        striker=Striker(MASS, velocity),
-        motion="measured",
-    )
-    return spring, measurement
+def random_spring(rng: np.random.Generator) -> tuple[ff.MicroscaleSpring, float]:
+    """A random spring, and the strain at which the stress first holds 0.7 to 0.98 of it snapped."""
+    while True:
+        k0 = 10 ** rng.uniform(5, 7)
+        kc = k0 * 10 ** rng.uniform(-0.5, 1)
+        sigma_plus, spread_plus = k0 * rng.uniform(0.1, 0.5), rng.uniform(0.15, 0.6)
+        spring = ff.MicroscaleSpring(
+            k0=k0, kc=kc, eps_star=least_eps_star(k0, kc) + rng.uniform(0.02, 0.3),
+            sigma_plus=sigma_plus, spread_plus=spread_plus,
+            sigma_minus=sigma_plus * rng.uniform(0.3, 0.8), spread_minus=rng.uniform(0.3, 0.9),
+            relaxation=[(rng.uniform(0.1, 1.0), DURATION * 10 ** rng.uniform(-2, -0.5))],
+        )  # fmt: skip
+        most = sigma_plus * np.exp(spread_plus * ndtri(rng.uniform(0.7, 0.98)))
+        strain = float(spring.strain(most))
+        if strain < 0.85:
+            return spring, strain
 
 
-def run(cases: int, seed: int) -> pd.DataFrame:
-    """Fit every case; one row each."""
-    rows = []
-    for case in range(cases + 1):  # the first only compiles
-        rng = np.random.default_rng([seed, case])
-        spring, measurement = random_case(rng)
-        began = time.perf_counter()
-        result = ff.fit(measurement, seed=0)
-        seconds = time.perf_counter() - began
-        objective = Objective(measurement, Model.parse("bistable"), "impact", result.weights)
-        truth = objective.residual(np.array([*spring.seven, spring.eta, 0.0]))
-        ratio = result.statistics["chisqr"] / float(truth @ truth)
-        if case:
-            rows.append(
-                {
-                    "case": case,
-                    "eta (Pa s)": spring.eta,
-                    "chi-square over true": ratio,
-                    "noise floor reached": ratio <= 1.02,
-                    "seconds": seconds,
-                    "evaluations": result.statistics["nfev"],
-                    "visited": "".join(result.visited["s1"]),
-                }
-            )
-    return pd.DataFrame(rows)
+def slow_test(case: int, seed: int) -> dict[str, Any]:
+    """Fit one slow test by way of its files: a row of microscale.csv."""
+    rng = np.random.default_rng([seed, case])
+    spring, strain = random_spring(rng)
+    clock = np.linspace(0.0, DURATION, SAMPLES)
+    motion = HEIGHT * strain * (1.0 - np.abs(2.0 * clock / DURATION - 1.0))
+    chain = ff.Chain([spring], [HEIGHT], 0.25 * np.pi * DIAMETER**2)
+    stress = ff.simulate(chain, ff.DisplacementDrive(motion), clock).base_stress
+    stress = stress + NOISE * np.ptp(stress) * rng.standard_normal(SAMPLES)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"synthetic-{case}.csv"
+        studies.write_test(path, time=clock, displacement=motion, stress=stress)
+        studies.write_specimen(path.with_suffix(".toml"), "10 mm", "7.6 mm", "")
+        test = ff.read_test(path)
+    result = ff.fit(test, model="microscale", relaxation=1)
+    problem = make_problem(test, "microscale", "displacement", None, None, False, relaxation=1)
+    names = tuple(name for name in problem.free() if not name.endswith("_eta"))
+    own = [getattr(spring, name.removeprefix("s1_")) for name in MODEL.names[:8]]
+    truth = np.zeros(problem.vector().size)  # the zeros of the record are right
+    truth[: len(MODEL.names)] = *own, *spring.relaxation[0], 0.0
+    around, objective = BestPoint(problem, truth, names), problem.objective
+    (curve,) = objective.counted
+    level = NOISE * np.ptp(around.simulated.curves[curve]) * objective.factor(curve)
+    pull, sd = linear(around, {curve: level})
+    sure = dict(zip(names, (np.abs(pull @ around.residual) < 1.96 * sd).tolist(), strict=True))
+    chisqr: Any = result.statistics["chisqr"]
+    ratio = float(chisqr) / float(around.residual @ around.residual)
+    row: dict[str, Any] = {
+        "case": case, "samples": objective.n_data, "chi-square over true": ratio,
+        "noise floor reached": ratio <= REACHED,
+    }  # fmt: skip
+    for name, value in zip(MODEL.names, truth, strict=False):
+        found = result.parameters[name]
+        if found.vary:
+            inside = None if found.ci95 is None else found.ci95[0] <= value <= found.ci95[1]
+            row |= {f"{name} state": found.state, f"{name} held": inside}
+            row |= {f"{name} linear": sure.get(name)}
+    return row
+
+
+def coverage(table: pd.DataFrame) -> Iterator[str]:
+    """Say how often intervals hold, and what a linear problem has."""
+    names = [name for name in MODEL.names[:-1] if f"{name} held" in table]
+    pairs = {name: table[[f"{name} held", f"{name} linear"]].dropna() for name in names}
+    pairs = {name: own.astype(bool).to_numpy() for name, own in pairs.items()}
+    yield "of the intervals so many hold the true value; of a linear problem with the same noise:"
+    for name, own in {"all": np.concatenate(list(pairs.values())), **pairs}.items():
+        held, sure = own.mean(axis=0)
+        yield f"  {name}: {held:.1%} of {len(own)}; {sure:.1%}"
 
 
 def picture(table: pd.DataFrame, path: Path) -> None:
     """Chi-square reached against seconds."""
-    figure = Figure(figsize=(5.0, 3.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    reached = table["noise floor reached"]
-    for mask, colour, label in ((reached, "#0072B2", "reached"), (~reached, "#D55E00", "missed")):
-        axes.plot(
-            table["seconds"][mask],
-            table["chi-square over true"][mask],
-            "o",
-            color=colour,
-            markerfacecolor="none",
-            label=f"noise floor {label} ({mask.sum()})",
-        )
-    axes.axhline(1.0, color="0.6", linewidth=0.8)
-    axes.set(xlabel="run time of the fit (s)", ylabel="χ² over χ² of the true parameters (–)")
-    axes.set_title(f"{len(table)} synthetic impacts, 1 % noise", fontsize=10)
-    figure.legend(frameon=False, fontsize=8, loc="outside lower center", ncols=2)
-    figure.savefig(path, dpi=200)
+    with studies.sheet(path, 5.0, 3.2) as figure:
+        axes = figure.add_subplot()
+        for reached, colour, label in (
+            (True, studies.BLUE, "reached"), (False, studies.VERMILION, "missed"),
+        ):  # fmt: skip
+            own = table[table["noise floor reached"] == reached]
+            label = f"noise floor {label} ({len(own)})"
+            axes.plot(
+                own["seconds"], own["chi-square over true"], "o", color=colour, mfc="none",
+                label=label,
+            )  # fmt: skip
+        axes.axhline(1.0, color="0.6", linewidth=0.8)
+        axes.set(xlabel="run time of the fit (s)", ylabel="χ² over χ² of the true parameters (–)")
+        axes.set_title(f"{len(table)} synthetic impacts, 1 % noise")
+        figure.legend(loc="outside lower center", ncols=2)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cases", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=2014)
-    parser.add_argument("--out", type=Path, default=HERE)
+    parser = studies.arguments(__doc__, HERE, cases=100, seed=2014)
+    parser.add_argument("--law", choices=("bistable", "microscale"), default="bistable")
     options = parser.parse_args()
-    table = run(options.cases, options.seed)
+    fit = impact if options.law == "bistable" else slow_test
+    fit(0, options.seed)  # compiles
+    table = pd.DataFrame([fit(case, options.seed) for case in range(1, options.cases + 1)])
     reached = int(table["noise floor reached"].sum())
+    print(f"noise floor reached in {reached} of {len(table)} synthetic tests")
+    if options.law == "microscale":
+        studies.write_csv(table, options.out / "microscale.csv")
+        print("\n".join(coverage(table)))
+        return
     written = options.out / "noise_floor.csv"
-    with keep_unchanged(written):
-        table.to_csv(written, index=False, float_format="%.4g")
+    with studies.keep_unchanged(written):
+        studies.write_csv(table, written)
     picture(pd.read_csv(written), options.out / "noise_floor.png")  # times as they were kept
+    seconds = table["seconds"]
     print(
-        f"noise floor reached in {reached} of {len(table)} synthetic impacts, "
-        f"median {table['seconds'].median():.2f} s, slowest {table['seconds'].max():.2f} s "
-        f"(foamfit {ff.__version__}, Python {platform.python_version()}, {platform.machine()})"
+        f"median {seconds.median():.2f} s, slowest {seconds.max():.2f} s", studies.circumstances()
     )
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(HERE.parent))
-    from unchanged import keep_unchanged
-
-    with keep_unchanged(HERE):
-        main()
+    studies.run(main, HERE)

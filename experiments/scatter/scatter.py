@@ -1,17 +1,18 @@
 """Does the band of a prediction hold the next specimen of a foam, and is it as narrow as can be?
 
-    FOAMFIT_DATA=path/to/data python experiments/scatter/scatter.py
+Method. shoe-foam-twins/ (not part of this repository) are compressions of five specimens of a new
+and of a worn heel (arXiv:2602.12694, LivingMatterLab/CANN on GitHub). Each specimen is predicted
+from a joint fit of the other four of its heel, all parameters "scatter", and then three specimens
+from two, most parameters "own". Beside the band stands the t interval of the measured curves.
 
-The measurements are not part of this repository: shoe-foam-twins/ are compressions of five
-specimens of a new and of a worn heel (arXiv:2602.12694, LivingMatterLab/CANN on GitHub). Each
-specimen is predicted from a joint fit of the other four of its heel, all parameters "scatter", and
-then three specimens from two, most parameters "own". Writes README.md and scatter.csv beside this
-file. About ten minutes.
+Answer. 95.7 % of the samples are inside; the band is 1.27 times as wide as the t interval. Writes
+README.md and scatter.csv. About ten minutes.
+
+    FOAMFIT_DATA=path/to/data python experiments/scatter/scatter.py
 """
 
 from __future__ import annotations
 
-import os
 import sys
 import tempfile
 from pathlib import Path
@@ -26,31 +27,12 @@ from foamfit.text import percent
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
-from specimens import twins, write_specimen  # noqa: E402
+import studies  # noqa: E402
 
 GROUPS, COUNT = ("new", "worn"), 5
-LAW = (
-    "k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus", "g1", "tau1"
-)  # fmt: skip
-SCATTER = {f"s1_{name}": "scatter" for name in LAW}
-OPEN = {"s1_k0": "scatter", "s1_sigma_plus": "shared"}  # the others are own
-STUDY = """\
-name = "{group} heel"
-tests = [{tests}]
-model = "microscale"
-relaxation = 1
-drive = "displacement"
-
-[parameters]
-{parameters}
-"""
-
-
-def place_tests(data: Path, folder: Path) -> None:
-    """Link the tests into a folder, with the TOML of each beside it."""
-    for test, height, diameter in twins(data):
-        (folder / f"{test}_raw.txt").symlink_to((data / f"{test}_raw.txt").resolve())
-        write_specimen(folder / f"{test}_raw.toml", height, diameter)
+OWN = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
+SCATTER = dict.fromkeys((*OWN, "g1", "tau1"), "scatter")
+OPEN = {"k0": "scatter", "sigma_plus": "shared"}  # the others are own
 
 
 def name_of(group: str, number: int) -> str:
@@ -62,14 +44,10 @@ def predicted(
     folder: Path, group: str, fitted: list[int], left: list[int], kinds: dict[str, str]
 ) -> list[dict[str, Any]]:
     """Fit some specimens together and predict others: one row for each."""
-    study = folder / "study.toml"
-    study.write_text(
-        STUDY.format(
-            group=group,
-            tests=", ".join(f'"{name_of(group, i)}"' for i in fitted),
-            parameters="\n".join(f'{name} = "{kind}"' for name, kind in kinds.items()),
-        )
-    )
+    study = studies.write_study(
+        folder / "study.toml", [name_of(group, i) for i in fitted], "microscale", kinds,
+        relaxation=1, drive="displacement", name=f"{group} heel",
+    )  # fmt: skip
     result, rows = ff.joint(study, jobs=1), []
     every = {i: ff.read_test(folder / name_of(group, i)) for i in (*fitted, *left)}
     for i in left:
@@ -103,50 +81,46 @@ def along(test: Any, other: Any) -> np.ndarray:
     return np.concatenate([up, np.interp(at[back:], falling, test.stress[turn:][::-1])])
 
 
-def page(frame: pd.DataFrame) -> str:
-    """The page of all rows."""
+def page(frame: pd.DataFrame) -> None:
+    """Write the page of all rows."""
     four, two = frame[frame.fitted == COUNT - 1], frame[frame.fitted == 2]
     ratio = four.half_width / four.half_width_simple
-    worst = ratio.idxmax()
-    t_alone = np.sqrt(1.0 + 1.0 / (COUNT - 1))
-    rows = [
-        f"| {r.specimen} | {percent(r.inside, 3)} | ±{percent(r.half_width)} | "
-        f"{percent(r.inside_simple, 3)} | ±{percent(r.half_width_simple)} | "
-        f"{ratio[r.Index]:.2f} | {ratio[r.Index] * t_alone:.2f} |"
+    worst, t_alone = ratio.idxmax(), np.sqrt(1.0 + 1.0 / (COUNT - 1))
+    rows = (
+        [r.specimen, percent(r.inside, 3), f"±{percent(r.half_width)}", percent(r.inside_simple, 3),
+         f"±{percent(r.half_width_simple)}", f"{ratio[r.Index]:.2f}",
+         f"{ratio[r.Index] * t_alone:.2f}"]
         for r in four.itertuples()
-    ]
+    )  # fmt: skip
+    pairs = (
+        (r.specimen, percent(r.inside, 3), f"±{percent(r.half_width)}") for r in two.itertuples()
+    )
     good = four[four.inside >= 0.93]
-    template = (HERE / "page.template.md").read_text(encoding="utf-8")
-    return template.format(
-        rows="\n".join(rows),
+    studies.write_page(
+        HERE, rows=studies.lines(rows), two=studies.lines(pairs),
         inside=percent(float(np.average(four.inside, weights=four.samples)), 3),
         simple=percent(float(np.average(four.inside_simple, weights=four.samples)), 3),
         median=ratio.median(), most=ratio.drop(worst).max(), worst=four.specimen[worst],
         outlier=percent(four.inside_simple[worst]), few=len(four) - len(good), count=len(four),
         rest=percent(good.inside.min(), 3),
-        two="\n".join(
-            f"| {r.specimen} | {percent(r.inside, 3)} | ±{percent(r.half_width)} |"
-            for r in two.itertuples()
-        ),
     )  # fmt: skip
 
 
 def main() -> None:
-    data = Path(os.environ.get("FOAMFIT_DATA", "")) / "shoe-foam-twins"
-    if not data.is_dir():
-        sys.exit(f"there is no {data}; set FOAMFIT_DATA to the folder with shoe-foam-twins/")
+    studies.arguments(__doc__).parse_args()
+    data = studies.measurements("shoe-foam-twins") / "shoe-foam-twins"
     rows, numbers = [], list(range(1, COUNT + 1))
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        place_tests(data, folder)
+        studies.place_twins(data, folder)
         for group in GROUPS:
             for left in numbers:
                 others = [i for i in numbers if i != left]
                 rows += predicted(folder, group, others, [left], SCATTER)
             rows += predicted(folder, group, [1, 2], [3, 4, 5], OPEN)
     frame = pd.DataFrame(rows)
-    frame.to_csv(HERE / "scatter.csv", index=False, float_format="%.5g", lineterminator="\n")
-    (HERE / "README.md").write_text(page(frame), encoding="utf-8")
+    studies.write_csv(frame, HERE / "scatter.csv", 5)
+    page(frame)
 
 
 if __name__ == "__main__":

@@ -1,20 +1,28 @@
 """A judge that shares neither code nor method with the solver: brute force by Runge-Kutta steps.
 
 It reads the public attributes of springs, chain and drive and imports nothing else. The law is
-written out branch by branch, its derived points are roots found by bracketing, and the motion is an
-ordinary differential equation of the velocities of the nodes with mass and the strains of all
-springs: no algebraic equation is solved. The method of Dormand and Prince of order 8(5,3) takes
-explicit steps with compensated sums, ends one at each sample, and ends one at each switch of
-branch, which it finds by taking the same step again and again with another length.
+written out branch by branch, the derived points of a bistable spring are roots found by bracketing,
+and the motion is an ordinary differential equation; no algebraic equation is solved. The state are
+the velocities of the nodes with mass, the strain of each linear or bistable spring, the equilibrium
+stress s of each microscale spring, and z = q - g s of each relaxation term. In s the microscale law
+is explicit: its strain is (1-p) s/(k0+s) + p (eps_star + s/(kc+s)), and ds/dt = (dε/dt)/(dε/ds). A
+spring carries T = (1 + Σ g) s + Σ z and its dashpot. Springs between two nodes that have mass, are
+clamped or are driven carry one stress S:
 
-Springs between two nodes that have mass, are clamped or are driven carry one stress S:
+- every spring has a dashpot: S = (v_top - v_bottom + Σ h T/η)/(Σ h/η), dε/dt = (S - T)/η;
+- some have none: S is the T of one of these; those with a dashpot follow as above, and the others
+  share the rest of the elongation's rate by dε/dt = (dε/ds) (dS/dt - Σ dz/dt)/(1 + Σ g); a flat
+  branch takes all of it;
+- the stress on a massless top is prescribed: S is that stress.
 
-- every spring has a dashpot: S = (v_top - v_bottom + Σ h σ/η)/(Σ h/η), dε/dt = (S - σ)/η;
-- some have none: S is the stress of one of these; those with a dashpot follow as above and the
-  others share the rest of the elongation's rate by h/slope; a flat branch takes all of it;
-- the stress on a massless top is prescribed: S is that, dε/dt = (dS/dt)/slope without a dashpot.
+The rank of a microscale spring that is held is a normal score w: it snaps through again where
+ln s = ln sigma_plus + spread_plus w, and back where ln s = ln sigma_minus + spread_minus w.
 
-Stiff scenes take many steps: past a bound there is no judgement.
+The method of Dormand and Prince of order 8(5,3) takes explicit steps with compensated sums. A step
+ends at each sample, kink of the drive, end of a branch and turning point of s on a branch that
+snaps; these are found by taking the same step again and again with another length. The normal
+distribution is crossed in steps of at most one standard deviation. Stiff scenes take many steps:
+past a bound there is no judgement.
 """
 
 from __future__ import annotations
@@ -22,7 +30,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -37,20 +45,60 @@ TIGHT, LOOSE = 1e-13, 1e-12  # local error of a step relative to the largest val
 MOST_WORK = 30_000_000  # steps times springs of one run
 # Base stress over the largest stress so far from which on it has risen, and can return to zero.
 RISEN = 1e-11
+FAR = 8.0  # standard deviations beyond which the normal distribution is 0 or 1 to rounding
 
 _A, _B, _C = DOP853.A[:12, :12].copy(), DOP853.B.copy(), DOP853.C[:12].copy()
 _E3, _E5 = DOP853.E3[:12].copy(), DOP853.E5[:12].copy()
 
-# Columns of a spring.
+# Columns of a spring; those of a microscale spring beside K0, KC, ETA and H.
 K0, KC, EPS_A, EPS_C, STAR, SIG_A, SIG_C, UP, DOWN, HAT_A, HAT_C, ETA, H = range(13)
-# Branches.
-A, D, C, E, LINE, ONE_SIDED, GAP = range(7)
+EPS_STAR, LOG_PLUS, WIDE_PLUS, LOG_MINUS, WIDE_MINUS = 2, 3, 4, 5, 6
+# Branches; of a microscale spring: p is held; p = P+; p = raw P-; both are the same.
+A, D, C, E, LINE, ONE_SIDED, GAP, HELD, SNAP, BACK, BOTH = range(11)
 # What is known of the top.
 MASS, DAMPER, STRESS, MOTION = range(4)
 # How a run ended.
 DONE, TOO_LONG, NO_STEP, FLAT = range(4)
 WHY = ("", "too many steps", "no step is short enough", "stress prescribed on a flat branch")
 SHARED = "several gaps or flat branches share an elongation, and the law does not say how"
+
+# What only other loops call is compiled once, as a part of them.
+inner = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
+class System(NamedTuple):
+    """A chain under a drive: what does not change along a run."""
+
+    springs: Array  # (n, 13)
+    relax: Array  # (n, terms, 2): g and tau
+    ends: Integers  # of the groups that carry one stress
+    mass: Array  # of their upper nodes, over the area
+    drag: float
+    top: int
+    speed: float  # of a striker, else 0
+    values: Array  # of the drive at the samples
+    work: Array  # (4, n), overwritten by `_rates`
+
+
+class Flags(NamedTuple):
+    """Branch of each spring, and the rank up to which a microscale spring has snapped."""
+
+    branch: Integers
+    ranks: Array
+
+
+class Tried(NamedTuple):
+    """A step: rates of its stages, its end, what it adds, and scales of its error."""
+
+    k: Array
+    y1: Array
+    some: Array
+    scale: Array
+    reach: Array
+    stress: Array
+    rates: Array
+    units: Integers
+    paces: Array
 
 
 # ------------------------------------------------------------------------------------ the law
@@ -87,13 +135,21 @@ def bistable_row(spring: Any, height: float) -> list[float]:
     ]  # fmt: skip
 
 
-def _linear(spring: Any, height: float) -> list[float]:
+def row_of(spring: Any, height: float) -> tuple[list[float], int]:
+    """Parameters of a spring, and the branch on which it starts."""
+    if hasattr(spring, "kc") and not hasattr(spring, "sigma_plus"):
+        return bistable_row(spring, height), A
     row = [0.0] * 13
     row[K0], row[ETA], row[H] = spring.k0, spring.eta, height
-    return row
+    if not hasattr(spring, "sigma_plus"):
+        return row, ONE_SIDED if spring.unilateral else LINE
+    row[KC], row[EPS_STAR] = spring.kc, spring.eps_star
+    row[LOG_PLUS], row[WIDE_PLUS] = math.log(spring.sigma_plus), spring.spread_plus
+    row[LOG_MINUS], row[WIDE_MINUS] = math.log(spring.sigma_minus), spring.spread_minus
+    return row, HELD
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _sigma(p: Array, branch: int, eps: float) -> float:
     if branch == A:
         return p[K0] * eps / (1.0 - eps) if eps < 1.0 else math.inf
@@ -107,7 +163,7 @@ def _sigma(p: Array, branch: int, eps: float) -> float:
     return 0.0 if branch == GAP else p[K0] * eps
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _slope(p: Array, branch: int, eps: float) -> float:
     if branch == A:
         return p[K0] / (1.0 - eps) ** 2
@@ -120,7 +176,7 @@ def _slope(p: Array, branch: int, eps: float) -> float:
     return 0.0 if branch == GAP else p[K0]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _bounds(p: Array, branch: int) -> tuple[float, float, int, int]:
     """Strains at which a branch ends, below and above, and the branches that follow there."""
     if branch == A:
@@ -138,115 +194,297 @@ def _bounds(p: Array, branch: int) -> tuple[float, float, int, int]:
     return -math.inf, math.inf, LINE, LINE
 
 
+@inner
+def _score(p: Array, branch: int, rank: float, s: float) -> tuple[float, float]:
+    """Normal score of what is snapped, and the spread by which it follows ln s (0 = held)."""
+    if branch == HELD:
+        return rank, 0.0
+    if s <= 0.0:
+        return -math.inf, 0.0
+    if branch == BACK:
+        return (math.log(s) - p[LOG_MINUS]) / p[WIDE_MINUS], p[WIDE_MINUS]
+    return (math.log(s) - p[LOG_PLUS]) / p[WIDE_PLUS], p[WIDE_PLUS]
+
+
+@inner
+def _mixture(p: Array, branch: int, rank: float, s: float) -> tuple[float, float]:
+    """Strain of a microscale spring at a stress, and dε/ds; infinite past the pole."""
+    u, wide = _score(p, branch, rank, s)
+    snapped, whole = 0.5 * math.erfc(-u / math.sqrt(2.0)), 0.5 * math.erfc(u / math.sqrt(2.0))
+    if p[K0] + s <= 0.0 or (snapped > 0.0 and p[KC] + s <= 0.0):
+        return -math.inf, math.nan
+    a, c = s / (p[K0] + s), p[EPS_STAR] + s / (p[KC] + s)
+    soft = whole * p[K0] / (p[K0] + s) ** 2 + snapped * p[KC] / (p[KC] + s) ** 2
+    if wide > 0.0:
+        density = math.exp(-0.5 * u * u) / math.sqrt(2.0 * math.pi)
+        soft += density / (wide * s) * (c - a)
+    return whole * a + snapped * c, soft
+
+
+@inner
+def _lag(p: Array, log_s: float) -> float:
+    """Score of snap-back less that of snap-through at a stress; above 0 the spring is hysteretic.
+
+    Well below every stress at -inf.
+    """
+    slope = 1.0 / p[WIDE_MINUS] - 1.0 / p[WIDE_PLUS]
+    constant = p[LOG_PLUS] / p[WIDE_PLUS] - p[LOG_MINUS] / p[WIDE_MINUS]
+    if slope == 0.0:
+        return constant
+    if log_s == -math.inf:
+        return -slope
+    return log_s * slope + constant
+
+
+@inner
+def _meets(p: Array) -> tuple[float, bool]:
+    """Stress at which both scores are the same, and whether the spring is hysteretic above it."""
+    slope = 1.0 / p[WIDE_MINUS] - 1.0 / p[WIDE_PLUS]
+    constant = p[LOG_PLUS] / p[WIDE_PLUS] - p[LOG_MINUS] / p[WIDE_MINUS]
+    if slope == 0.0:
+        return (-math.inf if constant > 0.0 else math.inf), True
+    at = -constant / slope
+    if at > 690.0:
+        return math.inf, slope > 0.0
+    return (math.exp(at) if at > -690.0 else -math.inf), slope > 0.0
+
+
+@inner
+def _ends(p: Array, branch: int, rank: float) -> tuple[float, float, int, int]:
+    """What a branch is followed between (stress or strain), and the branches beyond."""
+    if branch < HELD:
+        return _bounds(p, branch)
+    cross, above = _meets(p)
+    if branch == HELD:
+        high = math.exp(p[LOG_PLUS] + p[WIDE_PLUS] * rank) if rank > -math.inf else 0.0
+        low = math.exp(p[LOG_MINUS] + p[WIDE_MINUS] * rank) if rank > -math.inf else -math.inf
+        start = p[LOG_PLUS] + p[WIDE_PLUS] * rank if rank > -math.inf else -math.inf
+        return low, high, BACK, (SNAP if _lag(p, start) > 0.0 else BOTH)
+    if branch == SNAP:
+        return -math.inf, (math.inf if above else cross), SNAP, BOTH
+    if branch == BACK:
+        return (cross if above else -math.inf), math.inf, BOTH, BACK
+    return (
+        (-math.inf if above else cross), (cross if above else math.inf), BACK, SNAP,
+    )  # fmt: skip
+
+
+@inner
+def _strain(x: float, branch: int, rank: float, p: Array) -> float:
+    return _mixture(p, branch, rank, x)[0] if branch >= HELD else x
+
+
 # ----------------------------------------------------------------------------- the equations
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _rates(
-    y: Array,
-    out: Array,
-    stress: Array,
-    branch: Integers,
-    springs: Array,
-    ends: Integers,
-    mass: Array,
-    drag: float,
-    top: int,
-    value: float,
-    rate: float,
+    y: Array, out: Array, stress: Array, flags: Flags, system: System, value: float, rate: float
 ) -> bool:
     """Fill the rates `out` of a state and the `stress` of each group.
 
     `value` and `rate` are those of the drive (stress or displacement). False on a flat branch under
-    a prescribed stress.
+    a prescribed stress, and past the pole of a law.
     """
-    groups = ends.size
+    springs, relax, ends, top = system.springs, system.relax, system.ends, system.top
+    groups, count, terms = ends.size, springs.shape[0], relax.shape[1]
     moving = groups if top == MASS else groups - 1
+    work = system.work
+    held, fade, gain, soft = work[0], work[1], work[2], work[3]  # T, Σ dz/dt, 1 + Σ g, dε/ds
+    for i in range(count):
+        p, x = springs[i], y[moving + i]
+        if flags.branch[i] >= HELD:
+            s = x
+            soft[i] = _mixture(p, flags.branch[i], flags.ranks[i], s)[1]
+            if not soft[i] > 0.0:
+                return False
+        else:
+            s = _sigma(p, flags.branch[i], x)
+            slope = _slope(p, flags.branch[i], x)
+            soft[i] = 1.0 / slope if slope > 0.0 else math.inf
+        gain[i], held[i], fade[i] = 1.0, 0.0, 0.0
+        for n in range(terms):
+            g, tau, at = relax[i, n, 0], relax[i, n, 1], moving + count + i * terms + n
+            out[at] = 0.0
+            if g > 0.0:
+                gain[i] += g
+                held[i] += y[at]
+                out[at] = -(y[at] + g * s) / tau
+                fade[i] += out[at]
+        held[i] += gain[i] * s
     for g in range(groups):
-        i0 = ends[g - 1] if g > 0 else 0
-        i1 = ends[g]
+        i0, i1 = ends[g - 1] if g > 0 else 0, ends[g]
         low = y[g - 1] if g > 0 else 0.0
-        last = g == groups - 1
-        prescribed = last and top == STRESS
-        damper = last and top == DAMPER
+        prescribed = g == groups - 1 and top == STRESS
+        damper = g == groups - 1 and top == DAMPER
         high = y[g] if g < moving else rate  # of a driven top
         flow = pull = 0.0
-        softest, least = -1, math.inf
+        free = -1  # the softest spring without a dashpot
         for i in range(i0, i1):
-            p = springs[i]
-            if p[ETA] > 0.0:
-                flow += p[H] / p[ETA]
-                pull += p[H] * _sigma(p, branch[i], y[moving + i]) / p[ETA]
-            else:
-                slope = _slope(p, branch[i], y[moving + i])
-                if slope < least:
-                    softest, least = i, slope
+            if springs[i, ETA] > 0.0:
+                flow += springs[i, H] / springs[i, ETA]
+                pull += springs[i, H] * held[i] / springs[i, ETA]
+            elif free < 0 or soft[i] > soft[free]:
+                free = i
         if prescribed:
             s = value
-        elif softest >= 0:
-            s = _sigma(springs[softest], branch[softest], y[moving + softest])
+        elif free >= 0:
+            s = held[free]
             if damper:
-                high = (value - s) / drag
+                high = (value - s) / system.drag
         elif damper:
-            s = (value / drag - low + pull) / (flow + 1.0 / drag)
-            high = (value - s) / drag
+            s = (value / system.drag - low + pull) / (flow + 1.0 / system.drag)
+            high = (value - s) / system.drag
         elif i1 - i0 == 1:
-            p = springs[i0]
-            s = _sigma(p, branch[i0], y[moving + i0]) + p[ETA] * (high - low) / p[H]
+            s = held[i0] + springs[i0, ETA] * (high - low) / springs[i0, H]
         else:
             s = (high - low + pull) / flow
         stress[g] = s
-        rest, soft = high - low, 0.0
+        rest, give, drift = high - low, 0.0, 0.0
         for i in range(i0, i1):
-            p = springs[i]
-            eps = y[moving + i]
-            if p[ETA] > 0.0:
+            if springs[i, ETA] > 0.0:
                 if i1 - i0 == 1 and not prescribed and not damper:
-                    out[moving + i] = (high - low) / p[H]
+                    out[moving + i] = (high - low) / springs[i, H]
                 else:
-                    out[moving + i] = (s - _sigma(p, branch[i], eps)) / p[ETA]
-                rest -= p[H] * out[moving + i]
+                    out[moving + i] = (s - held[i]) / springs[i, ETA]
+                rest -= springs[i, H] * out[moving + i]
             else:
-                slope = _slope(p, branch[i], eps)
-                if prescribed:
-                    if slope == 0.0:
-                        return False
-                    out[moving + i] = rate / slope
-                elif least > 0.0:
-                    soft += p[H] / slope
-        if not prescribed and softest >= 0:
-            for i in range(i0, i1):
-                p = springs[i]
-                if p[ETA] == 0.0:
-                    if least == 0.0:
-                        out[moving + i] = rest / p[H] if i == softest else 0.0
-                    else:
-                        slope = _slope(p, branch[i], y[moving + i])
-                        out[moving + i] = rest / soft / slope
+                part = springs[i, H] * soft[i] / gain[i]
+                give += part
+                drift += part * fade[i]
+        if free < 0:
+            continue
+        flat = soft[free] == math.inf
+        if prescribed and flat:
+            return False
+        pace = rate if prescribed else fade[free] if flat else (rest + drift) / give
+        for i in range(i0, i1):
+            if springs[i, ETA] == 0.0 and not (flat and i == free):
+                out[moving + i] = (
+                    soft[i] * (pace - fade[i]) / gain[i] if soft[i] < math.inf else 0.0
+                )
+                rest -= springs[i, H] * out[moving + i]
+        if flat:
+            out[moving + free] = rest / springs[free, H]
+    for i in range(count):
+        if flags.branch[i] >= HELD:
+            out[moving + i] /= soft[i]
     for g in range(moving):
         net = (stress[g + 1] if g + 1 < groups else 0.0) - stress[g]
         if g == groups - 1:
-            net += value - drag * y[g]
-        out[g] = net / mass[g]
+            net += value - system.drag * y[g]
+        out[g] = net / system.mass[g]
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _over(
-    y: Array, moving: int, branch: Integers, springs: Array, base: float, lifts: bool, peak: float
+    y: Array, rates: Array, paces: Array, flags: Flags, system: System, base: float, peak: float
 ) -> float:
-    """By how much a state is past the end of a branch, or of contact; negative if it is not."""
-    worst = -math.inf
-    for i in range(branch.size):
-        low, high, _, _ = _bounds(springs[i], branch[i])
-        eps = y[moving + i]
-        worst = max(worst, low - eps, eps - high)
-    if lifts:
-        worst = max(worst, -base / peak)
-    return worst
+    """By how much a state is past the end of a branch, a turn, or contact; negative if not.
+
+    `peak` is the largest base stress so far, or 0 where contact cannot end.
+    """
+    moving, worst = y.size - system.relax[:, :, 0].size - flags.branch.size, -math.inf
+    for i in range(flags.branch.size):
+        p, branch, x = system.springs[i], flags.branch[i], y[moving + i]
+        low, high, _, _ = _ends(p, branch, flags.ranks[i])
+        unit = p[K0] if branch >= HELD else 1.0
+        if branch >= HELD and max(abs(low), abs(high)) < math.inf and high > 0.0:
+            unit = high
+        worst = max(worst, (low - x) / unit, (x - high) / unit)
+        if branch in (SNAP, BACK):
+            way = -1.0 if branch == SNAP else 1.0
+            worst = max(worst, way * rates[moving + i] / paces[i])
+    return max(worst, -base / peak) if peak > 0.0 else worst
 
 
-@njit(cache=True, error_model="numpy")
+@inner
+def _leaps(y: Array, y1: Array, moving: int, flags: Flags, springs: Array) -> bool:
+    """Whether a step crosses more than a standard deviation of what snaps."""
+    for i in range(flags.branch.size):
+        if flags.branch[i] > HELD:
+            u0 = _score(springs[i], flags.branch[i], flags.ranks[i], y[moving + i])[0]
+            u1 = _score(springs[i], flags.branch[i], flags.ranks[i], y1[moving + i])[0]
+            if abs(min(max(u1, -FAR), FAR) - min(max(u0, -FAR), FAR)) > 1.0:
+                return True
+    return False
+
+
+@inner
+def _enter(y: Array, rates: Array, moving: int, flags: Flags, springs: Array) -> int:
+    """Change the branch of each spring that is at an end, or turns, on its way out; how many."""
+    moved = 0
+    for i in range(flags.branch.size):
+        before = flags.branch[i]
+        low, high, under, over = _ends(springs[i], before, flags.ranks[i])
+        x, way = y[moving + i], rates[moving + i]
+        if x >= high and way > 0.0:
+            flags.branch[i] = over
+        elif x <= low and way < 0.0:
+            flags.branch[i] = under
+        elif (before == SNAP and way < 0.0) or (before == BACK and way > 0.0):
+            flags.ranks[i] = _score(springs[i], before, flags.ranks[i], x)[0]
+            flags.branch[i] = HELD
+        moved += flags.branch[i] != before
+    return moved
+
+
+@inner
+def _step(
+    y: Array, h: float, one: Tried, flags: Flags, system: System, value: float, rate: float,
+    tol: float,
+) -> float:  # fmt: skip
+    """Take a step of length h from y, whose rates are one.k[0]; fills y1 and, in `some`, y1 - y.
+
+    Returns the error over the tolerance; infinite where something is not finite.
+    """
+    k, y1, some, scale = one.k, one.y1, one.some, one.scale
+    size = y.size
+    for stage in range(1, 12):
+        for j in range(size):
+            total = 0.0
+            for m in range(stage):
+                total += _A[stage, m] * k[m, j]
+            y1[j] = y[j] + h * total
+        at = value + rate * _C[stage] * h
+        if not _rates(y1, k[stage], one.stress, flags, system, at, rate):
+            return math.inf
+    largest = np.zeros(3)
+    for j in range(size):
+        total = 0.0
+        for m in range(12):
+            total += _B[m] * k[m, j]
+        some[j] = h * total
+        y1[j] = y[j] + some[j]
+        scale[j] = max(one.reach[j], abs(y1[j]))
+        largest[one.units[j]] = max(largest[one.units[j]], scale[j])
+    norm5 = norm3 = 0.0
+    for j in range(size):
+        e5 = e3 = 0.0
+        for m in range(12):
+            e5 += _E5[m] * k[m, j]
+            e3 += _E3[m] * k[m, j]
+        unit = tol * max(scale[j], 1e-6 * largest[one.units[j]]) + 1e-290
+        norm5 += (e5 / unit) ** 2
+        norm3 += (e3 / unit) ** 2
+    if not math.isfinite(norm5 + norm3):
+        return math.inf
+    return abs(h) * norm5 / math.sqrt((norm5 + 0.01 * norm3) * size) if norm5 > 0.0 else 0.0
+
+
+@inner
+def _past(
+    y: Array, h: float, one: Tried, flags: Flags, system: System, value: float, rate: float,
+    tol: float, peak: float,
+) -> float:  # fmt: skip
+    """Take a step, and tell by how much its end is past a switch; see `_over`."""
+    _step(y, h, one, flags, system, value, rate, tol)
+    _rates(one.y1, one.rates, one.stress, flags, system, value + rate * h, rate)
+    return _over(one.y1, one.rates, one.paces, flags, system, one.stress[0], peak)
+
+
+@inner
 def _turn(g0: float, d0: float, g1: float, d1: float, h: float) -> float:
     """Where in a step a quantity that rises at first and falls at last is largest; 1 if nowhere.
 
@@ -262,69 +500,106 @@ def _turn(g0: float, d0: float, g1: float, d1: float, h: float) -> float:
     return min(max(x, 0.0), 1.0)
 
 
+@inner
+def _suspect(
+    y: Array, stress: Array, h: float, one: Tried, flags: Flags, system: System, value: float,
+    rate: float, lifts: bool,
+) -> float:  # fmt: skip
+    """Share of a step at which a switch may have come and gone within it; 1 if none may have."""
+    k, y1, f1, first = one.k, one.y1, one.rates, 1.0
+    moving = y.size - system.relax[:, :, 0].size - flags.branch.size
+    for i in range(flags.branch.size):
+        low, high, _, _ = _ends(system.springs[i], flags.branch[i], flags.ranks[i])
+        e0, e1, d0, d1 = y[moving + i], y1[moving + i], k[0, moving + i], f1[moving + i]
+        if high < math.inf and d0 > 0.0 > d1:
+            x = _turn(e0, d0, e1, d1, h)
+            if max(e0, e1) + 2.0 * h * d0 * x > high:
+                first = min(first, x)
+        if low > -math.inf and d0 < 0.0 < d1:
+            x = _turn(-e0, -d0, -e1, -d1, h)
+            if min(e0, e1) + 2.0 * h * d0 * x < low:
+                first = min(first, x)
+        if flags.branch[i] in (SNAP, BACK):
+            way = 1.0 if flags.branch[i] == SNAP else -1.0
+            for stage in range(1, 12):
+                if way * k[stage, moving + i] < 0.0:
+                    first = min(first, _C[stage])
+    if lifts:  # rates of the base stress at both ends, by differences
+        tiny, base0, base1, other = 1e-5 * h, stress[0], one.stress[0], np.empty(stress.size)
+        _rates(y + tiny * k[0], one.scale, other, flags, system, value + tiny * rate, rate)
+        d0 = (other[0] - base0) / tiny
+        at_end = value + rate * h - tiny * rate
+        _rates(y1 - tiny * f1, one.scale, other, flags, system, at_end, rate)
+        d1 = (base1 - other[0]) / tiny
+        if d0 < 0.0 < d1:
+            x = _turn(-base0, -d0, -base1, -d1, h)
+            if min(base0, base1) + 2.0 * h * d0 * x < 0.0:
+                first = min(first, x)
+    return first
+
+
+@inner
+def _record(
+    y: Array, moving: int, flags: Flags, springs: Array, times: Array, now: float, done: int,
+    pressure: float, nodes: Array, base: Array,
+) -> int:  # fmt: skip
+    """Write the samples that are due; returns how many are done."""
+    while done < times.size and times[done] <= now:
+        place = 0.0
+        for i in range(springs.shape[0]):
+            x = _strain(y[moving + i], flags.branch[i], flags.ranks[i], springs[i])
+            place += springs[i, H] * x
+            nodes[i, done] = place
+        base[done] = pressure
+        done += 1
+    return done
+
+
 @njit(cache=True, error_model="numpy")
 def _follow(
-    springs: Array,
-    kinds: Integers,
-    ends: Integers,
-    mass: Array,
-    drag: float,
-    top: int,
-    speed: float,
-    start: Array,
-    times: Array,
-    values: Array,
-    tol: float,
-    most: int,
-    nodes: Array,
-    base: Array,
-    log: Array,
-    tableau: tuple[Array, Array, Array, Array, Array],
-) -> tuple[int, int, int, float, float, float]:
+    system: System, kinds: Integers, times: Array, tol: float, most: int,
+    nodes: Array, base: Array,
+) -> tuple[int, int, int, float, float]:  # fmt: skip
     """Follow a chain over the samples; fills displacements and base stress.
 
-    Returns how it ended, the steps, the switches, the end of contact (NaN if none), the least
-    minimum of the base stress before it over its maximum, and the time reached.
+    Returns how it ended, the steps, the switches, the end of contact (NaN if none) and the least
+    minimum of the base stress before it over its maximum.
     """
-    count, groups = springs.shape[0], ends.size
+    springs, values, top = system.springs, system.values, system.top
+    count, groups = springs.shape[0], system.ends.size
     moving = groups if top == MASS else groups - 1
-    size = moving + count
-    y, lost, reach = np.zeros(size), np.zeros(size), np.zeros(size)
-    y1, some, scale = np.empty(size), np.empty(size), np.empty(size)
-    near = np.empty(size)
-    k, f1 = np.empty((12, size)), np.empty(size)
-    stress, stress1, stress2 = np.empty(groups), np.empty(groups), np.empty(groups)
-    branch = kinds.copy()
-    struck = speed > 0.0
-    now = 0.0 if struck else times[0]
-    done = 0
+    size = moving + count + system.relax[:, :, 0].size
+    y, lost = np.zeros(size), np.zeros(size)
+    stress = np.empty(groups)
+    one = Tried(
+        np.empty((12, size)), np.empty(size), np.empty(size), np.empty(size), np.zeros(size),
+        np.empty(groups), np.empty(size), np.zeros(size, np.int64), np.ones(count),
+    )  # fmt: skip
+    one.units[moving:] = 2
+    flags = Flags(kinds.copy(), np.full(count, -math.inf))
+    for i in range(count):
+        if kinds[i] < HELD:
+            one.units[moving + i] = 1
+    struck = system.speed > 0.0
+    now, done = (0.0 if struck else times[0]), 0
     if struck:
-        y[groups - 1] = speed
+        y[groups - 1] = system.speed
         while done < times.size and times[done] < 0.0:
-            for i in range(count):
-                nodes[i, done] = speed * times[done] if i == count - 1 else 0.0
+            nodes[:, done] = 0.0
+            nodes[count - 1, done] = system.speed * times[done]
             base[done] = 0.0
             done += 1
-    for i in range(count):
-        y[moving + i] = start[i]
-        while True:  # a spring that starts far along
-            _, high, _, after = _bounds(springs[i], branch[i])
-            if start[i] <= high:
-                break
-            branch[i] = after
     knot, steps, switches, peak, largest = 0, 0, 0, 0.0, 0.0
     pressed, least, last_base, falling = False, math.inf, 0.0, False
-    h = 0.0
+    h = value = rate = 0.0
     late = 0.0  # what the clock has lost to rounding
-    value = rate = 0.0
     fresh, since = True, now
     while True:
         # samples that are due, by the rate of the drive that led to them
-        due = done < times.size and times[done] <= now
-        if due and not fresh:
+        if done < times.size and times[done] <= now and not fresh:
             value += rate * (now - since)
-            due = _rates(y, k[0], stress, branch, springs, ends, mass, drag, top, value, rate)
-            done = _record(y, moving, springs, times, now, done, stress[0], nodes, base, due)
+            if _rates(y, one.k[0], stress, flags, system, value, rate):
+                done = _record(y, moving, flags, springs, times, now, done, stress[0], nodes, base)
         # what the drive does from here on
         since = now
         if not struck:
@@ -334,162 +609,101 @@ def _follow(
             if fresh and times.size > 1:
                 rate = (values[knot + 1] - values[knot]) / (times[knot + 1] - times[knot])
             value = values[knot] + rate * (now - times[knot])
-        fine = _rates(y, k[0], stress, branch, springs, ends, mass, drag, top, value, rate)
+        if not _rates(y, one.k[0], stress, flags, system, value, rate):
+            return DONE if done == times.size else FLAT, steps, switches, math.nan, least
         if fresh and not struck and knot > 0 and top == MOTION:  # dashpots feel the mean rate
             a, b = times[knot] - times[knot - 1], times[knot + 1] - times[knot]
             base[knot] += a / (a + b) * (stress[0] - base[knot])
         fresh = False
-        # a spring at the end of its branch, on its way out
-        moved = False
-        for i in range(count):
-            low, high, under, over = _bounds(springs[i], branch[i])
-            eps, way = y[moving + i], k[0, moving + i]
-            if fine and ((eps >= high and way > 0.0) or (eps <= low and way < 0.0)):
-                if switches < log.shape[0]:
-                    log[switches, 0], log[switches, 1] = now, i
-                    log[switches, 2] = branch[i]
-                switches += 1
-                branch[i] = over if way > 0.0 else under
-                moved = True
+        moved = _enter(y, one.k[0], moving, flags, springs)
         if moved:
+            switches += moved
             steps += 1
             if steps > most:
-                return TOO_LONG, steps, switches, math.nan, least, now
+                return TOO_LONG, steps, switches, math.nan, least
             continue
-        done = _record(y, moving, springs, times, now, done, stress[0], nodes, base, fine)
+        done = _record(y, moving, flags, springs, times, now, done, stress[0], nodes, base)
         if done == times.size:
-            return DONE, steps, switches, math.nan, least, now
-        if not fine:
-            return FLAT, steps, switches, math.nan, least, now
-        for g in range(groups):
-            largest = max(largest, abs(stress[g]))
-        peak = max(peak, stress[0])
-        if struck and not pressed and stress[0] > RISEN * largest:
-            pressed = True
+            return DONE, steps, switches, math.nan, least
+        largest, peak = max(largest, np.abs(stress).max()), max(peak, stress[0])
+        pressed = pressed or (struck and stress[0] > RISEN * largest)
         if pressed:
             if stress[0] > last_base and falling:
                 least = min(least, last_base / peak)
             falling = stress[0] < last_base
             last_base = stress[0]
         for j in range(size):
-            reach[j] = max(reach[j], abs(y[j]))
-        target = times[done]
-        left = (target - now) - late
+            one.reach[j] = max(one.reach[j], abs(y[j]))
+        for i in range(count):
+            x, pace = y[moving + i], one.k[0, moving + i]
+            one.paces[i] = max(abs(pace), 1e-12 * abs(x), 1e-290)
+        left = (times[done] - now) - late
         if h == 0.0:
             h = 1e-6 * (times[times.size - 1] - now)
         while True:  # until a step is short enough
             steps += 1
             if steps > most:
-                return TOO_LONG, steps, switches, math.nan, least, now
+                return TOO_LONG, steps, switches, math.nan, least
             full = h
             lands = h >= left
             if lands:
                 h = left
             elif h > 0.5 * left:
                 h = 0.5 * left
-            error = _step(
-                y, h, k, y1, some, scale, reach, stress1, branch, springs, ends, mass, drag, top,
-                value, rate, tol, tableau, moving,
-            )  # fmt: skip
+            error = _step(y, h, one, flags, system, value, rate, tol)
+            if error <= 1.0 and _leaps(y, one.y1, moving, flags, springs):
+                error = 20.0
             if error <= 1.0:
                 break
             h *= max(0.9 * error**-0.125, 0.2) if error < math.inf else 0.1
             if now + 1e-3 * h == now and h < 1e-22:
-                return NO_STEP, steps, switches, math.nan, least, now
+                return NO_STEP, steps, switches, math.nan, least
         grow = min(0.9 * max(error, 1e-30) ** -0.125, 6.0)
         following = max(full, h * grow) if h < full else h * grow
         # does a branch, or contact, end in it?
-        at_end = value + rate * h
-        if not _rates(y1, f1, stress1, branch, springs, ends, mass, drag, top, at_end, rate):
-            return FLAT, steps, switches, math.nan, least, now
-        lifts = pressed and stress[0] > 0.0
-        past = _over(y1, moving, branch, springs, stress1[0], lifts, peak)
-        high_at, hit = 1.0, past > 0.0
-        if not hit:  # may it have come and gone?
-            first = 1.0
-            for i in range(count):
-                low, high, _, _ = _bounds(springs[i], branch[i])
-                e0, e1, d0, d1 = y[moving + i], y1[moving + i], k[0, moving + i], f1[moving + i]
-                if high < math.inf and d0 > 0.0 > d1:
-                    x = _turn(e0, d0, e1, d1, h)
-                    if max(e0, e1) + 2.0 * h * d0 * x > high:
-                        first = min(first, x)
-                if low > -math.inf and d0 < 0.0 < d1:
-                    x = _turn(-e0, -d0, -e1, -d1, h)
-                    if min(e0, e1) + 2.0 * h * d0 * x < low:
-                        first = min(first, x)
-            if lifts:
-                tiny = 1e-5
-                for j in range(size):
-                    near[j] = y[j] + tiny * h * k[0, j]
-                _rates(near, scale, stress2, branch, springs, ends, mass, drag, top,
-                       value + tiny * h * rate, rate)  # fmt: skip
-                d0 = (stress2[0] - stress[0]) / (tiny * h)
-                for j in range(size):
-                    near[j] = y1[j] - tiny * h * f1[j]
-                _rates(near, scale, stress2, branch, springs, ends, mass, drag, top,
-                       at_end - tiny * h * rate, rate)  # fmt: skip
-                d1 = (stress1[0] - stress2[0]) / (tiny * h)
-                if d0 < 0.0 < d1:
-                    x = _turn(-stress[0], -d0, -stress1[0], -d1, h)
-                    if min(stress[0], stress1[0]) + 2.0 * h * d0 * x < 0.0:
-                        first = min(first, x)
+        if not _rates(one.y1, one.rates, one.stress, flags, system, value + rate * h, rate):
+            return FLAT, steps, switches, math.nan, least
+        lifts = peak if pressed and stress[0] > 0.0 else 0.0
+        past = _over(one.y1, one.rates, one.paces, flags, system, one.stress[0], lifts)
+        high_at = 1.0
+        if past <= 0.0:
+            first = _suspect(y, stress, h, one, flags, system, value, rate, lifts > 0.0)
             if 1e-6 < first < 1.0:
-                _step(
-                    y, first * h, k, y1, some, scale, reach, stress1, branch, springs, ends, mass,
-                    drag, top, value, rate, tol, tableau, moving,
-                )  # fmt: skip
+                past = _past(y, first * h, one, flags, system, value, rate, tol, lifts)
                 steps += 1
-                _rates(y1, f1, stress1, branch, springs, ends, mass, drag, top,
-                       value + rate * first * h, rate)  # fmt: skip
-                past = _over(y1, moving, branch, springs, stress1[0], lifts, peak)
-                high_at, hit, lands = first, past > 0.0, False
-        if hit:
-            # the length at which it happens: false position and bisection in turn
-            lands = False
-            low_at, low_past = (
-                0.0,
-                min(_over(y, moving, branch, springs, stress[0], lifts, peak), 0.0),
-            )
+                high_at, lands = first, False
+        hit = past > 0.0
+        if hit:  # the length at which it happens: false position and bisection in turn
+            lands, low_at = False, 0.0
+            low_past = min(_over(y, one.k[0], one.paces, flags, system, stress[0], lifts), 0.0)
             high_past = past
             for turn in range(80):
                 if high_past <= 1e-16 or high_at - low_at <= 1e-15 * high_at:
                     break
                 mid = 0.5 * (low_at + high_at)
-                if turn % 3 != 2 and high_past > low_past:
+                if turn % 3 != 2 and low_past < high_past < math.inf:
                     mid = high_at - high_past * (high_at - low_at) / (high_past - low_past)
-                    nudge = 1e-3 if turn % 3 == 0 else 0.0
-                    mid += nudge * (high_at - mid)
+                    mid += (1e-3 if turn % 3 == 0 else 0.0) * (high_at - mid)
                     if not low_at < mid < high_at:
                         mid = 0.5 * (low_at + high_at)
-                _step(
-                    y, mid * h, k, y1, some, scale, reach, stress1, branch, springs, ends, mass,
-                    drag, top, value, rate, tol, tableau, moving,
-                )  # fmt: skip
+                past = _past(y, mid * h, one, flags, system, value, rate, tol, lifts)
                 steps += 1
-                _rates(y1, f1, stress1, branch, springs, ends, mass, drag, top,
-                       value + rate * mid * h, rate)  # fmt: skip
-                past = _over(y1, moving, branch, springs, stress1[0], lifts, peak)
                 if past > 0.0:
                     high_at, high_past = mid, past
                 else:
                     low_at, low_past = mid, past
-            # y1 is of the last length that was tried: take that of the one that was found
         length = high_at * h
-        if high_at < 1.0:
-            _step(
-                y, length, k, y1, some, scale, reach, stress1, branch, springs, ends, mass, drag,
-                top, value, rate, tol, tableau, moving,
-            )  # fmt: skip
+        if high_at < 1.0:  # what was tried last may have another length
+            _step(y, length, one, flags, system, value, rate, tol)
             steps += 1
         # the step is taken, with what rounding takes off it
         for j in range(size):
-            more = some[j] - lost[j]
+            more = one.some[j] - lost[j]
             total = y[j] + more
             lost[j] = (total - y[j]) - more
             y[j] = total
         if lands:
-            now, late = target, 0.0
+            now, late = times[done], 0.0
         else:
             more = length + late
             total = now + more
@@ -497,127 +711,23 @@ def _follow(
             now = total
         h = following
         if hit:
-            _rates(y, f1, stress1, branch, springs, ends, mass, drag, top,
-                   value + rate * length, rate)  # fmt: skip
+            _rates(y, one.rates, one.stress, flags, system, value + rate * length, rate)
             for i in range(count):
-                low, high, _, _ = _bounds(springs[i], branch[i])
+                low, high, _, _ = _ends(springs[i], flags.branch[i], flags.ranks[i])
                 for bound in (low, high):
-                    near_it = abs(y[moving + i] - bound) <= 1e-15 * max(abs(bound), 1e-2)
-                    if math.isfinite(bound) and near_it:
+                    x = y[moving + i]
+                    floor = 1e-2 if flags.branch[i] < HELD else 1e-290
+                    if math.isfinite(bound) and abs(x - bound) <= 1e-15 * max(abs(bound), floor):
                         y[moving + i], lost[moving + i] = bound, 0.0
-            if lifts and stress1[0] <= 1e-15 * peak:
-                _fly(y, moving, groups, springs, times, done, now, nodes, base)
-                return DONE, steps, switches, now, least, now
-
-
-@njit(cache=True, error_model="numpy")
-def _record(
-    y: Array,
-    moving: int,
-    springs: Array,
-    times: Array,
-    now: float,
-    done: int,
-    pressure: float,
-    nodes: Array,
-    base: Array,
-    fine: bool,
-) -> int:
-    """Write the samples that are due; returns how many are done."""
-    while fine and done < times.size and times[done] <= now:
-        place = 0.0
-        for i in range(springs.shape[0]):
-            place += springs[i, H] * y[moving + i]
-            nodes[i, done] = place
-        base[done] = pressure
-        done += 1
-    return done
-
-
-@njit(cache=True, error_model="numpy")
-def _fly(
-    y: Array,
-    moving: int,
-    groups: int,
-    springs: Array,
-    times: Array,
-    done: int,
-    now: float,
-    nodes: Array,
-    base: Array,
-) -> None:
-    """After contact the chain moves with the striker, and nothing presses."""
+            if lifts > 0.0 and one.stress[0] <= 1e-15 * peak:
+                break
+    # after contact the chain moves with the striker, and nothing presses
     for j in range(done, times.size):
-        place = y[groups - 1] * (times[j] - now)
-        for i in range(springs.shape[0]):
-            place += springs[i, H] * y[moving + i]
-            nodes[i, j] = place
-        base[j] = 0.0
-
-
-@njit(cache=True, error_model="numpy")
-def _step(
-    y: Array,
-    h: float,
-    k: Array,
-    y1: Array,
-    some: Array,
-    scale: Array,
-    reach: Array,
-    stress: Array,
-    branch: Integers,
-    springs: Array,
-    ends: Integers,
-    mass: Array,
-    drag: float,
-    top: int,
-    value: float,
-    rate: float,
-    tol: float,
-    tableau: tuple[Array, Array, Array, Array, Array],
-    moving: int,
-) -> float:
-    """Take a step of length h from y, whose rates are k[0]; fills y1 and, in `some`, y1 - y.
-
-    Returns the error over the tolerance; infinite where something is not finite.
-    """
-    ra, rb, rc, re3, re5 = tableau
-    size = y.size
-    for stage in range(1, 12):
-        for j in range(size):
-            total = 0.0
-            for m in range(stage):
-                total += ra[stage, m] * k[m, j]
-            y1[j] = y[j] + h * total
-        if not _rates(y1, k[stage], stress, branch, springs, ends, mass, drag, top,
-                      value + rate * rc[stage] * h, rate):  # fmt: skip
-            return math.inf
-    fastest = longest = 0.0
-    for j in range(size):
-        total = 0.0
-        for m in range(12):
-            total += rb[m] * k[m, j]
-        some[j] = h * total
-        y1[j] = y[j] + some[j]
-        scale[j] = max(reach[j], abs(y1[j]))
-        if j < moving:
-            fastest = max(fastest, scale[j])
-        else:
-            longest = max(longest, scale[j])
-    norm5 = norm3 = 0.0
-    for j in range(size):
-        e5 = e3 = 0.0
-        for m in range(12):
-            e5 += re5[m] * k[m, j]
-            e3 += re3[m] * k[m, j]
-        unit = tol * max(scale[j], 1e-6 * (fastest if j < moving else longest)) + 1e-290
-        norm5 += (e5 / unit) ** 2
-        norm3 += (e3 / unit) ** 2
-    if not math.isfinite(norm5 + norm3):
-        return math.inf
-    if norm5 == 0.0:
-        return 0.0
-    return abs(h) * norm5 / math.sqrt((norm5 + 0.01 * norm3) * size)
+        _record(
+            y, moving, flags, springs, times[j : j + 1], math.inf, 0, 0.0, nodes[:, j:], base[j:]
+        )
+        nodes[:, j] += y[groups - 1] * (times[j] - now)
+    return DONE, steps, switches, now, least
 
 
 # ------------------------------------------------------------------------------------ the judge
@@ -668,43 +778,6 @@ def over_range(one: Array, other: Array) -> float:
     return miss / span if span > 0.0 and math.isfinite(miss) else math.inf
 
 
-def _virgin_strain(p: Array, bistable: bool, sigma: float) -> float:
-    """Strain at a stress of a spring that was never loaded before."""
-    if not bistable:
-        return sigma / float(p[K0])
-    if sigma <= p[SIG_A]:
-        return sigma / (float(p[K0]) + sigma)
-    if sigma <= p[SIG_A] + p[UP] * (p[HAT_C] - p[EPS_A]):
-        return float(p[EPS_A]) + (sigma - float(p[SIG_A])) / float(p[UP])
-    return float(p[STAR]) + sigma / (float(p[KC]) + sigma)
-
-
-def _start(rows: Array, kinds: Integers, ends: Integers, top: int, first: float) -> Array:
-    """Strains of the springs under the top at the first sample of a drive that does not start at 0.
-
-    In equilibrium with it; under a stress, a dashpot holds its spring where it is.
-    """
-    start = np.zeros(len(rows))
-    own = range(int(ends[-2]) if len(ends) > 1 else 0, len(rows))
-    if top in (MASS, DAMPER) or first == 0.0:
-        return start
-
-    def strains(sigma: float) -> Array:
-        return np.array([_virgin_strain(rows[i], bool(kinds[i] == A), sigma) for i in own])
-
-    if top == STRESS:
-        held = rows[own, ETA] > 0.0
-        start[own] = np.where(held, 0.0, strains(first))
-        return start
-    heights = rows[own, H]
-    high = 1.0
-    while heights @ strains(high) < first:
-        high *= 2.0
-    sigma = float(brentq(lambda s: float(heights @ strains(s)) - first, 0.0, high, xtol=1e-30))
-    start[own] = strains(sigma)
-    return start
-
-
 def _fastest(rows: Array, ends: Integers, mass: Array, top: int) -> float:
     """Largest rate (1/s) at which dashpots stop a mass: explicit steps are a few times shorter."""
     hold = []
@@ -742,22 +815,21 @@ def _shares(chain: Any, drive: Any, ends: Integers) -> bool:
     return False
 
 
+def has_memory(chain: Any) -> bool:
+    """Whether a spring of a chain is microscale, or relaxes."""
+    return any(hasattr(s, "sigma_plus") or getattr(s, "relaxation", ()) for s in chain.springs)
+
+
 def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = MOST_WORK) -> Truth:
     """Follow a scene once, at one tolerance; its own uncertainty is not known then."""
     count = len(chain.springs)
-    bistable = [hasattr(spring, "kc") for spring in chain.springs]
-    rows = np.array(
-        [
-            (bistable_row if two else _linear)(spring, h)
-            for spring, h, two in zip(chain.springs, chain.heights, bistable, strict=True)
-        ]
-    )
-    kinds = np.array(
-        [
-            A if two else ONE_SIDED if spring.unilateral else LINE
-            for spring, two in zip(chain.springs, bistable, strict=True)
-        ]
-    )
+    pairs = [row_of(s, h) for s, h in zip(chain.springs, chain.heights, strict=True)]
+    rows, kinds = np.array([row for row, _ in pairs]), np.array([kind for _, kind in pairs])
+    relaxing = [list(getattr(spring, "relaxation", ())) for spring in chain.springs]
+    relax = np.tile([0.0, 1.0], (count, max(map(len, relaxing)), 1))
+    for i, terms in enumerate(relaxing):
+        for n, term in enumerate(terms):
+            relax[i, n] = term
     time = np.ascontiguousarray(time, float)
     above, speed, values, top = float(chain.masses[-1]), 0.0, np.zeros(time.size), MASS
     drag = chain.site_damping / math.fsum(chain.heights)
@@ -772,22 +844,22 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = 
     ends = np.array([*(i + 1 for i in inside), count])
     mass = np.array([*(chain.masses[i] for i in inside), above]) / chain.area
     nodes, base = np.zeros((count, time.size)), np.zeros(time.size)
-    if _fastest(rows, ends, mass, top) * (time[-1] - time[0]) > 6.0 * most / count:
-        return Truth(nodes, base, None, math.nan, math.nan, math.inf, 0, 0, WHY[TOO_LONG])
-    if _shares(chain, drive, ends):
-        return Truth(nodes, base, None, math.nan, math.nan, math.inf, 0, 0, SHARED)
-    log = np.zeros((4096, 3))
-    start = _start(rows, kinds, ends, top, float(values[0]))
-    outcome, steps, switches, end, dip, _ = _follow(
-        rows, kinds, ends, mass, drag, top, speed, start, time, values, tol, most // count, nodes,
-        base, log, (_A, _B, _C, _E3, _E5),
-    )  # fmt: skip
+    if values[0] != 0.0:
+        raise ValueError("a drive must start at zero")
+    if not has_memory(chain):
+        too_long = _fastest(rows, ends, mass, top) * (time[-1] - time[0]) > 6.0 * most / count
+        if too_long or _shares(chain, drive, ends):
+            why = WHY[TOO_LONG] if too_long else SHARED
+            return Truth(nodes, base, None, math.nan, math.nan, math.inf, 0, 0, why)
+    system = System(rows, relax, ends, mass, drag, top, speed, values, np.empty((4, count)))
+    outcome, steps, switches, end, dip = _follow(
+        system, kinds, time, tol, most // count, nodes, base
+    )
     why = WHY[outcome]
     if not why and not (np.isfinite(nodes).all() and np.isfinite(base).all()):
         why = "not finite"
-    return Truth(
-        nodes, base, None if math.isnan(end) else end, math.nan, math.nan, dip, steps, switches, why
-    )
+    end = None if math.isnan(end) else end
+    return Truth(nodes, base, end, math.nan, math.nan, dip, steps, switches, why)
 
 
 def judge(

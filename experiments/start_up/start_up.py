@@ -1,10 +1,12 @@
-"""From the command to the report: how long it takes, warm and at first use, and where time goes.
+"""From the command to the report: how long does it take, warm and at first use, and where?
 
-A synthetic impact of 600 rows (published foam-1/model-1 at 2 m/s, 1 % white noise) is fitted by
-`foamfit fit`, each time in a new process. "First use" is the first fit after installation: nothing
-is compiled (an empty NUMBA_CACHE_DIR). The parts are those of one more process, which calls in turn
-what the command calls; in the last part, figures are drawn in other processes where there are two
-cores, as by the command.
+Method. A synthetic impact of 600 rows (published foam-1/model-1 at 2 m/s, 1 % white noise) is
+fitted by `foamfit fit`, each time in a new process. "First use" is the first fit after
+installation: nothing is compiled (an empty NUMBA_CACHE_DIR). The parts are those of one more
+process, which calls in turn what the command calls; in the last part, figures are drawn in other
+processes where there are two cores, as by the command.
+
+Answer. 2.3 s once compiled, 11.4 s at first use; README.md says where the time goes.
 
     python experiments/start_up/start_up.py                 # table of this version
     python experiments/start_up/start_up.py --before PATH   # and of another checkout, in turns
@@ -14,7 +16,6 @@ Another checkout is the `src` folder of an earlier version; it runs with this Py
 
 from __future__ import annotations
 
-import argparse
 import os
 import platform
 import resource
@@ -27,6 +28,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
+import studies  # noqa: E402
 from million_rows import write  # noqa: E402
 
 ROWS, WARM, FIRST = 600, 9, 3
@@ -141,17 +143,13 @@ def table(names: list[str], measured: list[list[float]]) -> str:
         "processor time of its first process",
         *(f"– {part}" for part in PARTS),
     )
-    lines = [
-        f"| {ROWS} rows; wall time in s | {' | '.join(names)} |",
-        "| --- |" + " ---: |" * len(names),
-    ]
-    for row, values in zip(rows, zip(*measured, strict=True), strict=True):
-        lines.append(f"| {row} | {' | '.join(f'{value:.2f}' for value in values)} |")
-    return "\n".join(lines)
+    told = ([f"{value:.2f}" for value in values] for values in zip(*measured, strict=True))
+    cells = ([row, *values] for row, values in zip(rows, told, strict=True))
+    return studies.markdown([f"{ROWS} rows; wall time in s", *names], cells)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = studies.arguments(__doc__)
     parser.add_argument("--before", type=Path, metavar="PATH", help="src folder of another version")
     before = parser.parse_args().before
     sources: list[Path | None] = [None] if before is None else [before, None]
@@ -160,9 +158,8 @@ def main() -> None:
     told = table(["now"] if before is None else ["before", "now"], measured)
     print(told)
     if before is not None:
-        machine = (
-            f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
-        )
+        machine = f"{os.cpu_count()} cores, {platform.machine()}"
+        machine += f", Python {platform.python_version()}"
         page = (HERE / "page.template.md").read_text(encoding="utf-8")
         text = page.replace("{table}", told).replace("{machine}", machine)
         (HERE / "README.md").write_text(text, encoding="utf-8")

@@ -1,61 +1,47 @@
 """What does wear do to a running-shoe foam? Five specimens of a new heel against five of a worn.
 
+Method. The measurements (arXiv:2602.12694, LivingMatterLab/CANN on GitHub; not part of this
+repository) are compressions of ten specimens, six to seven cycles each. The study goes the way of a
+user: a TOML beside each test, `foamfit.batch` over all tests and cycles, `foamfit.joint` of the new
+and of the worn ones. Common values are compared by Welch's test of their logarithms, all
+comparisons of a cycle counted together (Holm).
+
+Answer. The worn heel dissipates less, but no parameter changes by more than the specimens of one
+heel differ: see README.md, which this writes with batch.csv, wear.csv and two pictures.
+
     FOAMFIT_DATA=path/to/data python experiments/twins/twins.py
-
-The measurements are not part of this repository: shoe-foam-twins/ are compressions of ten
-specimens, six to seven cycles each (arXiv:2602.12694, LivingMatterLab/CANN on GitHub), with a
-specimens.csv of diameters and heights. The study goes the way of a user: a TOML beside each test,
-`foamfit.batch` over all tests and cycles, `foamfit.joint` of the new and of the worn ones.
-
-Writes README.md, batch.csv, wear.csv, new_against_worn.png and by_cycle.png beside this file.
 """
 
 from __future__ import annotations
 
 import math
-import os
 import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy import stats
 
 import foamfit as ff
-from foamfit.report.figures import BLUE, GREY, VERMILION, drawing, save
+from foamfit.report.figures import BLUE, GREY, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.springs.parameters import unit_of
 from foamfit.text import listed, percent, significant
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
-from specimens import twins, write_specimen  # noqa: E402
+import studies  # noqa: E402
 
-SOURCE = "measurements: arXiv:2602.12694, LivingMatterLab/CANN"
+SOURCE = "Measurements: arXiv:2602.12694, LivingMatterLab/CANN"
 GROUPS, COLOURS = ("new", "worn"), {"new": BLUE, "worn": VERMILION}
 FIRST, LATER = 1, 5  # cycles that the page has tables of
-STUDY = """\
-name = "shoe foam, {group} heel, cycle {cycle}"
-tests = ["{group}-heel-comp-*_raw.txt"]
-model = "microscale"
-relaxation = 1
-drive = "displacement"
-cycle = {cycle}
-
-[parameters]
-{parameters}
-"""
-LAW = (
-    "k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus", "g1", "tau1"
-)  # fmt: skip
+OWN = ["k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus"]
+LAW = [*OWN, "g1", "tau1"]
 # No test tells kc from eps_star (r = 1.00), and all ten say that eps_star is one value by evidence:
 # it is found from all of them and held in the fits of the groups, so that their kc compare.
 HELD = "s1_eps_star"
@@ -73,42 +59,60 @@ Found = Mapping[int, Mapping[str, Mapping[str, Any]]]
 # ------------------------------------------------------------------------------- fits
 
 
-def place_tests(data: Path, folder: Path) -> None:
-    """Link the tests into a folder, with the TOML of each beside it."""
-    for test, height, diameter in twins(data):
-        stem = f"{test}_raw"
-        (folder / f"{stem}.txt").symlink_to((data / f"{stem}.txt").resolve())
-        write_specimen(folder / f"{stem}.toml", height, diameter)
+@dataclass(frozen=True)
+class Made:
+    """All that is fitted: the batch, the joint fits by cycle, and of the first with HELD free.
+
+    Also the measured loops by cycle, and seconds.
+    """
+
+    table: pd.DataFrame
+    found: Found
+    free: Mapping[str, Mapping[str, Any]]
+    measured: Mapping[int, Loops]
+    seconds: Mapping[str, float]
 
 
-def fit_each(folder: Path) -> pd.DataFrame:
-    """Fit every cycle of every test on its own; rows of summary.csv with specimen and cycle."""
+def measure(data: Path, folder: Path) -> Made:
+    """Make all fits: each cycle of each test, then each group together."""
+    began = time.perf_counter()
+    studies.place_twins(data, folder)
     found = ff.batch(
         folder, out=folder / "runs", model="microscale", relaxation=1, drive="displacement",
         cycle="all", intervals="local", report=False,
     )  # fmt: skip
     split = found["test"].str.extract(r"^(?P<specimen>.*)_raw(?:/cycle-(?P<cycle>\d+))?$")
-    return pd.concat([split, found.drop(columns=["test", "file"])], axis=1)
+    table = pd.concat([split, found.drop(columns=["test", "file"])], axis=1)
+    took = time.perf_counter() - began
+    print(f"batch: {len(table)} fits in {took:.0f} s", flush=True)
+    counts = table["cycle"].dropna().astype(int).value_counts()
+    # A cycle that few records have is no group.
+    full = sorted(n for n, count in counts.items() if count == table["specimen"].nunique())
+    free = {group: fit_study(folder, group, FIRST, "own") for group in GROUPS}
+    together = {n: fit_together(folder, n) for n in full}
+    seconds = {"batch": took, "joint": time.perf_counter() - began - took}
+    return Made(table, together, free, {n: loops(folder, n) for n in full}, seconds)
 
 
 def fit_together(folder: Path, cycle: int) -> dict[str, dict[str, Any]]:
     """Fit one cycle of all specimens, of the new and of the worn together; joint.json of each."""
-    found = {"all": fit_study(folder, "*", cycle, '"auto"')}
+    found = {"all": fit_study(folder, "*", cycle, "auto")}
     held = found["all"]["parameters"][HELD]
     if held["kind"] != "shared":
         sys.exit(f"cycle {cycle}: the evidence is for {HELD} {held['kind']}, not shared")
     for group in GROUPS:
-        found[group] = fit_study(folder, group, cycle, repr(held["value"]))
+        found[group] = fit_study(folder, group, cycle, held["value"])
+    print(f"cycle {cycle} together", flush=True)
     return found
 
 
-def fit_study(folder: Path, group: str, cycle: int, held: str) -> dict[str, Any]:
+def fit_study(folder: Path, group: str, cycle: int, held: str | float) -> dict[str, Any]:
     """Fit one study; content of joint.json."""
-    study = folder / "study.toml"
-    parameters = "\n".join(f'{name} = "scatter"' for name in SCATTERING)
-    study.write_text(
-        STUDY.format(group=group, cycle=cycle, parameters=f"{parameters}\n{HELD} = {held}")
-    )
+    study = studies.write_study(
+        folder / "study.toml", [f"{group}-heel-comp-*_raw.txt"], "microscale",
+        dict.fromkeys(SCATTERING, "scatter") | {HELD: held}, relaxation=1, drive="displacement",
+        cycle=cycle, name=f"shoe foam, {group} heel, cycle {cycle}",
+    )  # fmt: skip
     return ff.joint(study).to_json_dict()
 
 
@@ -143,11 +147,6 @@ def mean_loop(group: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarra
 def lost(loop: tuple[np.ndarray, np.ndarray]) -> float:
     """Energy that a loop dissipates, J/m³."""
     return float(np.trapezoid(loop[1], loop[0]))
-
-
-def peak(loop: tuple[np.ndarray, np.ndarray]) -> float:
-    """The largest stress of a loop, Pa."""
-    return float(loop[1].max())
 
 
 # ------------------------------------------------------------------------------- comparison
@@ -253,7 +252,7 @@ def wear(found: Mapping[str, Mapping[str, Any]], measured: Loops) -> list[Change
     """What differs between the joint fits of two groups, and what their loops say without a law."""
     out = [
         change_of(name, *(Group.of([one(loop) for loop in measured[g]]) for g in GROUPS))
-        for name, one in ((ENERGY, lost), (PEAK, peak))
+        for name, one in ((ENERGY, lost), (PEAK, lambda loop: float(loop[1].max())))
     ]
     for name in SCATTERING:
         new, worn = (Group.of_joint(found[group]["parameters"][name]) for group in GROUPS)
@@ -295,14 +294,27 @@ def title(one: Change) -> str:
     return f"{one.name.removeprefix('s1_')}{f' ({unit})' if unit else ''}"
 
 
+def code(name: str) -> str:
+    """Write the name of a parameter as such."""
+    return name if name in UNITS else f"`{name.removeprefix('s1_')}`"
+
+
 # ------------------------------------------------------------------------------- pictures
 
 
 def draw_wear(changes: Sequence[Change], measured: Loops, cycle: int, path: Path) -> None:
     """The mean loops, and each quantity new against worn."""
-    with drawing(7.6, 6.4) as figure:
+    with studies.sheet(path, 7.6, 6.4) as figure:
         grid = figure.add_gridspec(3, 4)
-        draw_loops(figure.add_subplot(grid[0, :2]), measured)
+        ax = figure.add_subplot(grid[0, :2])
+        for group, colour in COLOURS.items():
+            strain, stress, spread = mean_loop(measured[group])
+            for part in (slice(None, POINTS), slice(POINTS, None)):
+                low, high = ((stress + sign * spread)[part] / 1e3 for sign in (-1.0, 1.0))
+                ax.fill_between(strain[part], low, high, color=colour, alpha=0.15, linewidth=0)
+            ax.plot(strain, stress / 1e3, color=colour, linewidth=1.2, label=group)
+        ax.set(xlabel="strain", ylabel="stress (kPa)", title="mean loops ± standard deviation")
+        ax.legend(loc="upper left")
         places = [grid[0, 2], grid[0, 3], *(grid[r, c] for r in (1, 2) for c in range(4))]
         for place, one in zip(places, changes, strict=True):
             draw_change(figure.add_subplot(place), one)
@@ -311,43 +323,31 @@ def draw_wear(changes: Sequence[Change], measured: Loops, cycle: int, path: Path
             "largest change over spread first\n"
             "points: specimens with 95 % intervals, hollow if not well determined; line and band: "
             "common value and its 95 % interval;\n"
-            f"dashed: spread between specimens. {SOURCE[0].upper()}{SOURCE[1:]}",
+            f"dashed: spread between specimens. {SOURCE}",
             x=0.01, ha="left", fontsize=7.5,
         )  # fmt: skip
-    save(figure, path)
 
 
-def draw_loops(ax: Axes, measured: Loops) -> None:
-    for group, colour in COLOURS.items():
-        strain, stress, spread = mean_loop(measured[group])
-        for part in (slice(None, POINTS), slice(POINTS, None)):
-            low, high = (stress[part] - spread[part]) / 1e3, (stress[part] + spread[part]) / 1e3
-            ax.fill_between(strain[part], low, high, color=colour, alpha=0.15, linewidth=0)
-        ax.plot(strain, stress / 1e3, color=colour, linewidth=1.2, label=group)
-    ax.set_title("mean loops ± standard deviation")
-    ax.set(xlabel="strain", ylabel="stress (kPa)")
-    ax.legend(loc="upper left")
-
-
-def draw_change(ax: Axes, one: Change) -> None:
+def draw_change(ax: Any, one: Change) -> None:
     """One quantity: specimens, common value and spread of both groups."""
     factor, _ = unit_for(one)
     for x, (name, group) in enumerate((("new", one.new), ("worn", one.worn))):
-        colour = COLOURS[name]
-        span = [x - 0.36, x + 0.36]
+        colour, span = COLOURS[name], [x - 0.36, x + 0.36]
         low, high = (end / factor for end in group.ci95)
         ax.fill_between(span, low, high, color=colour, alpha=0.18, linewidth=0, zorder=0)
         ax.plot(span, [group.common / factor] * 2, color=colour, linewidth=1.6, zorder=1)
         for edge in group.edges:
             ax.plot(span, [edge / factor] * 2, "--", color=colour, linewidth=0.7, zorder=1)
-        at = x + np.linspace(-0.24, 0.24, len(group.values))
-        for i, value in enumerate(group.values):
-            ends = group.ends[i] if group.ends else None
+        at, count = x + np.linspace(-0.24, 0.24, len(group.values)), len(group.values)
+        given = zip(
+            at, group.values, group.ends or [None] * count, group.sure or [True] * count,
+            strict=True,
+        )  # fmt: skip
+        for here, value, ends, sure in given:
             if ends is not None:
-                ax.plot([at[i]] * 2, [end / factor for end in ends], color=GREY, linewidth=0.8)
-            sure = not group.sure or group.sure[i]
-            ax.plot(at[i], value / factor, "o", color=colour, markersize=3.4,
-                    markerfacecolor=colour if sure else "white", markeredgewidth=0.8)  # fmt: skip
+                ax.plot([here] * 2, [end / factor for end in ends], color=GREY, linewidth=0.8)
+            fill = colour if sure else "white"
+            ax.plot(here, value / factor, "o", color=colour, markersize=3.4, mfc=fill, mew=0.8)
     ax.set_xlim(-0.55, 1.55)
     ax.set_xticks([0, 1], GROUPS)
     ax.set_title(
@@ -359,34 +359,30 @@ def draw_change(ax: Axes, one: Change) -> None:
 
 def draw_cycles(by_cycle: Mapping[int, Sequence[Change]], path: Path) -> None:
     """Common values of new and worn against the cycle."""
-    cycles = list(by_cycle)
-    with drawing(7.6, 4.0) as figure:
+    with studies.sheet(path, 7.6, 4.0) as figure:
         axes = figure.subplots(2, 5, sharex=True).ravel()
         for ax, name in zip(axes, (ENERGY, PEAK, *SCATTERING), strict=True):
-            there = [next(one for one in by_cycle[n] if one.name == name) for n in cycles]
+            there = [next(o for o in ones if o.name == name) for ones in by_cycle.values()]
             factor, _ = unit_for(there[0])
             for group, off in (("new", -0.1), ("worn", 0.1)):
                 ones = [getattr(one, group) for one in there]
-                x, colour = np.array(cycles) + off, COLOURS[group]
+                x, colour = np.array(list(by_cycle)) + off, COLOURS[group]
                 ends = np.array([one.ci95 for one in ones]) / factor
                 ax.vlines(x, ends[:, 0], ends[:, 1], color=colour, linewidth=0.9)
                 ax.plot(x, [one.common / factor for one in ones], color=colour, linewidth=0.7)
                 for at, one, change in zip(x, ones, there, strict=True):
                     ax.plot(at, one.common / factor, "o", color=colour, markersize=3.6,
-                            markerfacecolor=colour if change.stands_out else "white",
-                            label=group if at < 1.5 else None)  # fmt: skip
+                            mfc=colour if change.stands_out else "white")  # fmt: skip
             ax.set_title(title(there[0]))
-            ax.set_xticks(cycles)
+            ax.set_xticks(list(by_cycle))
             ax.set_ylim(bottom=0.0)
         for ax in axes[5:]:
             ax.set_xlabel("cycle")
         figure.suptitle(
             "New (blue) and worn (red) by cycle: common value of five specimens with its 95 % "
-            "interval, filled where wear stands out of the scatter\n"
-            f"{SOURCE[0].upper()}{SOURCE[1:]}",
+            f"interval, filled where wear stands out of the scatter\n{SOURCE}",
             x=0.01, ha="left", fontsize=7.5,
         )  # fmt: skip
-    save(figure, path)
 
 
 # ------------------------------------------------------------------------------- the page
@@ -394,63 +390,50 @@ def draw_cycles(by_cycle: Mapping[int, Sequence[Change]], path: Path) -> None:
 
 def change_rows(changes: Sequence[Change]) -> str:
     """Rows of the page's table of changes."""
-    out = []
+    rows = []
     for one in changes:
         factor, cells = unit_for(one)[0], []
         for group in (one.new, one.worn):
             told = [significant(v / factor, 3) for v in (group.common, *group.ci95)]
             cells += [f"{told[0]} ({told[1]} to {told[2]})", percent(group.spread)]
-        out.append(
-            f"| {title(one)} | {' | '.join(cells)} | {shown_change(one)} | "
-            f"{significant(one.size, 2)} | {significant(one.p, 2)} | "
-            f"{significant(one.adjusted, 2)} | {verdict(one)} |"
-        )
-    return "\n".join(out)
+        sizes = (significant(number, 2) for number in (one.size, one.p, one.adjusted))
+        rows.append([title(one), *cells, shown_change(one), *sizes, verdict(one)])
+    return studies.lines(rows)
 
 
 def batch_rows(table: pd.DataFrame) -> str:
     """By group and cycle: fits, misfits, states that are determined."""
-    out = []
-    table = table.assign(group=table["specimen"].str.split("-").str[0])
-    for (group, cycle), part in table.groupby(["group", "cycle"], dropna=False):
-        fitted = part[part["misfit_stress_strain"].notna()]
-        off = fitted["misfit_stress_strain"]
-        states = [part[f"s1_{name}_state"].eq("determined").sum() for name in LAW]
+    rows = []
+    groups = table.groupby([table["specimen"].str.split("-").str[0], "cycle"], dropna=False)
+    for (group, cycle), part in groups:
+        off = part["misfit_stress_strain"].dropna()
         told = f"{percent(off.min())} to {percent(off.max())}" if len(off) else "–"
         acceptable = part["status"].isin(["ok", "warnings"]).sum()
-        out.append(
-            f"| {group} | {cycle} | {acceptable} of {len(part)} | {told} | "
-            f"{' | '.join(str(count) for count in states)} |"
-        )
-    return "\n".join(out)
-
-
-def refusals(table: pd.DataFrame) -> str:
-    wrong = table[~table["status"].isin(["ok", "warnings"])]
-    told = [f"- {r.specimen}, cycle {r.cycle}: {r.status}, {r.error}" for r in wrong.itertuples()]
-    return "\n".join(told) or "Every test and cycle has a fit; none was refused."
+        states = (part[f"s1_{name}_state"].eq("determined").sum() for name in LAW)
+        rows.append([group, cycle, f"{acceptable} of {len(part)}", told, *states])
+    return studies.lines(rows)
 
 
 def joint_rows(found: Found) -> str:
     """Rows of the page's table of joint fits."""
-    out = []
+    rows = []
     for cycle, by_group in found.items():
         for group, content in by_group.items():
             off = [test["misfit"]["stress_strain"] for test in content["tests"].values()]
-            held, score = content["parameters"][HELD], content["statistics"]
+            parameters, bics = content["parameters"], {"shared": "–", "own": "–"}
             weak = [
-                f"`{name.removeprefix('s1_')}` {content['parameters'][name]['state']}"
+                f"{code(name)} {parameters[name]['state']}"
                 for name in SCATTERING
-                if content["parameters"][name]["state"] != "determined"
+                if parameters[name]["state"] != "determined"
             ]
-            bics = {one["kind"]: f"{one['bic']:.0f}" for one in content["evidence"]}
-            out.append(
-                f"| {cycle} | {group} | {len(off)} | {score['n_vary']} | {percent(min(off))} to "
-                f"{percent(max(off))} | {held['value']:.3f}"
-                f"{'' if group == 'all' else ', held'} | {bics.get('shared', '–')} / "
-                f"{bics.get('own', '–')} | {', '.join(weak) or 'none'} |"
-            )
-    return "\n".join(out)
+            bics |= {one["kind"]: f"{one['bic']:.0f}" for one in content["evidence"]}
+            rows.append(
+                (cycle, group, len(off), content["statistics"]["n_vary"],
+                 f"{percent(min(off))} to {percent(max(off))}",
+                 f"{parameters[HELD]['value']:.3f}{'' if group == 'all' else ', held'}",
+                 f"{bics['shared']} / {bics['own']}", ", ".join(weak) or "none")
+            )  # fmt: skip
+    return studies.lines(rows)
 
 
 def power(size: float, count: int) -> float:
@@ -465,42 +448,25 @@ def needed(size: float) -> int:
     return next(count for count in range(2, 10_000) if power(size, count) >= POWER)
 
 
-def one_way(changes: Mapping[int, Sequence[Change]]) -> str:
-    """Name what is lower, and what is higher, in the worn group in every cycle."""
-    signs = dict[str, set[bool]]()
-    for ones in changes.values():
-        for one in ones:
-            signs.setdefault(one.name, set()).add(one.change > 0.0)
-    lower = listed(code(name) for name in signs if signs[name] == {False})
-    higher = listed(code(name) for name in signs if signs[name] == {True})
-    return f"lower in the worn heel in every cycle are {lower}; higher are {higher}"
-
-
 def told(changes: Sequence[Change]) -> str:
     """Name what stands out, what may, and what does not."""
     parts = {
         "Stands out of the scatter between specimens": [o for o in changes if o.stands_out],
-        "A hint (p below 0.05 on its own)": [
+        f"A hint (p below {LEVEL} on its own)": [
             o for o in changes if o.p < LEVEL and not o.stands_out
         ],
         "Within the scatter": [o for o in changes if o.p >= LEVEL],
     }
-    lines = []
-    for words, ones in parts.items():
-        said = "; ".join(f"{code(one.name)} {shown_change(one)}" for one in ones)
-        lines.append(f"- {words}: {said or 'nothing'}.")
-    return "\n".join(lines)
-
-
-def code(name: str) -> str:
-    """Write the name of a parameter as such."""
-    return name if name in UNITS else f"`{name.removeprefix('s1_')}`"
+    return "\n".join(
+        f"- {words}: {'; '.join(f'{code(o.name)} {shown_change(o)}' for o in ones) or 'nothing'}."
+        for words, ones in parts.items()
+    )
 
 
 def write_tables(table: pd.DataFrame, changes: Mapping[int, Sequence[Change]]) -> None:
     """Write batch.csv and wear.csv."""
     errors = [name for name in table if name.endswith("_stderr")]
-    table.drop(columns=errors).to_csv(HERE / "batch.csv", index=False, float_format="%.5g")
+    studies.write_csv(table.drop(columns=errors), HERE / "batch.csv", 5)
     rows = []
     for cycle, ones in changes.items():
         for one in ones:
@@ -512,93 +478,49 @@ def write_tables(table: pd.DataFrame, changes: Mapping[int, Sequence[Change]]) -
             row |= {"change": one.change, "change_lo": one.ci95[0], "change_hi": one.ci95[1]}
             row |= {"change_over_spread": one.size, "p": one.p, "p_adjusted": one.adjusted}
             rows.append(row)
-    pd.DataFrame(rows).to_csv(HERE / "wear.csv", index=False, float_format="%.4g")
+    studies.write_csv(rows, HERE / "wear.csv")
 
 
 def write_page(made: Made, changes: Mapping[int, Sequence[Change]], free: Sequence[Change]) -> None:
     """Write README.md."""
-    table, found, seconds, largest = made.table, made.found, made.seconds, changes[FIRST][0]
-    by_size = [one for one in free if one.name in SCATTERING]
-    off = table["misfit_stress_strain"]
-    everywhere = [
-        code(name)
-        for name in (ENERGY, PEAK, *SCATTERING)
-        if all(o.stands_out for ones in changes.values() for o in ones if o.name == name)
+    largest, off, table = changes[FIRST][0], made.table["misfit_stress_strain"], made.table
+    by_name = {name: [o for ones in changes.values() for o in ones if o.name == name]
+               for name in (ENERGY, PEAK, *SCATTERING)}  # fmt: skip
+    everywhere = [code(n) for n, ones in by_name.items() if all(o.stands_out for o in ones)]
+    ways = {
+        way: listed(code(o.name) for o in changes[FIRST]
+                    if {other.change > 0.0 for other in by_name[o.name]} == {way == "higher"})
+        for way in ("lower", "higher")
+    }  # fmt: skip
+    wrong = table[~table["status"].isin(["ok", "warnings"])]
+    refused = [
+        f"- {r.specimen}, cycle {r.cycle}: {r.status}, {r.error}" for r in wrong.itertuples()
     ]
-    page = (HERE / "page.template.md").read_text(encoding="utf-8")
-    (HERE / "README.md").write_text(
-        page.format(
-            first=FIRST,
-            later=LATER,
-            last=max(changes),
-            fits=len(table),
-            fitted=int(table["status"].isin(["ok", "warnings"]).sum()),
-            refusals=refusals(table),
-            misfit_low=percent(off.min()),
-            misfit_high=percent(off.max()),
-            misfit_median=percent(off.median()),
-            batch=batch_rows(table),
-            names=" | ".join(f"`{name}`" for name in LAW),
-            dashes=" | ".join("---" for _ in LAW),
-            joint=joint_rows(found),
-            told_first=told(changes[FIRST]),
-            told_later=told(changes[LATER]),
-            everywhere=", ".join(everywhere) or "nothing",
-            one_way=one_way(changes),
-            largest=code(largest.name),
-            largest_size=significant(largest.size),
-            needed=needed(largest.size),
-            shown=percent(power(largest.size, 5)),
-            free="; ".join(
-                f"{code(one.name)} {shown_change(one)}, p = {significant(one.p)}"
-                for one in by_size[:2]
-            ),
-            free_spread=", ".join(
-                percent(made.free[group]["parameters"]["s1_kc"]["scatter"]) for group in GROUPS
-            ),
-            held_spread=", ".join(
-                percent(found[FIRST][group]["parameters"]["s1_kc"]["scatter"]) for group in GROUPS
-            ),
-            wear_first=change_rows(changes[FIRST]),
-            wear_later=change_rows(changes[LATER]),
-            batch_seconds=f"{seconds['batch']:.0f}",
-            joint_seconds=f"{seconds['joint']:.0f}",
+    by_size = [one for one in free if one.name in SCATTERING]
+
+    def spreads(found: Mapping[str, Any]) -> str:
+        return ", ".join(percent(found[g]["parameters"]["s1_kc"]["scatter"]) for g in GROUPS)
+
+    studies.write_page(
+        HERE, first=FIRST, later=LATER, last=max(changes), fits=len(table),
+        fitted=len(table) - len(wrong),
+        refusals="\n".join(refused) or "Every test and cycle has a fit; none was refused.",
+        misfit_low=percent(off.min()), misfit_high=percent(off.max()),
+        misfit_median=percent(off.median()), batch=batch_rows(table),
+        names=" | ".join(f"`{name}`" for name in LAW), dashes=" | ".join("---" for _ in LAW),
+        joint=joint_rows(made.found), told_first=told(changes[FIRST]),
+        told_later=told(changes[LATER]), everywhere=", ".join(everywhere) or "nothing",
+        one_way=f"lower in the worn heel in every cycle are {ways['lower']}; higher are "
+        f"{ways['higher']}",
+        largest=code(largest.name), largest_size=significant(largest.size),
+        needed=needed(largest.size), shown=percent(power(largest.size, 5)),
+        free="; ".join(
+            f"{code(one.name)} {shown_change(one)}, p = {significant(one.p)}" for one in by_size[:2]
         ),
-        encoding="utf-8",
-    )
-
-
-@dataclass(frozen=True)
-class Made:
-    """All that is fitted: the batch, the joint fits by cycle, and of the first with HELD free.
-
-    Also the measured loops by cycle, and seconds.
-    """
-
-    table: pd.DataFrame
-    found: Found
-    free: Mapping[str, Mapping[str, Any]]
-    measured: Mapping[int, Loops]
-    seconds: Mapping[str, float]
-
-
-def measure(data: Path, folder: Path) -> Made:
-    """Make all fits."""
-    began = time.perf_counter()
-    place_tests(data, folder)
-    table = fit_each(folder)
-    took = time.perf_counter() - began
-    print(f"batch: {len(table)} fits in {took:.0f} s", flush=True)
-    counts = table["cycle"].dropna().astype(int).value_counts()
-    # A cycle that few records have is no group.
-    full = sorted(n for n, count in counts.items() if count == table["specimen"].nunique())
-    found = dict[int, dict[str, dict[str, Any]]]()
-    free = {group: fit_study(folder, group, FIRST, '"own"') for group in GROUPS}
-    for n in full:
-        found[n] = fit_together(folder, n)
-        print(f"cycle {n} together", flush=True)
-    seconds = {"batch": took, "joint": time.perf_counter() - began - took}
-    return Made(table, found, free, {n: loops(folder, n) for n in full}, seconds)
+        free_spread=spreads(made.free), held_spread=spreads(made.found[FIRST]),
+        wear_first=change_rows(changes[FIRST]), wear_later=change_rows(changes[LATER]),
+        batch_seconds=f"{made.seconds['batch']:.0f}", joint_seconds=f"{made.seconds['joint']:.0f}",
+    )  # fmt: skip
 
 
 def write(made: Made) -> None:
@@ -611,16 +533,12 @@ def write(made: Made) -> None:
 
 
 def main() -> None:
-    data = Path(os.environ.get("FOAMFIT_DATA", "")) / "shoe-foam-twins"
-    if not data.is_dir():
-        sys.exit(f"there is no {data}; set FOAMFIT_DATA to the folder with shoe-foam-twins/")
-    with tempfile.TemporaryDirectory() as temporary:
-        made = measure(data, Path(temporary))
+    studies.arguments(__doc__).parse_args()
+    data = studies.measurements("shoe-foam-twins") / "shoe-foam-twins"
+    with tempfile.TemporaryDirectory() as folder:
+        made = measure(data, Path(folder))
     write(made)
 
 
 if __name__ == "__main__":
-    from unchanged import keep_unchanged
-
-    with keep_unchanged(HERE):
-        main()
+    studies.run(main, HERE)

@@ -17,7 +17,7 @@ from foamfit.trust.intervals import Announce
 
 
 class FitResult(Fit):
-    """Everything that a fit found, and how it is written; its fields are those of `results.Fit`."""
+    """The result of a fit: parameters, intervals, curves and verdict."""
 
     def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
         """Write the result folder whole, as `report.folder.save_result` does; returns it.
@@ -46,13 +46,13 @@ def fit(
         The test; see `foamfit.read_test`.
     model : str
         Springs from the base up, joined by "+"; "auto" compares models and takes the simplest
-        that holds, see `foamfit.auto.compare_models`.
+        that holds.
     params : lmfit.Parameters, optional
         Values, bounds, fixed values and expressions; see `make_params`.
     progress : callable, optional
-        Told the fraction done and what is going on.
+        Called with the fraction done and the current step.
     tell : callable, optional
-        Called with the expected run time of the intervals before it is spent.
+        Called with the expected run time of the intervals before they are computed.
     drive : str, optional
         "impact", "stress" or "displacement"; by default what the test allows, in this order:
         impact, displacement.
@@ -63,41 +63,40 @@ def fit(
     max_time : float, optional
         Seconds after which the best point so far is the result.
     weights : mapping, optional
-        Weight of each curve; see `fitting.objective.default_weights`.
+        Weight of each curve, by its name in `FitResult.misfit`.
     interior_mass : bool
-        Whether the specimen's mass sits between the springs of a chain, in equal parts; by default
-        it is left out, and the result's notes say what it would change.
+        Whether the specimen's mass is placed between the springs of a chain, in equal parts. By
+        default it is neglected, and the notes of the result say what it would change.
     time_shift : bool
-        Whether the time by which the motion channel is late against the force is fitted too, as
-        the parameter time_shift (s).
+        Whether to fit how late the motion is against the force, as the parameter time_shift (s).
     relaxation : int
         Relaxation terms of every bistable and microscale spring: s1_g1, s1_tau1, …; model="auto"
         tries one term by itself and refuses this.
     loss : str
-        "linear" (least squares), or one that gives way to large residuals: "soft_l1", "huber",
-        "cauchy"; see `fitting.objective.soften`.
+        "linear" (least squares), or one that reduces the weight of large residuals: "soft_l1",
+        "huber" or "cauchy".
     intervals : str
-        What makes the 95 % intervals: "auto" (local covariance, and profiles of the parameters
-        along which the cost is no parabola), "local", "profile", "bootstrap" or "mcmc".
+        Method of the 95 % intervals: "auto" (local covariance, and profiles of the parameters
+        along which the cost is not parabolic), "local", "profile", "bootstrap" or "mcmc".
     draws : int, optional
         Refits of the bootstrap (by default 500) or steps of the Markov chain (2000).
     watch : callable, optional
-        Called with the problem and the best parameters so far whenever these get better; it must
-        be quick.
+        Called with the problem and the best parameters so far whenever these improve; it must be
+        quick.
 
     Returns
     -------
     FitResult
-        Also when Ctrl-C or `max_time` ended the search: the best point ever seen.
+        If Ctrl-C or `max_time` ended the search, that of the best point found.
 
     Raises
     ------
     TypeError
-        If there is no option of that name.
+        If an option is unknown.
     InputError
         If the test cannot feed the drive or a parameter is unknown; the message names it.
     SimulationError
-        If nothing that was tried could be simulated.
+        If no trial could be simulated.
     """
     if not isinstance(measurement, Measurement):
         raise InputError(
@@ -107,24 +106,25 @@ def fit(
         raise InputError("params must be lmfit.Parameters, as foamfit.make_params returns them")
     chosen = Options.of("fit", options)
     progress, tell = progress or (lambda *_: None), tell or (lambda _: None)
-    if model == "auto":
-        if params is not None:
-            raise InputError("params belong to one model; name it instead of 'auto'")
-        if chosen.relaxation:
-            raise InputError(
-                f"relaxation = {chosen.relaxation} belongs to one model; name it instead of "
-                "'auto', which tries relaxation by itself"
-            )
-        from foamfit.auto import compare_models
+    if model != "auto":
 
-        found = compare_models(measurement, chosen, progress, tell)
-    else:
-        searched = identify(
-            measurement, model, params, chosen, lambda share, what: progress(SEARCHED * share, what)
-        )
-        found, _ = judge(
-            searched, chosen.choice, tell,
-            lambda share, what: progress(SEARCHED + (1.0 - SEARCHED) * share, what),
-        )  # fmt: skip
+        def search(share: float, what: str) -> None:
+            progress(SEARCHED * share, what)
+
+        def assess(share: float, what: str) -> None:
+            progress(SEARCHED + (1.0 - SEARCHED) * share, what)
+
+        searched = identify(measurement, model, params, chosen, search)
+        found, _ = judge(searched, chosen.choice, tell, assess)
         progress(1.0, "done")
-    return FitResult(**vars(found))
+        return FitResult(**vars(found))
+    if params is not None:
+        raise InputError("params belong to one model; name it instead of 'auto'")
+    if chosen.relaxation:
+        raise InputError(
+            f"relaxation = {chosen.relaxation} belongs to one model; name it instead of 'auto', "
+            "which tries relaxation by itself"
+        )
+    from foamfit.auto import compare_models
+
+    return FitResult(**vars(compare_models(measurement, chosen, progress, tell)))

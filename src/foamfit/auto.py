@@ -1,8 +1,8 @@
 """The simplest model that follows the curves, and the evidence for each that was tried.
 
-Models are fitted from the simplest up, each without damping and then with it. They are compared by
-AICc and BIC with the effective numbers of samples and of parameters where one of them comes to the
-noise, else by how well they predict what they were not fitted to (`trust.evidence`). The comparison
+Models are fitted from the simplest up, each without damping and then with it. If one of them
+reaches the noise, AICc and BIC compare them, with the effective numbers of samples and parameters;
+otherwise their predictions of samples that were held back do (`trust.evidence`). The comparison
 ends where the residuals are random, or where two groups of models in a row bring no gain.
 """
 
@@ -12,112 +12,98 @@ import math
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import lmfit
 import numpy as np
 
-from foamfit import one_model
+from foamfit import one_model, text
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.problem import make_params
 from foamfit.fitting.search import SearchStoppedError, what_stopped
 from foamfit.one_model import Found, Options, Progress
+from foamfit.report import render
 from foamfit.results import Fit, Ladder, Rung, rung_name
+from foamfit.springs import laws
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, family, split_name
-from foamfit.text import counted, percent
+from foamfit.text import percent
+from foamfit.trust import evidence
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import input_first
-from foamfit.trust.evidence import (
-    MARGIN,
-    SHARE,
-    WORSE,
-    Decision,
-    Tried,
-    choose,
-    effective_samples,
-    reference_of,
-)
+from foamfit.trust.evidence import BLOCKS, MARGIN, SHARE, Tried, predicted_misfit
 from foamfit.trust.intervals import Announce, Choice
-from foamfit.trust.prediction import BLOCKS, predicted_misfit
 from foamfit.trust.residuals.residual_tests import BENT, find_structure, neighbours_test, runs_test
 
 # From the simplest up, in groups: one spring; a linear spring below it or its relaxation; two
 # springs; three; two that relax. More springs have more parameters (23 and more) than a loop has
-# features.
-LADDER = (
-    (Model.parse("bistable"), Model.parse("microscale")),
-    (
-        Model.parse("linear+bistable"),
-        Model.parse("linear+microscale"),
-        Model.parse("bistable", 1),
-        Model.parse("microscale", 1),
-    ),
-    (Model.parse("bistable+bistable"), Model.parse("microscale+microscale")),
-    (Model.parse("linear+bistable+bistable"),),
-    (Model.parse("microscale+microscale", 1),),
+# features. Springs that remember take too long in three, others gain nothing in the last group.
+_OWN = [kind for kind in laws.kinds() if laws.law(kind).hysteretic and not laws.is_registered(kind)]
+_SLOW = [kind for kind in _OWN if laws.law(kind).remembers]
+_QUICK = [kind for kind in _OWN if kind not in _SLOW]
+LADDER = tuple(
+    tuple(Model.parse(name, terms) for name, terms in group)
+    for group in (
+        [(kind, 0) for kind in _OWN],
+        [*((f"linear+{kind}", 0) for kind in _OWN), *((kind, 1) for kind in _OWN)],
+        [(f"{kind}+{kind}", 0) for kind in _OWN],
+        [(f"linear+{kind}+{kind}", 0) for kind in _QUICK],
+        [(f"{kind}+{kind}", 1) for kind in _SLOW],
+    )
 )
-# So many groups in a row without a gain end the comparison.
+# The comparison ends after so many groups in a row without a gain.
 WITHOUT_GAIN = 2
-# Chains with microscale springs, which take minutes in an impact, are not tried where one such
-# spring misses the curves by so many times more than one bistable spring.
+# Chains with springs that remember, which take minutes in an impact, are not tried where one such
+# spring misses the curves by so many times more than one spring that does not.
 HOPELESS = 1.1
 # Two of them take a minute even under a known motion: they are not tried where one, perhaps with
 # relaxation, misses the curves by no more than this share of the range.
 CLOSE = 0.01
-# Share of the time of a comparison after which what is left is to judge the chosen model.
+# Share of the time of a comparison after which only the chosen model is left to be judged.
 CHOSEN = 0.9
-# Of a model that is compared: ranges and better intervals are made of the chosen one alone. They
-# cost as much as its search, and the comparison does not go by them.
+# While models are compared: only the chosen one gets ranges and better intervals, which cost as
+# much as a search.
 COMPARED = Choice("local", ranges=False)
 
 
 def _dampers(params: lmfit.Parameters) -> list[str]:
-    """Names of the dampers that vary."""
+    """Return the names of the dampers that vary."""
     return [name for name in params if split_name(name)[1] == "eta" and params[name].vary]
 
 
-def _nested(tried: Sequence[Tried], model: Model) -> Tried | None:
-    """Of the models whose springs and relaxation a model has too, the one that fits best."""
-    kinds = Counter(model.kinds)
+def _carry(params: lmfit.Parameters, model: Model, tried: Sequence[Tried]) -> None:
+    """Start from the best fit of a model that is contained in this one, top spring first; in place.
+
+    A new linear spring starts short and stiff and new relaxation with a share of zero, so that the
+    chain starts with the curves of that fit.
+    """
     inside = [
         one
         for one in tried
-        if Counter(Model.parse(one.result.model).kinds) <= kinds
+        if Counter(Model.parse(one.result.model).kinds) <= Counter(model.kinds)
         and one.result.relaxation <= model.relaxation
     ]
-    return min(inside, key=lambda one: one.chisqr, default=None)
-
-
-def _carry(params: lmfit.Parameters, model: Model, below: Fit | None) -> None:
-    """Start from the springs of a simpler model, the top one first; in place.
-
-    A new linear spring starts short and stiff and new relaxation with a share of zero, so that the
-    chain does what the simpler one did.
-    """
-    if below is None:
+    if not inside:
         return
+    below = min(inside, key=lambda one: one.chisqr).result
     values, was = below.params.valuesdict(), list(Model.parse(below.model).kinds)
-    for name in NUISANCE:
-        if name in params and params[name].vary:
-            params[name].value = values[name]
     sources: dict[int, int] = {}
     for spring in reversed(range(len(model.kinds))):
         if was and model.kinds[spring] == was[-1]:
             was.pop()
             sources[spring] = len(was)
-    for name in model.names:
-        spring, short = split_name(name)
-        source = "site_eta" if spring < 0 else f"s{sources.get(spring, -1) + 1}_{short}"
-        if not params[name].vary:
+    for name in (*NUISANCE, *model.names):
+        if name not in params or not params[name].vary:
             continue
+        spring, short = split_name(name)
+        source = name if spring < 0 else f"s{sources.get(spring, -1) + 1}_{short}"
         if source in values:
             params[name].value = values[source]
         elif spring in sources and family(short) == "g":
             params[name].value = 0.0
-        elif spring not in sources and model.kinds[spring] == "linear":
+        elif spring >= 0 and spring not in sources and model.kinds[spring] == "linear":
             params[name].value = params[name].min if short == "height" else 0.1 * params[name].max
 
 
@@ -129,245 +115,236 @@ def compare_models(
 ) -> Fit:
     """Fit ever richer models until one holds; this is `foamfit.fit` with model="auto".
 
-    The time limit is that of all models together; it and Ctrl-C keep what is done. Models have
-    local intervals and states by these alone; the intervals that were asked for, and ranges, are
-    made of the chosen one.
+    The time limit is that of all models together; it and Ctrl-C keep what is done. All models have
+    local intervals, and states by these alone; only the chosen one has ranges and the intervals
+    that were asked for.
     """
     state = _Comparison(measurement, options, progress)
-    groups, skipped = _models(measurement)
-    tried: list[Tried] = []
-    ended, stopped, idle = "there are no richer ones that this test allows", None, 0
+    tried = state.tried
     try:
-        state.of, number = sum(map(len, groups)), 0
-        for group in groups:
-            below = len(tried)
-            for model in group:
-                number += 1
-                if why := _hopeless(model, tried):
-                    skipped.append(f"{rung_name(model.name, 'none', model.relaxation)}: {why}")
-                    continue
-                family = state.family(model, number, tried, skipped)
-                if state.stopped or any(one.structureless for one in family):
-                    break
-            if state.stopped:
-                break
-            if any(one.structureless for one in tried[below:]):
-                ended = "the residuals are random"
-                break
-            if len(tried) > below:
-                idle = 0 if _has_gained(tried, below) else idle + 1
-            if idle == WITHOUT_GAIN:
-                ended = f"{WITHOUT_GAIN} groups of richer models in a row brought no gain"
-                break
-        stopped = state.stopped
+        state.climb()
     except KeyboardInterrupt as error:
         if not tried:
             raise
-        stopped = what_stopped(error)
+        state.stopped = what_stopped(error)
     if not tried:
-        raise SimulationError(f"{measurement.name}: no model could be tried: {'; '.join(skipped)}")
-    best = choose(tried).best
+        told = "; ".join(state.skipped)
+        raise SimulationError(f"{measurement.name}: no model could be tried: {told}")
+    best = evidence.choose(tried).best
     wanted = options.choice.method != "local" or tried[best].best.misfits
-    if stopped is None and wanted:
-        label = f"model chosen, {tried[best].name}"
-        result, point = one_model.judge(
-            state.fits[best], options.choice, announce,
-            lambda share, what: progress(CHOSEN + (1.0 - CHOSEN) * share, f"{label}: {what}"),
-        )  # fmt: skip
+    if state.stopped is None and wanted:
+
+        def tell(share: float, what: str) -> None:
+            done = CHOSEN + (1.0 - CHOSEN) * share
+            progress(done, f"model chosen, {tried[best].name}: {what}")
+
+        result, point = one_model.judge(state.fits[best], options.choice, announce, tell)
         tried[best] = replace(tried[best], result=result, best=point)  # it may be a better point
     progress(1.0, "done")
-    ended = f"it was stopped by {stopped}" if stopped else ended
-    return _conclude(tried, ended, stopped, tuple(skipped), time.perf_counter() - state.began)
+    return _conclude(state)
 
 
-def _hopeless(model: Model, tried: Sequence[Tried]) -> str:
-    """Why a chain with microscale springs cannot win; "" where it may, and of other models."""
-    if len(model.kinds) == 1 or "microscale" not in model.kinds:
-        return ""
-    least = {
-        kind: min(
-            (one.misfit for one in tried if one.result.model == kind and not one.result.relaxation),
-            default=math.nan,
-        )
-        for kind in ("microscale", "bistable")
-    }
-    one = min((t.misfit for t in tried if t.result.model == "microscale"), default=math.nan)
-    if model.kinds.count("microscale") > 1 and one <= CLOSE:
-        return f"one microscale spring misses the curves by {percent(one)} of the range only"
-    if not least["microscale"] > HOPELESS * least["bistable"]:
-        return ""
-    return (
-        f"one microscale spring misses the curves by {percent(least['microscale'])} of the range, "
-        f"one bistable spring by {percent(least['bistable'])}"
-    )
-
-
-def _has_gained(tried: Sequence[Tried], below: int) -> bool:
-    """Whether one of the last models is chosen, or AICc or BIC strongly prefers it to all below."""
-    if below == 0:
-        return True
-    decision = choose(tried)
-    if decision.best >= below or decision.by_prediction:
-        return decision.best >= below
-    return any(
-        min(values[below:]) < min(values[:below]) - MARGIN
-        for values in (
-            [one.aicc for one in decision.criteria],
-            [one.bic for one in decision.criteria],
-        )
-    )
-
-
-@dataclass(eq=False)
 class _Comparison:
-    """What every model is fitted with, and what stopped the comparison."""
+    """The test and options of all models, what was tried, and what stopped the comparison."""
 
-    measurement: Measurement
-    options: Options
-    progress: Progress
-    of: int = 0  # how many models there are
-    stopped: str | None = None
-    fits: list[Found] = field(default_factory=list)  # of what was tried, in its order
-
-    def __post_init__(self) -> None:
-        """Choose the drive and begin."""
-        self.began, limit = time.perf_counter(), self.options.max_time
+    def __init__(self, measurement: Measurement, options: Options, progress: Progress) -> None:
+        self.measurement, self.progress = measurement, progress
+        self.options = replace(options, drive=options.drive or choose_drive(measurement))
+        self.began, limit = time.perf_counter(), options.max_time
         self.deadline = None if limit is None else time.monotonic() + limit
-        if self.options.drive is None:
-            self.options = replace(self.options, drive=choose_drive(self.measurement))
+        self.skipped: list[str] = []  # models that cannot be tried, and why
+        self.groups = self._models()
+        self.of, self.number = sum(map(len, self.groups)), 0  # models in all, and the present one
+        self.tried: list[Tried] = []
+        self.fits: list[Found] = []  # of what was tried, in its order
+        self.stopped: str | None = None
+        self.ended = "there are no richer ones that this test allows"
 
-    def family(
-        self, model: Model, number: int, tried: list[Tried], skipped: list[str]
-    ) -> list[Tried]:
-        """Fit one model, the `number`-th, without damping and, unless that is enough, with it.
+    def _models(self) -> list[list[Model]]:
+        """Return the models that the test allows, in their groups.
 
-        What is fitted is added to `tried` at once.
+        They have as many springs as heights are given, or one, and every mass whose motion was
+        measured; relaxation needs the time.
         """
-        dampings = ("without", "with") if _dampers(self.params(model)) else ("none",)
-        family: list[Tried] = []
+        test = self.measurement
+        heights, inside = test.specimen.heights, max(test.interior, default=0)
+        groups = []
+        for group in LADDER:
+            allowed = []
+            for model in group:
+                count = len(model.kinds)
+                if inside >= count:
+                    self._skip(model, f"it has no mass {inside} inside, whose motion was measured")
+                elif heights is not None and count not in (1, len(heights)):
+                    self._skip(model, f"[specimen] heights are those of {len(heights)} springs")
+                elif model.relaxation and test.time is None:
+                    self._skip(model, "relaxation needs a time column")
+                else:
+                    allowed.append(model)
+            if allowed:
+                groups.append(allowed)
+        if not groups:
+            told = "; ".join(self.skipped)
+            raise InputError(f"{test.name}: no model of the ladder fits this test: {told}")
+        return groups
+
+    def _skip(self, model: Model, why: str) -> None:
+        self.skipped.append(f"{rung_name(model.name, 'none', model.relaxation)}: {why}")
+
+    def climb(self) -> None:
+        """Fit group after group until one model holds, two groups gain nothing, or time is up."""
+        idle = 0
+        for group in self.groups:
+            below = len(self.tried)
+            for model in group:
+                self.number += 1
+                if why := _hopeless(model, self.tried):
+                    self._skip(model, why)
+                else:
+                    self._family(model)
+                if any(one.structureless for one in self.tried):
+                    self.ended = "the residuals are random"
+                    return
+                if self.stopped:
+                    return
+            if len(self.tried) > below:
+                idle = 0 if _has_gained(self.tried, below) else idle + 1
+            if idle == WITHOUT_GAIN:
+                self.ended = f"{WITHOUT_GAIN} groups of richer models in a row brought no gain"
+                return
+
+    def _family(self, model: Model) -> None:
+        """Fit one model without damping and, unless that is enough, with it."""
+        dampings = ("without", "with") if _dampers(self._params(model)) else ("none",)
         for i, damping in enumerate(dampings):
-            part = number - 1 + i / len(dampings), 1.0 / len(dampings)
             left = None if self.deadline is None else max(self.deadline - time.monotonic(), 1e-6)
-            if left == 1e-6 and tried:
+            if left == 1e-6 and self.tried:
                 self.stopped = "the time limit"
-                break
+                return
             try:
-                found, one = self.rung(model, damping, _nested(tried, model), left, part)
-            except SimulationError as error:
-                told = str(error).removeprefix(f"{self.measurement.name}: ")
-                skipped.append(f"{rung_name(model.name, 'none', model.relaxation)}: {told}")
-                break  # a dashpot makes nothing easier to simulate
-            family.append(one)
-            tried.append(one)
-            self.fits.append(found)
+                one = self._fit(model, damping, left, i / len(dampings), 1.0 / len(dampings))
+            except SimulationError as error:  # a dashpot would not help
+                self._skip(model, str(error).removeprefix(f"{self.measurement.name}: "))
+                return
+            self.tried.append(one)
             self.stopped = one.result.stopped
             if self.stopped is not None or one.structureless:
-                break
-        return family
+                return
 
-    def params(self, model: Model) -> lmfit.Parameters:
-        """Parameters of a model, as they are by default."""
+    def _params(self, model: Model) -> lmfit.Parameters:
         options = self.options
         return make_params(self.measurement, model, options.drive, time_shift=options.time_shift)
 
-    def rung(
-        self, model: Model, damping: str, below: Tried | None, left: float | None,
-        part: tuple[float, float],
-    ) -> tuple[Found, Tried]:  # fmt: skip
-        """Fit one model with or without damping; `part` is where it begins, and what it takes.
-
-        Both count models.
-        """
-        began = time.perf_counter()
-        params = self.params(model)
-        _carry(params, model, None if below is None else below.result)
+    def _fit(
+        self, model: Model, damping: str, left: float | None, before: float, part: float
+    ) -> Tried:
+        """Fit one model with or without damping; `before` and `part` are shares of its work."""
+        began, params = time.perf_counter(), self._params(model)
+        _carry(params, model, self.tried)
         if damping == "without":
             for name in _dampers(params):
                 params[name].set(value=0.0, vary=False)
-        label = f"model {int(part[0]) + 1} of {self.of}: "
-        label += rung_name(model.name, damping, model.relaxation)
+        named = rung_name(model.name, damping, model.relaxation)
 
         def tell(share: float, what: str) -> None:
-            done = CHOSEN * (part[0] + 0.8 * part[1] * share) / self.of
-            self.progress(done, f"{label}: {what}")
+            done = CHOSEN * (self.number - 1 + before + 0.8 * part * share) / self.of
+            self.progress(done, f"model {self.number} of {self.of}: {named}: {what}")
 
-        found = one_model.identify(
-            self.measurement,
-            model.name,
-            params,
-            replace(self.options, max_time=left, relaxation=model.relaxation),
-            tell,
-        )
+        options = replace(self.options, max_time=left, relaxation=model.relaxation)
+        found = one_model.identify(self.measurement, model.name, params, options, tell)
         result, best = one_model.judge(found, COMPARED, lambda _: None)
-        predicted = None if result.stopped else self.predicted(best)
-        return found, Tried(result, damping, best, time.perf_counter() - began, predicted)
+        predicted = None if result.stopped else self._predicted(best)
+        self.fits.append(found)
+        return Tried(result, damping, best, time.perf_counter() - began, predicted)
 
-    def predicted(self, best: BestPoint) -> float | None:
-        """Misfit of samples that are held back; None if the time is up."""
+    def _predicted(self, best: BestPoint) -> float | None:
+        """Return the misfit of samples that are held back; None if the time is up."""
         try:
             return predicted_misfit(best, self.deadline)
         except SearchStoppedError:
             return None
 
 
-def _models(measurement: Measurement) -> tuple[list[list[Model]], list[str]]:
-    """Models that a test allows, in their groups, and which are left out and why.
+def _hopeless(model: Model, tried: Sequence[Tried]) -> str:
+    """Say why a chain with springs that remember cannot win; "" where it may, and of others."""
 
-    They have as many springs as heights were given, or one, and every mass that was followed; those
-    with relaxation need the time.
-    """
-    heights, inside = measurement.specimen.heights, max(measurement.interior, default=0)
-    groups, skipped = list[list[Model]](), []
-    for group in LADDER:
-        allowed = []
-        for model in group:
-            count, name = len(model.kinds), rung_name(model.name, "none", model.relaxation)
-            if inside >= count:
-                skipped.append(f"{name}: it has no mass {inside} inside, whose motion was measured")
-            elif heights is not None and count not in (1, len(heights)):
-                skipped.append(f"{name}: [specimen] heights are those of {len(heights)} springs")
-            elif model.relaxation and measurement.time is None:
-                skipped.append(f"{name}: relaxation needs a time column")
-            else:
-                allowed.append(model)
-        if allowed:
-            groups.append(allowed)
-    if not groups:
-        raise InputError(
-            f"{measurement.name}: no model of the ladder fits this test: {'; '.join(skipped)}"
+    def least(kinds: Sequence[str], most: float = math.inf) -> tuple[float, str]:
+        """Misfit of one spring of these kinds with no more relaxation terms, and its name."""
+        alone = (t for t in tried if t.result.model in kinds and t.result.relaxation <= most)
+        found = min(alone, key=lambda one: one.misfit, default=None)
+        if found is None:
+            return math.nan, ""
+        title = laws.law(found.result.model).title
+        return (
+            found.misfit,
+            f"one {title} misses the curves by {percent(found.misfit)} of the range",
         )
-    return groups, skipped
+
+    slow = [kind for kind in model.kinds if kind in _SLOW]
+    if len(model.kinds) == 1 or not slow:
+        return ""
+    near, told = least(slow)
+    if len(slow) > 1 and near <= CLOSE:
+        return f"{told} only"
+    (one, told), (other, against) = least(slow, 0), least(_QUICK, 0)
+    return f"{told}, {against}" if one > HOPELESS * other else ""
+
+
+def _has_gained(tried: Sequence[Tried], below: int) -> bool:
+    """Whether one of the last models is chosen, or AICc or BIC strongly prefers one."""
+    if below == 0:
+        return True
+    decision = evidence.choose(tried)
+    if decision.best >= below or decision.by_prediction:
+        return decision.best >= below
+    return any(
+        min(values[below:]) < min(values[:below]) - MARGIN
+        for values in zip(*((one.aicc, one.bic) for one in decision.criteria), strict=True)
+    )
 
 
 # ---------------------------------------------------------------- what it says
 
 
-def _conclude(
-    tried: Sequence[Tried], ended: str, stopped: str | None, skipped: tuple[str, ...], took: float
-) -> Fit:
-    """Result of the chosen model with the whole comparison."""
-    decision = choose(tried)
-    best = decision.best
-    reference, result = reference_of(tried), tried[best].result
-    said, warned = _choice_sentences(tried, decision, ended), []
-    if stopped is not None:
-        warned.append(
-            f"The comparison was stopped by {stopped} on {tried[-1].name}; richer models were not "
-            "tried."
-        )
-    if tried[best].states("not determined"):
-        warned.append(_undetermined(tried, decision))
-    if result.at_noise is False and not any(rung.structureless for rung in tried):
-        warned.append(_structure_left(tried, best))
+def _conclude(state: _Comparison) -> Fit:
+    """Return the result of the chosen model with the whole comparison."""
+    tried, stopped = state.tried, state.stopped
+    decision = evidence.choose(tried)
+    best, criteria = tried[decision.best], decision.criteria
+    result, ended = best.result, f"it was stopped by {stopped}" if stopped else state.ended
+    told = {"tried": tried, "decision": decision, "best": best, "ended": ended, "stopped": stopped}
+    others, lost = [], best.states("not determined")
+    for name in ("AICc", "BIC"):
+        values = [getattr(one, name.lower()) for one in criteria]
+        least = int(np.argmin(values))
+        if (off := values[least] - values[decision.best]) < -MARGIN:
+            others.append((name, tried[least].name, _signed(off)))
+    said = render.sentences(
+        "choice", part="choice", others=others, blocks=BLOCKS, share=SHARE, **told
+    )
+    sound = [i for i, one in enumerate(tried) if not one.states("not determined")]
+    if lost and sound:
+        misfits, bics = [one.misfit for one in tried], [one.bic for one in criteria]
+        costs = misfits if decision.by_prediction else bics
+        nearest = min(sound, key=lambda i: costs[i])
+        told |= {"sound": tried[nearest], "higher": bics[nearest] - bics[decision.best]}
+    if result.at_noise is False and not any(one.structureless for one in tried):
+        tests = [min(runs_test(part), neighbours_test(part)) for part in best.curves]
+        worst = int(np.argmin(tests))
+        left = find_structure(best.curves[worst], best.places[worst])
+        told |= {"left": left, "curve": best.counted[worst], "size": left.size / best.spans[worst]}
+    defaults = {"sound": None, "left": None}
+    warned = render.sentences("choice", part="cautions", lost=lost, bent=BENT, **(defaults | told))
+    reference = evidence.reference_of(tried)
     ladder = Ladder(
         rungs=tuple(_rung(i, tried, decision) for i in range(len(tried))),
-        n_eff=effective_samples(reference),
+        n_eff=evidence.effective_samples(reference),
         noise_from=reference.name,
         ended=ended,
         stopped=stopped,
-        skipped=skipped,
+        skipped=tuple(state.skipped),
         sentences=(*said, *warned),
-        cautions=tuple(warned),
+        cautions=warned,
         by_prediction=decision.by_prediction,
     )
     return replace(
@@ -376,165 +353,55 @@ def _conclude(
         warnings=input_first((*warned, *result.warnings)),
         ladder=ladder,
         stopped=stopped or result.stopped,
-        runtime_s=took,
+        runtime_s=time.perf_counter() - state.began,
     )
 
 
-def _rung(i: int, tried: Sequence[Tried], decision: Decision) -> Rung:
-    one, found, before = tried[i], decision.criteria[i], decision.before[i]
+def _rung(i: int, tried: Sequence[Tried], decision: evidence.Decision) -> Rung:
+    """Return what was found of the `i`-th model, and why it was chosen or not."""
+    one, best = tried[i], tried[decision.best]
+    found, chosen = decision.criteria[i], decision.criteria[decision.best]
+    before, ruler = (
+        None if j is None else tried[j] for j in (decision.before[i], decision.ruled_out_by[i])
+    )
+    gain = None
+    if before and one.predicted is not None and before.predicted is not None:
+        gain = 1.0 - one.predicted / before.predicted
+    why = render.words(
+        "why",
+        one=one,
+        best=best,
+        before=before,
+        ruler=ruler,
+        gain=gain,
+        by_prediction=decision.by_prediction,
+        chosen=one is best,
+        more=one.varied - before.varied if before else 0,
+        richest=one.varied >= max(each.varied for each in tried),
+        bic=_signed(found.bic - chosen.bic),
+        aicc=_signed(found.aicc - chosen.aicc),
+        worse=evidence.WORSE,
+        margin=MARGIN,
+        share=SHARE,
+    )
+    shared = ("damping", "chisqr", "runs_p", "neighbours_p", "seconds")
     return Rung(
-        model=one.result.model,
-        damping=one.damping,
+        **{name: getattr(one, name) for name in shared},
+        **{name: getattr(found, name) for name in ("rank", "aicc", "bic")},
+        **{name: getattr(one.result, name) for name in ("model", "relaxation", "stopped")},
         misfit=dict(one.result.misfit),
-        chisqr=one.chisqr,
         n_vary=one.varied,
-        rank=found.rank,
-        n_eff=effective_samples(one),
-        aicc=found.aicc,
-        bic=found.bic,
-        runs_p=one.runs_p,
-        neighbours_p=one.neighbours_p,
+        n_eff=evidence.effective_samples(one),
         not_determined=one.states("not determined"),
         weak=one.states("weak"),
-        seconds=one.seconds,
-        stopped=one.result.stopped,
-        chosen=i == decision.best,
-        why=_why(i, tried, decision),
-        relaxation=one.result.relaxation,
+        chosen=one is best,
+        why=why.replace("\n", ""),
         predicted_misfit=one.predicted,
-        gain=_gain(tried, i, before),
-        gain_over=None if before is None else tried[before].name,
+        gain=gain,
+        gain_over=None if before is None else before.name,
     )
 
 
-def _gain(tried: Sequence[Tried], i: int, before: int | None) -> float | None:
-    """Share by which the predicted misfit of a model is below that of another."""
-    if before is None:
-        return None
-    own, other = tried[i].predicted, tried[before].predicted
-    return None if own is None or other is None else 1.0 - own / other
-
-
-def _why(i: int, tried: Sequence[Tried], decision: Decision) -> str:
-    """Why a model was chosen or not."""
-    best, one = decision.best, tried[i]
-    if (ruler := decision.ruled_out_by[i]) is not None:
-        fewer = tried[ruler].varied < one.varied
-        told = "more closely with fewer" if fewer else f"over {WORSE:g} times better with as many"
-        return f"not considered: {tried[ruler].name} follows the curves {told} parameters"
-    if decision.by_prediction:
-        return _why_by_prediction(i, tried, decision)
-    if i == best:
-        reason = "its residuals are random" if one.structureless else "best supported"
-        richer = f"lowers AICc and BIC by {MARGIN:g}" if len(tried) > 1 else "was tried"
-        richer = "was tried" if one.varied >= max(each.varied for each in tried) else richer
-        return f"{reason}, and no richer model {richer}"
-    found = decision.criteria
-    bic, aicc = found[i].bic - found[best].bic, found[i].aicc - found[best].aicc
-    told = f"BIC {signed(bic)}, AICc {signed(aicc)}"
-    return told if one.varied <= tried[best].varied else f"richer without evidence: {told}"
-
-
-def _why_by_prediction(i: int, tried: Sequence[Tried], decision: Decision) -> str:
-    """Why a model was chosen or not, where what it predicts decides."""
-    one, before = tried[i], decision.before[i]
-    if one.predicted is None:
-        said = f"{percent(one.misfit)} of the range is left (no prediction: the time was up)"
-    else:
-        said = f"predicts held-back samples to {percent(one.predicted)} of the range"
-    gain = _gain(tried, i, before)
-    if before is not None and gain is not None:
-        more = one.varied - tried[before].varied
-        side = "less" if gain >= 0.0 else "more"
-        said += f", {percent(abs(gain))} {side} than {tried[before].name}"
-        if more and i != decision.best:
-            needed = 1.0 - (1.0 - SHARE) ** more
-            said += f" ({counted(more, 'more parameter')} must gain {percent(needed)})"
-    if i == decision.best:
-        said += "; none that was tried gains enough over it"
-    return said
-
-
-def signed(value: float) -> str:
-    """Write a difference with its sign."""
-    if not math.isfinite(value):  # too few effective samples for the correction of AICc
-        return "not defined"
-    return f"{value:+.1f}".replace("-", "−")
-
-
-def _choice_sentences(tried: Sequence[Tried], decision: Decision, ended: str) -> list[str]:
-    """What was chosen, and what each criterion alone would choose."""
-    best, found = decision.best, decision.criteria
-    one = tried[best]
-    if one.structureless:
-        reason = "it is the simplest whose residuals are random"
-    elif not decision.by_prediction:
-        reason = "the evidence supports it best"
-    elif any(each.predicted is None for each in tried):
-        reason = "for its number of parameters it follows the curves best"
-    else:
-        reason = "for its number of parameters it predicts best what was held back"
-    said = [
-        f"{one.name} was chosen of {counted(len(tried), 'model')}: {reason}. No more models were "
-        f"tried because {ended}."
-    ]
-    if any(item.range for item in one.result.parameters.values()):
-        said.append(
-            "Ranges were made of the chosen model alone; states of the others go by their 95 % "
-            "intervals."
-        )
-    if decision.by_prediction:
-        said.append(
-            "With every model systematic residuals remain, so AICc and BIC do not hold. Each was "
-            f"fitted without one of {BLOCKS} blocks in time, in turn, and predicted that block; "
-            f"each further parameter must lower this predicted misfit by {percent(SHARE)}."
-        )
-        return said
-    if found[best].rank < one.varied:
-        said.append(
-            f"The curves fix {found[best].rank} combinations of its {one.varied} parameters; AICc "
-            "and BIC count those."
-        )
-    for name, values in (("AICc", [one.aicc for one in found]), ("BIC", [c.bic for c in found])):
-        least = int(np.argmin(values))
-        off = values[least] - values[best]
-        if off < -MARGIN:
-            said.append(f"{name} alone would choose {tried[least].name} ({signed(off)}).")
-    return said
-
-
-def _undetermined(tried: Sequence[Tried], decision: Decision) -> str:
-    """Sentence on the parameters of the chosen model that the test does not determine."""
-    best, found = decision.best, decision.criteria
-    lost = ", ".join(tried[best].states("not determined"))
-    told = f"The test does not determine {lost} of the chosen model {tried[best].name}"
-    sound = [i for i, one in enumerate(tried) if not one.states("not determined")]
-    if not sound:
-        return f"{told}; no model of the ladder has all parameters determined."
-    if decision.by_prediction:
-        nearest = min(sound, key=lambda i: tried[i].misfit)
-        off = f"misfit of {percent(tried[nearest].misfit)} of the range"
-        return f"{told}; {_all_of(tried[nearest])}, at a {off}."
-    nearest = min(sound, key=lambda i: found[i].bic)
-    higher = found[nearest].bic - found[best].bic
-    return f"{told}; {_all_of(tried[nearest])}, at a BIC higher by {higher:.1f}."
-
-
-def _all_of(one: Tried) -> str:
-    """Say that a model that was not chosen has no parameter that is not determined."""
-    return f"by their 95 % intervals all of {one.name} are determined"
-
-
-def _structure_left(tried: Sequence[Tried], best: int) -> str:
-    """Sentence on the structure in the residuals of the chosen model."""
-    one = tried[best]
-    worst = int(np.argmin([min(runs_test(part), neighbours_test(part)) for part in one.curves]))
-    found = find_structure(one.curves[worst], one.places[worst])
-    told = (
-        f"With every model systematic residuals remain: those of {one.counted[worst]} are "
-        f"{percent(found.size / one.spans[worst])} of the range, {percent(found.share)} of them on "
-        f"{found.place}."
-    )
-    if found.bent > BENT and found.straight:
-        told += " The measured branch is curved where the law is a straight line."
-    return told
+def _signed(value: float) -> str:
+    """Write a difference of AICc or BIC; AICc is not defined with too few effective samples."""
+    return text.signed(value, 1) if math.isfinite(value) else "not defined"

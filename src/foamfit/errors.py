@@ -1,4 +1,4 @@
-"""Errors raised by foamfit, and Ctrl-C as what it is."""
+"""Errors raised by foamfit, and Ctrl-C inside compiled code."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from contextlib import contextmanager
 class InputError(ValueError):
     """A file, key, column, option or argument is wrong; the message says what would be right.
 
-    Any other ValueError, as numpy's LinAlgError is one, is a defect of foamfit. The command shows
-    `lines`, what is to be written into a file, beneath the message.
+    Any other ValueError (numpy's LinAlgError, say) is a defect of foamfit. The command prints
+    `lines`, which a user may copy into a file, below the message.
     """
 
     def __init__(self, message: str = "", lines: Sequence[str] = ()) -> None:
@@ -26,13 +26,13 @@ class SimulationError(RuntimeError):
 def as_signalled() -> Iterator[None]:
     """Raise Ctrl-C, or the end by a signal, as itself.
 
-    Where it comes while a compiled loop hands over its result Python makes a SystemError of it.
+    Python turns it into a SystemError if it comes while a compiled loop returns its result.
     """
     try:
         yield
     except SystemError as error:
         first: BaseException | None = error
-        while isinstance(first, SystemError):  # one for each compiled loop that called the next
+        while isinstance(first, SystemError):  # one for each nested compiled loop
             first = first.__cause__ or first.__context__
         if first is None or isinstance(first, Exception):
             raise

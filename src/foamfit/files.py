@@ -1,8 +1,7 @@
 """Write a whole file or a whole folder, or nothing.
 
-Each is made beside its place under a name that tells which process makes it, and is put in its
-place at the end. What a process that was killed has left behind is removed by the next one that
-writes to the same place.
+Each is written under a temporary name beside its place, which names the process, and moved there at
+the end. What a killed process leaves is removed by the next one that writes to the same place.
 """
 
 from __future__ import annotations
@@ -25,10 +24,9 @@ from uuid import uuid4
 
 from foamfit.errors import InputError
 
-# Of this process; another one may have its number later, or in another container.
+# Marks this process; another one may have its number later, or in another container.
 _TOKEN = uuid4().hex[:8]
-# Where it cannot be told whether a process lives, what is older than this, s, has been left behind:
-# to write a folder takes seconds.
+# Age, s, at which a temporary file of a process that cannot be checked counts as abandoned.
 _ABANDONED = 86400.0
 _LARGEST = 2**30  # bytes of a file that is read whole
 
@@ -50,14 +48,11 @@ def check_file(path: Path) -> None:
 
 
 def read_whole(path: Path, most: int | None = None) -> bytes:
-    """Read a file or a pipe, or its first bytes; OSError for one without end.
-
-    While that is read no signal is heard.
-    """
+    """Read a file or a pipe, or its first bytes; OSError for a device, which may have no end."""
     with path.open("rb") as file:
         mode = os.fstat(file.fileno()).st_mode
         if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
-            raise OSError(errno.EINVAL, "it is a device, no file")
+            raise OSError(errno.EINVAL, "it is a device, not a file")
         raw = file.read(_LARGEST + 1 if most is None else most)
     if len(raw) > _LARGEST:
         raise OSError(errno.EFBIG, f"it has more than {_LARGEST} bytes")
@@ -65,10 +60,10 @@ def read_whole(path: Path, most: int | None = None) -> bytes:
 
 
 def write_file(path: str | Path, content: bytes) -> None:
-    """Write a whole file; if it cannot be written, InputError, and what stood there stays."""
+    """Write a whole file; InputError if that fails, and an older file stays."""
     path = Path(path)
     try:
-        if path.exists() and not path.is_file():  # a device or a pipe, which stays what it is
+        if path.exists() and not path.is_file():  # a device or a pipe
             path.write_bytes(content)
             return
         target = path.resolve()  # a link stays a link
@@ -87,7 +82,7 @@ def write_file(path: str | Path, content: bytes) -> None:
 
 
 def csv_bytes(rows: Iterable[Iterable[object]]) -> bytes:
-    """Rows of cells as CSV; an apostrophe keeps a spreadsheet from taking a text for a formula."""
+    """Return rows of cells as CSV; an apostrophe keeps a spreadsheet from running a formula."""
     text = io.StringIO(newline="")
     csv.writer(text, lineterminator="\n").writerows(map(_harmless, row) for row in rows)
     # A non-UTF-8 name keeps its bytes as an escape.
@@ -106,10 +101,10 @@ def _harmless(cell: object) -> object:
 
 @contextmanager
 def replacing(folder: Path, *, swept: bool = False) -> Iterator[Path]:
-    """Give an empty sibling of `folder` (resolved) to write into, which replaces it at the end.
+    """Give an empty folder beside `folder` (resolved) to write into, which replaces it at the end.
 
-    Where many folders are written into one, that is `swept` once by the caller: to look through it
-    for each of them takes a time that grows with the square of their number.
+    A caller that writes many folders into one has it `swept` once: sweeping for each would take a
+    time that grows with the square of their number.
     """
     made = [parent for parent in folder.parents if not parent.exists()]
     fresh, old = _beside(folder, "new"), _beside(folder, "old")
@@ -130,13 +125,13 @@ def replacing(folder: Path, *, swept: bool = False) -> Iterator[Path]:
                 parent.rmdir()
         raise
     finally:
-        if folder.exists():  # never the last copy
+        if folder.exists():  # else the old one is the last copy
             shutil.rmtree(old, ignore_errors=True)
 
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """Give an empty folder for what is not to stay; what killed processes left of it is removed."""
+    """Give an empty temporary folder; what killed processes left of such folders is removed."""
     place = Path(tempfile.gettempdir()).resolve() / "foamfit"
     sweep(place.parent, [place.name])
     folder = _beside(place, "new")
@@ -148,18 +143,18 @@ def scratch() -> Iterator[Path]:
 
 
 def reason(error: BaseException) -> str:
-    """Why a file could not be read or written, in the system's words."""
+    """Return why a file could not be read or written, in the system's words."""
     return getattr(error, "strerror", None) or str(error)
 
 
 def _beside(path: Path, ending: str) -> Path:
-    """Name of what this process makes beside a path."""
+    """Return a temporary name beside a path."""
     owner = f"{_host()}.{os.getpid()}.{_TOKEN}{uuid4().hex[:8]}"
     return path.with_name(f".{_short(path.name)}.{owner}.{ending}")
 
 
 def _short(name: str) -> str:
-    """Name to which an ending can be added; its own if that is short enough."""
+    """Return a name to which an ending can be added: its own if that is short enough."""
     raw = os.fsencode(name)
     return name if len(raw) <= 100 else f"{name[:20]}~{hashlib.sha256(raw).hexdigest()[:12]}"
 
@@ -176,14 +171,14 @@ _LEFT = re.compile(
 
 
 def is_left(name: str) -> bool:
-    """Whether a name is that of what a process of foamfit makes beside a path."""
+    """Whether a name is a temporary one of foamfit."""
     return _LEFT.fullmatch(name) is not None
 
 
 def sweep(folder: Path, names: Iterable[str]) -> None:
-    """Remove what processes that are gone have left of these files and folders in a folder.
+    """Remove what ended processes left of these files and folders in a folder.
 
-    An older result that one of them had put aside goes back if nothing is in its place.
+    An older result that one of them had moved aside goes back if nothing is in its place.
     """
     if not folder.is_dir():
         return
@@ -203,9 +198,9 @@ def sweep(folder: Path, names: Iterable[str]) -> None:
 
 
 def _lives(found: re.Match[str], left: Path) -> bool:
-    """Whether the process that has made something may still be at it."""
+    """Whether the process that made a temporary file may still run."""
     process = int(found["process"])
-    # No harmless signal asks whether a process of another machine, or of another system, lives.
+    # A process of another machine cannot be asked, nor one of a system without POSIX signals.
     if found["host"] != _host() or os.name != "posix":
         with suppress(OSError):
             return time.time() - left.stat().st_mtime < _ABANDONED

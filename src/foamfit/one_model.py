@@ -40,7 +40,7 @@ from foamfit.trust.intervals import Announce, Choice, assess, evaluations_of
 from foamfit.trust.ranges import Open, left_open
 
 Progress = Callable[[float, str], None]
-# Called with the problem and the best point so far, many times a second; it must be quick.
+# Called with the problem and the best point so far, many times a second; must be quick.
 Watch = Callable[[Problem, Array], None]
 
 # Descents of the search for each spring, for each of several hysteretic springs in series, and at
@@ -49,19 +49,19 @@ STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 48, 100_000
 # Refits of the bootstrap and steps of the Markov chain.
 DRAWS = {"bootstrap": 500, "mcmc": 2000}
 # Evaluations that the default spends on profiles, and on ranges, over those of the search; and how
-# often it goes on from a better point that these have met.
+# often it continues from a better point found on the way.
 PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
-# Evaluations over those of the search past which no better point is gone on from, unless intervals
-# were asked for.
+# Beyond this share of the search's evaluations the fit does not continue from a better point,
+# unless intervals were asked for.
 TOGETHER = 0.8
-# Cost over the one before below which the ranges are made anew from a better point.
+# Ranges are made again from a better point whose cost is below this share of the one before.
 MOVED = 0.999
-# Evaluations over those of the search that ranges and profiles take, as measured: where the law has
-# an error, and where none.
+# Measured evaluations of ranges and profiles over those of the search: with an error of the law,
+# and at the noise.
 JUDGED, JUDGED_NOISE = 2.0, 0.15
-# How often the covariance by a driving motion is made.
+# How often the covariance of a driving motion is computed.
 WEIGHED = 2
-# Share of its time that a fit has searched, where the law has an error or none.
+# Share of the time of a fit that the search takes.
 SEARCHED = 0.5
 
 
@@ -112,16 +112,15 @@ class Options:
         return cls(**given)
 
     def __post_init__(self) -> None:
-        """Refuse what is of no use."""
-        for name, value, (least, most) in (
-            ("seed", self.seed, (0, math.inf)), ("starts", self.starts, (1, MOST_STARTS)),
-        ):  # fmt: skip
+        """Refuse inadmissible values."""
+        for name, least, most in (("seed", 0, math.inf), ("starts", 1, MOST_STARTS)):
+            value = getattr(self, name)
             whole = isinstance(value, Integral) and least <= int(value) <= most
             if not whole and (name == "seed" or value is not None):
-                up = "up" if most == math.inf else f"to {most}"
+                end = "up" if most == math.inf else f"to {most}"
                 raise InputError(
                     f"{name} = {value!r} is not admissible; it must be a whole number from {least} "
-                    f"{up}"
+                    f"{end}"
                 )
         limit = self.max_time
         if limit is not None and not (isinstance(limit, Real) and float(limit) > 0):
@@ -141,11 +140,10 @@ class Options:
     def problem(
         self, measurement: Measurement, model: str, params: lmfit.Parameters | None = None
     ) -> Problem:
-        """Make the problem of one model ready."""
-        return make_problem(
-            measurement, model, self.drive, params, self.weights, self.interior_mass,
-            time_shift=self.time_shift, loss=self.loss, relaxation=self.relaxation,
-        )  # fmt: skip
+        """Set up the fit of one model."""
+        more = {name: getattr(self, name) for name in ("time_shift", "loss", "relaxation")}
+        given = (self.drive, params, self.weights, self.interior_mass)
+        return make_problem(measurement, model, *given, **more)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +155,7 @@ class Found:
     record: SearchRecord
 
     def best(self) -> BestPoint:
-        """The best point, its springs in order, what is within rounding of a limit on it."""
+        """Return the best point, springs in order, parameters within rounding of a limit on it."""
         values = self.tracker.best_values
         assert values is not None  # checked by identify
         space = self.problem.space()
@@ -166,9 +164,12 @@ class Found:
 
 
 def identify(
-    measurement: Measurement, model: str, params: lmfit.Parameters | None, options: Options,
+    measurement: Measurement,
+    model: str,
+    params: lmfit.Parameters | None,
+    options: Options,
     progress: Progress,
-) -> Found:  # fmt: skip
+) -> Found:
     """Search and refine; see `foamfit.fit` for the arguments and the errors."""
     began = time.perf_counter()
     problem = options.problem(measurement, model, params)
@@ -188,7 +189,7 @@ def identify(
 
 
 def _why_not(problem: Problem) -> str:
-    """Why the values that a search begins with cannot be simulated."""
+    """Say why the start values cannot be simulated."""
     try:
         problem.objective.simulate(problem.vector())
     except SimulationError as error:
@@ -199,7 +200,7 @@ def _why_not(problem: Problem) -> str:
 def judge(
     found: Found, choice: Choice, announce: Announce, progress: Progress = lambda *_: None
 ) -> tuple[Fit, BestPoint]:
-    """Make the intervals (and ranges) that were chosen, and the result of the best point."""
+    """Compute the chosen intervals (and ranges), and the result of the best point."""
     try:
         with as_signalled():
             best, record, intervals = found.best(), found.record, Intervals()
@@ -207,7 +208,7 @@ def judge(
                 found.tracker.pulse = _pulse(found, best, choice, progress)
                 best, record, intervals = _assess(found, best, choice, announce)
             return _finish(found, best, record, intervals)
-    except KeyboardInterrupt as error:  # what was found is not given up for a late Ctrl-C
+    except KeyboardInterrupt as error:  # a late Ctrl-C keeps what was found
         record = replace(found.record, stopped=what_stopped(error))
         return _finish(found, found.best(), record, Intervals())
 
@@ -221,7 +222,7 @@ def _finish(
 
 
 def _pulse(found: Found, best: BestPoint, choice: Choice, progress: Progress) -> Callable[[], None]:
-    """Tell the share of the evaluations done that ranges and intervals are expected to take."""
+    """Report the evaluations done over those that ranges and intervals are expected to take."""
     objective, spent = found.problem.objective, found.problem.objective.evaluations
     share = JUDGED if choice.ranges and best.misfits else JUDGED_NOISE
     expected = max(share * spent, 1.0) + evaluations_of(best, choice)
@@ -236,7 +237,7 @@ def _pulse(found: Found, best: BestPoint, choice: Choice, progress: Progress) ->
 def _assess(
     found: Found, best: BestPoint, choice: Choice, announce: Announce
 ) -> tuple[BestPoint, SearchRecord, Intervals]:
-    """Make the intervals; where these meet a better point, go on from there."""
+    """Compute the intervals; where these find a better point, continue from there."""
     problem, tracker, record = found.problem, found.tracker, found.record
     budget = PROFILE_SHARE * problem.objective.evaluations
     enough = (1.0 + TOGETHER) * problem.objective.evaluations
@@ -248,18 +249,22 @@ def _assess(
         before = tracker.best_cost
         try:
             better = None
-            # What is left open is not that of the point before.
+            # The ranges of the point before do not hold here.
             if choice.ranges and best.cost < MOVED * there:
-                other = choice.method != "local"  # which goes by this one minimum
+                other = choice.method != "local"  # local intervals are those of this minimum
                 left = left_open(best, tracker.ends, tracker, budget, other)
                 better, there = left.better if other else None, best.cost
             made = Intervals(better=better)
             if better is None:
                 made = assess(
-                    best, choice, minima=[*tracker.ends, *left.minima],
-                    deadline=tracker.deadline, budget=budget, announce=announce,
+                    best,
+                    choice,
+                    minima=[*tracker.ends, *left.minima],
+                    deadline=tracker.deadline,
+                    budget=budget,
+                    announce=announce,
                     pulse=tracker.pulse,
-                )  # fmt: skip
+                )
             if made.better is None:
                 return best, record, replace(made, ranges=left.ranges)
             tracker.consider(made.better)
@@ -267,7 +272,7 @@ def _assess(
         except SearchStoppedError:
             return found.best(), record, Intervals()
         best = found.best()
-        if tracker.best_cost < before / 1.02:  # a minimum that no descent of the search has found
+        if tracker.best_cost < before / 1.02:  # a minimum that the search missed
             record = replace(record, costs=((tracker.best_cost, 1), *record.costs))
     return best, record, Intervals(ranges=left.ranges)
 
@@ -309,7 +314,7 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
         params[name].vary = False
     if not names:
         return
-    for name in names:  # least_squares wants its start off the bounds
+    for name in names:  # least_squares needs a start inside the bounds
         parameter = params[name]
         if math.isfinite(span := parameter.max - parameter.min):
             low, high = parameter.min + 1e-9 * span, parameter.max - 1e-9 * span
@@ -321,18 +326,17 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
     def jacobian(p: lmfit.Parameters) -> Array:
         return problem.slopes(problem.vector(p), names)
 
-    with warnings.catch_warnings():  # of its covariance, which `trust.covariance` does better
+    with warnings.catch_warnings():  # of its covariance, which is not used
         warnings.simplefilter("ignore", RuntimeWarning)
-        lmfit.minimize(
-            residual, params, method="least_squares", jac=jacobian, x_scale=best.sizes,
-            ftol=1e-10, xtol=1e-10, gtol=1e-12, max_nfev=60,
-        )  # fmt: skip
+        ends = {"ftol": 1e-10, "xtol": 1e-10, "gtol": 1e-12, "max_nfev": 60}
+        more = {"jac": jacobian, "x_scale": best.sizes} | ends
+        lmfit.minimize(residual, params, method="least_squares", **more)
 
 
 def weigh_motion(problem: Problem, tracker: Tracker) -> None:
-    """Count the residual in the covariance that the motion's own uncertainty gives it, and refine.
+    """Weight the residual by the covariance due to the motion's own uncertainty, and refine.
 
-    That covariance is the one at the best point, so it is made anew there once more.
+    The covariance depends on the best point, so this is done twice.
     """
     for _ in range(WEIGHED):
         if tracker.best_values is None:
@@ -344,7 +348,7 @@ def weigh_motion(problem: Problem, tracker: Tracker) -> None:
 
 
 def _on_limits(best: BestPoint, cost: float) -> BestPoint:
-    """Put parameters that are within rounding of a limit on it, if `cost` hardly rises."""
+    """Move parameters within rounding of a limit onto it, if `cost` hardly rises."""
     problem, space = best.problem, best.problem.space()
     values = best.values + 0.0  # no -0
     if np.any(np.signbit(best.values) & (values == 0.0)):

@@ -14,7 +14,7 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate
 from foamfit.springs.chain import Chain
-from foamfit.springs.laws import BistableSpring, MicroscaleSpring
+from foamfit.springs.spring import Spring
 from foamfit.text import counted
 
 if TYPE_CHECKING:
@@ -24,11 +24,8 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 # Of an uncertainty budget.
-SOURCES = (
-    "noise", "contact and zero", "velocity", "mass", "height", "area", "calibration", "law",
-)  # fmt: skip
 STATED = ("mass", "height", "area", "calibration")  # by their ± in the TOML, not fitted
-DERIVED_POINTS = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c")
+SOURCES = ("noise", "contact and zero", "velocity", *STATED, "law")
 
 
 @dataclass(frozen=True)
@@ -37,13 +34,12 @@ class ParameterEstimate:
 
     `stderr` and `ci95` are None where the test does not determine it; `state` is "determined",
     "weak", "not determined" or "fixed" (fixed by the user or the model), and `why` says so in a
-    sentence. `ci95_method` names what made the interval: "local covariance", "profile likelihood",
-    "block bootstrap", "MCMC" or "other minima" (ends of
-    the search's descents that noise could have made the best). `range` is the hull of its values
-    over descriptions that follow the curves about as well, which the error of the law leaves open;
-    None where only noise is left of the curves. `systematic` is one standard deviation from height,
-    area, mass and calibration, whose ± the TOML states; it is not in `stderr` and `ci95`, and is 0
-    where none is stated or the test does not determine the parameter.
+    sentence. `ci95_method` is the source of the interval: "local covariance", "profile likelihood",
+    "block bootstrap", "MCMC" or "other minima" (of the search, which noise could have made the
+    best). `range` includes model error: the values that fit almost equally well; None where the
+    residuals are noise. `systematic` is one standard deviation from the ± of height, area, mass and
+    calibration in the TOML; it is not in `stderr` and `ci95`, and is 0 where no ± is stated or the
+    test does not determine the parameter.
     """
 
     value: float
@@ -59,13 +55,8 @@ class ParameterEstimate:
 
     def counted_from(self, zero: float) -> ParameterEstimate:
         """Count value, interval and range from another zero."""
-
-        def moved(ends: tuple[float, float] | None) -> tuple[float, float] | None:
-            return None if ends is None else (ends[0] - zero, ends[1] - zero)
-
-        if zero == 0.0:
-            return self
-        ci95, span = moved(self.ci95), moved(self.range)
+        ends = (self.ci95, self.range)
+        ci95, span = (one and (one[0] - zero, one[1] - zero) for one in ends)
         return replace(self, value=self.value - zero, ci95=ci95, range=span)
 
 
@@ -105,17 +96,17 @@ class Profile:
     rises: Array  # (m,): Rise of the cost there as a χ² of one degree of freedom
     points: Array  # (m, n): All parameters of the model at each
     cut: float  # χ² of the 95 % interval
-    # Outermost crossings of the cut; a limit of the parameter where there is none.
+    # Outermost crossings of the cut, or a limit of the parameter
     ci95: tuple[float, float]
-    # Whether the cost does not reach the cut on that side.
+    # Whether the cost stays below the cut on that side
     open_low: bool
     open_high: bool
-    # What ended it before its end on both sides: "the time limit", "Ctrl-C".
+    # What ended it early: "the time limit", "Ctrl-C"
     stopped: str | None = None
 
     @property
     def complete(self) -> bool:
-        """Whether it was followed to its end on both sides."""
+        """Whether it was followed to both ends."""
         return self.stopped is None
 
 
@@ -127,14 +118,14 @@ class Intervals:
     ends: dict[str, tuple[float, float]] = field(default_factory=dict)
     methods: dict[str, str] = field(default_factory=dict)
     profiles: tuple[Profile, ...] = ()  # All profiles that were followed, whole or not
-    # Parameters along which the cost is no parabola and whose interval is local all the same.
+    # Parameters with a local interval although the cost along them is not a parabola
     doubtful: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()  # Why they are not, or hardly, what was asked for
-    better: Array | None = None  # A point of lower cost: the fit should go on from there
-    # Values, far outside of the interval, at minima that are hardly worse than the best.
+    warnings: tuple[str, ...] = ()  # Why they differ from what was asked for
+    better: Array | None = None  # A point of lower cost from which the fit should continue
+    # Values, far outside the interval, at minima almost as good as the best
     elsewhere: dict[str, float] = field(default_factory=dict)
-    # Ends of the ranges that the error of the law leaves open; none where there is no such error.
+    # Ends of the ranges that include the error of the law, where there is one
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
@@ -152,12 +143,12 @@ class Snapping:
 
     @property
     def most(self) -> float:
-        """Largest fraction that has snapped; the test tells nothing of the ranks above."""
+        """Largest fraction that has snapped; the test says nothing about the others."""
         return float(self.fraction[self.turn])
 
     @property
     def halves(self) -> tuple[int | None, int | None]:
-        """Samples from which on half have snapped, and half have snapped back; None if never."""
+        """First samples at which half have snapped, and half have snapped back; None if never."""
         turn, snapped = self.turn, self.fraction >= 0.5
         if not snapped[turn]:
             return None, None
@@ -192,15 +183,15 @@ class Budget:
 
     @property
     def telling(self) -> bool:
-        """Whether it says more than the standard errors and ranges of the parameters."""
+        """Whether it has more than the standard errors and ranges of the parameters."""
         return bool(set(self.sources) - {"noise", "law"})
 
     def combined(self, name: str) -> float:
-        """Root of the sum of the squares of all contributions to a parameter, SI."""
+        """Combine all contributions to a parameter by their squares, SI."""
         return math.hypot(*self.contributions[name].values())
 
     def rows(self) -> Iterator[list[object]]:
-        """Rows of budget.csv, the header first: SI, but for what is over the scale."""
+        """Give the rows of budget.csv, the header first: SI, but for the last column."""
         yield ["name", *SOURCES, "combined", "scale", "combined over scale"]
         for name, row in self.contributions.items():
             total, scale = self.combined(name), self.scales[name]
@@ -212,7 +203,7 @@ class Switch:
     """A change of branch in the fitted response: which spring, when, and where on the curves."""
 
     spring: int  # 1 at the base
-    source: str  # "a", "d", "c", "e", or "snap-through", … of a microscale spring
+    source: str  # name of a branch
     target: str
     time: float | None  # s
     displacement: float  # of the top, m
@@ -221,14 +212,13 @@ class Switch:
 
 @dataclass(frozen=True)
 class Check:
-    """One question to a fit."""
+    """One question of the checklist, put so that "yes" is good."""
 
     key: str  # Short name
-    question: str  # Put so that "yes" is good
-    answer: bool | None  # None where the test or the search does not allow to tell
+    question: str
+    answer: bool | None  # None where the test or the search cannot tell
     sentence: str  # What the answer rests on
-    # What a reader must know if the answer is no, one sentence each; empty otherwise.
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # What a reader must know if the answer is no
     fatal: bool = False  # Whether a "no" means that no acceptable fit was found
 
 
@@ -245,22 +235,22 @@ class Rung:
     """One model that was tried and the evidence for it."""
 
     model: str  # Springs from the base up
-    # "with", "without" (every dashpot held at zero) or "none" where the drive has none to vary.
+    # "with", "without" (every dashpot held at zero) or "none" (the drive has none to vary)
     damping: str
     misfit: dict[str, float | None]  # As `Fit.misfit`
     chisqr: float  # Sum of the squared residuals
     n_vary: int  # Parameters that were varied
     rank: int  # How many combinations of them the curves fix: what AICc and BIC count
-    # Effective samples by its own residuals. AICc and BIC use `Ladder.n_eff`, one for all.
+    # Effective samples by its own residuals; AICc and BIC use `Ladder.n_eff`
     n_eff: float
-    # Infinite where there are too few effective samples for so many parameters.
+    # Infinite if there are too few effective samples for so many parameters
     aicc: float
     bic: float
     # p-value of the runs test: the chance that noise without structure has as few runs.
     runs_p: float
-    # p-value of the neighbours test: the same by size, where the runs test goes by sign.
+    # p-value of the neighbours test, which goes by size, the runs test by sign
     neighbours_p: float
-    # Names of the parameters in these states, by the 95 % intervals alone where it was not chosen.
+    # Parameters in these states; by the 95 % intervals alone if it was not chosen
     not_determined: tuple[str, ...]
     weak: tuple[str, ...]
     seconds: float  # Run time
@@ -268,12 +258,11 @@ class Rung:
     chosen: bool  # Whether the result is that of this model
     why: str  # Why it was chosen or not
     relaxation: int = 0  # Terms of each hysteretic spring
-    # RMS over the range, all counted curves together, of samples that were held back in blocks;
-    # None where the time did not allow it.
+    # RMS over the range of samples that were held back in blocks; None if there was no time
     predicted_misfit: float | None = None
-    # By what share that is below the one of `gain_over`; None where that is none.
+    # By what share that is below the one of `gain_over`, if any
     gain: float | None = None
-    # The model that was the best of those with no more parameters; None of the first.
+    # The best of the models before with no more parameters; None for the first
     gain_over: str | None = None
 
     @property
@@ -288,14 +277,13 @@ class Ladder:
 
     rungs: tuple[Rung, ...]  # In the order in which they were tried, from the simplest up
     n_eff: float  # Effective samples that AICc and BIC use
-    noise_from: str  # The model of the least chi-square: its residuals are taken for the noise
+    noise_from: str  # The model of the least chi-square, whose residuals are taken as noise
     ended: str  # Why the comparison ended
     stopped: str | None  # "the time limit" or "Ctrl-C" if that ended it
     skipped: tuple[str, ...]  # Models that could not be tried, and why
     sentences: tuple[str, ...]  # What the comparison says
     cautions: tuple[str, ...]  # Those of them that are warnings
-    # Whether models were compared by what they predict, because none reaches the noise; else by
-    # AICc and BIC.
+    # Whether models were compared by their predictions, as none reaches the noise, not by AICc, BIC
     by_prediction: bool = False
 
     @property
@@ -316,21 +304,22 @@ class Ladder:
 
 
 def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dict[str, Snapping]:
-    """How each microscale spring snaps along an overall strain and a base stress (Pa).
+    """Return how each spring of micro-springs snaps along an overall strain and a base stress (Pa).
 
-    A single spring's snapping follows from its strain. In a chain it follows from the stress, if
-    all springs are in equilibrium under it, else there is none.
+    A single spring's snapping follows from its strain, that in a chain from the stress if all its
+    springs are in equilibrium, else it is not known.
     """
     out, springs = {}, chain.springs
-    plain = not any(spring.eta or spring.relaxation for spring in springs)
     for i, spring in enumerate(springs, start=1):
-        if not isinstance(spring, MicroscaleSpring):
+        if not spring.law.remembers:
             continue
-        own = stress if plain else None
+        own = None if any(one.eta or one.relaxation for one in springs) else stress
         if len(springs) == 1:
             own = None if strain is None else np.asarray(spring.stress(strain))
         if own is not None and np.all(np.isfinite(own)):
-            out[f"s{i}"] = Snapping(spring.fraction_along(own), own)
+            fraction = spring.fraction_along(own)
+            if fraction is not None:
+                out[f"s{i}"] = Snapping(fraction, own)
     return out
 
 
@@ -374,16 +363,9 @@ class Fit:
     budget: Budget | None = None
 
     @property
-    def bistable_springs(self) -> dict[str, BistableSpring]:
-        """The bistable springs of the chain by their prefix, "s1" at the base."""
-        springs = enumerate(self.chain.springs, start=1)
-        return {f"s{i}": one for i, one in springs if isinstance(one, BistableSpring)}
-
-    @property
-    def microscale_springs(self) -> dict[str, MicroscaleSpring]:
-        """The microscale springs of the chain by their prefix, "s1" at the base."""
-        springs = enumerate(self.chain.springs, start=1)
-        return {f"s{i}": one for i, one in springs if isinstance(one, MicroscaleSpring)}
+    def springs(self) -> dict[str, Spring]:
+        """The springs of the chain by their prefix, "s1" at the base."""
+        return {f"s{i}": one for i, one in enumerate(self.chain.springs, start=1)}
 
     @property
     def at_noise(self) -> bool | None:
@@ -410,65 +392,58 @@ class Fit:
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``fit.json``: SI, plain types, null for what is not there."""
-        content: dict[str, Any] = plain(
-            {
-                "schema": SCHEMA,
-                "foamfit": version("foamfit"),
-                "test": self.measurement.name,
-                "data_sha256": self.measurement.data_sha256,
-                "data": asdict(self.measurement.rows)
-                | {
-                    "cycle": self.measurement.cycle,
-                    "cycles": len(self.measurement.cycles),
-                    "start_strain": self.measurement.start_strain,
-                    "rate": loading_rate(self.measurement),
-                    "notes": self.measurement.notes,
-                },
-                "model": self.model,
-                "relaxation": self.relaxation,
-                "drive": self.drive,
-                "interior_mass": self.interior_mass,
-                "seed": self.seed,
-                "status": self.status,
-                "stopped": self.stopped,
-                "loss": self.loss,
-                "warnings": self.warnings,
-                "notes": self.notes,
-                "checklist": [
-                    {"question": c.question, "answer": c.answer, "sentence": c.sentence}
-                    for c in self.checklist
-                ],
-                "parameters": {name: asdict(p) for name, p in self.parameters.items()},
-                **({"correlation": vars(self.correlation)} if self.correlation else {}),
-                **({"budget": self.budget.contributions} if self.budget else {}),
-                "derived": {
-                    name: {point: getattr(spring, point) for point in DERIVED_POINTS}
-                    for name, spring in self.bistable_springs.items()
-                }
-                | {
-                    name: {
-                        "p_max": snapped.most,
-                        "p_max_stress": float(snapped.stress[snapped.turn]),
-                        "p_max_strain": None if self.strain is None else self.strain[snapped.turn],
-                        "snap_strain": self.microscale_springs[name].snap_strain,
-                    }
-                    for name, snapped in self.snapping.items()
-                },
-                "visited": self.visited,
-                "misfit": self.misfit,
-                "weights": self.weights,
-                "statistics": self.statistics,
-                "noise": self.noise,
-                "outliers": {
-                    channel: {name: getattr(found, name) for name in ("at", "values", "clipped_at")}
-                    for channel, found in self.measurement.outliers.items()
-                },
-                "energy": self.energy,
-                "runtime_s": self.runtime_s,
-                **({"ladder": asdict(self.ladder)} if self.ladder else {}),
-            }
-        )
-        return content
+        test = self.measurement
+        asked = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
+        optional = {
+            "correlation": self.correlation and vars(self.correlation),
+            "budget": self.budget and self.budget.contributions,
+            "ladder": self.ladder and asdict(self.ladder),
+        }
+        content = {
+            "schema": SCHEMA,
+            "foamfit": version("foamfit"),
+            "test": test.name,
+            "data_sha256": test.data_sha256,
+            "data": asdict(test.rows)
+            | {
+                "cycle": test.cycle,
+                "cycles": len(test.cycles),
+                "start_strain": test.start_strain,
+                "rate": loading_rate(test),
+                "notes": test.notes,
+            },
+            **{name: getattr(self, name) for name in (*asked, "loss", "warnings", "notes")},
+            "checklist": [
+                {name: getattr(check, name) for name in ("question", "answer", "sentence")}
+                for check in self.checklist
+            ],
+            "parameters": {name: asdict(one) for name, one in self.parameters.items()},
+            "derived": self._derived(),
+            **{name: getattr(self, name) for name in ("visited", "misfit", "weights")},
+            **{name: getattr(self, name) for name in ("statistics", "noise", "energy")},
+            "outliers": {
+                channel: {name: getattr(found, name) for name in ("at", "values", "clipped_at")}
+                for channel, found in test.outliers.items()
+            },
+            "runtime_s": self.runtime_s,
+            **{name: one for name, one in optional.items() if one},
+        }
+        made: dict[str, Any] = plain(content)
+        return made
+
+    def _derived(self) -> dict[str, dict[str, Any]]:
+        """Return derived points of the springs, and how far they snapped."""
+        found = dict[str, dict[str, Any]]()
+        for name, spring in self.springs.items():
+            points = {one.attribute: getattr(spring, one.attribute) for one in spring.law.points}
+            if (snapped := self.snapping.get(name)) is not None:
+                points["p_max"] = snapped.most
+                points["p_max_stress"] = snapped.stress[snapped.turn]
+                points["p_max_strain"] = None if self.strain is None else self.strain[snapped.turn]
+                points["snap_strain"] = getattr(spring, "snap_strain", None)
+            if points:
+                found[name] = points
+        return found
 
 
 def plain(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What the command and its terminal tell each other: text that can be shown, and signals."""
+"""The terminal: text that it can show, and signals."""
 
 from __future__ import annotations
 
@@ -17,24 +17,22 @@ from typing import Any, TextIO
 
 from foamfit.errors import InputError
 
-# Control characters but tab and new line, and what turns the direction of writing round: in a name
-# they would move the cursor, colour the terminal or hide what stands there. And what Python makes
-# of file names that are no Unicode.
+# Control characters but tab and new line, and those that reverse the direction of writing: in a
+# name they could move the cursor, colour the terminal or hide text. And surrogates, which stand for
+# bytes that are not UTF-8.
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-# What stands for a character that an encoding does not have; Greek letters are named.
-_INSTEAD = {
-    "−": "-", "–": "-", "±": "+/-", "·": "*", "…": "...", "→": "->", "√": "sqrt", "µ": "u",
-    "²": "^2", "³": "^3", "⁻": "^-", "¹": "1", "∂": "d",
-}  # fmt: skip
+# What replaces a character that an encoding does not have; Greek letters are named.
+_PAIRS = "−- –- ±+/- ·* …... →-> √sqrt µu ²^2 ³^3 ⁻^- ¹1 ∂d"
+_INSTEAD = {pair[0]: pair[1:] for pair in _PAIRS.split()}
 
 
 def printable(text: str) -> str:
-    r"""Return a text with its control characters written out, as in "\x1b"; lines stay lines."""
+    r"""Return a text with its control characters escaped, as in "\x1b"; lines stay lines."""
     return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
 
 
 def _instead(error: UnicodeError) -> tuple[str, int]:
-    """Replace what an encoding does not have by ASCII: an error handler of `codecs`."""
+    """Replace characters that an encoding lacks by ASCII: an error handler of `codecs`."""
     assert isinstance(error, UnicodeEncodeError)
     told = ""
     for character in error.object[error.start : error.end]:
@@ -52,25 +50,25 @@ codecs.register_error("foamfit.instead", _instead)
 
 
 def show_all() -> None:
-    """Let stdout and stderr replace what their encoding does not have, where they would fail."""
+    """Let stdout and stderr replace characters that their encoding lacks, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper) and stream.errors != "foamfit.instead":
             stream.reconfigure(errors="foamfit.instead")
 
 
 def say(text: str, *, err: bool = False, newline: bool = True) -> None:
-    """Print a text on stdout or stderr; InputError if stdout cannot be written, as to a full disk.
+    """Print a text on stdout or stderr; InputError if stdout cannot be written (a full disk).
 
-    A reader that has enough, as `head`, is no error; what is left is then not printed.
+    A reader that closes the pipe, as `head` does, is no error; the rest is not printed.
     """
     stream: TextIO | None = sys.stderr if err else sys.stdout
-    if stream is None:  # closed by whoever started this process
+    if stream is None:  # closed by the parent process
         return
     try:
         stream.write(printable(text) + ("\n" if newline else ""))
         stream.flush()
     except OSError as error:
-        if err:  # there is nowhere left to say it
+        if err:
             return
         drop_output()
         if not isinstance(error, BrokenPipeError):
@@ -81,16 +79,16 @@ def say(text: str, *, err: bool = False, newline: bool = True) -> None:
 
 
 def drop_output() -> None:
-    """Send what stdout still holds, and what is yet to come, nowhere."""
+    """Discard what stdout still holds and all further output."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())
     os.close(nowhere)
 
 
 class TerminatedError(KeyboardInterrupt):
-    """The process is asked to end, by the signal `number`: SIGTERM, or its terminal has gone.
+    """The signal `number` asks the process to end: SIGTERM, or SIGHUP of a closed terminal.
 
-    As Ctrl-C it keeps what was found. Its text is the name of the signal.
+    Like Ctrl-C it keeps what was found. Its text is the name of the signal.
     """
 
     def __init__(self, number: int) -> None:
@@ -103,16 +101,16 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def _handles_signals() -> bool:
-    """Whether this is the thread that may say what signals do."""
+    """Whether this thread may install signal handlers."""
     return threading.current_thread() is threading.main_thread()
 
 
 @contextmanager
 def ending_cleanly() -> Iterator[None]:
-    """Make SIGTERM and SIGHUP an exception, so that nothing half done stays behind.
+    """Turn SIGTERM and SIGHUP into an exception, so that nothing half-written stays behind.
 
-    Neither these nor Ctrl-C are lost in code that cannot raise, as the callbacks by which numba
-    loads what it compiled.
+    Neither these nor Ctrl-C get lost in code that cannot raise, such as the callbacks by which
+    numba loads compiled code.
     """
     if not _handles_signals():
         yield
@@ -131,7 +129,7 @@ def ending_cleanly() -> Iterator[None]:
 
 
 def _raise_again(lost: Any) -> None:
-    """Send a signal once more whose exception was ignored: a hook of `sys`."""
+    """Send a signal again whose exception was ignored: a hook of `sys`."""
     if isinstance(lost.exc_value, TerminatedError):
         number = lost.exc_value.number
     elif isinstance(lost.exc_value, KeyboardInterrupt):
@@ -146,7 +144,7 @@ def _raise_again(lost: Any) -> None:
 
 @contextmanager
 def without_ctrl_c() -> Iterator[None]:
-    """Let Ctrl-C wait for the end of the body, where it could only lose what was found."""
+    """Ignore Ctrl-C in the body, where it could only lose results."""
     if not _handles_signals():
         yield
         return

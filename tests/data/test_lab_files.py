@@ -297,7 +297,7 @@ def test_a_gzip_file(tmp_path, monkeypatch):
     assert test.name == "test"
     packed.write_bytes(packed.read_bytes()[:-20])
     refused(packed, "no whole gzip file")
-    monkeypatch.setattr("foamfit.data.layouts._LARGEST", 1000)
+    monkeypatch.setattr("foamfit.data.tables.layouts._LARGEST", 1000)
     packed.write_bytes(gzip.compress(path.read_bytes()))
     refused(packed, "unpacks to more than")
 

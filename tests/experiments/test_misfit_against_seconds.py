@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from conftest import EXPERIMENTS
+from foamfit.fitting.problem import Problem
 
 sys.path.insert(0, str(EXPERIMENTS / "error_vs_runtime"))
 
@@ -51,6 +52,11 @@ def test_a_run_is_solved_at_its_first_cost_within_five_percent() -> None:
     assert (never["solved_after_s"], never["misfit_ratio"]) == (np.inf, 3.0)
 
 
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return identification.CASES["displacement"].problem()
+
+
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     """A clock on which every look takes a millisecond."""
@@ -61,9 +67,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("coordinates", list(report.COORDINATES))
 @pytest.mark.parametrize("method", report.METHODS)
 def test_every_method_lowers_the_same_cost_until_its_time_is_up(
-    method: str, coordinates: str, clock: None
+    method: str, coordinates: str, problem: Problem, clock: None
 ) -> None:
-    problem = identification.CASES["displacement"].problem()
     plain = type(problem.objective).residual
     recorder = identification.Recorder(problem.objective, 0.4, known=0.0)
     with identification.recorded(recorder):
@@ -77,9 +82,8 @@ def test_every_method_lowers_the_same_cost_until_its_time_is_up(
     assert costs[-1] < costs[0]
 
 
-def test_a_run_ends_where_nothing_is_left_to_gain(clock: None) -> None:
+def test_a_run_ends_where_nothing_is_left_to_gain(problem: Problem, clock: None) -> None:
     case = identification.CASES["displacement"]
-    problem = case.problem()
     recorder = identification.Recorder(problem.objective, np.inf, known=1e9)
     with identification.recorded(recorder):
         identification.run_own(case, problem, seed=0)
@@ -88,8 +92,9 @@ def test_a_run_ends_where_nothing_is_left_to_gain(clock: None) -> None:
 
 
 @pytest.mark.parametrize("coordinates", list(report.COORDINATES))
-def test_the_derivatives_of_the_problem_serve_in_both_coordinates(coordinates: str) -> None:
-    problem = identification.CASES["displacement"].problem()
+def test_the_derivatives_of_the_problem_serve_in_both_coordinates(
+    problem: Problem, coordinates: str
+) -> None:
     space = problem.space()
     point = space.encode(problem.vector())
     variables = identification.Variables(problem, space, coordinates)
@@ -115,16 +120,8 @@ def test_the_derivatives_of_the_problem_serve_in_both_coordinates(coordinates: s
 def test_what_was_recorded_is_drawn_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    short = [
-        "--budget",
-        "0.05",
-        "--seeds",
-        "2",
-        "--methods",
-        "leastsq,powell",
-        "--coordinates",
-        "si",
-    ]
+    short = ["--budget", "0.05", "--seeds", "2", "--methods", "leastsq,powell"]
+    short += ["--coordinates", "si"]
     out = ["identification.py", "--out", str(tmp_path), "--problems", "displacement"]
     monkeypatch.setattr(sys, "argv", [*out, *short])
     monkeypatch.setattr(identification, "best_known", lambda *_: 5155.0)

@@ -20,8 +20,8 @@ from twins import (
     lost,
     mean_loop,
     needed,
-    place_tests,
     power,
+    studies,
 )
 
 
@@ -100,7 +100,7 @@ def test_the_mean_loop_of_one_loop_is_that_loop() -> None:
 def test_each_test_is_linked_beside_its_toml(tmp_path) -> None:
     import foamfit as ff
 
-    place_tests(DATA / "shoe-foam-twins", tmp_path)
+    studies.place_twins(DATA / "shoe-foam-twins", tmp_path)
     assert len(list(tmp_path.glob("*.toml"))) == len(list(tmp_path.glob("*_raw.txt"))) == 10
     test = ff.read_test(tmp_path / "worn-heel-comp-4_raw.txt")
     assert test.specimen.height == pytest.approx(8.827e-3)

@@ -58,7 +58,7 @@ def found(tmp_path_factory) -> JointData:
         "displacement", KINDS, {}, 0, None, None,
     )  # fmt: skip
     return JointData(
-        study=study, seed=0, tests=names, files=(here,) * 3, rates=RATES, rate0=0.1, fit=fit,
+        study=study, tests=names, files=(here,) * 3, rates=RATES, rate0=0.1, fit=fit,
         parameters=parameters_of(fit, names),
         covariance=common_covariance(fit),
         evidence=(

@@ -40,7 +40,7 @@ def test_notebook_is_stored_clean(name):
 
 @pytest.mark.parametrize("name", [LISTED[-1]])
 def test_notebook_runs_quietly_from_the_root(name, tmp_path, monkeypatch):
-    """Where they lie, all notebooks are run by nbmake: see testpaths in pyproject.toml.
+    """Where they lie, the other notebooks are run by nbmake: see addopts in pyproject.toml.
 
     The root is one of links to what is in it, where no other test leaves files meanwhile.
     """

@@ -71,15 +71,16 @@ def test_a_damped_spring() -> None:
     assert miss <= 1e-12 * stress.max()
 
 
-def test_creep_under_a_constant_stress() -> None:
-    k, eta, load = 3e6, 50.0, 1e5
+def test_creep_under_a_rising_stress() -> None:
+    k, eta, pace = 3e6, 50.0, 1e10
     time = np.linspace(0.0, 5.0 * eta / k, 30)
-    got = follow(chain(Linear(k, eta), Linear(2.0 * k)), Stress(np.full(30, load)), time)
-    creep = load / k * -np.expm1(-k * time / eta)
+    load = pace * time
+    got = follow(chain(Linear(k, eta), Linear(2.0 * k)), Stress(load), time)
+    creep = pace / k * (time - eta / k * -np.expm1(-k * time / eta))
     np.testing.assert_allclose(got.displacement[0], H * creep, rtol=0, atol=1e-15)
     top = H * creep + 1.2 * H * load / (2.0 * k)
     np.testing.assert_allclose(got.displacement[1], top, rtol=0, atol=1e-15)
-    np.testing.assert_array_equal(got.base_stress, load)
+    np.testing.assert_allclose(got.base_stress, load, rtol=1e-14)
 
 
 def test_relaxation_between_a_spring_and_a_dashpot_that_share_a_stress() -> None:
@@ -213,4 +214,4 @@ def test_it_has_no_say_where_the_law_leaves_open_which_spring_moves() -> None:
         twice = Chain((spring, spring), (1e-3, 1e-3), 2e-5, (0.0, 0.0))
         apart = Chain((spring, spring), (1e-3, 1e-3), 2e-5, (1e-3, 0.0))
         assert (independent.follow(twice, pull, time).why == "") == sure
-        assert independent.follow(apart, pull, time).why != independent.SHARED
+        assert independent.follow(apart, pull, time, most=10_000).why != independent.SHARED

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import foamfit as ff
+import memory_reference
+from conftest import EXPERIMENTS
 from foamfit.springs.chain import Drive
 from foamfit.springs.spring import Spring
-from memory_reference import Array, follow
+
+sys.path.insert(0, str(EXPERIMENTS / "stability"))
+from independent import Array, follow
 
 AREA = 1.9635e-5
 TIME = np.linspace(0.0, 3e-3, 61)
@@ -146,21 +151,20 @@ def with_value(given: ff.Chain, name: str, value: float) -> ff.Chain:
 
 
 # The others differ in little; all are within the error that is asked for.
-QUICK = [
-    "impact, sharp", "impact, wide", "impact, hysteretic below", "impact, hysteretic above",
-    "impact, reversible", "impact, sharp and wholly snapped", "impact, bistable relaxing, dashpot",
-    "impact on two microscale", "impact, one of two damped",
-    "impact, interior mass, two microscale", "impact on three", "motion of two, bistable",
-    "motion of two, both damped", "stress, relaxing", "stress on two, one damped",
-    "stress, viscous top", "impact, unilateral base", "impact, unilateral base, interior mass",
-    "impact, gap between masses",
-]  # fmt: skip
+# Where springs turn to and fro by rounding the judge has no say: SciPy, from event to event, has.
+TURNING = ("impact, gap between masses", "stress, viscous top")
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "motion of two"])
 def test_a_motion_is_as_exact_as_asked_for(name: str) -> None:
     given, drive = SCENES[name]
-    moved, pressed, end, _ = follow(given, drive, TIME)
+    if name in TURNING:
+        moved, pressed, end, _ = memory_reference.follow(given, drive, TIME)
+    else:
+        truth = follow(given, drive, TIME)
+        assert not truth.why
+        moved, pressed = truth.displacement, truth.base_stress
+        end = np.nan if truth.contact_end is None else truth.contact_end
     for rtol in (1e-4, 1e-6, 1e-8):
         got = ff.simulate(given, drive, TIME, rtol)
         assert difference(pressed, got.base_stress) < rtol

@@ -17,10 +17,8 @@ from conftest import EXPERIMENTS
 
 sys.path.insert(0, str(EXPERIMENTS / "stability"))
 import fresh
-import independent_memory
 from energy import rebound_of
-from independent import over_range
-from independent_memory import follow
+from independent import follow, over_range
 
 # Spreads that meet far away; snap-through wider than snap-back, and the other way round; a snap
 # within a thousandth of a stress; snap-back above snap-through at most ranks.
@@ -107,16 +105,6 @@ def test_the_judge_keeps_energy(law: tuple[float, ...]) -> None:
     flown = np.diff(truth.displacement[-1, -2:])[0] / np.diff(time[-2:])[0]
     assert -flown == pytest.approx(bounced[1], rel=1e-9)
     assert bounced[1] < drive.velocity  # the loop keeps something
-
-
-def test_the_judge_agrees_with_that_of_springs_without_memory() -> None:
-    for family, number in (("base", 20), ("turns", 4), ("long", 24)):
-        scene = fresh.scene_from(fresh.spec_of(family, number))
-        one, other = fresh.follow(*scene), independent_memory.follow(*scene)
-        assert over_range(other.base_stress, one.base_stress) <= 1e-11
-        assert over_range(other.displacement, one.displacement) <= 1e-11
-        if one.contact_end is not None:
-            assert other.contact_end == pytest.approx(one.contact_end, rel=1e-11)
 
 
 # ----------------------------------------------------------------------------------- closed forms

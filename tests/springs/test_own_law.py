@@ -118,6 +118,21 @@ def test_steps_of_any_law_agree_with_the_solver_of_the_papers_laws(
 NAMES = ("s1_k0", "s1_eta")
 
 
+def test_a_derivative_at_a_limit_of_a_law_is_one_sided() -> None:
+    """Δσ may not be positive: beside 0 there is one side."""
+    spring = ff.BistableSpring(5.5e6, 82.5e6, 0.0, 0.14, 0.31, 14.3e6, 2.34e6)
+    clone = copy_of("bistable")
+    time = np.linspace(0.0, 1.0, 81)
+    drive = ff.DisplacementDrive(4e-4 * np.sin(np.pi * time) ** 2)
+    one, other = (
+        ff.simulate(ff.Chain([of], [1e-3], 1e-5), drive, time, sensitivities=["s1_dsigma"])
+        .sensitivities["s1_dsigma"].base_stress
+        for of in (spring, clone.make(spring.values, ()))
+    )  # fmt: skip
+    assert np.abs(one).max() > 0.5
+    np.testing.assert_allclose(other, one, rtol=0, atol=1e-3)
+
+
 def test_a_law_stands_in_a_chain(bouc_wen: Law) -> None:
     springs = [ff.LinearSpring(4e6), bouc_wen.make(VALUES, ())]
     time = np.linspace(0.0, 1.0, 101)
@@ -150,6 +165,7 @@ def test_a_wrong_law_gets_one_sentence(bouc_wen: Law) -> None:
     first = bouc_wen.params[0]
     wrong = {
         "the function settle is missing": changed(bouc_wen, functions=of._replace(settle=None)),
+        "a function goes beyond": changed(bouc_wen, states=3),
         "the stress falls on loading": changed(bouc_wen, functions=of._replace(settle=_falling)),
         "the stress is not finite": changed(bouc_wen, functions=of._replace(settle=_infinite)),
         "the name is that of a law of foamfit": changed(bouc_wen, kind="bistable"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import errno
-import itertools
 import json
 import os
 import re
@@ -14,8 +13,9 @@ import sys
 import threading
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -525,31 +525,22 @@ class Local(Inline):
         """Nothing to end."""
 
 
-def test_progress_says_done_wrong_left_and_how_long(monkeypatch):
+def test_progress_says_done_wrong_left_and_how_long(here, monkeypatch):
     shown = []
+    line = SimpleNamespace(progress=lambda share, what: shown.append((share, what)))
+    monkeypatch.setattr(command, "progress_line", lambda *_: nullcontext(line))
 
-    class Bar:
-        pos = 0
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            pass
-
-        def update(self, n):
-            shown.append(self.label)
-
-    monkeypatch.setattr(command.sys, "stderr", type("T", (), {"isatty": lambda _: True})())
-    monkeypatch.setattr(command.click, "progressbar", lambda **_: Bar())
-    clock = itertools.count(0, 60)
-    monkeypatch.setattr(command.time, "monotonic", lambda: next(clock))
-    with command._progress_line(False) as progress:
+    def fitted(*_, progress, **__):
         progress(module.State(done=4, wrong=1, left=6, fitted=2))
         progress(module.State(done=10, wrong=1, left=0, fitted=8))
+        return SimpleNamespace(summary=[], out=here)
+
+    monkeypatch.setattr(module, "run", fitted)
+    run("batch", "tests", "--json")
+    # What an earlier call has done does not count for the time left.
     assert shown == [
-        "4 done, 1 without a fit, 6 left, about 3 min",
-        "10 done, 1 without a fit, 0 left",
+        (0.25, "4 done, 1 without a fit, 6 left"),
+        (1.0, "10 done, 1 without a fit, 0 left"),
     ]
 
 

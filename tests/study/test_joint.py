@@ -532,12 +532,12 @@ def test_joint_json_has_how_parameters_vary_together(found):
     np.testing.assert_allclose(read_source(found).together, matrix)
 
 
-@pytest.mark.parametrize("step", ["_evidence", "_conclude", "fit_jointly"])
+@pytest.mark.parametrize("step", ["joint_fit.evidence", "_conclude", "fit_jointly"])
 def test_what_was_found_is_on_disk_whatever_fails_then(folder, tmp_path, monkeypatch, step):
     def fails(*_, **__):
         raise OverflowError("math range error")
 
-    monkeypatch.setattr(joint_module, step, fails)
+    monkeypatch.setattr(f"foamfit.study.joint.{step}", fails)
     study = write_study(folder, 's1_k0 = "shared"\ns1_kc = 4e5' + SHARED)
     result = run("joint", study, "--out", tmp_path / "out", "--jobs", 1)
     file = tmp_path / "out.found.json"

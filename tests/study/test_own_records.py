@@ -8,6 +8,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -279,7 +280,7 @@ def test_richer_models_start_from_the_contact_that_simpler_ones_found(fitted):
 
     model = Model.parse("linear+bistable")
     params = ff.make_params(fitted.measurement, model)
-    _carry(params, model, fitted)
+    _carry(params, model, [SimpleNamespace(result=fitted, chisqr=1.0)])
     for name in ("contact_time", "displacement_zero"):
         assert params[name].value == fitted.params[name].value
         assert params[name].min < params[name].value < params[name].max

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from foamfit.trust.covariance import covariance, half_width, state
-from foamfit.trust.residuals.noise_process import autocorrelation_time
+from foamfit.trust.covariance import Block, Uncertainty, covariance, half_width, state
+from foamfit.trust.residuals.noise_process import NoiseProcess, autocorrelation_time
 
 
 def ar1(n: int, rho: float, seed: int) -> np.ndarray:
@@ -125,6 +125,8 @@ def test_hopeless_intervals_are_told_in_numbers_that_can_be_read(half, told):
 
 def test_parameters_that_no_curve_follows_have_no_covariance():
     flat, ones = np.zeros((50, 2)), np.ones(50)
-    found = covariance(flat, ones, (50,), np.ones(2), gradient=lambda step: 0.0 * step)
+    noise = [NoiseProcess(np.empty(0), 1.0)]
+    block = Block(flat, ones, (50,), noise, np.eye(2), gradient=lambda _, step: 0.0 * step)
+    found = Uncertainty((block,), np.ones(2)).covariance
     assert np.isnan(found.matrix).all()
     assert np.isnan(found.inflation).all()

@@ -6,6 +6,7 @@ import csv
 import importlib.util
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,11 +30,12 @@ from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord, Tracker
 from foamfit.one_model import Found, judge
 from foamfit.report.identifiability_plots import plot_profiles
+from foamfit.results import Profile
 from foamfit.trust import intervals, resample
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.intervals import Choice, assess
-from foamfit.trust.profile import departures, profile
+from foamfit.trust.profile import Tracing, departures
 from foamfit.trust.ranges import Open
 from foamfit.trust.refit import Refit
 from foamfit.trust.resample import block_length, bootstrap, mcmc
@@ -43,6 +45,12 @@ from foamfit.trust.residuals.noise_process import NoiseProcess, noise_process
 def autoregressive(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
     white = rng.standard_normal(n + 500)
     return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white)[500:]
+
+
+def profile(best: BestPoint, name: str, minima: Sequence[np.ndarray] = ()) -> Profile:
+    tracing = Tracing(best, name, Tracker(best.problem.objective))
+    tracing.follow(minima)
+    return tracing.profile
 
 
 @dataclass(eq=False)
@@ -97,7 +105,7 @@ class Bench:
         return np.ones(len(names))
 
     def space(self) -> Any:
-        return SimpleNamespace(complete=lambda values: values)
+        return SimpleNamespace(complete=lambda values: values, admit=lambda values, held: values)
 
     @property
     def linear(self) -> Bench:

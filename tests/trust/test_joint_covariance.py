@@ -50,34 +50,37 @@ def point():
     return JointPoint(found, errors_of(found))
 
 
-def test_blocks_give_the_dense_sandwich(point):
-    blocks, s, q = point.blocks, len(point.names), 2
-    size = s + 3 * q
-    hessian, meat = np.zeros((size, size)), np.zeros((size, size))
-    for t, block in enumerate(blocks):
-        at = [*range(s), *range(s + q * t, s + q * (t + 1))]
-        hessian[np.ix_(at, at)] += block.slopes.T @ block.slopes
-        meat[np.ix_(at, at)] += block.slopes.T @ block.times(block.slopes)
+def test_the_covariance_is_the_sandwich_of_all_residuals(point):
+    blocks, plain, s = point.uncertainty.blocks, point.uncertainty.plain, len(point.names)
+    slopes = [block.jacobian @ block.through for block in blocks]
+    hessian = sum(one.T @ one for one in slopes)
+    meat = sum(
+        one.T @ process.times(one)
+        for one, block in zip(slopes, blocks, strict=True)
+        for process in block.noise
+    )
     inverse = np.linalg.inv(hessian)
-    dense = inverse @ meat @ inverse
-    arrow = point._plain
-    assert arrow.shared == pytest.approx(dense[:s, :s], rel=1e-6)
-    for t in range(3):
-        at = [*range(s), *range(s + q * t, s + q * (t + 1))]
-        assert arrow.of_test(t) == pytest.approx(dense[np.ix_(at, at)], rel=1e-6)
-        assert arrow.inverse(t) == pytest.approx(inverse[np.ix_(at, at)], rel=1e-6)
-    places = [s + q * t + 1 for t in range(3)]
-    matrix, bread = arrow.across([1, 1, 1])
-    assert matrix == pytest.approx(dense[np.ix_(places, places)], rel=1e-6)
-    assert bread == pytest.approx(inverse[np.ix_(places, places)], rel=1e-6)
+    assert hessian.shape == (s + 3 * 2,) * 2
+    assert plain.inverse == pytest.approx(inverse, rel=1e-6)
+    assert plain.matrix == pytest.approx(inverse @ meat @ inverse, rel=1e-6)
+    value = np.array([values[point.bests[0].index["s1_kh_plus"]] for values in point.found.values])
+    places = [s + 2 * t + 1 for t in range(3)]
+    matrix, bread = point.of_logarithms("s1_kh_plus")
+    scales = point.uncertainty.scales[places] / value
+    assert matrix == pytest.approx(
+        plain.matrix[np.ix_(places, places)] * np.outer(scales, scales), rel=1e-6
+    )
+    assert bread == pytest.approx(
+        inverse[np.ix_(places, places)] * np.outer(scales, scales), rel=1e-6
+    )
 
 
 def test_the_slope_of_a_law_has_its_error(point):
-    error, freedom = point.covariance.of_common("s1_k0:b")
+    error, freedom = point.of_common("s1_k0:b")
     assert 1e-4 < error < 0.02
     assert 20 < freedom < 600
-    assert point.covariance.of_common("s1_eps_c")[0] != point.covariance.of_common("s1_eps_c")[0]
-    assert point.covariance.of_test(0, "s1_eps_c")[0] > 0.0
+    assert point.of_common("s1_eps_c")[0] != point.of_common("s1_eps_c")[0]
+    assert point.of_test(0, "s1_eps_c")[0] > 0.0
 
 
 @pytest.mark.parametrize("kind", ["log rate", "power rate"])
@@ -88,7 +91,7 @@ def test_the_error_of_a_rate_is_in_that_of_the_slope(kind):
     errors, step = np.array([0.0, 0.03, 0.06]), 1e-3
     found = fit_linked(problems, Links(kinds, X, rate_errors=errors), [vectors])
     sure = replace(found, links=replace(found.links, rate_errors=None))
-    with_rates, without = (JointPoint(one, errors_of(one)).covariance for one in (found, sure))
+    with_rates, without = (JointPoint(one, errors_of(one)) for one in (found, sure))
     moved = np.array([
         np.subtract(*(
             fit_linked(
@@ -109,9 +112,9 @@ def test_one_test_alone_has_the_covariance_of_its_own_fit():
     kinds = dict.fromkeys(problems[0].free(), "shared")
     joint = fit_jointly(problems, Links(kinds), [vectors])
     alone = BestPoint(problems[0], joint.found.values[0])
-    errors = [joint.covariance.of_common(name)[0] for name in alone.names]
+    errors = [joint.point.of_common(name)[0] for name in alone.names]
     assert errors == pytest.approx(alone.spread.stderr, rel=1e-3)
-    freedom = [joint.covariance.of_common(name)[1] for name in alone.names]
+    freedom = [joint.point.of_common(name)[1] for name in alone.names]
     assert freedom == pytest.approx(alone.spread.freedom, rel=0.05)
 
 
@@ -120,8 +123,8 @@ def test_four_tests_of_one_foam_have_half_the_error_of_one():
     for seed in range(20):
         problems, vectors = loops_of([{}] * 4, 2e4, seed)
         kinds = dict.fromkeys(problems[0].free(), "shared")
-        four = fit_jointly(problems, Links(kinds), [vectors]).covariance
-        one = fit_jointly(problems[:1], Links(kinds), [vectors[:1]]).covariance
+        four = fit_jointly(problems, Links(kinds), [vectors]).point
+        one = fit_jointly(problems[:1], Links(kinds), [vectors[:1]]).point
         ratios.append([four.of_common(n)[0] / one.of_common(n)[0] for n in kinds])
     assert np.mean(ratios) == pytest.approx(0.5, rel=0.05)
 
@@ -138,8 +141,8 @@ def test_what_no_test_reaches_has_no_error():
     ]
     kinds = dict.fromkeys(problems[0].free(), "shared")
     joint = fit_jointly(problems, Links(kinds), [vectors])
-    assert np.isfinite(joint.covariance.of_common("s1_k0")[0])
-    assert np.isnan(joint.covariance.of_common("s1_kc")[0])
+    assert np.isfinite(joint.point.of_common("s1_k0")[0])
+    assert np.isnan(joint.point.of_common("s1_kc")[0])
 
 
 def test_beside_an_error_of_the_law_tests_add_up_as_well():
@@ -159,5 +162,5 @@ def test_beside_an_error_of_the_law_tests_add_up_as_well():
     point = JointPoint(found, tuple(best.errors for best in alone))
     assert all(error.found for errors in point.errors for error in errors)
     wanted = np.sqrt(np.mean([best.spread.stderr**2 for best in alone], axis=0) / 3.0)
-    errors = [point.covariance.of_common(name)[0] for name in problems[0].free()]
+    errors = [point.of_common(name)[0] for name in problems[0].free()]
     assert errors == pytest.approx(wanted, rel=0.05)

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 import foamfit as ff
-from conftest import DATA, EXPERIMENTS, needs_data
+from conftest import EXPERIMENTS, needs_data
 from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.fitting.box import Scales
@@ -25,7 +25,15 @@ from foamfit.report.readable import readable
 from foamfit.springs.laws.bistable import read_off
 from foamfit.springs.loop import Loop
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import NOTHING, RULE, WEAK, covariance, half_width
+from foamfit.trust.covariance import (
+    NOTHING,
+    RULE,
+    WEAK,
+    Block,
+    Uncertainty,
+    covariance,
+    half_width,
+)
 from foamfit.trust.intervals import Choice
 from foamfit.trust.ranges import ALIKE, alike, left_open, tolerance
 from foamfit.trust.refit import Refit
@@ -101,20 +109,23 @@ def test_the_curvature_that_a_residual_leaves_is_in_the_covariance():
     best = least_squares(residual, [0.8], jac=slopes, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
     left, jacobian = residual(best), slopes(best)
     white = [NoiseProcess(np.empty(0), 1e-4)] * 2
-    found = covariance(
-        jacobian, left, (400, 400), np.ones(1), white,
-        lambda step: slopes(best + step).T @ residual(best + step),
+    one = Uncertainty(
+        (
+            Block(
+                jacobian, left, (400, 400), white, np.eye(1),
+                lambda _, step: slopes(best + step).T @ residual(best + step),
+            ),
+        ),
+        np.ones(1),
     )  # fmt: skip
+    found, plain = one.bent.covariance(one.scales), one.plain.covariance(one.scales)
     square = float(np.sum(jacobian**2))
     curvature = square + 2.0 * float(t @ left[:400])
     assert abs(curvature / square - 1.0) > 5e-3
     assert found.matrix[0, 0] == pytest.approx(1e-4 * square / curvature**2, rel=1e-4)
     # A rise of the cost by a χ² of one is one standard error on its parabola.
     assert found.inflation[0] == pytest.approx(found.matrix[0, 0] * curvature, rel=1e-4)
-    plain = covariance(jacobian, left, (400, 400), np.ones(1), white)
-    assert plain.with_some(np.array([0]), found).matrix[0, 0] == pytest.approx(
-        max(plain.matrix[0, 0], found.matrix[0, 0])
-    )
+    assert one.covariance.matrix[0, 0] == pytest.approx(max(plain.matrix[0, 0], found.matrix[0, 0]))
 
 
 # ---------------------------------------------------------------- on tests
@@ -362,8 +373,8 @@ def test_the_search_finds_the_soft_branch_c():
 
 
 @needs_data
-def test_twins_get_the_same_states():
-    rows = law_error.twins(DATA, ("turbo-comp", "leap-comp", "worn-heel-comp"))
+def test_twins_get_the_same_states(thin_foams):
+    rows = law_error.twins(thin_foams, ("turbo-comp", "leap-comp", "worn-heel-comp"), starts=4)
     cells = law_error.repeat(rows)
     assert cells["same"].sum() >= 0.85 * cells["specimens"].sum()
     near, close = cells[cells["scatter"] <= 0.15], cells[cells["scatter"] <= 0.10]

@@ -1,47 +1,42 @@
 """`foamfit check`: what the loader understood of a test, and what the test can tell."""
 
-# ruff: noqa: D301  (a \b keeps click from joining the lines of an example)
-
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-import click
-
+from foamfit.cli import options
 from foamfit.cli.group import main
-from foamfit.cli.options import (
-    DRIVE,
-    FILE,
-    PLOT,
-    RELAXATION,
-    SPECIMEN,
-    TEST,
-    WIDTH,
-    check_files,
-    compiling,
-)
 from foamfit.errors import InputError
 from foamfit.terminal import say
 
 
 @main.command()
-@TEST
-@SPECIMEN
-@click.option("--model", help="Also estimate what the test determines of this model.")
-@DRIVE
-@RELAXATION
-@click.option("--published", "published_set", metavar="NAME", help="Start from a published set.")
-@click.option(
-    "--params", metavar="RESULT", type=FILE,
-    help="Start from an earlier result. Default: a quick descent from the measured loop.",
-)  # fmt: skip
-@PLOT
-@WIDTH
+@options.TEST
+@options.SPECIMEN
+@options.option("--model", "Also estimate what the test determines of this model.", str)
+@options.DRIVE
+@options.RELAXATION
+@options.option("--published", "Start from a published set.", str, metavar="NAME")
+@options.option(
+    "--params",
+    "Start from an earlier result. Default: a quick descent from the measured loop.",
+    options.FILE,
+    metavar="RESULT",
+)
+@options.PLOT
+@options.WIDTH
 def check(
-    test: Path, specimen: Path | None, model: str | None, drive: str | None,
-    published_set: str | None, params: Path | None, plot: Path | None, figure_width: str,
+    test: Path,
+    specimen: Path | None,
+    model: str | None,
+    drive: str | None,
     relaxation: int,
-) -> None:  # fmt: skip
+    published: str | None,
+    params: Path | None,
+    plot: Path | None,
+    figure_width: str,
+) -> None:
     """Say what the loader understood of TEST.csv: columns, contact, specimen, energy.
 
     With --model also what the test determines: the velocity that closes the loop, the standard
@@ -59,41 +54,33 @@ def check(
     from foamfit.data.energy import audit
 
     if model is None:
-        given: dict[str, object] = {
-            "drive": drive, "published": published_set, "params": params, "plot": plot,
-            "relaxation": relaxation or None,
-        }  # fmt: skip
-        for option, value in given.items():
+        given = {"drive": drive, "published": published, "params": params, "plot": plot}
+        for name, value in (given | {"relaxation": relaxation or None}).items():
             if value is not None:
-                raise InputError(f"--{option} needs --model; give one, as --model bistable")
-    check_files(None, plot, ())
-    if published_set is not None and params is not None:
+                raise InputError(f"--{name} needs --model; give one, as --model bistable")
+    options.check_files(None, plot, ())
+    if published is not None and params is not None:
         raise InputError("--published and --params exclude each other; give one of them")
-    description = ""
+    told = []
     if model is None or test.suffix.lower() != ".toml":
         measurement = read_test(test, specimen)
-        description = describe(measurement, audit(measurement), exact=model is None) + "\n"
+        told.append(describe(measurement, audit(measurement), exact=model is None))
     if model is None:
-        say(description, newline=False)
+        say(told[0])
         return
+    from foamfit.report.identifiability_plots import plot_insight
     from foamfit.report.outlook import outlook_of, outlook_text
 
-    with compiling(False, model, relaxation) as compile_rest:
+    with options.compiling(False, model, relaxation) as compile_rest:
         compile_rest()
-    outlook = outlook_of(
-        test, specimen, model, drive, published_set=published_set, result=params,
-        relaxation=relaxation,
-    )  # fmt: skip
-    if description:
-        say(description)
-    say(outlook_text(outlook))
-    if plot is not None:
-        from foamfit.report.identifiability_plots import plot_insight
-
-        name, insight = outlook.problem.measurement.name, outlook.planned.insight
-        if insight is None:
-            say("\nnothing is drawn: no parameter changes the curves")
-        else:
-            title = f"{name} · {outlook.problem.model.name} · before the fit"
-            plot_insight(insight, title=title, path=plot, width=figure_width)
-            say(f"\ndrawn in {plot}, its data in {plot.with_suffix('.csv')}")
+    start: dict[str, Any] = {"published_set": published, "result": params, "relaxation": relaxation}
+    outlook = outlook_of(test, specimen, model, drive, **start)
+    told.append(outlook_text(outlook))
+    insight, problem = outlook.planned.insight, outlook.problem
+    if plot is not None and insight is None:
+        told.append("nothing is drawn: no parameter changes the curves")
+    elif plot is not None and insight is not None:
+        title = f"{problem.measurement.name} · {problem.model.name} · before the fit"
+        plot_insight(insight, title=title, path=plot, width=figure_width)
+        told.append(f"drawn in {plot}, its data in {plot.with_suffix('.csv')}")
+    say("\n\n".join(told))

@@ -1,31 +1,34 @@
 """`foamfit compare` and `foamfit published`: fitted beside published parameters."""
 
-# ruff: noqa: D301  (a \b keeps click from joining the lines of an example)
-
 from __future__ import annotations
 
 from pathlib import Path
 
 import click
 
+from foamfit.cli import options
 from foamfit.cli.group import main
-from foamfit.cli.options import FILE, PLOT, WIDTH, check_files
 from foamfit.terminal import say
 
 
 @main.command()
-@click.argument("results", metavar="RESULT [RESULT …]", nargs=-1, required=True, type=FILE)
-@click.option(
-    "--published", "name", metavar="NAME",
-    help="The published set to compare with. Default: the one that the name of the test contains.",
-)  # fmt: skip
-@PLOT
-@WIDTH
-@click.option("--csv", "table", type=FILE, help="Also write a table.")
+@click.argument("results", metavar="RESULT [RESULT …]", nargs=-1, required=True, type=options.FILE)
+@options.option(
+    "--published name",
+    "The published set to compare with. Default: the one in the name of the test.",
+    str,
+    metavar="NAME",
+)
+@options.PLOT
+@options.WIDTH
+@options.option("--csv table", "Also write a table.", options.FILE)
 def compare(
-    results: tuple[Path, ...], name: str | None, plot: Path | None, figure_width: str,
+    results: tuple[Path, ...],
+    name: str | None,
+    plot: Path | None,
+    figure_width: str,
     table: Path | None,
-) -> None:  # fmt: skip
+) -> None:
     """Put result folders beside the published parameters, or beside the first of them.
 
     \b
@@ -36,7 +39,8 @@ def compare(
     from foamfit.report.comparison import compare as side_by_side
     from foamfit.report.comparison import comparison_text, plot_comparison, write_csv
 
-    own = check_files(table, plot, [p / "fit.json" if p.is_dir() else p for p in results])
+    read = [path / "fit.json" if path.is_dir() else path for path in results]
+    own = options.check_files(table, plot, read)
     comparison = side_by_side(results, name)
     say(comparison_text(comparison))
     if plot is not None:

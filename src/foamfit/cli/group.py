@@ -1,7 +1,5 @@
 """The command `foamfit` itself: its help, its exit codes, and how every refusal is one sentence."""
 
-# ruff: noqa: D301  (a \b keeps click from joining the lines of an example)
-
 from __future__ import annotations
 
 import atexit
@@ -23,8 +21,31 @@ from foamfit.terminal import TerminatedError, ending_cleanly, say, show_all
 WRONG, NOT_ACCEPTABLE, DEFECT, SIGNALLED = 1, 2, 70, 128
 
 
+def _load_laws(context: click.Context, option: click.Parameter, files: tuple[str, ...]) -> None:
+    """Make the laws in the user's files known before anything else is done."""
+    if files:
+        from foamfit.springs import laws
+
+        for file in files:
+            laws.load_file(file)
+
+
 class _Group(click.Group):
-    """A command group whose every refusal is one sentence with its exit code."""
+    """A group whose commands all take --law, and whose every refusal is one sentence."""
+
+    def add_command(self, cmd: click.Command, name: str | None = None) -> None:
+        cmd.params.append(
+            click.Option(
+                ["--law"],
+                multiple=True,
+                metavar="FILE.py",
+                is_eager=True,
+                expose_value=False,
+                callback=_load_laws,
+                help="Make the laws of springs in a Python file of yours known; it is run.",
+            )
+        )
+        super().add_command(cmd, name)
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         kwargs["standalone_mode"] = False
@@ -85,7 +106,7 @@ def _one_sentence(error: click.ClickException) -> str:
     "foamfit",
     cls=_Group,
     invoke_without_command=True,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
 )
 @click.version_option(package_name="foamfit", message="foamfit %(version)s")
 @click.pass_context

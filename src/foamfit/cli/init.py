@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from foamfit.cli import options
 from foamfit.cli.group import main
-from foamfit.cli.options import TEST
 from foamfit.errors import InputError
 from foamfit.terminal import say
 
 
 @main.command()
-@TEST
+@options.TEST
 def init(test: Path) -> None:
     """Write TEST.toml beside TEST.csv: what was understood, and questions for the rest.
 
@@ -20,8 +20,8 @@ def init(test: Path) -> None:
 
     Example: foamfit init TEST.csv
     """
-    from foamfit.data.csv_table import read_text
-    from foamfit.data.draft import draft
+    from foamfit.data.tables.csv_table import read_text
+    from foamfit.data.tables.draft import draft
     from foamfit.data.toml_file import toml_beside
     from foamfit.files import reason
 

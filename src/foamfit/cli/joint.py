@@ -1,51 +1,26 @@
 """`foamfit joint`: several tests in one fit."""
 
-# ruff: noqa: D301  (a \b keeps click from joining the lines of an example)
-
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
+from foamfit.cli import options
 from foamfit.cli.group import NOT_ACCEPTABLE, main
-from foamfit.cli.options import (
-    FILE,
-    NO_REPORT,
-    OPEN,
-    WIDTH,
-    check_open,
-    compiling,
-    spare,
-    tell_written,
-)
+from foamfit.cli.options import Output
 from foamfit.cli.progress import progress_line
-from foamfit.errors import InputError
-from foamfit.terminal import say, without_ctrl_c
-
-if TYPE_CHECKING:
-    from foamfit.study.joint import JointResult
+from foamfit.terminal import say
 
 
 @main.command()
-@click.argument("study", metavar="STUDY.toml", type=FILE)
-@click.option("--out", type=FILE, help="Result folder. Default: fits/<STUDY>.")
-@click.option(
-    "--jobs", type=click.IntRange(min=1), help="Processes. Default: one for each core."
-)  # fmt: skip
-@click.option(
-    "--seed", type=click.IntRange(min=0), help="Same tests and seed, same numbers. Default: 0."
+@click.argument("study", metavar="STUDY.toml", type=options.FILE)
+@options.option("--jobs", "Processes. Default: one for each core.", options.COUNT)
+@options.option(
+    "--seed", "The same tests and seed give the same numbers. Default: 0.", options.WHOLE
 )
-@NO_REPORT
-@WIDTH
-@OPEN
-@click.option("--json", "as_json", is_flag=True, help="Print joint.json on stdout, nothing else.")
-@click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
-def joint(
-    study: Path, out: Path | None, jobs: int | None, seed: int | None,
-    no_report: bool, figure_width: str, as_json: bool, quiet: bool,
-) -> int:  # fmt: skip
+@options.output("fits/<STUDY>", "joint.json")
+def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> int:
     """Fit the tests of STUDY.toml together: shared, own, scattering, rate-dependent parameters.
 
     Writes joint.json, joint.html, joint.png and a result folder for each test. Exit codes are those
@@ -69,51 +44,32 @@ def joint(
         s1_eps_star = 0.3                       # held at a number (SI)
     Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
     """
-    check_open(as_json)
-    from foamfit.report.folder import save_somewhere, try_target
-
-    folder = Path("fits", study.stem) if out is None else out
-    try_target(folder)
+    output.check()
+    folder = output.folder(Path("fits", study.stem), [study])
     from foamfit.study.study_file import read_study
 
     read = read_study(study)
-    spare(folder, [study, *(path for _, path in read.tests)])
-    with compiling(quiet or as_json, read.model, read.relaxation) as compile_rest:
+    output.folder(folder, [path for _, path in read.tests])
+    with options.compiling(output.silent, read.model, read.relaxation) as compile_rest:
+        from foamfit.report.studies.joint import joint_text
         from foamfit.study.joint import FEW_FOLDERS
         from foamfit.study.joint import joint as fit_jointly
         from foamfit.study.workers import begin
 
         compile_rest()
-        if not no_report:
+        if not output.no_report:
             begin(jobs, len(read.tests), FEW_FOLDERS)
-        with progress_line(quiet or as_json, "joint fit") as shown:
-            result = fit_jointly(
-                read, jobs=jobs, seed=seed, progress=shown.progress, keep=folder
-            )  # fmt: skip
-        try:
-            with progress_line(quiet or as_json, "joint fit") as shown, without_ctrl_c():
-                shown.progress(1.0, "writing the reports")
-                save_somewhere(
-                    result.save, folder, report=not no_report, jobs=jobs, figure_width=figure_width
-                )
-        except InputError:  # the numbers are not lost with the folder
-            _tell(result, as_json, quiet)
-            raise
-    _tell(result, as_json, quiet)
-    tell_written(folder / "joint.html", quiet or as_json)
-    if result.status == "failed":
-        say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
-        return NOT_ACCEPTABLE
-    return 0
-
-
-def _tell(result: JointResult, as_json: bool, quiet: bool) -> None:
-    """Print a result."""
-    if as_json:
-        import json
-
-        say(json.dumps(result.to_json_dict(), allow_nan=False))
-    elif not quiet:
-        from foamfit.report.studies.joint import joint_text
-
-        say(joint_text(result))
+        with progress_line(output.silent, "joint fit") as line:
+            found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress, keep=folder)
+        output.finish(
+            found.save,
+            folder / "joint.html",
+            found.to_json_dict,
+            lambda: joint_text(found),
+            jobs=jobs,
+            figure_width=output.figure_width,
+        )
+    if found.status != "failed":
+        return 0
+    say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
+    return NOT_ACCEPTABLE

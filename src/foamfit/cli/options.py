@@ -1,41 +1,41 @@
-"""What several commands share: options, the compilation at first use, progress, files to write."""
+"""The options of the commands, each declared once, and what several commands do with them."""
 
 from __future__ import annotations
 
+import functools
+import json
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
 from foamfit.files import check_file
-from foamfit.terminal import say
+from foamfit.terminal import say, without_ctrl_c
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from foamfit.study.processes import Processes
 
-FILE = click.Path(path_type=Path)
-TEST = click.argument("test", metavar="TEST.csv", type=FILE)
-SPECIMEN = click.option(
-    "--specimen", metavar="FILE.toml", type=FILE,
-    help="Specimen, striker, columns, noise, window, data. Default: TEST.toml beside the CSV.",
-)  # fmt: skip
-CYCLE = click.option(
-    "--cycle", metavar="N|all",
-    help="Cycle of a slow record: a number, several as 1,2,10, or all. Default: the first.",
-)  # fmt: skip
-PLOT = click.option(
-    "--plot", type=FILE,
-    help="Also draw a PNG, PDF or SVG; what is plotted in it is beside it as CSV.",
-)  # fmt: skip
+Command = Callable[..., Any]
+FILE, WHOLE, COUNT = click.Path(path_type=Path), click.IntRange(min=0), click.IntRange(min=1)
 
 
-def _width(context: click.Context, option: click.Parameter, value: str) -> str:
-    """Refuse what is no width before anything is computed."""
+def option(flag: str, told: str, kind: Any = None, **more: Any) -> Callable[[Command], Command]:
+    """Declare an option with its help; one without a type or a name for its value is a flag."""
+    if kind is None and not more.keys() & {"metavar", "default"}:
+        more["is_flag"] = True
+    return click.option(*flag.split(), type=kind, help=told, **more)
+
+
+def _width(context: click.Context, parameter: click.Parameter, value: str) -> str:
+    """Refuse an inadmissible width before anything is computed."""
     if value not in ("one", "two"):  # these need no import
         from foamfit.report.figures import inches
 
@@ -43,56 +43,192 @@ def _width(context: click.Context, option: click.Parameter, value: str) -> str:
     return value
 
 
-WIDTH = click.option(
-    "--figure-width", metavar="one|two|LENGTH", default="two", show_default=True, callback=_width,
-    help='Width of figures: one column (3.25 in), two (7 in), or a length as "85 mm".',
-)  # fmt: skip
-NO_REPORT = click.option(
-    "--no-report", is_flag=True, help="Tables alone: no report and no figures of each fit."
+TEST = click.argument("test", metavar="TEST.csv", type=FILE)
+SPECIMEN = option(
+    "--specimen",
+    "Specimen, striker, columns, noise, window, data. Default: TEST.toml beside the CSV.",
+    FILE,
+    metavar="FILE.toml",
 )
-_OPENING = "foamfit.open"  # whether the command of a context is to open what it writes
-
-
-def _keep_open(context: click.Context, option: click.Parameter, value: bool) -> None:
-    context.meta[_OPENING] = value
-
-
-OPEN = click.option(
-    "--open", is_flag=True, expose_value=False, callback=_keep_open,
-    help="Open what was found in the browser, also with exit code 2; not together with --json.",
-)  # fmt: skip
-DRIVE = click.option(
+CYCLE = option(
+    "--cycle",
+    "Cycle of a slow record: a number, several as 1,2,10, or all. Default: the first.",
+    metavar="N|all",
+)
+DRIVE = option(
     "--drive",
-    type=click.Choice(["impact", "stress", "displacement"]),
-    help="Default: impact if striker and time are known, else displacement.",
-)  # fmt: skip
-RELAXATION = click.option(
-    "--relaxation", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
-    help="Relaxation terms of every bistable and microscale spring; auto tries one by itself.",
-)  # fmt: skip
+    "Default: impact if striker and time are known, else displacement.",
+    click.Choice(["impact", "stress", "displacement"]),
+)
+RELAXATION = option(
+    "--relaxation",
+    "Relaxation terms of every hysteretic spring; auto tries one by itself.",
+    WHOLE,
+    default=0,
+    metavar="N",
+)
+PLOT = option("--plot", "Also draw a PNG, PDF or SVG; its data go beside it as CSV.", FILE)
+WIDTH = option(
+    "--figure-width",
+    'Width of figures: one column (3.25 in), two (7 in), or a length as "85 mm".',
+    default="two",
+    metavar="one|two|LENGTH",
+    callback=_width,
+)
 
 
-def cycles_of(text: str | None) -> tuple[int | None, tuple[int, ...] | None]:
-    """Read --cycle: the one cycle that is named, or the several that are ("all" names none)."""
-    if text is None or text.strip().lower() == "all":
-        return None, None if text is None else ()
-    parts = text.split(",")
-    if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
-        raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
-    numbers = tuple(int(part) for part in parts)
-    return (None, numbers) if len(numbers) > 1 else (numbers[0], None)
+def together(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Make one decorator of several options; the help lists them in this order."""
+    return lambda command: functools.reduce(lambda f, add: add(f), reversed(options), command)
+
+
+# ---------------------------------------------------------------- what a command writes and prints
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where a command writes its folder, and what it prints of it."""
+
+    out: Path | None
+    no_report: bool
+    figure_width: str
+    opening: bool
+    as_json: bool
+    quiet: bool
+
+    @property
+    def silent(self) -> bool:
+        """Whether nothing is printed but a result as JSON and failures."""
+        return self.quiet or self.as_json
+
+    def check(self, *, without_report: bool = True) -> None:
+        """Refuse --open beside --json (a browser may print too), or where no page is made."""
+        for flag, given in (
+            ("json", self.as_json),
+            ("no-report", self.no_report and not without_report),
+        ):
+            if self.opening and given:
+                raise InputError(f"--open and --{flag} exclude each other; leave one of them out")
+
+    def folder(self, default: Path, inputs: Iterable[Path]) -> Path:
+        """Return the result folder; InputError if it cannot be written or holds an input."""
+        from foamfit.report.folder import try_target
+
+        folder = default if self.out is None else self.out
+        try_target(folder)
+        for path in inputs:
+            if folder.is_dir() and folder.resolve() in path.resolve().parents:
+                raise InputError(
+                    f"{folder} holds {path.name} and would be replaced as a whole; choose another "
+                    "--out"
+                )
+        return folder
+
+    def finish(
+        self,
+        save: Callable[..., object],
+        page: Path,
+        content: Callable[[], Any],
+        text: Callable[[], str],
+        **drawn: Any,
+    ) -> None:
+        """Save a result in the folder of `page`, print it, and say where it is.
+
+        It is printed even if it cannot be saved, so that the numbers are not lost.
+        """
+        from foamfit.report.folder import save_somewhere
+
+        try:
+            with progress_line(self.silent, "result") as line, without_ctrl_c():
+                line.progress(1.0, "writing the report")
+                save_somewhere(save, page.parent, report=not self.no_report, **drawn)
+        finally:
+            self.show(content, text)
+        self.tell_written(page)
+
+    def show(self, content: Callable[[], Any], text: Callable[[], str]) -> None:
+        """Print a result as JSON or as text, whichever is asked for."""
+        if self.as_json:
+            say(json.dumps(content(), allow_nan=False))
+        elif not self.quiet:
+            say(text())
+
+    def tell_written(self, page: Path) -> None:
+        """Say where a result is and which page of it to look at; with --open open that."""
+        if not self.silent:
+            say(f"\nwritten to {page.parent}" + (f": open {page}" if page.is_file() else ""))
+        if not self.opening:
+            return
+        import webbrowser
+
+        try:
+            opened = webbrowser.open(page.resolve().as_uri())
+        except (webbrowser.Error, OSError):
+            opened = False
+        if not opened:
+            say(f"foamfit: no browser could be opened; open {page} by hand", err=True)
+
+
+def output(folder: str, printed: str) -> Callable[[Command], Command]:
+    """Add the options of `Output` to a command, which takes them as `output`.
+
+    `folder` is its default folder and `printed` what --json prints, for the help.
+    """
+    options = together(
+        option("--out", f"Result folder. Default: {folder}.", FILE),
+        option("--no-report", "Tables alone: no report and no figures of each fit."),
+        WIDTH,
+        option("--open opening", "Open what was found in the browser; not together with --json."),
+        option("--json as_json", f"Print {printed} on stdout, nothing else."),
+        option("--quiet", "Print nothing but warnings of failure."),
+    )
+
+    def add(command: Command) -> Command:
+        @functools.wraps(command)
+        def run(**given: Any) -> Any:
+            wanted = Output(**{one.name: given.pop(one.name) for one in fields(Output)})
+            return command(output=wanted, **given)
+
+        return options(run)
+
+    return add
+
+
+def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> bool:
+    """Refuse files that cannot be written, or that are read too, before anything is computed.
+
+    Returns whether the plotted data need a table of their own: `table` may be it already.
+    """
+    given = [path for path in (table, plot) if path is not None]
+    for path in given:
+        check_file(path)
+        if path.resolve() in [source.resolve() for source in inputs]:
+            raise InputError(f"{path} is read by this command and would be lost; name another file")
+    if len({path.resolve() for path in given}) < len(given):
+        raise InputError(f"{given[0]} is named twice; the table and the figure must be two files")
+    if plot is None:
+        return False
+    from foamfit.report.figures import check_table, figure_format
+
+    figure_format(plot)
+    data = plot.with_suffix(".csv")
+    if table is not None and data.resolve() == table.resolve():
+        return False
+    check_table(data)
+    return True
+
+
+# ---------------------------------------------------------------- what runs beside a command
 
 
 @contextmanager
 def compiling(
     quiet: bool, model: str = "bistable", relaxation: int = 0
 ) -> Iterator[Callable[[], None]]:
-    """Compile at first use, beside the body; it calls what is given before it simulates."""
-    import logging
-
+    """Compile at first use, beside the body, which calls what it is given before it simulates."""
     from foamfit.solve import cache, precompile
 
-    if quiet:  # what is compiled later is announced by the log
+    if quiet:  # the log announces what is compiled later
         logging.getLogger("foamfit").setLevel(logging.ERROR)
 
     def tell() -> None:
@@ -104,25 +240,24 @@ def compiling(
 
 
 class Drawers:
-    """Two processes that draw figures, once they have begun and where there are two cores.
+    """Two processes that draw figures, once begun and where there are two cores.
 
-    They import what they need beside the process that begins them, which then need not. Where they
-    cannot be had, or end before they are done, that process draws.
+    They import matplotlib while this process fits. Where they are not available or fail, this
+    process draws.
     """
 
-    def __init__(self) -> None:
-        self._pool: Processes | None = None
+    _pool: Processes | None = None
 
     def begin(self) -> None:
         """Start the processes."""
         from foamfit.study import processes
 
         if processes.cores() > 1:
-            with suppress(OSError):  # the machine gives no more processes
+            with suppress(OSError):  # the system allows no more processes
                 self._pool = processes.Processes(2, processes.DRAWING)
 
     def map(self, draw: Callable[[str], Any], names: Iterable[str]) -> Iterable[Any]:
-        """Begin to draw; what is given is waited for when it is asked for."""
+        """Begin to draw; each figure is waited for when it is asked for."""
         if self._pool is None:
             return map(draw, names)
         begun = [(name, self._pool.submit(draw, name)) for name in names]
@@ -135,10 +270,9 @@ class Drawers:
 
 
 def _drawn(begun: Future[Any], draw: Callable[[str], Any], name: str) -> Any:
-    """What a process has drawn, or else this one draws, and says what is wrong with the figure."""
     try:
         return begun.result()
-    except Exception:
+    except Exception:  # drawing here says what is wrong with the figure, if that is why
         return draw(name)
 
 
@@ -150,59 +284,3 @@ def drawing_beside() -> Iterator[Drawers]:
         yield drawers
     finally:
         drawers.stop()
-
-
-def check_open(as_json: bool, no_report: bool = False) -> None:
-    """Refuse --open where JSON alone is printed (a browser may print too), or no page is made."""
-    for option, given in (("json", as_json), ("no-report", no_report)):
-        if click.get_current_context().meta[_OPENING] and given:
-            raise InputError(f"--open and --{option} exclude each other; leave one of them out")
-
-
-def tell_written(page: Path, silent: bool) -> None:
-    """Say where a result is and which page of it to look at; with --open open that."""
-    if not silent:
-        say(f"\nwritten to {page.parent}" + (f": open {page}" if page.is_file() else ""))
-    if not click.get_current_context().meta[_OPENING]:
-        return
-    import webbrowser
-
-    try:
-        opened = webbrowser.open(page.resolve().as_uri())
-    except (webbrowser.Error, OSError):
-        opened = False
-    if not opened:
-        say(f"foamfit: no browser could be opened; open {page} by hand", err=True)
-
-
-def spare(folder: Path, inputs: Iterable[Path]) -> None:
-    """Refuse a result folder that holds a file which the command reads."""
-    for path in inputs:
-        if folder.is_dir() and folder.resolve() in path.resolve().parents:
-            raise InputError(
-                f"{folder} holds {path.name} and would be replaced as a whole; choose another --out"
-            )
-
-
-def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> bool:
-    """Refuse files that could not be written, or that are read too, before anything is computed.
-
-    Returns whether what is plotted needs a table of its own: `table` may be it already.
-    """
-    given = [path for path in (table, plot) if path is not None]
-    for path in given:
-        check_file(path)
-        if path.resolve() in [source.resolve() for source in inputs]:
-            raise InputError(f"{path} is read by this command and would be lost; name another file")
-    if len({path.resolve() for path in given}) < len(given):
-        raise InputError(f"{given[0]} cannot be two things; name two files")
-    if plot is None:
-        return False
-    from foamfit.report.figures import check_table, figure_format
-
-    figure_format(plot)
-    data = plot.with_suffix(".csv")
-    if table is not None and data.resolve() == table.resolve():
-        return False
-    check_table(data)
-    return True

@@ -1,24 +1,20 @@
 """`foamfit page`: the same in a browser, on this machine."""
 
-# ruff: noqa: D301  (a \b keeps click from joining the lines of an example)
-
 from __future__ import annotations
 
 from pathlib import Path
 
 import click
 
+from foamfit.cli import options
 from foamfit.cli.group import main
-from foamfit.cli.options import FILE
 from foamfit.errors import InputError
 
 
 @main.command()
-@click.argument("test", metavar="[TEST.csv]", type=FILE, required=False)
-@click.option(
-    "--port", type=click.IntRange(1, 65535), help="Port of 127.0.0.1. Default: a free one."
-)
-@click.option("--no-browser", is_flag=True, help="Print the address only; open no browser.")
+@click.argument("test", metavar="[TEST.csv]", type=options.FILE, required=False)
+@options.option("--port", "Port of 127.0.0.1. Default: a free one.", click.IntRange(1, 65535))
+@options.option("--no-browser", "Print the address only; open no browser.")
 def page(test: Path | None, port: int | None, no_browser: bool) -> None:
     """Check, fit and turn the parameters of TEST.csv in a browser.
 

@@ -1,17 +1,16 @@
-"""What a command is at, on one line of its terminal: a bar, the best misfit, the time left."""
+"""What a command is doing, on one line of its terminal: best misfit, time left, a bar, the step."""
 
 from __future__ import annotations
 
 import logging
 import math
-import os
 import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, TextIO
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TextIO
 
 from foamfit.terminal import printable, say
 
@@ -19,17 +18,16 @@ if TYPE_CHECKING:
     from foamfit.arrays import Array
     from foamfit.fitting.problem import Problem
 
-REDRAWN = 0.2  # s between two looks whether the line has changed
-# Simulations for the best misfit take at most this share of the time of a fit, and are no nearer to
-# each other, s.
+REDRAWN = 0.2  # refresh interval, s
+# Simulations for the best misfit take at most this share of the time of a fit, and are at least so
+# many seconds apart.
 SHARE, APART = 0.02, 0.2
-# The time left is told after this share of the work, s; by the pace of this share of the time.
+# The time left is told after this share of the work; its pace is that of this share of the time.
 ENOUGH, RECENT = 0.03, 0.4
-BAR = 24  # characters at most; below a third of it there is none
 
 
 class Progress:
-    """Takes what a fit tells and shows nothing: stderr is no terminal, or is to stay silent."""
+    """Takes what a fit reports and shows nothing: stderr is no terminal, or is to stay silent."""
 
     watch: Callable[[Problem, Array], None] | None = None
 
@@ -37,49 +35,66 @@ class Progress:
         self.says = says
 
     def progress(self, fraction: float, what: str) -> None:
-        """Take how far the command is."""
+        """Take the share of the work that is done, and the present step."""
 
     def tell(self, told: str) -> None:
-        """Print a sentence on stderr, unless nothing is to be said."""
+        """Print a sentence on stderr, unless silence is asked for."""
         if self.says:
             say(f"foamfit: {told}", err=True)
 
 
-class _Above(logging.Handler):
-    """Prints what foamfit logs above a line of progress, not into it."""
+class Watcher(Progress):
+    """Looks at the best point so far a few times a second, for a small share of the time."""
 
-    def __init__(self, line: ProgressLine) -> None:
-        super().__init__(logging.WARNING)
-        self.line = line
+    def __init__(self, says: bool = True) -> None:
+        super().__init__(says)
+        self.watch = self._watch
+        self._best: tuple[Problem, Array] | None = None
+        self._next, self._looked = 0.0, False
 
-    def emit(self, record: logging.LogRecord) -> None:
-        """Print one sentence."""
-        self.line.tell(record.getMessage().removeprefix("foamfit: "))
+    def _watch(self, problem: Problem, values: Array) -> None:
+        self._best = problem, values
+        self.look()
+
+    def look(self) -> None:
+        """Simulate the best point so far, unless that would slow the fit."""
+        if self._best is None or (began := time.monotonic()) < self._next:
+            return
+        (problem, values), self._best = self._best, None
+        if (misfit := problem.objective.look(values, everything=True)) is not None:
+            self.seen(problem, values, misfit)
+        took = time.monotonic() - began if self._looked else 0.0  # the first one loads the solver
+        self._next, self._looked = began + took + max(took / SHARE, APART), True
+
+    def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
+        """Take the best point and its misfits, which count as no step of the fit."""
 
 
-class ProgressLine(Progress):
-    """Keeps one line of a terminal up to date, from a thread: fits may be silent for long.
+class ProgressLine(Watcher):
+    """Keeps one line of a terminal up to date, from a thread: a fit may be silent for long.
 
-    `limit` are the seconds after which the work ends in any case. `name` begins the line. The
-    misfit is the RMS of all fitted curves over their measured ranges.
+    The work ends after `limit` seconds in any case; `name` begins the line. The misfit is the RMS
+    of all fitted curves over their measured ranges.
     """
 
     def __init__(self, stream: TextIO, name: str, limit: float | None = None) -> None:
+        from tqdm import tqdm
+
         super().__init__()
-        self.stream, self.name, self.limit = stream, name, limit
+        self.name, self.limit = name, limit
         self.began = time.monotonic()
         self.fraction, self.what, self.scope = 0.0, "", ""
         self.misfit: float | None = None
         self.marks = deque([(self.began, 0.0)], maxlen=400)
-        self.watch = self._watch
-        self._best: tuple[Problem, Array] | None = None
-        self._next, self._looked, self._shown = 0.0, False, ""
-        self._lock, self._ended = threading.Lock(), threading.Event()
+        self._ended = threading.Event()
+        self._bar: Any = tqdm(
+            total=1.0, file=stream, leave=False, dynamic_ncols=True, bar_format=f"{name}:"
+        )
         self._thread = threading.Thread(target=self._keep, daemon=True)
         self._thread.start()
 
     def progress(self, fraction: float, what: str) -> None:
-        """Take how far the command is: the share of its time, and what is being done."""
+        """Take the share of the work that is done, and the present step."""
         scope = what.rpartition(": ")[0]
         if scope != self.scope and not scope.startswith("model"):
             self.misfit = self._best = None  # it was of another test
@@ -87,35 +102,22 @@ class ProgressLine(Progress):
         if fraction > self.fraction:
             self.fraction = fraction
             self.marks.append((time.monotonic(), fraction))
-        self._look()
+        self.look()
 
-    def _watch(self, problem: Problem, values: Array) -> None:
-        """Take the best point so far."""
-        self._best = problem, values
-        self._look()
-
-    def _look(self) -> None:
-        """Simulate the best point, unless that would slow the fit."""
-        if self._best is None or (began := time.monotonic()) < self._next:
-            return
-        (problem, values), self._best = self._best, None
+    def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
+        """Take the misfit of all fitted curves together."""
         objective = problem.objective
-        if (found := objective.look(values)) is not None:
-            pairs = zip(objective.counted, objective.sizes, strict=True)
-            squares = sum(size * (found[name] or 0.0) ** 2 for name, size in pairs)
-            misfit = math.sqrt(squares / objective.n_data)
-            self.misfit = misfit if self.misfit is None else min(self.misfit, misfit)
-        took = time.monotonic() - began if self._looked else 0.0  # the first one loads the solver
-        self._next, self._looked = began + took + max(took / SHARE, APART), True
+        pairs = zip(objective.counted, objective.sizes, strict=True)
+        squares = sum(size * (misfit[name] or 0.0) ** 2 for name, size in pairs)
+        whole = math.sqrt(squares / objective.n_data)
+        self.misfit = whole if self.misfit is None else min(self.misfit, whole)
 
     def tell(self, told: str) -> None:
         """Print a sentence above the line."""
-        with self._lock:
-            self._write("")
-            super().tell(told)
+        self._bar.write(printable(f"foamfit: {told}"), file=self._bar.fp)
 
     def left(self) -> str:
-        """Say what time is left, by the pace of late and the limit; "" where neither tells."""
+        """Say how much time is left, by the recent pace and the limit; "" if neither tells."""
         if self.fraction >= 1.0:
             return ""
         now, ahead = time.monotonic(), self._ahead()
@@ -125,7 +127,7 @@ class ProgressLine(Progress):
         return f"about {duration(ahead)} left"
 
     def _ahead(self) -> float:
-        """Seconds that are left by the pace of late; infinite where it does not tell."""
+        """Seconds left by the recent pace; infinite where it is not known yet."""
         now, (at, done) = time.monotonic(), self.marks[-1]
         if self.fraction < ENOUGH:
             return math.inf
@@ -133,54 +135,31 @@ class ProgressLine(Progress):
         before = [mark for mark in self.marks if mark[0] <= since] or [self.marks[0]]
         pace = (done - before[-1][1]) / max(at - before[-1][0], 1e-6)
         ahead = (1.0 - done) / pace
-        return max(ahead - (now - at), 0.5 * ahead)  # past that nobody knows
+        return max(ahead - (now - at), 0.5 * ahead)  # a late step makes the pace unknown
 
-    def line(self, width: int) -> str:
-        """Return what is shown in so many columns."""
-        parts = [] if self.misfit is None else [f"best misfit {100.0 * self.misfit:.2g} %"]
-        parts += filter(None, [self.left()])
-        head, tail = printable(f"{self.name}: {self.what}"), ", ".join(parts)
-        room = min(BAR, width - len(head) - len(tail) - 6)
-        if room < BAR // 3:  # what is best and when it ends is worth more than what is done
-            most = width - len(tail) - 3
-            head = head if len(head) <= most else f"{head[: max(most - 1, 0)]}…"
-            return f"{head}  {tail}".rstrip()[: width - 1]
-        done = round(room * min(self.fraction, 1.0))
-        return f"{head} [{'#' * done}{'-' * (room - done)}] {tail}".rstrip()
+    def draw(self) -> None:
+        """Show the line as it is now; a narrow terminal cuts its end."""
+        best = "" if self.misfit is None else f"best misfit {100.0 * self.misfit:.2g} %"
+        told = ", ".join(filter(None, [best, self.left()]))
+        what = printable(self.what).replace("{", "{{").replace("}", "}}")
+        self._bar.bar_format = f"{self.name}: {told and told + ' '}|{{bar}}| {what}"
+        self._bar.n = min(self.fraction, 1.0)
+        self._bar.refresh()
 
     def close(self) -> None:
         """Take the line away."""
         self._ended.set()
         self._thread.join()
-        with self._lock:
-            self._write("")
+        self._bar.close()
 
     def _keep(self) -> None:
         while not self._ended.wait(REDRAWN):
-            with self._lock:
-                if self.what and not self._ended.is_set():
-                    self._write(self.line(_columns(self.stream)))
-
-    def _write(self, line: str) -> None:
-        """Put a line in the place of the one that is shown."""
-        if line == self._shown:
-            return
-        blank = " " * max(len(self._shown) - len(line), 0)
-        with suppress(OSError, ValueError):  # the terminal has gone
-            self.stream.write(f"\r{line}{blank}" + ("" if line else "\r"))
-            self.stream.flush()
-        self._shown = line
-
-
-def _columns(stream: TextIO) -> int:
-    try:
-        return os.get_terminal_size(stream.fileno()).columns or 80
-    except (OSError, ValueError):
-        return 80
+            if self.what:
+                self.draw()
 
 
 def duration(seconds: float) -> str:
-    """Write a time that is only about known."""
+    """Write an approximate time."""
     if seconds < 90:
         return f"{max(seconds, 1.0):.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
@@ -197,11 +176,11 @@ def progress_line(
     if quiet or sys.stderr is None or not sys.stderr.isatty():
         yield Progress(says)
         return
-    line, log = ProgressLine(sys.stderr, name, limit), logging.getLogger("foamfit")
-    above = _Above(line)
-    log.addHandler(above)
-    try:
-        yield line
-    finally:
-        log.removeHandler(above)
-        line.close()
+    from tqdm.contrib.logging import logging_redirect_tqdm
+
+    with logging_redirect_tqdm([logging.getLogger("foamfit")]):
+        line = ProgressLine(sys.stderr, name, limit)
+        try:
+            yield line
+        finally:
+            line.close()

@@ -1,27 +1,24 @@
 """`foamfit simulate`: a forward run of any chain."""
 
-# ruff: noqa: D301  (a \b keeps click from joining the lines of an example)
-
 from __future__ import annotations
 
 from pathlib import Path
 
 import click
 
+from foamfit.cli import options
 from foamfit.cli.group import main
-from foamfit.cli.options import FILE, PLOT, WIDTH, check_files, compiling
 from foamfit.terminal import say
 
 
 @main.command()
-@click.argument("scene", metavar="SCENE.toml", type=FILE)
-@click.option("--out", type=FILE, help="CSV. Default: SCENE.csv here.")
-@PLOT
-@WIDTH
-@click.option(
-    "--rtol", type=click.FloatRange(1e-14, 0.1), default=1e-6, show_default=True,
-    help="Wanted error over the range.",
-)  # fmt: skip
+@click.argument("scene", metavar="SCENE.toml", type=options.FILE)
+@options.option("--out", "CSV. Default: SCENE.csv here.", options.FILE)
+@options.PLOT
+@options.WIDTH
+@options.option(
+    "--rtol", "Wanted error over the range.", click.FloatRange(1e-14, 0.1), default=1e-6
+)
 def simulate(
     scene: Path, out: Path | None, plot: Path | None, figure_width: str, rtol: float
 ) -> None:
@@ -57,10 +54,10 @@ def simulate(
     from foamfit.solve.simulation import simulate as run
 
     target = Path(scene.with_suffix(".csv").name) if out is None else out
-    table = check_files(target, plot, files_of_scene(scene))
+    table = options.check_files(target, plot, files_of_scene(scene))
     if target.is_file():
         check_table(target, RESPONSE, "the response is to go, and is not one; choose another name")
-    with compiling(quiet=False) as compile_rest:
+    with options.compiling(quiet=False) as compile_rest:
         chain, drive, time = read_scene(scene)
         compile_rest()
     response = run(chain, drive, time, rtol)

@@ -11,29 +11,16 @@ import hashlib
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.data.columns import (
-    TWINS,
-    assign_columns,
-    left_out,
-    motion_columns,
-    needed_columns,
-    read_note,
-    scale_spreads,
-    si_factor,
-    sign_advice,
-)
-from foamfit.data.csv_table import Table, find_table, read_numbers, read_text, without_cut_row
-from foamfit.data.draft import without_toml
 from foamfit.data.frames import Frames, join
-from foamfit.data.headers import CHANNELS, example
 from foamfit.data.measurement import (
     MIN_ROWS,
     Dropped,
@@ -46,6 +33,16 @@ from foamfit.data.measurement import (
 from foamfit.data.noise import with_noise
 from foamfit.data.outliers import fresh_samples
 from foamfit.data.prepare import condition, stress_of_motion
+from foamfit.data.tables import columns as named
+from foamfit.data.tables.csv_table import (
+    Table,
+    find_table,
+    read_numbers,
+    read_text,
+    without_cut_row,
+)
+from foamfit.data.tables.draft import without_toml
+from foamfit.data.tables.headers import CHANNELS, example
 from foamfit.data.toml_file import Column, Settings, read_bytes, read_settings, toml_beside
 from foamfit.data.units import LARGEST
 from foamfit.errors import InputError
@@ -88,27 +85,38 @@ def read_test(
     text = read_text(path, "the CSV file of a test", settings.sheet)
     window = settings.window if cycle is None else replace(settings.window, cycle=cycle)
     table = find_table(text, {column.column for column in settings.columns.values()})
-    columns = assign_columns(table, settings.columns, toml)
+    columns = named.assign_columns(table, settings.columns, toml)
     record, notes = _record(table, columns, settings)
-    sha256, spreads = text.sha256, scale_spreads(columns, settings.columns)
-    advice = partial(sign_advice, table, columns, settings.columns)
+    sha256, spreads = text.sha256, named.scale_spreads(columns, settings.columns)
+    advice = partial(named.sign_advice, table, columns, settings.columns)
     if settings.motion is not None:
         moved = _read_motion(path, toml, settings)
         try:
             record, more = join(record, moved.frames)
         except InputError as error:
             raise InputError(f"{toml}: {error}") from None
-        notes, spreads = (*notes, *moved.notes, *more), spreads | moved.spreads
+        notes, spreads = [*notes, *moved.notes, *more], spreads | moved.spreads
         sha256 = hashlib.sha256(f"{sha256} {moved.sha256}".encode()).hexdigest()
         advice = partial(_advice_of, advice, moved.advice)
     try:
         test = condition(
-            record, settings.specimen, striker=settings.striker, window=window, advice=advice,
+            record,
+            settings.specimen,
+            striker=settings.striker,
+            window=window,
+            advice=advice,
             spread=settings.uncertainties.get("velocity", 0.0),
-        )  # fmt: skip
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    _check_noise(toml, settings, test)
+    for channel, unit in (("stress", "Pa"), ("displacement", "m")):
+        size, sigma = float(np.ptp(test.channels()[channel])), getattr(settings.noise, channel)
+        if sigma is not None and sigma > size:
+            raise InputError(
+                f"{toml}: [noise] {channel} = {engineering(sigma, unit)} is "
+                f"{percent(sigma / size, 3)} of the range of the measured {channel}, "
+                f"{engineering(size, unit)}; give one standard deviation."
+            )
     spreads |= settings.uncertainties
     test = replace(test, name=settings.name, path=path, data_sha256=sha256, uncertainties=spreads)
     noise = replace(settings.noise, estimated=test.noise.estimated)
@@ -119,7 +127,7 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
     """Read time and one other channel of a table in SI; a column without a unit is in SI."""
     wanted = f"a CSV with the columns 'time (ms)' and '{example(channel)}'"
     table = find_table(read_text(path, wanted), set())
-    found = assign_columns(table, {}, None)
+    found = named.assign_columns(table, {}, None)
     for name in ("time", channel):
         if name not in found:
             raise InputError(f"{path}: has no column for the {name}; it must be {wanted}.")
@@ -130,16 +138,15 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
     for name, k in columns.items():
         header = table.headers[k]
         in_si = Column(header.text, CHANNELS[name].si) if header.unit is None else None
-        numbers[name] = numbers[name] * si_factor(table, name, k, in_si)
+        numbers[name] = numbers[name] * named.si_factor(table, name, k, in_si)
     return numbers["time"], numbers[channel]
 
 
-@dataclass(frozen=True)
-class _Moved:
+class _Moved(NamedTuple):
     """What the file of [motion] holds; `advice` is that of `sign_advice`."""
 
     frames: Frames
-    notes: tuple[str, ...]
+    notes: list[str]
     spreads: dict[str, float]
     sha256: str
     advice: Callable[[str], str]
@@ -149,32 +156,30 @@ def _read_motion(path: Path, toml: Path, settings: Settings) -> _Moved:
     """Read the motion from the file that [motion] names; `path` is that of the force."""
     motion = settings.motion
     assert motion is not None  # else there is nothing to read
+    name = motion.file.name
     if os.path.realpath(motion.file) == os.path.realpath(path):
         raise InputError(
-            f"{toml}: [motion] file = {motion.file.name!r} is the file of the force; name one of "
-            "its own."
+            f"{toml}: [motion] file = {name!r} is the file of the force; name one of its own."
         )
-    wanted = f"in [motion] file of {toml.name} the CSV file of the motion"
-    text = read_text(motion.file, wanted)
+    text = read_text(motion.file, f"in [motion] file of {toml.name} the CSV file of the motion")
     try:
         table = find_table(text, {column.column for column in motion.columns.values()})
-        needed = motion_columns(table, assign_columns(table, motion.columns, toml))
+        columns = named.assign_columns(table, motion.columns, toml)
+        needed = named.motion_columns(table, columns)
         numbers, _, dropped, notes = _channels(table, needed, motion.columns, settings)
-        advice = partial(sign_advice, table, needed, motion.columns)
     except InputError as error:
         raise InputError(_of_motion(str(error))) from None
     notes += [f"Not used: {item}." for item in dropped]
     top = _one_of(numbers, "displacement", "strain", 1 / settings.specimen.height, "height", notes)
     assert top is not None  # see motion_columns
     inside = {interior_channel(k): w for k, w in _inside(numbers, top, notes).items()}
-    spread = settings.uncertainties.get("delay")
-    name, moved = motion.file.name, {"displacement": top} | inside
+    spread, moved = settings.uncertainties.get("delay"), {"displacement": top} | inside
     return _Moved(
         Frames(name, numbers["time"], moved, motion.delay, spread),
-        tuple(f"{name}: {note}" for note in notes),
-        scale_spreads(needed, motion.columns),
+        [f"{name}: {note}" for note in notes],
+        named.scale_spreads(needed, motion.columns),
         text.sha256,
-        lambda channel: _of_motion(advice(channel)),
+        lambda channel: _of_motion(named.sign_advice(table, needed, motion.columns, channel)),
     )
 
 
@@ -187,20 +192,49 @@ def _advice_of(force: Callable[[str], str], motion: Callable[[str], str], channe
     return (motion if channel.startswith("displacement") else force)(channel)
 
 
-def _record(
-    table: Table, columns: dict[str, int], settings: Settings
-) -> tuple[Record, tuple[str, ...]]:
+def _record(table: Table, columns: dict[str, int], settings: Settings) -> tuple[Record, list[str]]:
     """Read the channels that are needed, in SI, and say what was read from where."""
-    needed = needed_columns(table, columns, settings)
+    needed = named.needed_columns(table, columns, settings)
     numbers, rows, dropped, notes = _channels(table, needed, settings.columns, settings)
     notes += _compare(table, needed, numbers, settings)
+    specimen, striker = settings.specimen, settings.striker or Striker()
     if settings.striker is not None and "time" not in numbers:
         notes.append(
             "Check: there is a [striker], but no column is a time, so that this is taken for a "
             "slow test and the striker is not used; name the time in [columns]."
         )
-    record = _to_record(numbers, settings, notes)
-    return replace(record, numbers=rows, dropped=tuple(dropped)), tuple(notes)
+    # Stress and displacement are derived from the channels that stand for them.
+    stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
+    displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
+    acceleration = numbers.get("acceleration")
+    derived, braked = tuple[str, ...](), stress is None
+    if stress is None:
+        assert striker.mass is not None  # see needed_columns
+        ratio = striker.mass / specimen.area
+        if acceleration is not None:
+            stress, acceleration = acceleration * ratio, None
+            notes.append("The force is the striker's mass times its acceleration.")
+        else:
+            motion = displacement, numbers.get("velocity")
+            stress, derived = stress_of_motion(numbers["time"], *motion, ratio), ("stress",)
+            notes.append(
+                "The force is the striker's mass times the deceleration of its motion, read off a "
+                "smoothing spline; it is no measurement of its own."
+            )
+    record = Record(
+        numbers.get("time"),
+        stress,
+        displacement,
+        numbers.get("velocity"),
+        acceleration,
+        _inside(numbers, displacement, notes),
+        cycle=numbers.get("cycle"),
+        numbers=rows,
+        dropped=tuple(dropped),
+        derived=derived,
+        braked=braked,
+    )
+    return record, notes
 
 
 def _channels(
@@ -208,34 +242,39 @@ def _channels(
 ) -> tuple[dict[str, Array], NDArray[np.int64], list[Dropped], list[str]]:
     """Channels of a table in SI, the numbers of their rows, the rows left out, and notes."""
     table, dropped = without_cut_row(table)
-    headers = table.headers
-    factors = {c: si_factor(table, c, k, given.get(c)) for c, k in needed.items()}
+    factors = {c: named.si_factor(table, c, k, given.get(c)) for c, k in needed.items()}
     numbers, empty = read_numbers(table, needed)
     count = len(next(iter(numbers.values())))
     if count < MIN_ROWS:
         raise InputError(f"{table.path}: has fewer than {MIN_ROWS} rows; a test needs more.")
-    converted = list[str]()
+    notes = [named.read_note(table, needed, given)]
     for channel, values in numbers.items():
-        name = headers[needed[channel]].text
+        header = table.headers[needed[channel]]
+        column, measure = f"{table.path}: column {header.text!r}", header.measure(channel)
         if np.ptp(values) == 0:
-            raise InputError(f"{table.path}: column {name!r} is constant; a {channel} must vary.")
-        measure = headers[needed[channel]].measure(channel)
+            raise InputError(f"{column} is constant; a {channel} must vary.")
         numbers[channel] = _nominal(table.path, measure, values * factors[channel])
         if not 1.0 / LARGEST < np.max(np.abs(numbers[channel])) < LARGEST:
             raise InputError(
-                f"{table.path}: column {name!r} is up to {np.max(np.abs(values)):.3g} in the file, "
-                f"which is no {channel}; correct its numbers, its unit or its scale."
+                f"{column} is up to {np.max(np.abs(values)):.3g} in the file, which is no "
+                f"{channel}; correct its numbers, its unit or its scale."
             )
         if measure:
-            converted.append(f"The strain is converted from the {measure} strain {name!r}.")
-    notes = [read_note(table, needed, given), *converted, *_announced(table, count)]
+            notes.append(f"The strain is converted from the {measure} strain {header.text!r}.")
+    # An instrument's header may announce the number of samples.
+    for row, line in enumerate(table.raw.split(b"\n", table.first_row)[: table.first_row], 1):
+        match = re.match(rb"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE)
+        if match and int(match[1]) != count:
+            told = f"announces {int(match[1])} samples, the table has {count}"
+            notes.append(f"Check: row {row} {told}.")
+            break
     rows = table.row_numbers(count, empty)
     if empty.size:
         dropped.append(Dropped.of(empty, "nothing in the columns that are read"))
     if "time" in numbers:
         if settings.duplicates == "average":
             numbers, rows = _averaged(numbers, rows, dropped, notes)
-        _check_time(table, numbers["time"], headers[needed["time"]].text, rows)
+        _check_time(table, numbers["time"], table.headers[needed["time"]].text, rows)
     return numbers, rows, dropped, notes
 
 
@@ -260,14 +299,14 @@ def _compare(
     """
     notes = list[str]()
     as_used = {"force": 1 / settings.specimen.area, "strain": settings.specimen.height}
-    for channel, k in left_out(table, needed).items():
+    for channel, k in named.left_out(table, needed).items():
         try:
             values = read_numbers(table, {channel: k})[0][channel]
-            values = values * si_factor(table, channel, k, None)
+            values = values * named.si_factor(table, channel, k, None)
             values = _nominal(table.path, table.headers[k].measure(channel), values)
         except InputError:  # it could not have been read
             continue
-        used = TWINS.get(channel, channel)
+        used = named.TWINS.get(channel, channel)
         one, name = numbers[used] * as_used.get(used, 1.0), table.name(k)
         if len(values) != len(one) or (channel == "time" and "time" in settings.columns):
             continue
@@ -290,33 +329,6 @@ def _compare(
     return notes
 
 
-def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) -> Record:
-    """Derive stress and displacement from the channels, in SI, that stand for them."""
-    specimen, mass = settings.specimen, (settings.striker or Striker()).mass
-    stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
-    displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
-    acceleration = numbers.get("acceleration")
-    derived, braked = tuple[str, ...](), stress is None
-    if stress is None:
-        assert mass is not None  # see needed_columns
-        if acceleration is not None:
-            stress, acceleration = acceleration * mass / specimen.area, None
-            notes.append("The force is the striker's mass times its acceleration.")
-        else:
-            motion = displacement, numbers.get("velocity")
-            stress = stress_of_motion(numbers["time"], *motion, mass / specimen.area)
-            derived = ("stress",)
-            notes.append(
-                "The force is the striker's mass times the deceleration of its motion, read off a "
-                "smoothing spline; it is no measurement of its own."
-            )
-    inside = _inside(numbers, displacement, notes)
-    return Record(
-        numbers.get("time"), stress, displacement, numbers.get("velocity"), acceleration, inside,
-        cycle=numbers.get("cycle"), derived=derived, braked=braked,
-    )  # fmt: skip
-
-
 def _inside(numbers: dict[str, Array], top: Array | None, notes: list[str]) -> dict[int, Array]:
     """Displacements of masses inside; one that is that of the top is left out."""
     inside = {}
@@ -327,16 +339,6 @@ def _inside(numbers: dict[str, Array], top: Array | None, notes: list[str]) -> d
         elif node:
             inside[node] = values
     return inside
-
-
-def _announced(table: Table, count: int) -> list[str]:
-    """Compare with the number of samples that an instrument's header announces."""
-    head = table.raw.split(b"\n", table.first_row)[: table.first_row]
-    for row, line in enumerate(head, 1):
-        match = re.match(rb"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE)
-        if match and int(match[1]) != count:
-            return [f"Check: row {row} announces {int(match[1])} samples, the table has {count}."]
-    return []
 
 
 def _averaged(
@@ -393,15 +395,3 @@ def _one_of(
         told = f"The {first} is used rather than the {second}, and they agree to"
         notes.append(f"{told} {apart} of the range.")
     return one
-
-
-def _check_noise(toml: Path, settings: Settings, test: Measurement) -> None:
-    """Refuse a stated noise that is larger than all that was measured."""
-    for channel, unit in (("stress", "Pa"), ("displacement", "m")):
-        size, sigma = float(np.ptp(test.channels()[channel])), getattr(settings.noise, channel)
-        if sigma is not None and sigma > size:
-            raise InputError(
-                f"{toml}: [noise] {channel} = {engineering(sigma, unit)} is "
-                f"{percent(sigma / size, 3)} of the range of the measured {channel}, "
-                f"{engineering(size, unit)}; give one standard deviation."
-            )

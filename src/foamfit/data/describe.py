@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from foamfit.data.energy import EnergyAudit, largest_motion
-from foamfit.data.measurement import Measurement, Specimen, Striker, interior_node
+from foamfit.data.measurement import Measurement, Striker, interior_node
 from foamfit.text import engineering, labelled, listed, percent
 
 # What 1 % of a quantity does: in an impact, and in a slow test (None: it does not enter there).
@@ -26,16 +26,22 @@ def describe(test: Measurement, audit: EnergyAudit, *, exact: bool = True) -> st
     lines = [
         ("test", [test.name]),
         ("file", [str(test.path or "none")]),
-        ("specimen", [_specimen(test.specimen, test.uncertainties)]),
-        ("striker", [_striker(test.striker, test.uncertainties)]),
+        *_given(test),
         ("rows", test.rows.sentences()),
-        ("samples", [_samples(test)]),
-        *_peaks(test),
+        *_measured(test),
         ("noise", noise_sentences(test)),
         ("done", test.notes),
         ("energy", audit.sentences()),
-        ("exact", _exact_sentences(test) if exact else []),
     ]
+    effects = {name.replace("_", " "): effect for name, effect in taken_for_exact(test).items()}
+    if exact and effects:
+        told = ", ".join(f"1 % of the {name} is {effect}" for name, effect in effects.items())
+        sentences = [
+            f"The TOML states no ± of {listed(effects)}, which therefore count as exact.",
+            f"The ± of the {next(iter(effects))} would probably matter most: {told}. "
+            "With --model check says what each does to the parameters.",
+        ]
+        lines.append(("exact", sentences))
     return labelled(lines)
 
 
@@ -55,19 +61,6 @@ def taken_for_exact(test: Measurement) -> dict[str, str]:
     return effects
 
 
-def _exact_sentences(test: Measurement) -> list[str]:
-    """Say which ± the TOML lacks, and which of them would matter most."""
-    effects = {name.replace("_", " "): effect for name, effect in taken_for_exact(test).items()}
-    if not effects:
-        return []
-    told = ", ".join(f"1 % of the {name} is {effect}" for name, effect in effects.items())
-    return [
-        f"The TOML states no ± of {listed(effects)}, which therefore count as exact.",
-        f"The ± of the {next(iter(effects))} would probably matter most: {told}. "
-        "With --model check says what each does to the parameters.",
-    ]
-
-
 def noise_sentences(measurement: Measurement) -> list[str]:
     """Say of each channel what its noise is, one standard deviation, and how it is known."""
     sentences = []
@@ -81,63 +74,56 @@ def noise_sentences(measurement: Measurement) -> list[str]:
     return sentences
 
 
-def _specimen(s: Specimen, spread: dict[str, float]) -> str:
+def _given(test: Measurement) -> list[tuple[str, list[str]]]:
+    """What the TOML says of specimen and striker, with the ± of each quantity that has one."""
+    spread, s, striker = test.uncertainties, test.specimen, test.striker
+
+    def given(value: float, unit: str, name: str, scale: float = 1.0) -> str:
+        sigma = scale * spread.get(name, 0.0)
+        return engineering(scale * value, unit) + (f" ± {engineering(sigma, unit)}" * bool(sigma))
+
     area = f"{s.area * 1e6:.4g}"
     area += f" ± {spread['area'] * 1e6:.2g}" if "area" in spread else ""
-    text = f"height {_uncertain(s.height, 'm', spread.get('height'))}, area {area} mm²"
+    specimen = f"height {given(s.height, 'm', 'height')}, area {area} mm²"
     if s.mass:
         density = s.mass / (s.area * s.height)
-        mass = _uncertain(s.mass * 1e3, "g", spread.get("specimen_mass", 0.0) * 1e3)
-        text += f", mass {mass} ({density:.4g} kg/m³)"
+        specimen += f", mass {given(s.mass, 'g', 'specimen_mass', 1e3)} ({density:.4g} kg/m³)"
     if s.heights:
-        springs = [
-            _uncertain(h, "m", spread.get(f"height_{i}")) for i, h in enumerate(s.heights, 1)
-        ]
-        text += f", springs from the base {' + '.join(springs)}"
-    return text
+        springs = [given(h, "m", f"height_{i}") for i, h in enumerate(s.heights, 1)]
+        specimen += f", springs from the base {' + '.join(springs)}"
+    if striker is None:
+        return [("specimen", [specimen]), ("striker", ["none given"])]
+    mass, velocity = "mass unknown", "velocity unknown"
+    if striker.mass:
+        mass = given(striker.mass, "g", "striker_mass", 1e3)
+    if striker.velocity:
+        own = f" ± {spread['velocity']:.2g}" if "velocity" in spread else ""
+        velocity = f"{striker.velocity:.4g}{own} m/s"
+    return [("specimen", [specimen]), ("striker", [f"{mass}, {velocity}"])]
 
 
-def _striker(s: Striker | None, spread: dict[str, float]) -> str:
-    if s is None:
-        return "none given"
-    mass = "mass unknown"
-    if s.mass:
-        mass = _uncertain(s.mass * 1e3, "g", spread.get("striker_mass", 0.0) * 1e3)
-    if not s.velocity:
-        return f"{mass}, velocity unknown"
-    own = f" ± {spread['velocity']:.2g}" if "velocity" in spread else ""
-    return f"{mass}, {s.velocity:.4g}{own} m/s"
-
-
-def _uncertain(value: float, unit: str, sigma: float | None) -> str:
-    """Write a quantity with its standard deviation, if it has one."""
-    return engineering(value, unit) + (f" ± {engineering(sigma, unit)}" if sigma else "")
-
-
-def _samples(test: Measurement) -> str:
+def _measured(test: Measurement) -> list[tuple[str, list[str]]]:
+    """How many samples there are, and the largest value of each channel, with its instant."""
     channels, time = test.channels(), test.time
-    present = ", ".join(([] if time is None else ["time"]) + list(channels))
-    text = f"{max(map(len, channels.values()))} of {present}"
+    text = f"{max(map(len, channels.values()))} of "
     if time is None:
-        return f"{text}; no time, so only slow drives make sense"
-    step, end = float(np.median(np.diff(time))), float(time[-1])
-    first = engineering(float(time[0]), "s") if time[0] < 0.0 else "time zero"
-    return f"{text}, every {engineering(step, 's')} from {first} to {engineering(end, 's')}"
-
-
-def _peaks(test: Measurement) -> list[tuple[str, list[str]]]:
-    """The largest value of each channel, and when it is reached."""
-    lines = []
-    for name, values in test.channels().items():
-        node = interior_node(name)
+        text += f"{', '.join(channels)}; no time, so only slow drives make sense"
+    else:
+        step, end = float(np.median(np.diff(time))), float(time[-1])
+        first = engineering(float(time[0]), "s") if time[0] < 0.0 else "time zero"
+        text += f"{', '.join(['time', *channels])}, every {engineering(step, 's')} from {first} to "
+        text += engineering(end, "s")
+    lines = [("samples", [text])]
+    for name, values in channels.items():
+        node, source = interior_node(name), ""
         if name == "stress":
-            top, label, text = int(np.argmax(values)), name, engineering(float(values.max()), "Pa")
+            top, label, peak = int(np.argmax(values)), name, engineering(float(values.max()), "Pa")
         else:
-            top, w = largest_motion(values, test.time)
-            label, text = f"mass {node}", engineering(w, "m")
+            top, w = largest_motion(values, time)
+            label, peak = f"mass {node}", engineering(w, "m")
             if node is None:
-                label, text = "strain", f"{w / test.specimen.height:.4g} ({text})"
-        source = f", {test.motion}" if label == "strain" else ""
-        moment = "" if test.time is None else f" at {engineering(float(test.time[top]), 's')}"
-        lines.append((label, [f"peak {text}{moment}{source}"]))
+                label, peak = "strain", f"{w / test.specimen.height:.4g} ({peak})"
+                source = f", {test.motion}"
+        moment = "" if time is None else f" at {engineering(float(time[top]), 's')}"
+        lines.append((label, [f"peak {peak}{moment}{source}"]))
     return lines

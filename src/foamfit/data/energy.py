@@ -11,9 +11,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.contact import line_at
 from foamfit.data.measurement import INTEGRATED, Measurement, Striker
-from foamfit.data.noise import noise_level
+from foamfit.data.noise import line_at, noise_level
 from foamfit.text import engineering, percent
 
 
@@ -92,24 +91,25 @@ class EnergyAudit:
 
     def sentences(self) -> list[str]:
         """Return what was found, what does not close, and what is missing."""
-        found, ratio = [], self.absorbed_over_striker
-        if self.striker_energy is not None:
-            found.append(f"The striker brings {engineering(self.striker_energy, 'J/m³')}.")
-        if self.absorbed_energy is not None:
-            taken = engineering(self.absorbed_energy, "J/m³")
-            share = "" if ratio is None else f", {ratio:.2f} of what the striker brings"
-            found.append(f"The foam absorbs {taken} up to the largest strain{share}.")
-        if self.dissipated_energy is not None and self.dissipated_fraction is not None:
-            lost = engineering(self.dissipated_energy, "J/m³")
-            found.append(f"It dissipates {lost}, {percent(self.dissipated_fraction)} of that.")
+        brought, taken, lost = (
+            None if value is None else engineering(value, "J/m³")
+            for value in (self.striker_energy, self.absorbed_energy, self.dissipated_energy)
+        )
+        ratio, share, told = self.absorbed_over_striker, self.dissipated_fraction, list[str]()
+        told += [f"The striker brings {brought}."] * (brought is not None)
+        if taken is not None:
+            more = "" if ratio is None else f", {ratio:.2f} of what the striker brings"
+            told.append(f"The foam absorbs {taken} up to the largest strain{more}.")
+        if share is not None:
+            told.append(f"It dissipates {lost}, {percent(share)} of that.")
         if self.rebound_velocity is not None:
-            found.append(f"The striker leaves at {self.rebound_velocity:.3g} m/s.")
+            told.append(f"The striker leaves at {self.rebound_velocity:.3g} m/s.")
         if self.impulse is not None and self.momentum_change is not None:
-            found.append(
+            told.append(
                 f"The impulse of the force is {self.impulse:.4g} N·s, the striker's change of "
                 f"momentum {self.momentum_change:.4g} N·s (ratio {self.impulse_ratio:.2f})."
             )
-        return [*found, *self.warnings(), *self.missing]
+        return [*told, *self.warnings(), *self.missing]
 
 
 def audit(measurement: Measurement) -> EnergyAudit:
@@ -119,17 +119,36 @@ def audit(measurement: Measurement) -> EnergyAudit:
     """
     test, missing = measurement, list[str]()
     striker, specimen = test.striker or Striker(), test.specimen
-    brought = None
+    stress, w, time = test.stress, test.displacement, test.time
+    brought = absorbed = dissipated = rebound = impulse = change = None
     if striker.mass and striker.velocity:
         brought = striker.mass * striker.velocity**2 / (2 * specimen.area * specimen.height)
     else:
         missing.append("The striker's energy needs its mass and velocity.")
-    absorbed, dissipated = _absorbed(test)
+    unloaded = stress is not None and float(stress[-3:].mean()) < 0.1 * float(stress.max())
+    if stress is not None and w is not None:
+        strain = w / specimen.height
+        top, largest = largest_motion(w, time)
+        # What precedes the first sample is the triangle from zero at time zero.
+        before = 0.5 * float(max(stress[0], 0.0) * max(strain[0], 0.0))
+        absorbed = before + float(np.trapezoid(stress[: top + 1], strain[: top + 1]))
+        # The sum ends at a noisy strain, where the stress is highest; the true end is the turn.
+        absorbed += float(stress[top]) * (largest / specimen.height - float(strain[top]))
+        dissipated = before + float(np.trapezoid(stress, strain)) if unloaded else None
     if absorbed is None:
         missing.append("The absorbed energy needs stress and displacement.")
     elif dissipated is None:
         missing.append("The dissipated energy needs the unloading.")
-    rebound, impulse, change = _momentum(test)
+    if test.striker is not None and time is not None and stress is not None:
+        lead = 0.5 * stress[0] * max(time[0], 0.0)
+        impulse = specimen.area * float(np.trapezoid(stress, time) + lead)
+        if w is not None and unloaded:
+            # A gauge that rests again after contact does not show the striker any more.
+            shown = np.flatnonzero(test.sampled.get("displacement", np.ones(len(w), dtype=bool)))
+            last = shown[-max(5, len(shown) // 20) :]
+            rebound = -line_at(time[last], w[last], time[last[-1]])[1]
+            if striker.mass and striker.velocity and test.motion != INTEGRATED:
+                change = striker.mass * (striker.velocity + rebound)
     if test.motion == INTEGRATED:
         missing.append("The motion comes from the force, so the balances check nothing here.")
     elif change is None:
@@ -149,21 +168,6 @@ def audit(measurement: Measurement) -> EnergyAudit:
     )
 
 
-def _absorbed(test: Measurement) -> tuple[float | None, float | None]:
-    """∫σ dε up to the largest strain, and over the whole history if the test unloads."""
-    stress, w, height = test.stress, test.displacement, test.specimen.height
-    if stress is None or w is None:
-        return None, None
-    strain = w / height
-    top, largest = largest_motion(w, test.time)
-    # What precedes the first sample is the triangle from zero at time zero.
-    before = 0.5 * float(max(stress[0], 0.0) * max(strain[0], 0.0))
-    absorbed = before + float(np.trapezoid(stress[: top + 1], strain[: top + 1]))
-    # The sum ends at a noisy strain, where the stress is highest; the true end is the turn.
-    absorbed += float(stress[top]) * (largest / height - float(strain[top]))
-    return absorbed, before + float(np.trapezoid(stress, strain)) if _unloaded(stress) else None
-
-
 def largest_motion(displacement: Array, time: Array | None = None) -> tuple[int, float]:
     """Find the turn of a motion: the largest of its samples would be the largest of its noise.
 
@@ -181,26 +185,3 @@ def largest_motion(displacement: Array, time: Array | None = None) -> tuple[int,
     turn = np.polyval(np.polyfit(x, displacement[about], 4), x)
     top = int(np.argmax(turn))
     return int(about[top]), float(turn[top])
-
-
-def _unloaded(stress: Array) -> bool:
-    return float(stress[-3:].mean()) < 0.1 * float(stress.max())
-
-
-def _momentum(test: Measurement) -> tuple[float | None, float | None, float | None]:
-    """Rebound velocity, impulse of the force and the striker's change of momentum in an impact."""
-    time, stress, w, striker = test.time, test.stress, test.displacement, test.striker
-    if striker is None or time is None or stress is None:
-        return None, None, None
-    impulse = test.specimen.area * float(
-        np.trapezoid(stress, time) + 0.5 * stress[0] * max(time[0], 0.0)
-    )
-    if w is None or not _unloaded(stress):
-        return None, impulse, None
-    # A gauge that rests again after contact does not show the striker any more.
-    shown = np.flatnonzero(test.sampled.get("displacement", np.ones(len(w), dtype=np.bool_)))
-    last = shown[-max(5, len(shown) // 20) :]
-    rebound = -line_at(time[last], w[last], time[last[-1]])[1]
-    if not (striker.mass and striker.velocity) or test.motion == INTEGRATED:
-        return rebound, impulse, None
-    return rebound, impulse, striker.mass * (striker.velocity + rebound)

@@ -19,6 +19,7 @@ from foamfit.errors import InputError
 from foamfit.text import counted, engineering
 
 _FEW = 8  # frames through which straight lines are drawn, not a spline
+_SEVERAL = 2.0  # frames of a block, usually, that are averaged
 _PAUSE = 6.0  # usual steps of time that are a pause, across which the line is straight, too
 
 
@@ -111,9 +112,7 @@ def join(record: Record, frames: Frames) -> tuple[Record, list[str]]:
 
 
 def _nearest(time: Array, at: Array) -> NDArray[np.intp]:
-    """Samples nearest to some times."""
-    middles = 0.5 * (time[1:] + time[:-1])
-    return np.searchsorted(middles, at)
+    return np.searchsorted(0.5 * (time[1:] + time[:-1]), at)
 
 
 def _through(at: Array, values: Array, time: Array) -> Array:
@@ -147,20 +146,18 @@ def frames_of_blocks(record: Record, thinned: Record, edges: NDArray[np.int64]) 
     A block has a frame, and the value that is interpolated at its own time, so that no average
     bends it; where each block has several frames it is their average after all.
     """
+    middle = np.add.reduceat(record.instants, edges) / np.diff(np.append(edges, len(record)))
     for name, taken in record.sampled.items():
         values = record.channel(name)
         if values is None:
             continue
         many = np.add.reduceat(taken.astype(np.int64), edges)
-        if _several(many):
-            whole = many >= 0.5 * np.median(many)
-            if not whole.all():
-                thinned = replace(thinned, sampled=thinned.sampled | {name: whole})
-            continue
-        counts = np.diff(np.append(edges, len(record)))
-        middle = np.add.reduceat(record.instants, edges) / counts
-        thinned = thinned.changed(name, np.interp(middle, record.instants, values))
-        thinned = replace(thinned, sampled=thinned.sampled | {name: many > 0})
+        usual = float(np.median(many))
+        whole = many >= 0.5 * usual if usual >= _SEVERAL else many > 0
+        if usual < _SEVERAL:
+            thinned = thinned.changed(name, np.interp(middle, record.instants, values))
+        if usual < _SEVERAL or not whole.all():
+            thinned = replace(thinned, sampled=thinned.sampled | {name: whole})
     return thinned
 
 
@@ -168,11 +165,7 @@ def noise_of_blocks(level: NoiseLevel, block: int, taken: NDArray[np.bool_] | No
     """Noise of blocks of samples, some of which were `taken`; see `frames_of_blocks`."""
     if taken is None:
         return averaged(level, block)
-    if _several(np.add.reduceat(taken.astype(np.int64), np.arange(0, taken.size, block))):
+    many = np.add.reduceat(taken.astype(np.int64), np.arange(0, taken.size, block))
+    if float(np.median(many)) >= _SEVERAL:
         return averaged(level, block)
     return replace(level, time=max(level.time * float(taken.mean()), 1.0))
-
-
-def _several(many: NDArray[np.int64]) -> bool:
-    """Whether blocks usually have several frames."""
-    return float(np.median(many)) >= 2.0

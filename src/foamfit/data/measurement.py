@@ -33,10 +33,7 @@ def interior_node(channel: str) -> int | None:
 
 @dataclass(frozen=True)
 class Specimen:
-    """The foam specimen: height before the test (m), cross-section (m²), mass (kg).
-
-    `heights` are those of the springs of a chain, base first, m.
-    """
+    """Height before the test, m, cross-section, m², mass, kg; heights of springs, base first."""
 
     height: float
     area: float
@@ -46,7 +43,7 @@ class Specimen:
 
 @dataclass(frozen=True)
 class Striker:
-    """The striker: mass in kg and velocity at contact in m/s (either may be unknown)."""
+    """Mass, kg, and velocity at contact, m/s, of the striker; either may be unknown."""
 
     mass: float | None = None
     velocity: float | None = None
@@ -54,10 +51,9 @@ class Striker:
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """The noise of one channel: one standard deviation, Pa or m.
+    """Standard deviation of the noise of a channel, Pa or m, `given` or estimated (`how`).
 
-    It is `given` by the test, or else estimated from the data, and `how` says from what. `time` is
-    its autocorrelation time, in samples (1: white).
+    `time` is its autocorrelation time, in samples (1: white).
     """
 
     sigma: float
@@ -68,11 +64,9 @@ class NoiseLevel:
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise of the channels, each one standard deviation, Pa or m.
+    """Noise that the TOML states, one standard deviation each, Pa and m, or else estimated.
 
-    `stress` and `displacement` are what the TOML states; the second holds for masses inside too.
-    `estimated` holds what was estimated from the data of the channels that it does not state
-    ("stress", "displacement", "displacement_1", …, and "acceleration", m/s²).
+    The displacement's holds for masses inside, too.
     """
 
     stress: float | None = None
@@ -90,11 +84,10 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class Outliers:
-    """Samples of a channel that are not fitted: spikes, short gaps, and a clipped top.
+    """Samples of a channel that are `left_out` of the fit (n,): spikes, short gaps, a clipped top.
 
-    `left_out` marks these samples, shape (n,); at spikes and gaps the channel holds a straight
-    line. The file has the `values` (k,), Pa or m, `at` times (k,), s, or samples where the test has
-    no time. At `clipped_at`, Pa, the sensor or its amplifier clips the channel.
+    Spikes and gaps are bridged by a straight line; the file has the `values` (k,), Pa or m, `at`
+    times (k,), s, or samples. The force is clipped at `clipped_at`, Pa.
     """
 
     left_out: NDArray[np.bool_]
@@ -105,10 +98,9 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Standstill:
-    """A stretch in which the gauge stood still before it jumped; a straight line bridges it.
+    """Rows of the file, `first` to `last`, in which the gauge stood still before it jumped.
 
-    `first` and `last` are rows of the file. In them the stress changed by the share `change` of its
-    largest value there; the displacement then jumped by `jump`, m.
+    Meanwhile the stress changed by the share `change`; the jump is in m.
     """
 
     first: int
@@ -123,10 +115,7 @@ class Standstill:
 
 @dataclass(frozen=True)
 class Dropped:
-    """Rows of a file that are not used, for one reason; rows that are used may lie between.
-
-    `first` and `last` are lines of the file as an editor counts them, from 1 and with the header.
-    """
+    """Number of rows not used for one reason, the `first` and the `last` (lines of the file)."""
 
     rows: int
     first: int
@@ -135,7 +124,7 @@ class Dropped:
 
     @classmethod
     def of(cls, rows: NDArray[np.int64], why: str) -> Dropped:
-        """Leave out the rows with these numbers."""
+        """Count the rows with these numbers."""
         return cls(rows.size, int(rows[0]), int(rows[-1]), why)
 
     def __str__(self) -> str:
@@ -148,10 +137,9 @@ class Dropped:
 
 @dataclass(frozen=True)
 class RowCount:
-    """How many rows of numbers a file has, how many of them are used, and why not the others.
+    """Rows of numbers in a file: all, used and dropped, with the reasons.
 
-    `rows` is `used` plus the rows of all `dropped`. A row is used if each channel that was read
-    from it is fitted or integrated as it stands, or is averaged with its neighbours.
+    A row is used if each of its channels is fitted or integrated, as it stands or averaged.
     """
 
     rows: int
@@ -177,15 +165,11 @@ class Window:
 class Record:
     """The channels of a test in SI, each of shape (n,) or None where the file lacks it.
 
-    Time in s, stress in Pa, displacement of the top in m, velocity of the top in m/s and its
-    deceleration in m/s² (like the stress that causes it, it is positive in compression). `interior`
-    holds the displacement of masses inside in m, 1 for the one above spring 1. `excess` is what the
-    file has beyond the straight line that bridges an outlier, 0 elsewhere, for each channel that
-    has outliers. `clipped` marks the samples at which the force is clipped. `cycle` is the number
-    of the cycle, where a column counts them. `numbers` holds the row number in the file of each
-    sample (None: they count from 1), `dropped` the rows of the file that were left out so far, and
-    `standstills` those over which the displacement is bridged, left or not. `sampled`,
-    `derived` and `braked` are those of `Measurement`.
+    Time, s, stress, Pa, displacement, m, velocity, m/s, and deceleration of the top, m/s² (positive
+    in compression), and displacements of masses inside, m, by their number. `excess` is what the
+    file has beyond the straight line that bridges outliers, 0 elsewhere. `clipped` marks samples of
+    a clipped force. `cycle` is what a column of cycle numbers says; `numbers` are the rows in the
+    file (None: from 1). `sampled`, `derived` and `braked` are those of `Measurement`.
     """
 
     time: Array | None
@@ -279,43 +263,32 @@ class Measurement:
     Attributes
     ----------
     name, path, data_sha256
-        Name of the test, and the file that it was read from (None if from none) with the
-        hexadecimal digest of its bytes.
-    time : (n,) array or None
-        s, increasing; None where the file has no time.
-    stress, displacement : (n,) array or None
-        Nominal base stress, Pa, and displacement of the top, m.
-    interior : dict of int to (n,) array
-        Displacement of the masses inside that a camera followed, m: 1 is the one above spring 1.
-    specimen, striker
-        What the TOML says; `striker` is None where nothing of it is known.
-    noise : Noise
-        What the TOML says of it, and what was estimated of the rest.
+        Its name, its file (None if from none) and the digest of that.
+    time, stress, displacement : (n,) array or None
+        s, increasing; nominal base stress, Pa; displacement of the top, m.
+    specimen, striker, noise
+        What the TOML says, and the noise that was estimated.
     motion : str or None
         Where the displacement came from: "measured", "integrated from force", …
     notes : tuple of str
-        Each thing that was done to the data or could not be done, one sentence each.
+        A sentence for each thing that was done or could not be done.
+    interior : dict of int to (n,) array
+        Displacements of the masses inside, m: 1 is the one above spring 1.
     outliers : dict of str to Outliers
-        Of the channels that have some.
+        By channel.
     contact : str
-        What set time zero: "stress" (then the displacement is zero there too), "motion", or "file"
-        for the file's own.
+        What set time zero: "stress" (then the displacement is zero there too), "motion" or "file".
     count : RowCount or None
-        The rows of the file; None if the test was not read from one.
+        Rows of the file.
     cycle, cycles
-        Number of the cycle that is used, and those of all cycles in the record, in its order.
+        Number of the cycle that is used, and of all in the record.
     start_strain : float
-        Strain of a later cycle, counted from the first contact, at which its own contact starts:
-        what the foam had not recovered. It is taken off.
+        Strain at which the contact of a later cycle starts, from the first contact; taken off.
     sampled : dict of str to (n,) bool array
-        Of a channel of which some samples do not count as measured: True at those that do, which
-        are those at which its instrument took or renewed a value. Elsewhere it is interpolated.
-    zeros : dict of str to float
-        Standard error of the zero of a channel ("stress", Pa, "acceleration", m/s², and
-        "displacement", m), where samples before contact show the zero.
-    origins : dict of str to float
-        What was taken off, in SI: "contact_time", s, "stress_zero", Pa, "acceleration_zero", m/s²,
-        and "displacement_zero", m.
+        Samples of a channel that count as measured, where not all do; others are interpolated.
+    zeros, origins : dict of str to float
+        Standard error of the zero of a channel where samples show it; and what was taken off:
+        "contact_time", s, "stress_zero", Pa, "acceleration_zero", m/s², "displacement_zero", m.
     acceleration : (n,) array or None
         Deceleration of the striker, m/s², where an impact has it and no displacement.
     derived : tuple of str
@@ -325,15 +298,11 @@ class Measurement:
     block : int
         Rows of the file that are averaged in each sample.
     uncertainties : dict of str to float
-        What the TOML says is uncertain, one standard deviation each: "height" and those of the
-        springs of a chain, "height_1", … (m), "area" (m²), "specimen_mass" and "striker_mass" (kg),
-        "velocity" (m/s), and as a share of the scale of a channel "stress_scale",
-        "displacement_scale", "acceleration_scale", "velocity_scale"; and "delay" (s) of a
-        motion with its own clock: time of the force = time of the motion + delay. What it does not
-        say is not there.
+        Standard deviations that the TOML states: "height", "height_1", … (m), "area" (m²),
+        "specimen_mass", "striker_mass" (kg), "velocity" (m/s), "delay" (s) of a motion with its own
+        clock, and of scales, as a share: "stress_scale", "displacement_scale", ….
     standstills
-        First and last time, s, of each stretch in which the gauge stood still and the displacement
-        is bridged by a straight line; samples where the test has no time.
+        First and last time, s (or sample), of each stretch in which the gauge stood still.
     """
 
     name: str

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -124,18 +125,15 @@ def estimated_noise(values: Array, what: str = "samples") -> NoiseLevel:
 
 
 def noise_before_contact(
-    rest: dict[str, Array], curves: dict[str, Array], block: int
+    whole: dict[str, Array], n: int, curves: dict[str, Array], block: int
 ) -> dict[str, NoiseLevel]:
-    """Noise of channels from their samples before contact, about their line, if they are twenty.
+    """Noise of channels from their `n` samples before contact, about their line, if so many.
 
     The `curves` during contact are means of `block` samples; where the noise that they show
     contradicts, it is the answer.
     """
-    found = dict[str, NoiseLevel]()
-    for name, values in rest.items():
-        n, x = len(values), np.arange(len(values), dtype=np.float64)
-        if n < MIN_REST:
-            continue
+    found, x = dict[str, NoiseLevel](), np.arange(n, dtype=np.float64)
+    for name, values in ((c, v[:n]) for c, v in whole.items() if n >= MIN_REST):
         off = values - np.polyval(np.polyfit(x, values, 1), x)
         sigma, phi = float(np.sqrt(off @ off / (n - 2))), lag_one(off)
         time = correlation_time(phi) if 2 / np.sqrt(n) < phi < 1 else 1.0
@@ -148,6 +146,58 @@ def noise_before_contact(
             word = "quieter" if level.sigma < during.sigma else "less quiet"
             found[name] = replace(during, how=f"{during.how}, the {n} before contact being {word}")
     return found
+
+
+class Level(NamedTuple):
+    """Value of a signal at one time, its standard error, and from how many samples it is."""
+
+    value: float
+    error: float
+    samples: int
+
+    def source(self, noise: NoiseLevel, shape: str) -> str:
+        """Say its size over that of the noise, and what it was read off."""
+        size = abs(self.value) / noise.sigma if noise.sigma > 0 else np.inf
+        ratio = f"{size:.{0 if size >= 10 else 1}f} noise standard deviations; "
+        return f"{ratio if np.isfinite(size) else ''}{shape} {self.samples} samples"
+
+
+NOTHING = Level(0.0, 0.0, 0)
+
+
+def mean_level(values: Array, noise: NoiseLevel) -> Level:
+    """Level of a signal at rest: the mean of its samples; few of them do not show their noise."""
+    n, sigma, time, zero = len(values), noise.sigma, noise.time, float(values.mean())
+    if n >= MIN_REST:
+        phi = lag_one(values - zero)
+        time = max(time, correlation_time(phi)) if 2 / np.sqrt(n) < phi < 1 else time
+    if n >= MIN_REST * time:
+        sigma = float(np.std(values, ddof=1))
+    return Level(zero, sigma * float(np.sqrt(min(time, n) / n)), n)
+
+
+def line_at(time: Array, values: Array, at: float) -> tuple[float, float]:
+    """Value at the time `at`, and slope, of the straight line through the samples."""
+    slope, level = np.polyfit(time - at, values, 1)
+    return float(level), float(slope)
+
+
+def level_on_line(time: Array, values: Array, at: float, noise: NoiseLevel) -> tuple[Level, Level]:
+    """Level of a signal at a time, and its slope, by the line through the samples around it."""
+    n, t = len(time), time - time.mean()
+    spread = float(t @ t)
+    level, slope = line_at(time, values, at)
+    left = values - level - slope * (time - at)  # noise, or what is no straight line
+    scatter = max(noise.sigma, float(np.sqrt(left @ left / max(n - 2, 1)))) * np.sqrt(noise.time)
+    error = scatter * np.sqrt(1.0 / n + (at - time.mean()) ** 2 / spread)
+    return Level(level, float(error), n), Level(slope, float(scatter / np.sqrt(spread)), n)
+
+
+def smooth(values: Array, width: int) -> Array:
+    """Take the moving mean over `width` samples, shape (n,)."""
+    from scipy.ndimage import uniform_filter1d
+
+    return values if width < 2 else np.asarray(uniform_filter1d(values, width, mode="nearest"))
 
 
 def averaged(level: NoiseLevel, block: int) -> NoiseLevel:

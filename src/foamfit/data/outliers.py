@@ -1,19 +1,23 @@
-"""Samples that are no measurements: spikes, short gaps, a clipped force, and values that are held.
+"""Samples that are no measurements: spikes, short gaps, a clipped force, a gauge that stands still.
 
-A sample is judged by its neighbours, not by a model.
+A sample is judged by its neighbours, not by a model. A gauge that stands still while the stress
+goes on, and then jumps, shows its play where a motion turns round, or a display that is not
+renewed there. A true hold has another end: the motion goes on smoothly from where it stood, and the
+stress follows.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Outliers, Record
-from foamfit.data.noise import estimated_noise, robust_variance
-from foamfit.text import counted, engineering
+from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Outliers, Record, Standstill
+from foamfit.data.noise import estimated_noise, noise_level, robust_variance
+from foamfit.text import counted, engineering, percent
 
 # An outlier is off by this many standard deviations of its leave-one-out residual, and by this
 # many of what its neighbours are off when it is gone (at a kink they are off too).
@@ -31,6 +35,20 @@ _CHUNK = 50_000
 # A force may be clipped where so many samples are equal at its top; a parabola falls by so many
 # steps of its digits within half that length on either side.
 _FLAT, _PARABOLA = 5, 3
+# A gauge stands still for at least so many of the steps in which it is read, and so many samples.
+_STEPS, _SAMPLES = 4, 8
+# A jump is at least this share of the range, so many deviations of the noise and so many steps of
+# the digitiser; it takes so many samples at most; after it the motion goes on by less than a share.
+_LEAP, _ABOVE_NOISE, _DIGITS, _LONGEST, _GOES_ON = 0.003, 12.0, 2.5, 3, 0.75
+# While it stands the gauge moves by less than this share of its jump, and so many deviations; it
+# stands as soon as it is so near its level.
+_STANDS, _SCATTER, _NEAR = 0.1, 5.0, 0.02
+# Of the range of the stress: what a specimen in contact bears, by how much the stress changes while
+# the gauge stands, and what a motion as large as the jump would change.
+_CONTACT, _CHANGE, _FELT = 0.1, 0.005, 0.004
+# Of what such a motion would change, the stress changes by less than this share, and what is
+# missing is so many standard errors. The stiffness is taken over so many jumps on either side.
+_FOLLOWS, _SURE, _AROUND = 0.5, 3.0, 3.0
 
 
 def find_outliers(values: Array, time: Array | None = None) -> NDArray[np.bool_]:
@@ -49,8 +67,13 @@ def find_outliers(values: Array, time: Array | None = None) -> NDArray[np.bool_]
     if n < 30:
         return np.zeros(n, dtype=bool)
     least = _LEAST * float(np.ptp(np.quantile(values, (0.005, 0.995))))
-    even = time is None or _is_even(time, values, least)
-    at = np.arange(n, dtype=np.float64) if time is None or even else time
+    even, at = True, np.arange(n, dtype=np.float64)
+    if time is not None:  # are its steps equal, or so nearly that the values hardly differ by it?
+        step = np.diff(time)
+        off = float(np.abs(step / np.median(step) - 1.0).max())
+        differ = off * float(np.quantile(np.abs(np.diff(values)), 0.99))
+        even = off <= _EVEN or differ < 0.1 * least
+        at = at if even else time
     cubics = _cubics(at, even)
     wrong = _gaps(values, at)
     for _ in range(4):  # beside a large spike a small one is found later
@@ -62,14 +85,6 @@ def find_outliers(values: Array, time: Array | None = None) -> NDArray[np.bool_]
             break
         wrong |= found
     return wrong if wrong.sum() <= max(_MOST * n, 2) else np.zeros(n, dtype=bool)
-
-
-def _is_even(time: Array, values: Array, least: float) -> bool:
-    """Whether the steps of time are equal, or so nearly that the values hardly differ by it."""
-    step = np.diff(time)
-    usual = float(np.median(step))
-    off = float(np.abs(step - usual).max()) / usual
-    return off <= _EVEN or off * float(np.quantile(np.abs(np.diff(values)), 0.99)) < 0.1 * least
 
 
 def _bridged(values: Array, wrong: NDArray[np.bool_], time: Array) -> Array:
@@ -111,8 +126,13 @@ def _spikes(
     alone = np.sqrt(np.maximum(rest, 0.0) / (_WIDTH - 5) / own[far])
     # Beside a spike the cubic is off too: only the farthest of five is one.
     nearby = _windows(np.pad(off, 2), 5).max(axis=1)
-    # The tip of a kink is where the line from one of its sides leads.
-    leads = [np.sum(near[:, at] * _line_to_middle(times, at), axis=1) for at in _SIDES]
+    leads = []  # the tip of a kink is where the line from one of its sides leads
+    for side in _SIDES:
+        x = times[:, side] - times[:, [_HALF]]
+        centre = x.mean(axis=1, keepdims=True)
+        x = x - centre
+        line = 1.0 / 3.0 - centre * x / np.sum(x**2, axis=1, keepdims=True)
+        leads.append(np.sum(near[:, side] * line, axis=1))
     beside = np.min((near[:, _HALF] - np.array(leads)) * np.sign(residual[far]), axis=0)
     out[far + _HALF] = (
         (off[far] > _ALONE * alone) & (off[far] >= nearby[far]) & (beside > 0.5 * off[far])
@@ -154,14 +174,6 @@ def _orthonormal(times: Array) -> Array:
             new = new - np.einsum("sw,sw->w", new, lower) * lower
         basis[k] = new / np.sqrt(np.einsum("sw,sw->w", new, new))
     return basis
-
-
-def _line_to_middle(times: Array, at: list[int]) -> Array:
-    """Weights of three samples of each window in the value of their line in its middle."""
-    x = times[:, at] - times[:, [_HALF]]
-    centre = x.mean(axis=1, keepdims=True)
-    x = x - centre
-    return np.asarray(1.0 / 3.0 - centre * x / np.sum(x**2, axis=1, keepdims=True))
 
 
 def bridge_outliers(record: Record) -> Record:
@@ -209,26 +221,26 @@ def mark_clipped(record: Record) -> tuple[Record, list[str]]:
 
 def outliers_of_blocks(record: Record, block: int) -> dict[str, Outliers]:
     """Outliers of blocks of samples: a block of them is left out, one in a block is not."""
-    found = {}
+    found, none = dict[str, Outliers](), np.zeros(0)
     edges = np.arange(0, len(record), block)
+
+    def share(wrong: NDArray[np.bool_]) -> Array:
+        return np.asarray(np.add.reduceat(wrong.astype(float), edges) / block)
+
     for name, excess in record.excess.items():
-        values, wrong = record.channel(name), excess != 0.0
-        if values is None or not wrong.any():
-            continue
-        share = np.add.reduceat(wrong.astype(float), edges) / block
-        at = np.flatnonzero(wrong)
-        found[name] = Outliers(share > 0.5, record.instants[at], values[at] + excess[at])
-    still = record.stood_still
-    none = np.zeros(0)
-    if still.any():
-        left_out = np.add.reduceat(still.astype(float), edges) > 0.5 * block
-        spikes = found.get("displacement") or Outliers(np.zeros_like(left_out), none, none)
-        found["displacement"] = replace(spikes, left_out=spikes.left_out | left_out)
-    if record.clipped is not None and record.clipped.any():
-        left_out = np.add.reduceat(record.clipped.astype(float), edges) > 0.0
-        spikes = found.get("stress") or Outliers(np.zeros_like(left_out), none, none)
-        top = float(record.stress[record.clipped].max())
-        found["stress"] = replace(spikes, left_out=spikes.left_out | left_out, clipped_at=top)
+        values, at = record.channel(name), np.flatnonzero(excess)
+        if values is not None and at.size:
+            file = values[at] + excess[at]
+            found[name] = Outliers(share(excess != 0.0) > 0.5, record.instants[at], file)
+    still, clipped, top = record.stood_still, record.clipped, float(record.stress.max())
+    for name, left_out, clipped_at in (
+        ("displacement", share(still) > 0.5, None),
+        *([] if clipped is None else [("stress", share(clipped) > 0.0, top)]),
+    ):
+        if left_out.any() or (clipped_at is None and still.any()):
+            spikes = found.get(name) or Outliers(np.zeros_like(left_out), none, none)
+            wrong = spikes.left_out | left_out
+            found[name] = replace(spikes, left_out=wrong, clipped_at=clipped_at)
     return found
 
 
@@ -303,3 +315,171 @@ def fill_staircase(record: Record) -> tuple[Record, list[str]]:
             f"{len(fresh)} instants where it is fresh."
         )
     return record, notes
+
+
+@dataclass(frozen=True)
+class _Gauge:
+    """Displacement and stress that are looked at, the noise of the first, and its reading step."""
+
+    w: Array
+    stress: Array
+    noise: float
+    step: int  # samples
+
+
+def find_standstills(record: Record) -> list[tuple[int, int]]:
+    """Find where the gauge of a slow test stands still and then jumps.
+
+    Each is the last sample before the stretch and the first after the jump. The displacement stands
+    still, with the specimen in contact and a stress that changes, then jumps by more than the
+    motion goes on with, and the stress does not follow the jump. Nothing is found where the noise
+    or the digitiser's step is too large to tell.
+
+    The displacement is taken as it was recorded: a held one is not yet interpolated.
+    """
+    w = record.displacement
+    if w is None or len(w) < 4 * _SAMPLES:
+        return []
+    fresh, lengths = fresh_samples(w)
+    at = _Gauge(w, record.stress, noise_level(w[fresh]), int(np.median(lengths)))
+    shortest = max(_STEPS * at.step, _SAMPLES)
+    found = list[tuple[int, int]]()
+    for after, length in sorted(_jumps(at, shortest).items()):
+        last = after - length
+        if found and last < found[-1][1]:
+            continue
+        level = float(np.median(w[last - _SAMPLES + 1 : last + 1]))
+        near = _NEAR * abs(float(w[after]) - level) + _SCATTER * at.noise
+        moving = np.flatnonzero(np.abs(w[: last + 1] - level) > near)
+        before = int(moving[-1]) + 1 if moving.size else 0  # there the gauge is still right
+        long = last + 1 - before >= shortest
+        if long and _stress_goes_on(at, before, last) and not _follows(at, before, last, after):
+            found.append((before, after))
+    return found
+
+
+def _jumps(at: _Gauge, width: int) -> dict[int, int]:
+    """First samples after jumps out of a stretch, and how many samples each jump takes."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    w, n = at.w, len(at.w)
+    # The window of sample i ends with it.
+    shift: Any = {"size": width, "origin": (width - 1) // 2, "mode": "nearest"}
+    range_before = maximum_filter1d(w, **shift) - minimum_filter1d(w, **shift)
+    size = float(np.ptp(w))
+    gaps, digit = (
+        np.diff(np.unique(w)),
+        0.0,
+    )  # of levels, nearly all multiples of a digitiser's step
+    gaps = gaps[gaps > 1e-6 * size]
+    if gaps.size:
+        step = float(np.quantile(gaps, 0.1, method="nearest"))  # below it a few that were bridged
+        off = np.abs(gaps / step - np.rint(gaps / step))
+        digit = step if float(np.mean(off < 0.05)) > 0.8 else 0.0
+    least = max(_LEAP * size, _ABOVE_NOISE * at.noise, _DIGITS * digit)
+    found = dict[int, int]()
+    for length in range(_LONGEST, 0, -1):  # the shortest counts
+        last = np.arange(width - 1, n - length)
+        jump = w[last + length] - w[last]
+        far = np.abs(jump)
+        later = np.minimum(last + length + 2 * max(at.step, length), n - 1)
+        goes_on = (w[later] - w[last + length]) * np.sign(jump) > _GOES_ON * far
+        stands = range_before[last] <= _STANDS * far + _SCATTER * at.noise
+        good = (far >= least) & stands & ~goes_on
+        found |= dict.fromkeys((last[good] + length).tolist(), length)
+    return found
+
+
+def _stress_goes_on(at: _Gauge, before: int, last: int) -> bool:
+    """Whether the specimen is loaded while the gauge stands, by a stress that changes."""
+    stress = at.stress[before : last + 1]
+    size, low = float(np.ptp(at.stress)), float(np.quantile(at.stress, 0.01))
+    changes, part = _changes(stress)
+    error = noise_level(stress) * np.sqrt(2.0 / part)
+    changed = max(map(abs, changes)) >= max(_CHANGE * size, _SURE * error)
+    return bool(changed and np.median(stress) - low >= _CONTACT * size)
+
+
+def _changes(stress: Array) -> tuple[tuple[float, float], int]:
+    """By how much a stress has risen from its lowest, and fallen from its highest, in the end.
+
+    These are means of so many samples.
+    """
+    part = max(stress.size // 4, _SAMPLES // 2)
+    mean = np.convolve(stress, np.full(part, 1.0 / part), "valid")
+    return (float(mean[-1] - mean.min()), float(mean[-1] - mean.max())), part
+
+
+def _follows(at: _Gauge, before: int, last: int, after: int) -> bool:
+    """Whether the stress changes as it would by a motion as large as the jump, or this is unknown.
+
+    What it does is compared with its trend while the gauge stood; a gauge that is read at steps may
+    show a motion a step late.
+    """
+    w, stress = at.w, at.stress
+    # As long as the displacement stays where it jumped to.
+    rest = w[after : after + 3 * max(at.step, 2)]
+    jump = float(rest[0] - np.median(w[before : last + 1]))
+    away = np.abs(rest - rest[0]) > 0.25 * abs(jump) + _SCATTER * at.noise
+    window = after + np.arange(int(np.argmax(away)) if away.any() else rest.size)
+    end = last + 1 - (at.step if at.step > 1 else 0)
+    fitted = np.arange(min((before + end) // 2, end - 5), end)
+    middle = float(fitted.mean())
+    slope, level = np.polyfit(fitted - middle, stress[fitted], 1)
+    scatter = float(np.std(stress[fitted] - level - slope * (fitted - middle)))
+    ahead = float(window.mean()) - middle
+    shares = 1.0 / window.size, 1.0 / fitted.size, ahead**2 / np.sum((fitted - middle) ** 2)
+    error = max(noise_level(stress[before : last + 1]), scatter) * np.sqrt(sum(shares))
+    slopes = []  # the smaller of the stiffnesses before and after counts, Pa/m
+    for sides in (slice(before, None, -1), slice(after, None)):
+        motion, force = w[sides], stress[sides]
+        far = int(np.argmax(np.abs(motion - motion[0]) >= _AROUND * abs(w[after] - w[before])))
+        if far:
+            change = float(force[far : far + 5].mean() - force[:5].mean())
+            slopes.append(change / float(motion[far] - motion[0]))
+    expected = max(min(slopes, default=0.0), 0.0) * abs(jump)
+    change = (float(stress[window].mean()) - level - slope * ahead) * np.sign(jump)
+    return bool(
+        expected < _FELT * float(np.ptp(stress))
+        or change > _FOLLOWS * expected
+        or expected - change < _SURE * error
+    )
+
+
+def bridge_standstills(record: Record, found: list[tuple[int, int]]) -> Record:
+    """Draw straight lines from the last sample before each stretch to the first after its jump."""
+    if record.displacement is None or not found:
+        return record
+    w, time, numbers = record.displacement.copy(), record.instants, record.row_numbers
+    standstills = []
+    for before, after in found:
+        stress = record.stress[before:after]
+        (rise, fall), _ = _changes(stress)
+        change = (rise if rise > -fall else fall) / float(np.abs(stress).max())
+        first, last = int(numbers[before + 1]), int(numbers[after - 1])
+        standstills.append(Standstill(first, last, change, float(w[after] - w[before])))
+        inside, ends = slice(before + 1, after), [before, after]
+        w[inside] = np.interp(time[inside], time[ends], w[ends])
+    return replace(record, displacement=w, standstills=tuple(standstills))
+
+
+def standstill_notes(record: Record, height: float) -> list[str]:
+    """Name the stretches in what is left of a record, by the rows of the file."""
+    return [
+        f"Check: the displacement stands still in rows {one.first} to {one.last} while the stress "
+        f"{'rises' if one.change > 0.0 else 'falls'} by {percent(abs(one.change))}, then jumps by "
+        f"{percent(abs(one.jump) / height)} strain, which the stress does not follow: play of the "
+        "gauge; it is bridged by a straight line."
+        for one in record.standstills
+        if one.among(record.row_numbers).any()
+    ]
+
+
+def standstill_spans(record: Record, block: int) -> tuple[tuple[float, float], ...]:
+    """First and last instant of each stretch in what is left of a record, s or blocks of samples.
+
+    Blocks are what is left of samples where there are many; without a time they are counted.
+    """
+    instants = record.instants if record.time is not None else record.instants // block
+    there = [instants[one.among(record.row_numbers)] for one in record.standstills]
+    return tuple((float(at[0]), float(at[-1])) for at in there if at.size)

@@ -12,22 +12,24 @@ from dataclasses import replace
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.contact import Start, leave_rest, smooth, start_of_impact, start_of_slow_test
+from foamfit.data import outliers as spoilt
+from foamfit.data import zeros
+from foamfit.data.contact import (
+    STILL_MOTION,
+    Start,
+    leave_rest,
+    start_of_impact,
+    start_of_slow_test,
+)
 from foamfit.data.cycles import (
+    Cycle,
     choose_cycle,
     cut_to_cycle,
     cut_to_reload,
     find_cycles,
-    find_reload,
     inner_reversals,
 )
 from foamfit.data.frames import frames_of_blocks, noise_of_blocks
-from foamfit.data.gauge import (
-    bridge_standstills,
-    find_standstills,
-    standstill_notes,
-    standstill_spans,
-)
 from foamfit.data.measurement import (
     INTEGRATED,
     MEASURED,
@@ -43,24 +45,7 @@ from foamfit.data.measurement import (
     Window,
     interior_channel,
 )
-from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, noise_level
-from foamfit.data.outliers import (
-    bridge_outliers,
-    fill_staircase,
-    mark_clipped,
-    noise_of_held,
-    outlier_note,
-    outliers_of_blocks,
-)
-from foamfit.data.zeros import (
-    CONTRADICTED,
-    Span,
-    flight_notes,
-    mark_flight,
-    span_of_impact,
-    span_of_slow_test,
-    take_zeros,
-)
+from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, noise_level, smooth
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
@@ -91,78 +76,58 @@ def condition(
     `advice` see `check_signs`. At most 1500 samples are left; time and displacement are zero where
     contact starts. The noise is estimated where samples before contact, or held ones, show it.
     """
-    window, notes = window or Window(), list[str]()
+    window, notes, known = window or Window(), list[str](), striker or Striker()
     impact = striker is not None and record.time is not None
+    if impact and window.cycle not in (None, 1):
+        raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
 
     def done(result: tuple[Record, list[str]]) -> Record:
         notes.extend(result[1])
         return result[0]
 
     record = done(cut_to_window(record, window))
-    record = done(mark_clipped(bridge_outliers(record)))
-    spoilt = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
+    record = done(spoilt.mark_clipped(spoilt.bridge_outliers(record)))
+    spikes = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
     check_signs(record, advice)
-    held = noise_of_held(record)
-    still = [] if impact else find_standstills(record)
-    record = bridge_standstills(done(fill_staircase(record)), still)
-    if impact and window.cycle not in (None, 1):
-        raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
+    held = spoilt.noise_of_held(record)
+    still = [] if impact else spoilt.find_standstills(record)
+    record = spoilt.bridge_standstills(done(spoilt.fill_staircase(record)), still)
     cycles = [] if impact else find_cycles(record)
-    chosen = choose_cycle(cycles, window.cycle) if cycles else None
+    chosen = choose_cycle(cycles, window.cycle)
     first = cut_to_cycle(record, cycles, cycles[0])[0] if cycles else record
-    levels = held | {
-        c: estimated_noise(v) for c, v in first.curves("acceleration").items() if c not in held
-    }
+    curves = first.curves("acceleration")
+    levels = {c: estimated_noise(v) for c, v in curves.items()} | held
     if impact:
-        assert striker is not None
-        start = start_of_impact(first, levels, striker)
-        span = span_of_impact(first, start, levels)
-        notes += flight_notes(first, start, span, levels, striker, spread)
+        start = start_of_impact(first, levels)
+        start = replace(start, gauge=zeros.gauge_before(first, start, levels, known))
+        span = zeros.Span.of_impact(first, start, levels)
+        notes += zeros.flight_notes(first, start, span, levels, known, spread)
     else:
         start = start_of_slow_test(first, levels)
-        span = span_of_slow_test(first, start)
-    record, zeros = take_zeros(record, first, start, span, levels, impact=impact)
-    notes += zeros.notes
-    start_strain, origins = 0.0, zeros.origins
-    if chosen is not None and chosen.place:  # not the first: it has a contact of its own
-        at = find_reload(record, cycles, chosen)
-        notes += cut_to_cycle(record, cycles, chosen)[1]
-        record = done(cut_to_reload(record, chosen, at, specimen.height))
-        start_strain = at.displacement / specimen.height
-        origins["stress_zero"] += at.offset
-        origins["displacement_zero"] += at.displacement
-        contact_time = at.time
+        span = zeros.Span.of_slow_test(first, start)
+    record, found = zeros.take_zeros(record, first, start, span, levels, impact=impact)
+    notes += found.notes
+    later = chosen if chosen is not None and chosen.place else None  # with a contact of its own
+    if later:
+        record = done(_later_cycle(record, cycles, later, specimen, found.origins))
     else:
         record = done(cut_to_cycle(record, cycles, chosen)) if chosen else record
-        record = done(cut_to_contact(record, start, span))
-        contact_time = start.time
-    if record.time is not None:
-        origins["contact_time"] = contact_time
+        record = done(cut_to_contact(record, start, span, found.origins))
     if impact:
-        record = mark_flight(record, start, span)
-    record, motion = integrate_motion(record, specimen, striker or Striker())
-    if striker is not None and impact:
-        record, late = start_within_height(record, specimen, striker)
-        origins["contact_time"] += late
-        if late:
-            told = f"Contact is taken to be {engineering(late, 's')} later, where"
-            notes.append(f"{told} the motion does not go farther than the height.")
-            if motion == MEASURED:
-                origins["displacement_zero"] += late * (striker.velocity or 0.0)
-    if motion != MEASURED:
-        notes.append(f"The file has no displacement: the motion is {motion}.")
-    notes += checks(record, specimen, striker or Striker(), motion)
+        record = zeros.mark_flight(record, start, span)
+    record, motion = integrate_motion(record, specimen, known)
+    if impact:
+        record = done(start_within_height(record, specimen, known, motion, found.origins))
+    notes += checks(record, specimen, known, motion)
     whole, record = record, done(thin(record))
     block = -(-len(whole) // len(record))
     resting = max(0, start.first - 2) if start.free else 0
-    before = {name: values[:resting] for name, values in first.curves("acceleration").items()}
-    noise = noise_before_contact(before, record.curves("acceleration"), block)
-    taken = whole.sampled
-    noise |= {c: noise_of_blocks(level, block, taken.get(c)) for c, level in held.items()}
-    outliers = outliers_of_blocks(whole, block)
-    for name, n in spoilt.items():
-        notes.append(outlier_note(name, n, outliers.get(name), record.time is not None))
-    notes += standstill_notes(whole, specimen.height)
+    noise = noise_before_contact(curves, resting, record.curves("acceleration"), block)
+    noise |= {c: noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
+    outliers = spoilt.outliers_of_blocks(whole, block)
+    for name, n in spikes.items():
+        notes.append(spoilt.outlier_note(name, n, outliers.get(name), record.time is not None))
+    notes += spoilt.standstill_notes(whole, specimen.height)
     channels = record.time, record.stress, record.displacement
     return Measurement(
         *("", None, "", *channels, specimen, striker),  # no name and no file
@@ -171,23 +136,39 @@ def condition(
         notes=tuple(notes),
         interior=record.interior,
         outliers=outliers,
-        contact="stress" if chosen is not None and chosen.place else start.by,
+        contact="stress" if later else start.by,
         count=count_rows(whole, outliers, block),
         cycle=chosen.number if chosen else 1,
         cycles=tuple(cycle.number for cycle in cycles) or (1,),
-        start_strain=start_strain,
+        start_strain=found.origins.pop("start_strain", 0.0),
         sampled=record.sampled,
-        zeros=zeros.errors,
-        origins=origins,
+        zeros=found.errors,
+        origins=found.origins,
         acceleration=record.acceleration if impact else None,
         derived=record.derived,
         braked=record.braked,
         block=block,
-        standstills=standstill_spans(whole, block),
+        standstills=spoilt.standstill_spans(whole, block),
     )
 
 
-def cut_to_contact(record: Record, start: Start, span: Span) -> tuple[Record, list[str]]:
+def _later_cycle(
+    record: Record, cycles: list[Cycle], cycle: Cycle, specimen: Specimen, origins: dict[str, float]
+) -> tuple[Record, list[str]]:
+    """Cut a later cycle to its own contact; what is taken off there joins the `origins`."""
+    notes = cut_to_cycle(record, cycles, cycle)[1]
+    cut, at, more = cut_to_reload(record, cycles, cycle, specimen.height)
+    origins["start_strain"] = at.displacement / specimen.height
+    origins["stress_zero"] += at.offset
+    origins["displacement_zero"] += at.displacement
+    if record.time is not None:
+        origins["contact_time"] = at.time
+    return cut, notes + more
+
+
+def cut_to_contact(
+    record: Record, start: Start, span: zeros.Span, origins: dict[str, float]
+) -> tuple[Record, list[str]]:
     """Keep the rows of contact and those just before it; time is zero where it starts."""
     n, lead = len(record), start.first - span.first
     notes = (
@@ -199,6 +180,7 @@ def cut_to_contact(record: Record, start: Start, span: Span) -> tuple[Record, li
     cut = cut if span.end - start.first < n else ""
     notes.insert(0, f"Contact starts {start.how}{at}{cut}.")
     if record.time is not None:
+        origins["contact_time"] = start.time
         record = replace(record, time=record.time - start.time)
     why = "before contact starts", "after contact ends"
     return record.between(span.first, span.end, *why), notes
@@ -307,9 +289,9 @@ def stress_of_motion(
     noise, first, end = estimated_noise(values), 0, len(time)
     if velocity is None:
         top = int(np.argmax(values))
-        found = leave_rest(time[: top + 1], values[: top + 1], noise, 0.5)
+        found = leave_rest(time[: top + 1], values[: top + 1], noise, STILL_MOTION)
         first = int(np.searchsorted(time, found.time)) if found else 0
-        found = leave_rest(-time[top:][::-1], values[top:][::-1], noise, 0.5)
+        found = leave_rest(-time[top:][::-1], values[top:][::-1], noise, STILL_MOTION)
         end = int(np.searchsorted(time, -found.time)) if found else end
     n = end - first
     block = max(1, min(round(noise.time), n // 50), n // 1000)
@@ -332,27 +314,33 @@ def stress_of_motion(
 
 
 def start_within_height(
-    record: Record, specimen: Specimen, striker: Striker
-) -> tuple[Record, float]:
-    """Move the start of an impact, s, if its motion goes a little farther than the height.
+    record: Record, specimen: Specimen, striker: Striker, motion: str, origins: dict[str, float]
+) -> tuple[Record, list[str]]:
+    """Move the start of an impact if its motion goes a little farther than the height.
 
     It started too early by then: contact is as much later as the motion goes too far.
     """
     w, most = record.displacement, 0.97 * specimen.height
     assert w is not None  # measured or integrated by now
+    assert record.time is not None  # it is an impact
     over, rough = float(w.max()) - most, 0.5 if "stress" in record.derived else 0.2
     if not striker.velocity or not 0.03 * specimen.height <= over < rough * specimen.height:
-        return record, 0.0
-    assert record.time is not None  # it is an impact
+        return record, []
     late = over / striker.velocity
-    return replace(record, time=record.time - late, displacement=w - over), late
+    origins["contact_time"] += late
+    if motion == MEASURED:
+        origins["displacement_zero"] += over
+    told = f"Contact is taken to be {engineering(late, 's')} later, where the motion does not go "
+    record = replace(record, time=record.time - late, displacement=w - over)
+    return record, [told + "farther than the height."]
 
 
 def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) -> list[str]:
     """Refuse strains beyond one; say what is not plausible."""
     displacement, height = record.displacement, specimen.height
     assert displacement is not None  # measured or integrated by now
-    notes = inner_reversals(displacement)
+    notes = [] if motion == MEASURED else [f"The file has no displacement: the motion is {motion}."]
+    notes += inner_reversals(displacement)
     if len(record) < MIN_ROWS:
         raise InputError(f"only {len(record)} samples are in contact; at least {MIN_ROWS} needed.")
     strain = float(displacement.max()) / height
@@ -367,7 +355,15 @@ def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) ->
             raise InputError(f"{name} reaches {reached}; check its unit.")
         if most > 1.05 * displacement.max():
             notes.append(f"Check: {name} goes farther than the top; check its unit and its node.")
-    notes += _stress_notes(record.stress)
+    stress = record.stress
+    peak, width, first = float(stress.max()), max(1, len(stress) // 100), stress[:3].mean()
+    if first > 0.05 * peak:
+        load = percent(first / peak)
+        notes.append(f"Check: the record starts under load, at {load} of the peak stress.")
+    lowest = float(smooth(stress, width)[np.argmax(stress) :].min())
+    if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
+        after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"
+        notes.append(f"The stress goes down to {after}; it is kept.")
     if striker.velocity and record.time is not None and motion != INTEGRATED:
         early = displacement <= 0.15 * displacement.max()
         early[int(np.argmax(displacement)) :] = False
@@ -376,7 +372,7 @@ def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) ->
             speed = float(np.polyfit(record.time[early], displacement[early], 1)[0])
             if abs(speed / striker.velocity - 1) > 0.1:
                 notes.append(
-                    f"Check: the displacement starts at {speed:.3g} m/s, {CONTRADICTED} "
+                    f"Check: the displacement starts at {speed:.3g} m/s, {zeros.CONTRADICTED} "
                     f"{striker.velocity:.3g} m/s."
                 )
     density = (specimen.mass or 0.0) / (specimen.area * height)
@@ -399,19 +395,6 @@ def _unusual(record: Record, specimen: Specimen, strain: float) -> list[str]:
                 f"Check: the {name} is {shown}, but tests of specimens have {least} to {most}; "
                 "check the units (mm or Mm, mN or MN)."
             )
-    return notes
-
-
-def _stress_notes(stress: Array) -> list[str]:
-    """Say where a stress does not start or end at zero."""
-    peak, width, notes = float(stress.max()), max(1, len(stress) // 100), []
-    first, lowest = stress[:3].mean(), float(smooth(stress, width)[np.argmax(stress) :].min())
-    if first > 0.05 * peak:
-        load = f"at {percent(first / peak)} of the peak stress"
-        notes.append(f"Check: the record starts under load, {load}.")
-    if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
-        after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"
-        notes.append(f"The stress goes down to {after}; it is kept.")
     return notes
 
 

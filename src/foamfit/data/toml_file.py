@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 from foamfit.data.measurement import Noise, Specimen, Striker, Window, interior_node
 from foamfit.data.units import (
     is_unit,
-    parse_quantity,
+    no_spread,
     parse_uncertain,
     split_quantity,
     split_uncertain,
@@ -74,10 +74,10 @@ MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
 
 @dataclass(frozen=True)
 class Column:
-    """What [columns] says of one channel; one that `counts_down` gets smaller in compression.
+    """What [columns] says of one channel: its header, or number from 1, its unit and its scale.
 
-    `column` is a header or the number of a column, from 1. `spread` is the standard deviation of
-    the scale over the scale, 0 for an exact one.
+    `spread` is the relative standard deviation of the scale; one that `counts_down` gets smaller in
+    compression.
     """
 
     column: str | int
@@ -90,10 +90,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Motion:
-    """What [motion] says: the file of a motion with its own clock, its columns, and its delay.
-
-    Time of the force = time of the motion + `delay`, s.
-    """
+    """A motion with its own clock: time of the force = time of the motion + `delay`, s."""
 
     file: Path
     columns: dict[str, Column]
@@ -102,10 +99,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Settings:
-    """What the TOML says, in SI; `duplicates` says what becomes of rows with one time stamp.
-
-    `uncertainties` are those of `Measurement`, without the scales, which their `columns` have.
-    """
+    """What the TOML says, in SI; `uncertainties` are those of `Measurement`, without the scales."""
 
     name: str
     specimen: Specimen
@@ -179,10 +173,16 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
             raise InputError(f"{path}: {section} must be a table, [{section}].")
         check_keys(f"{path}: [{section}]", table, keys)
         values[section] = {k: _value(path, section, k, v, spreads) for k, v in table.items()}
+    name = document.get("name", printable(toml_beside(test).stem))
+    if not isinstance(name, str) or not name.strip():
+        raise InputError(f"{path}: name = {name!r} is no text; give it in quotation marks.")
+    if len(name) > LONGEST:
+        many = f"name has {len(name)} characters; it must have {LONGEST} at most"
+        raise InputError(f"{path}: {many}.")
+    for code in (f"U+{ord(c):04X}" for c in name if not c.isprintable()):
+        raise InputError(f"{path}: name has a control character, {code}; write it in plain text.")
     return Settings(
-        name=_name(path, document["name"])
-        if "name" in document
-        else printable(toml_beside(test).stem),
+        name=name,
         specimen=_specimen(path, values["specimen"], spreads),
         striker=Striker(**values["striker"]) if values["striker"] else None,
         noise=Noise(**values["noise"]),
@@ -194,40 +194,29 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     )
 
 
-def _name(path: Path, name: Any) -> str:
-    if not isinstance(name, str) or not name.strip():
-        raise InputError(f"{path}: name = {name!r} is no text; give it in quotation marks.")
-    n = len(name)
-    if n > LONGEST:
-        raise InputError(f"{path}: name has {n} characters; it must have {LONGEST} at most.")
-    for code in (f"U+{ord(c):04X}" for c in name if not c.isprintable()):
-        raise InputError(f"{path}: name has a control character, {code}; write it in plain text.")
-    return name
-
-
 def _value(path: Path, section: str, key: str, value: Any, spreads: dict[str, float]) -> Any:
     """Check and return what a key says, in SI, and put its ± into `spreads`."""
     si, example, spread = _SECTIONS[section][key]
-    where = f"{path}: [{section}] {key}"
+    where, wrong = f"{path}: [{section}] {key}", ""
     if key == "cycle" and (type(value) is not int or value < 1):
-        raise InputError(f"{where} = {value!r} must be a whole number from 1 up.")
-    if key == "duplicates" and value not in ("average", "refuse"):
-        raise InputError(f"{where} = {value!r} must be one of average, refuse.")
-    if key == "heights" and (not isinstance(value, list) or not value):
-        raise InputError(f'{where} must be a list like ["0.700 mm", "0.490 mm"], base first.')
-    if key == "sheet" and not isinstance(value, str):
-        raise InputError(f'{where} = {value!r} must be a name, like "Sheet1".')
+        wrong = f"= {value!r} must be a whole number from 1 up"
+    elif key == "duplicates" and value not in ("average", "refuse"):
+        wrong = f"= {value!r} must be one of average, refuse"
+    elif key == "heights" and (not isinstance(value, list) or not value):
+        wrong = 'must be a list like ["0.700 mm", "0.490 mm"], base first'
+    elif key == "sheet" and not isinstance(value, str):
+        wrong = f'= {value!r} must be a name, like "Sheet1"'
+    if wrong:
+        raise InputError(f"{where} {wrong}.")
     if key in ("cycle", "duplicates", "sheet"):
         return value
-    given = value if key == "heights" else [value]
     numbers = []
-    for i, v in enumerate(given, 1):
-        if spread:
-            number, sigma = parse_uncertain(v, si, where, example)
-            if sigma:
-                spreads[f"{spread}_{i}" if key == "heights" else spread] = sigma
-        else:
-            number = parse_quantity(v, si, where, example)
+    for i, v in enumerate(value if key == "heights" else [value], 1):
+        number, sigma = parse_uncertain(v, si, where, example)
+        if sigma is not None and not spread:
+            raise no_spread(where, v, example)
+        if sigma:
+            spreads[f"{spread}_{i}" if key == "heights" else spread] = sigma
         if section != "window" and not 0.0 < number < math.inf:
             raise InputError(f'{where} = "{v}" must be positive.')
         numbers.append(number)
@@ -272,14 +261,14 @@ def _file(toml: Path, table: Any) -> Path | None:
 
 
 def _motion(path: Path, table: Any, spreads: dict[str, float]) -> Motion:
-    file, example = _file(path, table), "0 ± 50 us"
+    file = _file(path, table)
     if isinstance(table, dict):
         check_keys(f"{path}: [motion]", table, ["file", "delay", "columns"])
     if file is None:
         raise InputError(f'{path}: [motion] must name a file, like file = "camera.csv".')
     columns = _columns(path, table.get("columns", {}), MOTION_CHANNELS, "motion.columns")
-    given = table.get("delay", "0 s")
-    delay, sigma = parse_uncertain(given, "s", f"{path}: [motion] delay", example, zero=True)
+    given, where = table.get("delay", "0 s"), f"{path}: [motion] delay"
+    delay, sigma = parse_uncertain(given, "s", where, "0 ± 50 us", zero=True)
     if sigma:
         spreads["delay"] = sigma
     return Motion(file, columns, delay)

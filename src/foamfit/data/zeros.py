@@ -7,17 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.contact import (
-    ELSEWHERE,
-    Level,
-    Levels,
-    Start,
-    level_on_line,
-    mean_level,
-    smooth,
-)
+from foamfit.data.contact import ELSEWHERE, Levels, Start
 from foamfit.data.measurement import NoiseLevel, Record, Striker
-from foamfit.data.noise import MIN_REST
+from foamfit.data.noise import MIN_REST, NOTHING, Level, level_on_line, line_at, mean_level, smooth
 from foamfit.text import engineering, percent
 
 _LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
@@ -42,6 +34,33 @@ class Span:
     leaves: int
     returned: bool = True
 
+    @classmethod
+    def of_slow_test(cls, record: Record, start: Start) -> Span:
+        """Keep a slow test from its contact on; nothing else shows that the specimen was free."""
+        n = len(record)
+        return cls(start.first, n, max(0, start.first - 2) if start.free else 0, n)
+
+    @classmethod
+    def of_impact(cls, record: Record, start: Start, levels: Levels) -> Span:
+        """Keep a tenth of the rows of contact before it, a fiftieth after it.
+
+        The rows kept from before contact show no zeros: the estimate of contact may be late. A
+        derived stress shows its end less well: a quarter is kept after it.
+        """
+        first, stress = start.first, record.stress
+        before = stress[: max(0, first - 2)]
+        zero = float(before.mean()) if before.size >= _FEWEST else 0.0
+        if before.size < _FEW and (tail := tail_level(stress, levels["stress"])):
+            zero = tail.value
+        found, returned = contact_end(stress[first:] - zero, levels["stress"])
+        after = found // (4 if "stress" in record.derived else 50)
+        end = min(len(record), first + found + max(3, after)) if returned else len(record)
+        # Of few rows before contact half are kept and half show the zeros.
+        lead = min(max(_LEAST_LEAD, found // 10), first // 2 if first >= 2 * _FEWEST else first)
+        late = int(3 * start.error / float(np.median(np.diff(record.instants))))
+        rest = first - max(lead, min(late, 2 * first // 3))
+        return cls(first - lead, end, rest, first + found, returned)
+
 
 @dataclass
 class Zeros:
@@ -50,33 +69,6 @@ class Zeros:
     origins: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-
-
-def span_of_slow_test(record: Record, start: Start) -> Span:
-    """Keep a slow test from its contact on; nothing else shows that the specimen was free."""
-    n = len(record)
-    return Span(start.first, n, max(0, start.first - 2) if start.free else 0, n)
-
-
-def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
-    """Keep a tenth of the rows of contact before it, a fiftieth after it.
-
-    The rows kept from before contact show no zeros: the estimate of contact may be late. A derived
-    stress shows its end less well: a quarter is kept after it.
-    """
-    first, stress = start.first, record.stress
-    before = stress[: max(0, first - 2)]
-    zero = float(before.mean()) if before.size >= _FEWEST else 0.0
-    if before.size < _FEW and (tail := tail_level(stress, levels["stress"])):
-        zero = tail.value
-    found, returned = contact_end(stress[first:] - zero, levels["stress"])
-    after = found // (4 if "stress" in record.derived else 50)
-    end = min(len(record), first + found + max(3, after)) if returned else len(record)
-    # Of few rows before contact half are kept and half show the zeros.
-    lead = min(max(_LEAST_LEAD, found // 10), first // 2 if first >= 2 * _FEWEST else first)
-    late = int(3 * start.error / float(np.median(np.diff(record.instants))))
-    rest = first - max(lead, min(late, 2 * first // 3))
-    return Span(first - lead, end, rest, first + found, returned)
 
 
 def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
@@ -119,33 +111,35 @@ def take_zeros(
     for name, values in first.curves("acceleration").items():
         if name in record.derived:
             continue
-        noise, zero = levels[name], Level(0.0, 0.0, 0)
+        noise, zero, note = levels[name], NOTHING, ""
         if name in ("stress", "acceleration"):
+            unit = "Pa" if name == "stress" else "m/s²"
             tail = tail_level(values, noise) if impact and n < _FEW else None
             if tail is not None and tail.samples > n:
-                zero, done.errors[name] = tail, tail.error
-                size = engineering(zero.value, "Pa" if name == "stress" else "m/s²")
-                done.notes.append(
-                    f"The {name} at the end of the record, {size}, is taken off as the sensor's "
-                    f"offset (the striker has left in the last {zero.samples} rows)."
+                zero = tail
+                note = (
+                    f"The {name} at the end of the record, {engineering(zero.value, unit)}, is "
+                    "taken off as the sensor's offset (the striker has left in the last "
+                    f"{zero.samples} rows)."
                 )
             elif n >= _FEWEST:
-                zero = _zero_at_rest(name, values, n, noise, done.notes)
-                done.errors[name] = zero.error
+                zero, note = _zero_at_rest(name, values[:n], unit, np.ptp(values), noise)
             elif start.first:
-                done.notes.append(
+                note = (
                     f"Only {n} rows certainly lie before contact: the file's own zero of the "
                     f"{name} stands."
                 )
-        else:
-            zero, source = _zero_of_motion(name, first, start, n, noise)
-            if name == "displacement" and start.gauge == "rest" and n >= _FEWEST:
+            if zero.samples:
                 done.errors[name] = zero.error
-            size = engineering(zero.value, "m")
-            if name == "displacement" and zero.value != 0.0:
-                done.notes.append(f"The displacement at contact, {size}, is taken off ({source}).")
-            elif abs(zero.value) > 1e-3 * np.ptp(values):
-                done.notes.append(f"{name} at contact, {size}, is taken off ({source}).")
+        else:
+            zero, source = _zero_of_motion(name, first, start, n, noise, impact=impact)
+            top = name == "displacement"
+            if top and start.gauge == "rest" and n >= _FEWEST:
+                done.errors[name] = zero.error
+            if abs(zero.value) > (0.0 if top else 1e-3 * np.ptp(values)):
+                label, size = "The displacement" if top else name, engineering(zero.value, "m")
+                note = f"{label} at contact, {size}, is taken off ({source})."
+        done.notes += [note] * bool(note)
         whole = record.channel(name)
         assert whole is not None  # the record has the channels of its first cycle
         record = record.changed(name, whole - zero.value)
@@ -153,43 +147,40 @@ def take_zeros(
     return record, done
 
 
-def _zero_at_rest(name: str, values: Array, n: int, noise: NoiseLevel, notes: list[str]) -> Level:
+def _zero_at_rest(
+    name: str, rest: Array, unit: str, size: float, noise: NoiseLevel
+) -> tuple[Level, str]:
     """Zero of a stress or acceleration at rest; one that drifts more than it is off is kept."""
-    rest, unit = values[:n], "Pa" if name == "stress" else "m/s²"
-    zero = mean_level(rest, noise)
-    scatter = float(rest.std())
+    n, zero, scatter, told = len(rest), mean_level(rest, noise), float(rest.std()), ""
     slope = level_on_line(np.arange(n, dtype=np.float64), rest, 0.0, noise)[1]
     rise = slope.value * n
-    if abs(rise) > max(0.01 * np.ptp(values), 4 * slope.error * n):
-        told = f"The {name} drifts by {engineering(rise, unit)} in the {n} samples before contact"
+    if abs(rise) > max(0.01 * size, 4 * slope.error * n):
         kept = abs(zero.value) <= abs(rise)
         done = "no offset is taken off" if kept else "its zero is known no better"
-        notes.append(f"{told}, so {done}.")
-        error = float(np.hypot(zero.error, rise))
-        zero = Level(0.0 if kept else zero.value, error, n)
+        drift = engineering(rise, unit)
+        told = f"The {name} drifts by {drift} in the {n} samples before contact, so {done}. "
+        zero = Level(0.0 if kept else zero.value, float(np.hypot(zero.error, rise)), n)
     if zero.value:
         ratio = f", {abs(zero.value) / scatter:.2g} times that" if scatter > 0 else ""
-        notes.append(
-            f"The {name} before contact, {engineering(zero.value, unit)}, is taken off as the "
-            f"sensor's offset ({n} samples at rest with a standard deviation of "
-            f"{engineering(scatter, unit)}{ratio}; standard error "
-            f"{engineering(zero.error, unit)})."
+        value, sigma, error = (engineering(v, unit) for v in (zero.value, scatter, zero.error))
+        told += (
+            f"The {name} before contact, {value}, is taken off as the sensor's offset ({n} samples "
+            f"at rest with a standard deviation of {sigma}{ratio}; standard error {error})."
         )
-    return zero
+    return zero, told.strip()
 
 
 def _zero_of_motion(
-    name: str, record: Record, start: Start, n: int, noise: NoiseLevel
+    name: str, record: Record, start: Start, n: int, noise: NoiseLevel, *, impact: bool
 ) -> tuple[Level, str]:
     """Value of a motion at contact: the mean of its rest, or else that of a line there.
 
-    Where nothing was recorded before contact, the file's zero stands unless it lies elsewhere.
+    Where nothing was recorded before contact, the file's zero stands unless it lies elsewhere; a
+    slow test whose record starts under load has its own zero, too.
     """
     time, values, first = record.instants, record.channel(name), start.first
     assert values is not None  # asked for by its name
     top = name == "displacement"
-    if top and start.zero is not None:
-        return start.zero, start.zero_from
     rows = n if n >= _FEWEST else max(0, first - 2)
     if rows >= _FEWEST and (not top or start.gauge == "rest"):
         zero = mean_level(values[:rows], noise)
@@ -199,8 +190,28 @@ def _zero_of_motion(
     near = slice(max(0, first - reach) if flies else first, first + reach)
     zero = level_on_line(time[near], values[near], start.time, noise)[0]
     source = zero.source(noise, "line through") + (" around it" if flies else " from there on")
-    least = max(ELSEWHERE * zero.error, (0.1 if top else 2e-3) * float(np.ptp(values)))
-    return (zero if flies or abs(zero.value) > least else Level(0.0, 0.0, 0)), source
+    size, stress = float(np.ptp(values)), record.stress
+    loaded = not impact and stress[:3].mean() > 0.05 * stress.max() and 0.0 < zero.value < size
+    least = max(ELSEWHERE * zero.error, ((0.1 if impact else 0.02) if top else 2e-3) * size)
+    own = not flies and (loaded or abs(zero.value) <= least)
+    return NOTHING if own else zero, source
+
+
+def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker) -> str:
+    """Say what the motion of an impact was before contact; see `Start.gauge`."""
+    time, w, before = record.instants, record.displacement, start.first - 2
+    if w is None or not start.free or start.first == 0:
+        return ""
+    if before < 3:
+        return "other"
+    top = int(np.argmax(w))
+    early = slice(start.first, start.first + max(5, (top - start.first) // 6))
+    speed = striker.velocity or line_at(time[early], w[early], start.time)[1]
+    slope = level_on_line(time[:before], w[:before], start.time, levels["displacement"])[1]
+    for gauge, expected in (("flight", speed), ("rest", 0.0)):
+        if abs(slope.value - expected) <= slope.error + 0.05 * speed:
+            return gauge if slope.error < 0.2 * speed else "other"
+    return "other"
 
 
 def mark_flight(record: Record, start: Start, span: Span) -> Record:

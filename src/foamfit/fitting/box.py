@@ -7,7 +7,7 @@ between ends that depend on other parameters; nuisance parameters move between t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -148,8 +148,8 @@ COMMON_ORDER = ("g", "tau", "eta", "height")
 class Coordinate(NamedTuple):
     """One coordinate: the place of its parameter in the vector, and how they depend on each other.
 
-    `param` is the record, None of a nuisance parameter; `unit` is its scale, SI; `of` has the
-    places of the parameters that it is relative to.
+    `param` is the record, None of a nuisance parameter or an absolute one; `unit` is its scale, SI,
+    0 of a nuisance parameter; `of` has the places of the parameters that it is relative to.
     """
 
     place: int
@@ -178,14 +178,18 @@ class Space:
     high: Array
     # Completes a vector in which some parameters hang on others.
     tied: Callable[[Array], Array] | None
+    # Parameters that are their own coordinates (SI) rather than relative to others, so that tests
+    # can share their values. Not every point is admissible then.
+    absolute: tuple[str, ...] = ()
 
     @cached_property
     def coordinates(self) -> list[Coordinate]:
         """The parameters that vary, each after those that it is relative to."""
         out, index = [], {name: i for i, name in enumerate(self.names)}
         for name in sorted(self.free, key=self._rank):
-            if name in NUISANCE:
-                out.append(Coordinate(index[name], name, None, 0.0, ()))
+            if name in NUISANCE or name in self.absolute:
+                unit = 1.0 if name in self.absolute else 0.0
+                out.append(Coordinate(index[name], name, None, unit, ()))
                 continue
             param, prefix = self.model.param(name), name.partition("_")[0]
             of = tuple(index[f"{prefix}_{short}"] for short in param.of)
@@ -205,8 +209,14 @@ class Space:
     @cached_property
     def box(self) -> tuple[Array, Array]:
         """Lowest and highest coordinates, (n_free,) each."""
-        pairs = [NUISANCE_BOX if c.param is None else c.param.limits for c in self.coordinates]
-        low, high = np.array(pairs).reshape(-1, 2).T
+        low, high = np.empty((2, len(self.coordinates)))
+        for j, one in enumerate(self.coordinates):
+            if one.param is not None:
+                low[j], high[j] = one.param.limits
+            elif one.unit:
+                low[j], high[j] = self.low[one.place], self.high[one.place]
+            else:
+                low[j], high[j] = NUISANCE_BOX
         return low, high
 
     def _middle(self, i: int) -> tuple[float, float]:
@@ -215,6 +225,8 @@ class Space:
 
     def _ends(self, one: Coordinate, values: Array) -> tuple[float, float]:
         """Values of a parameter at the coordinates 0 and 1, unless its logarithm is one."""
+        if one.param is None and one.unit:
+            return 0.0, one.unit
         if one.param is None:
             middle, half = self._middle(one.place)
             return middle, middle + half
@@ -241,6 +253,19 @@ class Space:
         for u, one in zip(point, self.coordinates, strict=True):
             value = self._value(u, one, values)
             values[one.place] = min(max(value, self.low[one.place]), self.high[one.place])
+        return self.complete(values)
+
+    def admit(self, values: Array, held: Collection[int] = ()) -> Array:
+        """Move what is relative to other parameters between its ends, in place, and complete it.
+
+        What stands at the places `held` stays.
+        """
+        for one in self.coordinates:
+            param = one.param
+            if param is not None and param.of and one.place not in held:
+                first, last = self._ends(one, values)
+                ends = [first + u * (last - first) for u in param.limits]
+                values[one.place] = np.clip(values[one.place], min(ends), max(ends))
         return self.complete(values)
 
     def complete(self, values: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Which curves a test and a drive allow to compare, and how much each counts."""
+"""What a test gives an objective: its drive, the curves to compare, and when they are simulated."""
 
 from __future__ import annotations
 
@@ -8,16 +8,20 @@ from scipy.ndimage import convolve1d
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel
+from foamfit.data.motion import SmoothMotion, follow
 from foamfit.errors import InputError
 from foamfit.springs.model import Model
 
-# Of every objective; to them come displacement_1_time … where masses inside were followed.
+# Those of every objective, besides displacement_1_time … where masses inside were followed.
 CURVES = ("stress_time", "displacement_time", "stress_strain")
 # Of an impact whose striker carries an accelerometer and whose displacement was not measured.
 ACCELERATION = "acceleration_time"
 # Those that need a motion.
 MOTION_CURVES = ("displacement_time", "stress_strain")
 DRIVES = ("impact", "stress", "displacement")
+# Noise of a motion, over its range, that counts as none; most that a smooth motion may leave of the
+# samples, over their noise.
+EXACT, FOLLOWED = 1e-6, 1.5
 
 
 def choose_drive(measurement: Measurement) -> str:
@@ -41,20 +45,15 @@ def check_drive(measurement: Measurement, drive: str) -> None:
     """Refuse a drive that the test cannot feed (InputError, naming what is missing)."""
     if drive not in DRIVES:
         raise InputError(f"drive '{drive}' is unknown; it must be one of {', '.join(DRIVES)}")
-    striker = measurement.striker
-    missing = []
-    if measurement.stress is None:
-        missing.append("a force or stress column")
-    if drive == "impact":
-        if measurement.time is None:
-            missing.append("a time column")
-        if striker is None or striker.mass is None:
-            missing.append("[striker] mass")
-        if striker is None or not striker.velocity:
-            missing.append("[striker] velocity greater than zero")
-    elif measurement.displacement is None:
-        missing.append("a displacement or strain column")
-    if missing:
+    striker, impact = measurement.striker, drive == "impact"
+    needed = {
+        "a force or stress column": measurement.stress is not None,
+        "a time column": not impact or measurement.time is not None,
+        "[striker] mass": not impact or (striker is not None and striker.mass is not None),
+        "[striker] velocity greater than zero": not impact or (striker and striker.velocity),
+        "a displacement or strain column": impact or measurement.displacement is not None,
+    }
+    if missing := [what for what, there in needed.items() if not there]:
         raise InputError(f"{measurement.name}: the {drive} drive needs {' and '.join(missing)}")
     force = measurement.outliers.get("stress")
     if drive == "stress" and force is not None and force.clipped_at is not None:
@@ -65,20 +64,20 @@ def check_drive(measurement: Measurement, drive: str) -> None:
 
 
 def interior_curves(measurement: Measurement, springs: int) -> dict[str, int]:
-    """Curves of the masses inside a chain of so many springs that were followed, and their node."""
+    """Curves of the masses inside a chain whose motion was measured, and their node."""
     nodes = sorted(node for node in measurement.interior if node < springs)
     return {f"{interior_channel(node)}_time": node for node in nodes}
 
 
 def check_interior(measurement: Measurement, springs: int) -> None:
-    """Refuse the displacement of a mass that is not inside a chain of so many springs (InputError).
+    """Refuse the displacement of a mass that is not inside the chain (InputError).
 
     A single spring has nothing inside; the result's notes say so.
     """
-    wrong = [node for node in sorted(measurement.interior) if node >= springs]
+    wrong = min((node for node in measurement.interior if node >= springs), default=0)
     if wrong and springs > 1:
         raise InputError(
-            f"{measurement.name}: {interior_channel(wrong[0])} is no mass inside a chain of "
+            f"{measurement.name}: {interior_channel(wrong)} is not a mass inside a chain of "
             f"{springs} springs: node {springs} of a {springs}-spring chain is the top, which is "
             "the 'displacement' column; take a model of more springs, or rename or leave out that "
             "column"
@@ -86,12 +85,12 @@ def check_interior(measurement: Measurement, springs: int) -> None:
 
 
 def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> dict[str, float]:
-    """Weights that count each measured channel once, for a chain of so many springs.
+    """Weights that count each measured channel once.
 
     In the impact drive stress and displacement are compared in time; a displacement that was
-    integrated from the force is no second measurement. In the displacement drive the stress along
-    the measured displacement is the one curve, in the stress drive the displacement. Displacements
-    of masses inside count in all drives: they tell the springs apart.
+    integrated from the force is not a second measurement. In the displacement drive the only curve
+    is the stress along the measured displacement, in the stress drive the displacement.
+    Displacements of masses inside count in all drives: they tell the springs apart.
     """
     weights = dict.fromkeys(CURVES, 0.0)
     weights |= dict.fromkeys(interior_curves(measurement, springs), 1.0)
@@ -134,13 +133,60 @@ def driving_stress(stress: Array, model: Model) -> Array:
     return np.maximum(smooth, 0.0) if "unilateral" in model.kinds else smooth
 
 
+def driving_motion(measurement: Measurement, time: Array) -> SmoothMotion | None:
+    """The measured motion without its noise; None where its samples say all, or are not there.
+
+    An exact motion that turns sharply between samples went further than they say. Where a noisy one
+    leaves the samples more than their noise the machine's motion is not that smooth: the samples
+    themselves are the better motion. `time` (n,) is that of the samples, s.
+    """
+    values, level = measurement.displacement, measurement.noise.of("displacement")
+    if values is None or level is None:
+        return None
+    counts = measurement.sampled.get("displacement")
+    found = follow(time, values, level, counts)
+    if level.sigma <= EXACT * float(np.ptp(values)):
+        beside = np.abs(found.turns[:, None] - time).min(axis=1, initial=np.inf)
+        return found if np.any(beside > 1e-6 * float(np.median(np.diff(time)))) else None
+    if measurement.block > 1 and found.turns.size:
+        # The mean of rows on either side of a turn lies off the motion.
+        gap = float(np.median(np.diff(time)))
+        apart = np.abs(time[:, None] - found.turns).min(axis=1) > 0.75 * gap
+        counts = apart if counts is None else counts & apart
+        found = follow(time, values, level, counts)
+    return found if found.sigma <= FOLLOWED * level.sigma else None
+
+
+def later(time: Array, curves: Array, late: float) -> Array:
+    """Curves (…, n) seen `late` seconds later, at the samples; straight past their ends."""
+    when = time - late
+    ahead, after = np.minimum(when - time[0], 0.0), np.maximum(when - time[-1], 0.0)
+    first = (curves[..., 1] - curves[..., 0]) / (time[1] - time[0])
+    last = (curves[..., -1] - curves[..., -2]) / (time[-1] - time[-2])
+    rows = [np.interp(when, time, row) for row in np.atleast_2d(curves)]
+    inside = np.reshape(rows, curves.shape)
+    return np.asarray(inside + first[..., None] * ahead + last[..., None] * after)
+
+
+def instants(time: Array, fine: int) -> Array:
+    """Instants that each sample averages: so many, evenly spread over its share of the clock."""
+    if fine == 1:
+        return time
+    gaps = np.diff(time)
+    widths = np.minimum(np.append(gaps, gaps[-1]), np.append(gaps[0], gaps))
+    offsets = (np.arange(fine) + 0.5) / fine - 0.5
+    return np.asarray((time[:, None] + widths[:, None] * offsets).ravel())
+
+
 def check_time_shift(measurement: Measurement, drive: str) -> None:
     """Refuse a time shift where the test has no two channels in time (InputError)."""
-    missing = "it has no time" if measurement.time is None else None
-    if missing is None and (measurement.displacement is None or measurement.motion == INTEGRATED):
-        missing = "its motion is not measured apart from the force"
-    if missing:
-        raise InputError(
-            f"{measurement.name}: a time shift between force and motion cannot be fitted in the "
-            f"{drive} drive, {missing}; both channels must be measured in time"
-        )
+    if measurement.time is None:
+        why = "it has no time"
+    elif measurement.displacement is None or measurement.motion == INTEGRATED:
+        why = "its motion is not measured apart from the force"
+    else:
+        return
+    raise InputError(
+        f"{measurement.name}: a time shift between force and motion cannot be fitted in the "
+        f"{drive} drive, {why}; both channels must be measured in time"
+    )

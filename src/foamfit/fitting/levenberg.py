@@ -1,9 +1,11 @@
-"""Levenberg-Marquardt: the one descent of the search and of refits close to a minimum."""
+"""Levenberg-Marquardt: the descent of one test, of several, and of refits near a minimum."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,40 +14,79 @@ from foamfit.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
+class Blocks:
+    """Jacobian of the residuals of several tests, one under the other.
+
+    Each test has the derivatives (n_t, c_t) of its residual by those of the `count` coordinates
+    that it depends on, and their places.
+    """
+
+    tests: Sequence[tuple[Array, NDArray[np.intp]]]
+    count: int
+
+    def gradient(self, residual: Array) -> Array:
+        """Return Jᵀr."""
+        out, first = np.zeros(self.count), 0
+        for slopes, places in self.tests:
+            out[places] += slopes.T @ residual[first : first + len(slopes)]
+            first += len(slopes)
+        return out
+
+    @property
+    def normal(self) -> Array:
+        """JᵀJ."""
+        out = np.zeros((self.count, self.count))
+        for slopes, places in self.tests:
+            out[np.ix_(places, places)] += slopes.T @ slopes
+        return out
+
+
+@dataclass(frozen=True, eq=False)
 class Iterate:
     """A point with its residual and the derivative of the residual by scaled coordinates."""
 
     point: Array
     residual: Array
-    jacobian: Array
+    jacobian: Any  # (n, k), or the Blocks of several tests
 
     @property
     def cost(self) -> float:
         """Sum of squares."""
         return float(self.residual @ self.residual)
 
+    @cached_property
+    def gradient(self) -> Array:
+        """Half the gradient of the cost, Jᵀr."""
+        if isinstance(self.jacobian, Blocks):
+            return self.jacobian.gradient(self.residual)
+        return np.asarray(self.jacobian.T @ self.residual)
 
-def damped_step(residual: Array, jacobian: Array, damping: float, held: NDArray[np.bool_]) -> Array:
+    @cached_property
+    def normal(self) -> Array:
+        """Normal matrix JᵀJ."""
+        if isinstance(self.jacobian, Blocks):
+            return self.jacobian.normal
+        return np.asarray(self.jacobian.T @ self.jacobian)
+
+    def expected(self, step: Array) -> float:
+        """Gain of the cost that the Jacobian predicts for a step."""
+        return -float(step @ (2.0 * self.gradient + self.normal @ step))
+
+
+def damped_step(gradient: Array, normal: Array, damping: float, held: NDArray[np.bool_]) -> Array:
     """Gauss-Newton step of what is not held, its damping over the diagonal of the normal matrix."""
-    gradient = jacobian.T @ residual
     moving = np.flatnonzero(~held)
     step = np.zeros(gradient.size)
     if moving.size:
-        own = jacobian[:, moving]
-        normal = own.T @ own
-        scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.trace(normal)), 1e-300))
-        step[moving] = np.linalg.solve(normal + damping * np.diag(scale), -gradient[moving])
+        own = normal[np.ix_(moving, moving)]
+        scale = np.maximum(np.diag(own), 1e-12 * max(float(np.trace(own)), 1e-300))
+        step[moving] = np.linalg.solve(own + damping * np.diag(scale), -gradient[moving])
     return step
-
-
-def _expected(at: Iterate, gradient: Array, step: Array) -> float:
-    """Gain of the cost that the Jacobian predicts for a step."""
-    return -float(step @ (2.0 * gradient + at.jacobian.T @ (at.jacobian @ step)))
 
 
 def descend(
     residual: Callable[[Array], Array],
-    jacobian: Callable[[Array], Array],
+    jacobian: Callable[[Array], Array | Blocks],
     start: Array,
     box: tuple[Array, Array],
     iterations: int,
@@ -58,15 +99,15 @@ def descend(
 
     The damping follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). It ends when two steps in a
     row lower the cost by less than the share `enough`, or when the expected gain is below `least`.
+    A point with an infinite residual is refused; the start must have a finite one.
     """
     low, high = box
     at = Iterate(start, residual(start), jacobian(start))
     growth, small = 2.0, 0
     for _ in range(iterations):
-        gradient = at.jacobian.T @ at.residual
-        held = ((at.point <= low) & (gradient > 0)) | ((at.point >= high) & (gradient < 0))
-        step = damped_step(at.residual, at.jacobian, damping, held | (low == high))
-        if not step.any() or _expected(at, gradient, step) < least:
+        held = ((at.point <= low) & (at.gradient > 0)) | ((at.point >= high) & (at.gradient < 0))
+        step = damped_step(at.gradient, at.normal, damping, held | (low == high))
+        if not step.any() or at.expected(step) < least:
             break
         trial = np.clip(at.point + step, low, high)
         moved = trial - at.point
@@ -74,13 +115,12 @@ def descend(
         gain = at.cost - float(found @ found)
         if gain > 0.0:
             small = small + 1 if gain < enough * at.cost else 0
-            ratio = gain / max(_expected(at, gradient, moved), 1e-300)
+            ratio = gain / max(at.expected(moved), 1e-300)
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3)
             growth = 2.0
-            at = replace(at, point=trial, residual=found)
             if small == 2:
-                break
-            at = replace(at, jacobian=jacobian(trial))
+                return replace(at, point=trial, residual=found)
+            at = Iterate(trial, found, jacobian(trial))
         else:
             damping *= growth
             growth *= 2.0

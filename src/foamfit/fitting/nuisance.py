@@ -1,9 +1,9 @@
 """What a record does not say exactly: contact, zeros of the channels, and the striker.
 
-They are unknowns beside the parameters of the springs: all of them of an impact, the zeros of
-motion and stress where a motion drives. Each value counts from what the
-record itself gives (`Measurement.origins`, the striker of the TOML), so that a measurement taken
-for exact has zeros here, and the velocity and mass that the TOML states.
+These are unknowns beside the parameters of the springs: all of them in an impact, the zeros of
+motion and stress where a motion drives. Each value counts from what the record itself gives
+(`Measurement.origins`, the striker of the TOML), so that for an exact measurement times and zeros
+are 0, and velocity and mass those of the TOML.
 """
 
 from __future__ import annotations
@@ -101,17 +101,14 @@ def limits_of(
     name: str, measurement: Measurement, drive: str, duration: float, ranges: Mapping[str, float]
 ) -> tuple[float, float]:
     """Limits of a nuisance parameter, SI; `ranges` are those of the channels."""
-    prior = priors_of(measurement, drive).get(name)
-    middle = values_of(measurement)[name]
+    prior, middle = priors_of(measurement, drive).get(name), values_of(measurement)[name]
     if prior is not None:
         reach = REACH * prior.sigma
-        if name in STRIKER:
-            reach = min(reach, 0.9 * middle)
-        return middle - reach, middle + reach
-    if name in (CONTACT_TIME, TIME_SHIFT):
-        reach = (LARGEST_CONTACT if name == CONTACT_TIME else LARGEST_SHIFT) * duration
-        return -reach, reach
-    if name in ZEROS:
+        reach = min(reach, 0.9 * middle) if name in STRIKER else reach
+    elif name in STRIKER:
+        return 0.1 * middle, 10.0 * middle
+    elif name in ZEROS:
         reach = LARGEST_ZERO * ranges.get(ZEROS[name], 0.0)
-        return -reach, reach
-    return 0.1 * middle, 10.0 * middle
+    else:
+        reach = (LARGEST_CONTACT if name == CONTACT_TIME else LARGEST_SHIFT) * duration
+    return middle - reach, middle + reach

@@ -22,18 +22,19 @@ from foamfit.data.motion import SmoothMotion
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.fitting import nuisance as nuisances
-from foamfit.fitting.clock import driving_motion, instants, later
 from foamfit.fitting.curves import (
     ACCELERATION,
     CURVES,
     MOTION_CURVES,
     check_drive,
     check_time_shift,
+    driving_motion,
     driving_stress,
+    instants,
     interior_curves,
+    later,
 )
-from foamfit.fitting.losses import LOSSES, soften, softness
-from foamfit.fitting.weighing import Weighing
+from foamfit.fitting.losses import LOSSES, Weighing, soften, softness
 from foamfit.solve.plan import AnyPlan, Motion
 from foamfit.solve.plan import plan as make_plan
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive

@@ -16,24 +16,18 @@ def in_order(space: Space, objective: Objective, values: Array) -> Array:
 
     Two springs can be exchanged if they are of one kind and the curves stay the same, so never
     across a mass inside whose displacement is counted; the foam of the paper buckles first at its
-    base.
+    base. Relaxation terms are ordered by their times, unless one of them is held.
     """
-    for law in dict.fromkeys(space.model.laws):
-        if law.hysteretic:
-            values = _of_law(space, objective, values, law)
-    return _terms_by_time(space, values)
-
-
-def _terms_by_time(space: Space, values: Array) -> Array:
-    """Order the relaxation terms of each spring by their times, unless one of them is held."""
-    model, out = space.model, values.copy()
+    model, free = space.model, set(space.free)
+    for law in dict.fromkeys(model.laws):
+        values = _of_law(space, objective, values, law) if law.hysteretic else values
+    out = values.copy()
     for spring in range(1, len(model.kinds) + 1):
         names = [f"s{spring}_{short}" for short in relaxation_names(model.relaxation)]
-        if not names or names[0] not in model.index:
-            continue
-        if all(name in space.free for name in names):
-            terms = values[[model.index[name] for name in names]].reshape(-1, 2)
-            out[[model.index[name] for name in names]] = terms[np.argsort(terms[:, 1])].ravel()
+        if names and free.issuperset(names):
+            places = [model.index[name] for name in names]
+            terms = values[places].reshape(-1, 2)
+            out[places] = terms[np.argsort(terms[:, 1])].ravel()
     return out
 
 

@@ -44,10 +44,10 @@ def make_params(
     model : str or Model
         For example "linear+bistable".
     drive : str, optional
-        "impact", "stress" or "displacement"; see `fitting.curves.choose_drive`.
+        "impact", "stress" or "displacement"; by default as in `fit`.
     time_shift : bool
-        Whether the time by which the motion channel is late is a parameter too; where the delay of
-        a motion with its own clock has a ±, it is one in any case.
+        Whether the delay of the motion against the force is a parameter. It always is if the motion
+        has its own clock and its delay has a ±.
     relaxation : int
         Relaxation terms of every hysteretic spring of a model that is given by its name.
 

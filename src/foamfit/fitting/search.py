@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import CURVE_STARTS, box_starts, curve_starts, smooth_loop
+from foamfit.fitting.together import Squares
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 
@@ -125,15 +125,8 @@ def descend(
     tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
 ) -> tuple[float, Array]:
     """Levenberg-Marquardt descent inside the box; returns (cost, coordinates) of its end."""
-
-    def jacobian(point: Array) -> Array:
-        values = space.decode(point)
-        return tracker.objective.jacobian_along(values, space.slopes(point, values))
-
-    end = levenberg.descend(
-        lambda point: tracker.residual(space.decode(point)), jacobian,
-        start, space.box, iterations, enough=enough,
-    )  # fmt: skip
+    squares = Squares.of_one(tracker.residual, tracker.objective, space)
+    end = squares.descend(start, iterations, enough)
     return end.cost, end.point
 
 

@@ -59,6 +59,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
     more = sum(max(law.marks - OWN_MARKS, 0) for law in laws if law.hysteretic)
     marks = qmc.LatinHypercube(7 * count + more + relaxing, rng=rng).random(CURVE_STARTS)
     starts = []
+    lines = [law.own == ("k0",) for law in laws]
     ways = range(max(law.ways for law in laws))
     for (turn, mark), way in product(enumerate(marks), ways):
         values = space.values.copy()
@@ -71,16 +72,16 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
             values = space.complete(values)
             heights = np.maximum(values[given], 1e-3 * space.scales.height)
         motion = loop.displacement.copy()
-        for i, law in enumerate(laws):
-            if not law.hysteretic:
+        for i in range(count):
+            if lines[i]:
                 share = 10.0 ** (-3.0 + 2.7 * mark[7 * i + 6])
                 k0 = heights[i] * space.scales.stress / (share * motion.max())
                 values[index[f"s{i + 1}_k0"]] = k0
                 motion = motion - heights[i] * loop.stress / k0
-        soft = sum(h for h, law in zip(heights, laws, strict=True) if law.hysteretic)
+        soft = sum(h for h, line in zip(heights, lines, strict=True) if not line)
         left, rest = Loop(motion / (soft or 1.0), loop.stress), iter(mark[7 * count :])
         for i, law in enumerate(laws):
-            if not law.hysteretic:
+            if lines[i]:
                 continue
             extra = [next(rest) for _ in range(max(law.marks - OWN_MARKS, 0))]
             places = np.append(mark[7 * i : 7 * i + OWN_MARKS], extra)
@@ -92,7 +93,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
             else:
                 own[:] = law.read_off(left, places, space.scales, way)
             terms = model.own_places[i] + own.size
-            for at in range(terms, terms + 2 * model.relaxation, 2):
+            for at in range(terms, terms + 2 * model.relaxation * law.hysteretic, 2):
                 values[at] = 10.0 ** (1.5 * next(rest) - 1.5)
                 values[at + 1] = space.scales.duration * 10.0 ** (2.0 * next(rest) - 2.5)
         starts.append(space.encode(values))

@@ -1,43 +1,165 @@
-"""One fit of several tests: some parameters have one value for all, the others one for each test.
+"""The sum of squares of one test or several, and the fit of several tests with linked parameters.
 
 All residuals are minimised as one sum of squares, each test in units of its own noise. A parameter
-may also scatter about a common value or follow a law of rate (`fitting.links`). The normal matrix
-has a block for each test, and only the shared coordinates couple them: own parameters are
-eliminated test by test (Schur complement), so that a step costs as much as the tests one by one.
+has one value for all tests, one for each, scatters about a common value or follows a law of rate
+(`fitting.links`). The fit of a single test is the case of one test whose coordinates are its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.box import Scales, Space, is_logarithmic
-from foamfit.fitting.links import (
-    RATES,
-    STEEPEST,
-    Links,
-    Slots,
-    law,
-    law_slopes,
-    log_law,
-    log_law_slopes,
-    start_of,
-)
+from foamfit.fitting import levenberg
+from foamfit.fitting.box import Scales, Space
+from foamfit.fitting.links import RATES, STEEPEST, Links, factor, start_of
+from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import Problem
-from foamfit.springs.parameters import NUISANCE, any_param, split_name
+from foamfit.springs.parameters import NUISANCE
 
 # Descents end when two steps in a row gain less than this share, or after so many steps.
 ENOUGH, ITERATIONS = 1e-5, 80
-_LEAST_MOVE, _MOST_DAMPING = 1e-9, 1e8
 # Least value of which a scattering parameter has the logarithm, and the largest logarithm.
 _TINY, _FAR = 1e-30, 100.0
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A coordinate of one test that follows a law of rate."""
+
+    at: int  # Its place among the coordinates of the test
+    kind: str  # One of `RATES`
+    x: float  # ln(rate/rate0) of the test
+    logarithmic: bool  # Whether the coordinate is the logarithm of the parameter
+
+    def value(self, v: float, b: float) -> tuple[float, float, float]:
+        """Return the coordinate and its derivatives by the coordinate v at rate0 and by b."""
+        f, slope, _ = factor(self.kind, b, self.x)
+        if self.logarithmic:
+            return v + float(np.log(f)), 1.0, slope / f
+        return v * f, f, v * slope
+
+
+@dataclass(frozen=True)
+class Pull:
+    """What draws a scattering parameter of one test to its common value."""
+
+    place: int  # In the vector of parameters
+    common: int  # Coordinate of the logarithm of the common value
+    weight: float  # Root of the weight
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """One test in a sum of squares.
+
+    Its parameters are those of the point of its box (`space`) whose coordinates stand at `places`
+    of all coordinates; the slope b of a law of rate stands behind the value at rate0.
+    """
+
+    residual: Callable[[Array], Array]  # By the parameters, SI; infinite where not simulated
+    objective: Objective
+    space: Space
+    places: NDArray[np.intp]
+    rates: tuple[Rate, ...] = ()
+    pulls: tuple[Pull, ...] = ()
+
+    @cached_property
+    def all_places(self) -> NDArray[np.intp]:
+        """Places of all coordinates on which the residual depends."""
+        slopes = [self.places[rate.at] + 1 for rate in self.rates]
+        return np.array([*self.places, *slopes, *(pull.common for pull in self.pulls)], np.intp)
+
+    def _at(self, point: Array) -> tuple[Array, Array]:
+        """Point of the box at all coordinates, and its derivative by those in `all_places`."""
+        own = point[self.places]
+        through = np.eye(own.size, self.all_places.size)
+        for j, rate in enumerate(self.rates):
+            at, slope = rate.at, own.size + j
+            found = rate.value(own[at], point[self.places[at] + 1])
+            own[at], through[at, at], through[at, slope] = found
+        return own, through
+
+    def values(self, point: Array) -> Array:
+        """Parameters at all coordinates, SI."""
+        return self.space.decode(self._at(point)[0] if self.rates else point[self.places])
+
+    def residual_at(self, point: Array) -> Array:
+        """Residual at all coordinates, followed by those of what is drawn to a common value."""
+        values = self.values(point)
+        found = self.residual(values)
+        if not self.pulls:
+            return found
+        off = [
+            pull.weight * (_logarithm(values[pull.place]) - point[pull.common])
+            for pull in self.pulls
+        ]
+        return np.append(found, off)
+
+    def jacobian_at(self, point: Array) -> Array:
+        """Derivative of `residual_at` by the coordinates in `all_places`, (n, c)."""
+        own, through = self._at(point)
+        values = self.space.decode(own)
+        moves = self.space.slopes(own, values) @ through
+        slopes = self.objective.jacobian_along(values, moves)
+        rows = []
+        first = self.places.size + len(self.rates)
+        for j, pull in enumerate(self.pulls):
+            value = values[pull.place]
+            row = np.zeros(moves.shape[1])
+            if abs(value) > _TINY:
+                row = pull.weight * moves[pull.place] / value
+                row[first + j] -= pull.weight
+            rows.append(row)
+        return np.vstack([slopes, *rows]) if rows else slopes
+
+
+@dataclass(frozen=True, eq=False)
+class Squares:
+    """The sum of squares of one test or several, by the coordinates (k,) of a box."""
+
+    terms: tuple[Term, ...]
+    box: tuple[Array, Array]
+
+    @classmethod
+    def of_one(
+        cls, residual: Callable[[Array], Array], objective: Objective, space: Space
+    ) -> Squares:
+        """Sum of squares of one test, whose coordinates are those of its own box."""
+        places = np.arange(len(space.coordinates), dtype=np.intp)
+        return cls((Term(residual, objective, space, places),), space.box)
+
+    @cached_property
+    def _is_plain(self) -> bool:
+        """Whether the coordinates are those of the box of one test."""
+        return len(self.terms) == 1 and bool(
+            np.array_equal(self.terms[0].all_places, np.arange(self.box[0].size))
+        )
+
+    def residual(self, point: Array) -> Array:
+        """Residuals of the tests, one after the other; infinite where one is not simulated."""
+        if len(self.terms) == 1:
+            return self.terms[0].residual_at(point)
+        return np.concatenate([term.residual_at(point) for term in self.terms])
+
+    def jacobian(self, point: Array) -> Array | levenberg.Blocks:
+        """Derivative of the residual by the coordinates."""
+        if self._is_plain:
+            return self.terms[0].jacobian_at(point)
+        found = [(term.jacobian_at(point), term.all_places) for term in self.terms]
+        return levenberg.Blocks(found, point.size)
+
+    def descend(self, start: Array, iterations: int, enough: float = ENOUGH) -> levenberg.Iterate:
+        """Levenberg-Marquardt descent in the box; see `levenberg.descend`."""
+        return levenberg.descend(
+            self.residual, self.jacobian, start, self.box, iterations, enough=enough
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,15 +172,14 @@ class Together:
     """
 
     problems: tuple[Problem, ...]
+    links: Links
     shared: tuple[str, ...]
     own: tuple[str, ...]
     values: tuple[Array, ...]
     costs: tuple[float, ...]
-    steps: int  # Steps of the descent
-    links: Links
     # What all tests have in common, SI: the value of a shared parameter, value and slope by a law
     # of rate, common value (its logarithm is the mean of theirs) of a scattering one.
-    common: dict[str, tuple[float, ...]]
+    common: Mapping[str, tuple[float, ...]]
 
     @property
     def cost(self) -> float:
@@ -68,8 +189,8 @@ class Together:
     @property
     def n_vary(self) -> int:
         """Numbers that the fit chose: those of all tests, and one of each test where it varies."""
-        laws = sum(self.links.kind(name) in RATES for name in self.shared)
-        return len(self.shared) + laws + sum(len(self.own_of(p)) for p in self.problems)
+        shared = sum(2 if self.links.kind(name) in RATES else 1 for name in self.shared)
+        return shared + sum(name in p.free() for name in self.own for p in self.problems)
 
     @property
     def n_data(self) -> int:
@@ -84,10 +205,6 @@ class Together:
             for problem, values in zip(self.problems, self.values, strict=True)
         )
 
-    def own_of(self, problem: Problem) -> tuple[str, ...]:
-        """Names of the parameters that one test has of its own."""
-        return tuple(name for name in problem.free() if name in self.own)
-
     def value(self, name: str) -> list[float]:
         """Values of one parameter, one for each test that has it."""
         return [
@@ -95,29 +212,6 @@ class Together:
             for problem, values in zip(self.problems, self.values, strict=True)
             if name in problem.index
         ]
-
-
-def fit_together(
-    problems: Sequence[Problem],
-    own: Collection[str],
-    starts: Sequence[Sequence[Array]],
-    *,
-    iterations: int = ITERATIONS,
-) -> Together:
-    """Fit several tests at once, parameters named in `own` for each test, the others for all.
-
-    What a record does not say exactly (`fitting.nuisance`) is one of each test in any case. See
-    `fit_linked`, which this calls.
-    """
-    names = _varying(problems)
-    for name in own:
-        if name not in names:
-            raise InputError(
-                f"parameter '{name}' cannot be one of each test; it must be one of "
-                f"{', '.join(names)}"
-            )
-    kinds = {name: "own" if name in own or name in NUISANCE else "shared" for name in names}
-    return fit_linked(problems, Links(kinds), starts, iterations=iterations)
 
 
 def fit_linked(
@@ -155,23 +249,33 @@ def fit_linked(
         If no start can be simulated.
     """
     layout = _Layout.of(tuple(problems), links)
-    best: tuple[float, _Point, int] | None = None
-    for start in starts:
-        found = _descend(layout, layout.start(start), iterations)
-        if found is not None and (best is None or found[0] < best[0]):
-            best = found
-    if best is None:
+    ends = list[levenberg.Iterate]()
+    for vectors in starts:
+        start = layout.start(vectors)
+        if np.all(np.isfinite(layout.squares.residual(start))):
+            ends.append(layout.squares.descend(start, iterations))
+    if not ends:
         raise SimulationError(
             f"{problems[0].measurement.name}: no start of the fit of {len(problems)} tests can be "
             "simulated; give values that each test can be simulated with"
         )
-    _, point, steps = best
-    values = tuple(layout.values(point))
-    costs = tuple(float(r @ r) for r in map(_residual, layout.problems, values) if r is not None)
+    best = min(ends, key=lambda end: end.cost)
+    parts = np.split(best.residual, np.cumsum(layout.counts)[:-1])
+    terms = layout.squares.terms
+    values = tuple(term.values(best.point) for term in terms)
+    costs = tuple(
+        float(np.sum(part[: part.size - len(term.pulls)] ** 2))
+        for part, term in zip(parts, terms, strict=True)
+    )
     return Together(
-        layout.problems, layout.slots.linked, layout.own, values, costs, steps, links,
-        layout.common(point, values),
-    )  # fmt: skip
+        layout.problems,
+        links,
+        layout.linked,
+        layout.own,
+        values,
+        costs,
+        layout.common(best.point, values),
+    )
 
 
 def _varying(problems: Sequence[Problem]) -> tuple[str, ...]:
@@ -187,416 +291,174 @@ def _varying(problems: Sequence[Problem]) -> tuple[str, ...]:
     return tuple(name for name in (*first.model.names, *NUISANCE) if name in free)
 
 
-# ------------------------------------------------------------------------------- coordinates
-
-
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """Arrays of the shared coordinates (s,) and of the own ones of each test (n, q)."""
-
-    shared: Any
-    own: Any
-
-    def moved(self, step: _Point, low: _Point, high: _Point) -> _Point:
-        """The point a step away, kept in the box."""
-        return _Point(
-            np.clip(self.shared + step.shared, low.shared, high.shared),
-            np.clip(self.own + step.own, low.own, high.own),
+def _spaces(problems: Sequence[Problem], absolute: Sequence[str]) -> list[Space]:
+    """Boxes of the tests, all on one set of scales and limits."""
+    every, spaces = [problem.scales for problem in problems], [one.space() for one in problems]
+    scales = Scales(
+        max(one.stress for one in every),
+        max(one.strain for one in every),
+        float(np.median([one.rate for one in every])),
+        max(one.height for one in every),
+    )
+    count = len(problems[0].model.names)  # nuisance parameters have limits of their own
+    low = np.min([space.low[:count] for space in spaces], axis=0)
+    high = np.max([space.high[:count] for space in spaces], axis=0)
+    return [
+        replace(
+            space,
+            scales=scales,
+            absolute=tuple(absolute),
+            low=np.append(low, space.low[count:]),
+            high=np.append(high, space.high[count:]),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class _Test:
-    """The way from the local coordinates of one test, in the order of `names`, to its parameters.
-
-    The box of the search has coordinates in which every point is admissible, some of them relative
-    to other parameters. A linked parameter that is relative to one of another value in each test
-    (`plain`) would not be one value: its coordinate is the parameter itself, and a point with it
-    may not be admissible. What does not vary in this test has a coordinate that does nothing.
-    """
-
-    problem: Problem
-    space: Space
-    names: tuple[str, ...]
-    plain: tuple[str, ...]
-
-    @cached_property
-    def _order(self) -> NDArray[np.intp]:
-        """Where each coordinate of the box stands among the local ones."""
-        named = [self.problem.names[one.place] for one in self.space.coordinates]
-        return np.array([self.names.index(name) for name in named], dtype=np.intp)
-
-    @cached_property
-    def _plain(self) -> NDArray[np.intp]:
-        return np.array([self.names.index(name) for name in self.plain], dtype=np.intp)
-
-    @cached_property
-    def _places(self) -> NDArray[np.intp]:
-        return np.array([self.problem.index[name] for name in self.plain], dtype=np.intp)
-
-    @cached_property
-    def present(self) -> NDArray[np.bool_]:
-        """Which of the local coordinates vary in this test."""
-        free = set(self.problem.free())
-        return np.array([name in free for name in self.names])
-
-    @cached_property
-    def box(self) -> tuple[Array, Array]:
-        """Lowest and highest local coordinates; both zero for what does not vary here."""
-        low, high = np.zeros(len(self.names)), np.zeros(len(self.names))
-        low[self._order], high[self._order] = self.space.box
-        for at, place in zip(self._plain, self._places, strict=True):
-            low[at], high[at] = self.space.low[place], self.space.high[place]
-            param = self.problem.model.param(self.problem.names[place])
-            if param.scale == "one":
-                high[at] = min(high[at], param.bounds[1])
-        return low, high
-
-    def encode(self, values: Array) -> Array:
-        """Local coordinates of parameters, moved into the box."""
-        local = np.zeros(len(self.names))
-        local[self._order] = self.space.encode(values)
-        local[self._plain] = values[self._places]
-        return np.clip(local, *self.box)
-
-    def _at(self, local: Array) -> Space:
-        """The box with the plain parameters held at their values."""
-        if not self.plain:
-            return self.space
-        values = self.space.values.copy()
-        values[self._places] = local[self._plain]
-        return replace(self.space, values=values)
-
-    def decode(self, local: Array) -> Array:
-        """Parameters at local coordinates, SI."""
-        return self._at(local).decode(local[self._order])
-
-    def moves(self, local: Array, values: Array) -> Array:
-        """Derivative of the parameters by the local coordinates, (n_values, n_local)."""
-        moves = np.zeros((values.size, local.size))
-        moves[:, self._order] = self._at(local).slopes(local[self._order], values)
-        moves[self._places, self._plain] = 1.0
-        return moves
+        for space in spaces
+    ]
 
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """The tests, what links their parameters, and the box of all coordinates.
-
-    Local coordinates of a test are those of the linked parameters, then those of its own ones; the
-    linked ones follow from the shared coordinates of all tests.
-    """
+    """The sum of squares of tests that are linked, and the places of what they have in common."""
 
     problems: tuple[Problem, ...]
     links: Links
-    slots: Slots
     own: tuple[str, ...]
-    logarithmic: tuple[bool, ...]  # Whether the coordinate of each linked one is its logarithm
-    tests: tuple[_Test, ...] = field(default=())
+    common_places: Mapping[str, int]  # Of what is shared, follows a law of rate, or scatters
+    squares: Squares
 
     @classmethod
     def of(cls, problems: tuple[Problem, ...], links: Links) -> _Layout:
-        """Check that the tests can be fitted together, and put all of them on one set of scales."""
+        """Lay out the coordinates: those in common first, then the own ones test by test."""
         names = _varying(problems)
         kinds = {name: links.kind(name) for name in names}
-        linked = tuple(name for name in names if kinds[name] not in ("own", "scatter"))
-        mine = tuple(name for name in names if name not in linked)
-        one_value = {name for name in names if kinds[name] == "shared"}
-        plain = tuple(
-            name for name in linked
-            if _parents(name) & set(names) - one_value or (_parents(name) and kinds[name] in RATES)
-        )  # fmt: skip
-        every = [problem.scales for problem in problems]
-        scales = Scales(
-            max(one.stress for one in every),
-            max(one.strain for one in every),
-            float(np.median([one.rate for one in every])),
-            max(one.height for one in every),
-        )
-        spaces = [problem.space() for problem in problems]
-        count = len(problems[0].model.names)  # nuisance parameters have limits of their own
-        low = np.min([space.low[:count] for space in spaces], axis=0)
-        high = np.max([space.high[:count] for space in spaces], axis=0)
-        tests = list[_Test]()
-        for problem, space in zip(problems, spaces, strict=True):
-            free = problem.free()
-            boxed = tuple(name for name in free if name not in plain)
-            here = tuple(name for name in plain if name in free)
-            space = replace(
-                space, scales=scales, free=boxed, low=np.append(low, space.low[count:]),
-                high=np.append(high, space.high[count:]),
-            )  # fmt: skip
-            tests.append(_Test(problem, space, linked + mine, here))
-        return cls(
-            problems,
-            links,
-            Slots(linked, tuple(kinds[name] for name in linked),
-                  tuple(name for name in mine if kinds[name] == "scatter")),
-            mine,
-            tuple(is_logarithmic(split_name(name)[1]) for name in linked),
-            tuple(tests),
-        )  # fmt: skip
+        own = tuple(name for name in names if kinds[name] in ("own", "scatter"))
+        shared = {name for name in names if kinds[name] == "shared"}
+        absolute = [
+            name
+            for name in names
+            if name not in own
+            and (parents := _parents(problems[0], name) & set(names))
+            and (parents - shared or kinds[name] in RATES)
+        ]
+        places, count = dict[str, int](), 0
+        for name in names:
+            if kinds[name] != "own":
+                places[name] = count
+                count += 2 if kinds[name] in RATES else 1
+        terms = list[Term]()
+        for t, (problem, space) in enumerate(
+            zip(problems, _spaces(problems, absolute), strict=True)
+        ):
+            at, rates = list[int](), list[Rate]()
+            for j, one in enumerate(space.coordinates):
+                name = problem.names[one.place]
+                if name in own:
+                    at.append(count)
+                    count += 1
+                    continue
+                at.append(places[name])
+                if kinds[name] in RATES:
+                    rates.append(Rate(j, kinds[name], links.x(t), one.is_logarithmic))
+            pulls = tuple(
+                Pull(problem.index[name], places[name], float(pull[t]))
+                for name, pull in links.pulls.items()
+                if name in places and name in problem.free() and pull[t]
+            )
+            terms.append(
+                Term(
+                    _finite(problem),
+                    problem.objective,
+                    space,
+                    np.array(at, np.intp),
+                    tuple(rates),
+                    pulls,
+                )
+            )
+        box = np.full(count, -_FAR), np.full(count, _FAR)
+        for term in terms:
+            for side, ends, steepest in zip(
+                box, term.space.box, (-STEEPEST, STEEPEST), strict=True
+            ):
+                side[term.places] = ends
+                side[[term.places[rate.at] + 1 for rate in term.rates]] = steepest
+        return cls(problems, links, own, places, Squares(tuple(terms), box))
 
-    def _x(self, test: int) -> float:
-        return 0.0 if self.links.log_rates is None else float(self.links.log_rates[test])
+    @property
+    def linked(self) -> tuple[str, ...]:
+        """Names of the parameters that follow from what all tests have in common."""
+        return tuple(name for name in self.common_places if name not in self.own)
 
-    def through(self, test: int, shared: Array) -> Array:
-        """Coordinates of the linked parameters of a test."""
-        out = np.empty(len(self.slots.linked))
-        for j, (at, kind) in enumerate(zip(self.slots.places, self.slots.kinds, strict=True)):
-            out[j] = shared[at]
-            if kind in RATES:
-                follow = log_law if self.logarithmic[j] else law
-                out[j] = follow(kind, shared[at], shared[at + 1], self._x(test))
-        return out
-
-    def through_slopes(self, test: int, shared: Array) -> Array:
-        """Derivative of these by the shared coordinates, (n_linked, n_shared)."""
-        out = np.zeros((len(self.slots.linked), self.slots.count))
-        for j, (at, kind) in enumerate(zip(self.slots.places, self.slots.kinds, strict=True)):
-            out[j, at] = 1.0
-            if kind in RATES and self.logarithmic[j]:
-                out[j, at : at + 2] = log_law_slopes(kind, shared[at + 1], self._x(test))
-            elif kind in RATES:
-                out[j, at : at + 2] = law_slopes(kind, shared[at], shared[at + 1], self._x(test))
-        return out
-
-    def local(self, point: _Point) -> list[Array]:
-        """Coordinates of each test: the linked ones, then its own."""
+    @property
+    def counts(self) -> list[int]:
+        """Residuals of each test, those of what is drawn among them."""
         return [
-            np.concatenate([self.through(t, point.shared), own]) for t, own in enumerate(point.own)
+            term.objective.n_data + len(term.objective.priors) + len(term.pulls)
+            for term in self.squares.terms
         ]
 
-    def start(self, vectors: Sequence[Array]) -> _Point:
+    def start(self, vectors: Sequence[Array]) -> Array:
         """The point that has the own parameters of these vectors, and what is nearest in common."""
-        table = np.array([t.encode(v) for t, v in zip(self.tests, vectors, strict=True)])
-        first, shared = len(self.slots.linked), np.empty(self.slots.count)
-        for j, (at, kind) in enumerate(zip(self.slots.places, self.slots.kinds, strict=True)):
-            there = [t for t, test in enumerate(self.tests) if test.present[j]]
-            own = table[there, j]
-            if kind not in RATES:
-                shared[at] = np.median(own)
+        terms, (low, high) = self.squares.terms, self.squares.box
+        point = np.zeros(low.size)
+        there = dict[int, list[tuple[float, Rate | None]]]()
+        for term, vector in zip(terms, vectors, strict=True):
+            found = term.space.encode(vector)
+            point[term.places] = found
+            rates = {rate.at: rate for rate in term.rates}
+            for j, place in enumerate(term.places.tolist()):
+                there.setdefault(place, []).append((found[j], rates.get(j)))
+        for name, place in self.common_places.items():
+            if name in self.own:
+                logs = [
+                    _logarithm(vector[problem.index[name]])
+                    for problem, vector in zip(self.problems, vectors, strict=True)
+                    if name in problem.free()
+                ]
+                point[place] = np.median(logs)
                 continue
-            x = np.array([self._x(t) for t in there])
-            values = np.exp(own) if self.logarithmic[j] else own
-            v, slope = start_of(kind, values, x)
-            shared[at : at + 2] = float(np.log(v)) if self.logarithmic[j] else v, slope
-        for name, at in zip(self.slots.scatter, self.slots.common, strict=True):
-            shared[at] = np.median(
-                [_logarithm(p, v, name) for p, v in zip(self.problems, vectors, strict=True)
-                 if name in p.free()]
-            )  # fmt: skip
-        low, high = self.box
-        return _Point(np.clip(shared, low.shared, high.shared), table[:, first:])
+            own, rates_ = zip(*there[place], strict=True)
+            rate = rates_[0]
+            if rate is None:
+                point[place] = np.median(own)
+                continue
+            values = np.exp(own) if rate.logarithmic else np.array(own)
+            v, b = start_of(rate.kind, values, np.array([one.x for one in rates_]))
+            point[place : place + 2] = np.log(v) if rate.logarithmic else v, b
+        return np.clip(point, low, high)
 
-    @cached_property
-    def box(self) -> tuple[_Point, _Point]:
-        """Lowest and highest coordinates."""
-        first, sides = len(self.slots.linked), list[_Point]()
-        for side, far in ((0, -1.0), (1, 1.0)):
-            ends = np.array([test.box[side] for test in self.tests])
-            there = np.array([test.present for test in self.tests])
-            shared = np.full(self.slots.count, far * _FAR)
-            for j, (at, kind) in enumerate(zip(self.slots.places, self.slots.kinds, strict=True)):
-                shared[at] = np.median(ends[there[:, j], j])
-                if kind in RATES:
-                    shared[at + 1] = far * STEEPEST
-            sides.append(_Point(shared, ends[:, first:]))
-        return sides[0], sides[1]
-
-    def values(self, point: _Point) -> list[Array]:
-        """Parameters of each test at a point, SI."""
-        return [
-            test.decode(local) for test, local in zip(self.tests, self.local(point), strict=True)
-        ]
-
-    def common(self, point: _Point, values: Sequence[Array]) -> dict[str, tuple[float, ...]]:
+    def common(self, point: Array, values: Sequence[Array]) -> dict[str, tuple[float, ...]]:
         """What all tests have in common at a point, SI; see `Together.common`."""
         out = dict[str, tuple[float, ...]]()
-        for j, (name, at) in enumerate(zip(self.slots.linked, self.slots.places, strict=True)):
-            t = next(t for t, test in enumerate(self.tests) if test.present[j])
-            value = float(values[t][self.problems[t].index[name]])
-            if self.slots.kinds[j] not in RATES:
+        for name, place in self.common_places.items():
+            if name in self.own:
+                out[name] = (float(np.exp(point[place])),)
+                continue
+            t = next(t for t, problem in enumerate(self.problems) if name in problem.free())
+            value, kind = float(values[t][self.problems[t].index[name]]), self.links.kind(name)
+            if kind not in RATES:
                 out[name] = (value,)
                 continue
-            slope = float(point.shared[at + 1])
-            out[name] = value / law(self.slots.kinds[j], 1.0, slope, self._x(t)), slope
-        for name, at in zip(self.slots.scatter, self.slots.common, strict=True):
-            out[name] = (float(np.exp(point.shared[at])),)
-        return out
-
-    def pull(self, test: int, name: str) -> float:
-        """Root of the weight that draws a scattering parameter of a test to its common value."""
-        pulls = self.links.pulls.get(name)
-        there = pulls is not None and name in self.problems[test].free()
-        return float(pulls[test]) if there and pulls is not None else 0.0
-
-    def pulled(self, test: int, point: _Point, values: Array) -> Array:
-        """Residuals of the scattering parameters of a test, (n_scatter,)."""
-        return np.array([
-            pull * (_logarithm(self.problems[test], values, name) - point.shared[at])
-            if (pull := self.pull(test, name)) else 0.0
-            for name, at in zip(self.slots.scatter, self.slots.common, strict=True)
-        ])  # fmt: skip
-
-    def pulled_slopes(self, test: int, values: Array, moves: Array) -> Array:
-        """Derivative of these by the coordinates along which the parameters move, (·, m).
-
-        The first coordinates are the shared ones.
-        """
-        out = np.zeros((len(self.slots.scatter), moves.shape[1]))
-        for j, (name, at) in enumerate(zip(self.slots.scatter, self.slots.common, strict=True)):
-            pull, place = self.pull(test, name), self.problems[test].index[name]
-            if pull and abs(values[place]) > _TINY:
-                out[j] = pull * moves[place] / values[place]
-                out[j, at] -= pull
+            b = float(point[place + 1])
+            out[name] = value / factor(kind, b, self.links.x(t))[0], b
         return out
 
 
-def _logarithm(problem: Problem, values: Array, name: str) -> float:
+def _finite(problem: Problem) -> Callable[[Array], Array]:
+    """Give the residual of one test, infinite where it cannot be simulated."""
+
+    def residual(values: Array) -> Array:
+        failures = problem.objective.failures
+        found = problem.objective.residual(values)
+        return found if problem.objective.failures == failures else np.full(found.size, np.inf)
+
+    return residual
+
+
+def _logarithm(value: float) -> float:
     """Logarithm of the size of a parameter."""
-    return float(np.log(max(abs(float(values[problem.index[name]])), _TINY)))
+    return float(np.log(max(abs(value), _TINY)))
 
 
-def _parents(name: str) -> set[str]:
+def _parents(problem: Problem, name: str) -> set[str]:
     """Names of the parameters that the coordinate of this one is relative to."""
-    spring, short = split_name(name)
-    of = () if name in NUISANCE else any_param(short).of
-    return {f"s{spring + 1}_{parent}" for parent in of}
-
-
-# ------------------------------------------------------------------------------- the descent
-
-
-@dataclass(frozen=True, eq=False)
-class _Normal:
-    """Normal matrices (n, p, p) and gradients (n, p) of the tests; s parameters are shared."""
-
-    matrices: Array
-    gradients: Array
-    s: int
-
-    def step(self, damping: float, held: _Point) -> _Point:
-        """Damped Gauss-Newton step of what is not held; own parameters are eliminated first."""
-        s, n = self.s, len(self.matrices)
-        q = self.matrices.shape[1] - s
-        diagonal = np.diagonal(self.matrices, axis1=1, axis2=2)
-        least = 1e-12 * max(float(diagonal.sum()), 1e-300)
-        free_s, free_q = ~held.shared.astype(bool), ~held.own.astype(bool)
-        top = self.matrices[:, :s, :s].sum(axis=0)
-        top += damping * np.diag(np.maximum(np.diag(top), least))
-        right = -self.gradients[:, :s].sum(axis=0)
-        corner = self.matrices[:, s:, s:] * (free_q[:, :, None] & free_q[:, None, :])
-        extra = np.where(free_q, damping * np.maximum(diagonal[:, s:], least), 1.0)
-        corner = corner + extra[:, :, None] * np.eye(q)
-        side = self.matrices[:, :s, s:] * free_q[:, None, :]
-        own = -self.gradients[:, s:] * free_q
-        if q:
-            solved = np.linalg.solve(corner, np.concatenate([side.mT, own[:, :, None]], axis=2))
-            top = top - np.sum(side @ solved[:, :, :s], axis=0)
-            right = right - np.sum(side @ solved[:, :, s:], axis=0)[:, 0]
-        step = np.zeros(s)
-        if free_s.any():
-            step[free_s] = np.linalg.solve(top[np.ix_(free_s, free_s)], right[free_s])
-        if not q:
-            return _Point(step, np.zeros((n, 0)))
-        return _Point(step, solved[:, :, s] - solved[:, :, :s] @ step)
-
-    def expected(self, moved: _Point) -> float:
-        """Gain of the cost that is expected of a move."""
-        count = len(moved.own)
-        local = np.concatenate([np.tile(moved.shared, (count, 1)), moved.own], axis=1)
-        curved = np.einsum("ij,ijk,ik->", local, self.matrices, local)
-        return -float(2.0 * np.sum(self.gradients * local) + curved)
-
-    def pressed(self, point: _Point, box: tuple[_Point, _Point]) -> _Point:
-        """What lies at a limit and is pressed outwards."""
-        low, high = box
-        total = self.gradients[:, : self.s].sum(axis=0)
-        own = self.gradients[:, self.s :]
-        return _Point(
-            _outwards(point.shared, total, low.shared, high.shared),
-            _outwards(point.own, own, low.own, high.own),
-        )
-
-
-def _outwards(at: Array, gradient: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-    pressed = ((at <= low) & (gradient > 0)) | ((at >= high) & (gradient < 0)) | (low == high)
-    return np.asarray(pressed)
-
-
-def _residual(problem: Problem, values: Array) -> Array | None:
-    """Residual of one test; None where it cannot be simulated."""
-    failures = problem.objective.failures
-    residual = problem.objective.residual(values)
-    return residual if problem.objective.failures == failures else None
-
-
-def _residuals(layout: _Layout, point: _Point) -> list[Array] | None:
-    """Residual of each test, and of what its scattering parameters are drawn by.
-
-    None where one cannot be simulated.
-    """
-    found = []
-    for t, (problem, values) in enumerate(zip(layout.problems, layout.values(point), strict=True)):
-        residual = _residual(problem, values)
-        if residual is None:
-            return None
-        found.append(np.concatenate([residual, layout.pulled(t, point, values)]))
-    return found
-
-
-def _normal(layout: _Layout, point: _Point, residuals: Sequence[Array]) -> _Normal:
-    """Normal matrix and gradient of each test; no Jacobian is kept."""
-    matrices, gradients = [], []
-    first, locals_ = len(layout.slots.linked), layout.local(point)
-    for t, (test, local, residual) in enumerate(zip(layout.tests, locals_, residuals, strict=True)):
-        values = test.decode(local)
-        own = test.moves(local, values)
-        moves = np.hstack([own[:, :first] @ layout.through_slopes(t, point.shared), own[:, first:]])
-        jacobian = test.problem.objective.jacobian_along(values, moves)
-        jacobian = np.vstack([jacobian, layout.pulled_slopes(t, values, moves)])
-        matrices.append(jacobian.T @ jacobian)
-        gradients.append(jacobian.T @ residual)
-    return _Normal(np.array(matrices), np.array(gradients), layout.slots.count)
-
-
-def _cost(residuals: Sequence[Array]) -> float:
-    return float(sum(residual @ residual for residual in residuals))
-
-
-def _descend(layout: _Layout, point: _Point, iterations: int) -> tuple[float, _Point, int] | None:
-    """Levenberg-Marquardt inside the box; the cost of the end, the end, and the steps.
-
-    The damping follows the gain ratio as in `levenberg.descend`; a point that cannot be simulated
-    is refused as one that gains nothing. None if the start cannot be simulated.
-    """
-    residuals = _residuals(layout, point)
-    if residuals is None:
-        return None
-    cost, damping, growth, small, count = _cost(residuals), 1e-3, 2.0, 0, 0
-    normal = _normal(layout, point, residuals)
-    low, high = layout.box
-    while count < iterations:
-        count += 1
-        step = normal.step(damping, normal.pressed(point, layout.box))
-        trial = point.moved(step, low, high)
-        moved = _Point(trial.shared - point.shared, trial.own - point.own)
-        size = max(float(np.max(np.abs(part), initial=0.0)) for part in (moved.shared, moved.own))
-        if size < _LEAST_MOVE:
-            break
-        found = _residuals(layout, trial)
-        gain = -1.0 if found is None else cost - _cost(found)
-        if found is None or gain <= 0.0:
-            damping, growth = damping * growth, 2.0 * growth
-            if damping > _MOST_DAMPING:
-                break
-            continue
-        small = small + 1 if gain < ENOUGH * cost else 0
-        ratio = gain / max(normal.expected(moved), 1e-300)
-        damping *= max(1.0 / 3.0, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3)
-        growth, cost, point = 2.0, cost - gain, trial
-        if small == 2:
-            break
-        normal = _normal(layout, point, found)
-    return cost, point, count
+    of = () if name in NUISANCE else problem.model.param(name).of
+    return {f"{name.partition('_')[0]}_{parent}" for parent in of}

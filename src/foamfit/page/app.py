@@ -1,13 +1,12 @@
 """One window of the page: its inputs, its curves, and what happens when something is pressed.
 
-What is computed stands in `desk` and `turning`, and is what the commands compute; here it is asked
-for and shown. All that comes from a file is shown as text.
+`desk` and `turning` compute, as the commands do; here their results are asked for and shown. All
+that comes from a file is shown as text.
 """
 
 from __future__ import annotations
 
 import base64
-import html
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -20,26 +19,27 @@ import panel as pn
 
 from foamfit.errors import InputError, SimulationError
 from foamfit.page.curves import Curves, grid, misfits_text
-from foamfit.page.desk import BUSY, LARGEST, QUANTITIES, Checked, Desk, Excerpt
+from foamfit.page.desk import BUSY, LARGEST, QUANTITIES, Checked, Desk
 from foamfit.page.fields import RELAXATIONS, Field
 from foamfit.page.first_use import FirstUse
 from foamfit.page.turning import Turning
-from foamfit.page.widgets import TEMPLATES, Upload, message
+from foamfit.page.widgets import TEMPLATES, Upload, message, piece, style
 from foamfit.page.worker import News, parsed
 from foamfit.report.folder import load_result
 from foamfit.results import law_in_words
+from foamfit.springs import laws
 from foamfit.springs.published import published
 
-# Where a checkout of the repository may be: the working directory, or around an editable package.
+# Where a checkout of the repository may be: the working directory, or around an editable install.
 CHECKOUTS = (Path(), Path(__file__).parents[3])
-MODELS = ("auto", "bistable", "linear+bistable", "bistable+bistable", "microscale",
-          "linear+microscale", "unilateral+bistable")  # fmt: skip
-# Options of the command that are folded away; fixed and varied parameters have ticks.
-FOLDED = ("starts", "max_time", "seed", "loss", "interior_mass", "time_shift", "profile",
-          "bootstrap", "mcmc")  # fmt: skip
-ENDED = '<p role="status">The fit has ended: see <a href="#h-result">its result</a>.</p>'
+# Options that are shown, and those that are folded away; --fix and --vary have ticks.
+SHOWN = ("model", "drive", "relaxation", "cycle")
+FOLDED = (
+    *("starts", "max_time", "seed", "loss", "interior_mass", "time_shift"),
+    *("profile", "bootstrap", "mcmc"),
+)
 POLL = 200  # ms
-# For all windows one test is read at a time, and the curves of one are prepared.
+# Over all windows, one test is read and the curves of one are prepared at a time.
 READING, PREPARING = (
     ThreadPoolExecutor(1, thread_name_prefix=f"foamfit-{name}") for name in ("reading", "preparing")
 )
@@ -47,77 +47,53 @@ COMPILING = (
     "The solver is being compiled, once after installation, in half a minute or, where the "
     "machine is busy, a whole one. Meanwhile a test can be dropped and its specimen filled in."
 )
-TEXT = """
-  :host { font: 1rem/1.5 system-ui, sans-serif; color: #1d2327; }
-  p { margin: .3rem 0; overflow-wrap: anywhere; } pre { margin: 0; overflow-x: auto;
-    font: .8rem/1.45 ui-monospace, Menlo, Consolas, monospace; white-space: pre; }
-  .error { border-left: 4px solid #b3261e; background: #fdeeed; padding: .5rem .8rem; }
-  .soft { color: #4f5960; } iframe { width: 100%; height: 85vh; border: 1px solid #dfe3e6; }
-  .wide { overflow-x: auto; } img { max-width: 100%; height: auto; }
-  table { border-collapse: collapse; font-size: .84rem; margin: .6rem 0; }
-  th, td { border: 1px solid #aab2b8; padding: .1rem .5rem; text-align: left; white-space: pre; }
-  th { background: #f5f7f8; } td.wrong { background: #f9dbd3; outline: 2px solid #85280a; }
-  progress { width: 100%; height: .8rem; accent-color: #0072B2; }
-"""
-FIELD = """
-  :host { width: 100%; color: #1d2327; font-size: .9rem; --font-size: .9rem; }
-  label { color: #1d2327; font-size: .9rem; white-space: normal; line-height: 1.3; }
-  .bk-input { color: #1d2327; border: 1px solid #6f7a81; font-size: .95rem; }
-  .bk-input::placeholder { color: #667078; }
-  .bk-input:focus-visible, .bk-btn:focus-visible { outline: 3px solid #0072B2;
-    outline-offset: 2px; }
-  .bk-btn, .bk-btn a { font-size: .95rem; }
-  .bk-btn-primary { background: #005a8f; color: white; }
-  .bk-btn-danger { background: #9b2218; color: white; }
-"""
+TEXT, FIELD = style("text"), style("field")
 WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: #fdeeed; }"
-
-
-def text_pane() -> pn.pane.HTML:
-    """Make a place for text that is put there already escaped."""
-    return pn.pane.HTML("", stylesheets=[TEXT], sizing_mode="stretch_width", margin=(4, 0))
-
-
-def paragraph(text: str, kind: str = "") -> str:
-    """Write a text, whatever is in it, as a paragraph."""
-    role = ' role="alert"' if kind == "error" else ""
-    return f'<p class="{kind}"{role}>{html.escape(text)}</p>'
+WIDE: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
+STYLE: dict[str, Any] = {
+    "stylesheets": [FIELD],
+    "sizing_mode": "stretch_width",
+    "margin": (3, 0),
+}
 
 
 class Window:
     """The page in one window of a browser; it shares nothing with another one."""
 
     def __init__(
-        self, desk: Desk, address: str, test: Path | None, first_use: FirstUse,
+        self,
+        desk: Desk,
+        address: str,
+        test: Path | None,
+        first_use: FirstUse,
         gone: Callable[[], None],
-    ) -> None:  # fmt: skip
-        self.desk = desk
-        self.curves = Curves()
+    ) -> None:
+        self.desk, self.first_use, self.curves = desk, first_use, Curves()
         self._shown: object = None
         self._filling = False
         self._asked = {READING: 0, PREPARING: 0}
-        self._inputs(address)
+        self._before: tuple[dict[str, str], str] = {}, ""
         self._outputs()
-        self._react()
+        self._inputs(address)
         self.template = pn.Template((TEMPLATES / "page.html").read_text(encoding="utf-8"))
-        wide: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
+        test_parts = [self.upload, self.chosen, self.as_before, *self.quantities.values()]
+        result_parts = [self.saves, self.ending, self.report_of, self.beside, self.comparison]
         parts = {
-            "test": pn.Column(self.upload, self.chosen, self.as_before, *self.quantities.values(),
-                              self.rest, self.check, self.problem, **wide),
-            "model": pn.Column(*(self.options[name].widget for name in self.options
-                                 if name not in FOLDED), **wide),
-            "more": pn.Column(*(self.options[name].widget for name in FOLDED), **wide),
-            "run": pn.Column(self.run, self.stop, self.progress, **wide),
-            "curves": pn.Column(self.compiling, self.misfit, self.curves.view, self.back, **wide),
-            "understood": pn.Column(self.understood, **wide),
-            "result": pn.Column(self.saves, self.ending, self.report_of, self.beside,
-                                self.comparison, self.report, **wide),
-        }  # fmt: skip
-        for name, part in parts.items():
-            self.template.add_panel(name, part)
-        self.first_use = first_use
+            "test": [*test_parts, self.rest, self.check, self.problem],
+            "model": [self.options[name].widget for name in SHOWN],
+            "more": [self.options[name].widget for name in FOLDED],
+            "run": [self.run, self.stop, self.progress],
+            "curves": [self.compiling, self.misfit, self.curves.view, self.back],
+            "understood": [self.understood],
+            "result": [*result_parts, self.report],
+        }
+        for name, widgets in parts.items():
+            self.template.add_panel(name, pn.Column(*widgets, **WIDE))
         self._allow()
-        self._await()
+        document = pn.state.curdoc
+        for part in first_use.parts:  # what waits for the solver to be compiled
+            if not part.done():
+                part.add_done_callback(lambda _: document.add_next_tick_callback(self._allow))
         self._poll = pn.state.add_periodic_callback(self._follow, POLL, start=False)
         pn.state.on_session_destroyed(lambda _: gone())
         pn.state.onload(send_at_once)
@@ -127,107 +103,97 @@ class Window:
     # ------------------------------------------------------------------------------- the parts
 
     def _inputs(self, address: str) -> None:
-        style: dict[str, Any] = {
-            "stylesheets": [FIELD], "sizing_mode": "stretch_width", "margin": (3, 0),
-        }  # fmt: skip
-        text, select, button = pn.widgets.TextInput, pn.widgets.Select, pn.widgets.Button
+        text, select = (partial(getattr(pn.widgets, n), **STYLE) for n in ("TextInput", "Select"))
+
+        def button(name: str, do: Callable[[Any], None], kind: str = "default", **more: Any) -> Any:
+            made = pn.widgets.Button(name=name, button_type=kind, **more, **STYLE)
+            made.on_click(do)
+            return made
+
         self.upload = Upload(address=address, limit=LARGEST, sizing_mode="stretch_width")
+        self.upload.on_msg(self._received)
         listed = [sorted(one.glob("experiments/foam-*/*-reconstruction.csv")) for one in CHECKOUTS]
         found = next(filter(None, listed), [])
         self.reconstructions = {f"{one.parent.name}: {one.stem}": one for one in found}
         self.chosen = select(
-            name="or a reconstruction of the repository", options=["", *self.reconstructions],
-            visible=bool(found), **style,
-        )  # fmt: skip
+            name="or a reconstruction of the repository",
+            options=["", *self.reconstructions],
+            visible=bool(found),
+        )
+        self.chosen.param.watch(self._choose, "value")
         self.quantities = {
-            q.name: text(name=q.label, placeholder=f"like {q.example}", **style) for q in QUANTITIES
+            name: text(name=label, placeholder=f"like {example}")
+            for name, (label, example) in QUANTITIES.items()
         }
         self.rest = pn.widgets.TextAreaInput(
-            name="Further TOML: name, [columns], [noise], [window]", rows=4, max_length=20_000,
-            placeholder='[columns]\nforce = { column = "Load", unit = "kN" }', **style,
-        )  # fmt: skip
-        self.as_before = button(name="Fill in as for the file before", visible=False, **style)
-        self._before: tuple[dict[str, str], str] = {}, ""
-        self.check = button(name="Check the test", **style)
-        lists = {"model": [*MODELS], "relaxation": [*range(RELAXATIONS)]}
-        self.options = {
-            name: Field(name, lists.get(name), **style)
-            for name in ("model", "drive", "relaxation", "cycle", *FOLDED)
-        }
-        self.model, self.relaxation = (self.options[n].widget for n in ("model", "relaxation"))
-        self.cycle = self.options["cycle"].widget
-        self.cycle.visible = False
-        self.run = button(name="Fit", button_type="primary", disabled=True, **style)
-        self.stop = button(name="Stop, and keep the best", button_type="danger", visible=False,
-                           **style)  # fmt: skip
-        self.back = button(name="Back to the fit", visible=False, **style)
-        self.report_of = select(name="Report and curves of cycle", options=[0], visible=False,
-                                **style)  # fmt: skip
-        self.beside = select(name="Compare with a published set", options=["", *published],
-                             visible=False, **style)  # fmt: skip
-        self.saves = grid(
-            [
-                self._save("Save the result folder", "result.zip", lambda: self.desk.zipped()),
-                self._save("Save the report", "report.html", lambda: self._report().encode()),
-                self._save("Save the TOML", "test.toml", lambda: self.desk.toml),
-            ],
-            11.0,
+            name="Further TOML: name, [columns], [noise], [window]",
+            placeholder='[columns]\nforce = { column = "Load", unit = "kN" }',
+            rows=4,
+            max_length=20_000,
+            **STYLE,
         )
-
-    def _save(self, label: str, filename: str, content: Callable[[], bytes]) -> Any:
-        return pn.widgets.FileDownload(
-            callback=lambda: BytesIO(content()), filename=filename, label=label, embed=False,
-            auto=True, stylesheets=[FIELD], margin=(3, 0), sizing_mode="stretch_width",
-        )  # fmt: skip
-
-    def _report(self) -> str:
-        """The report of the fit, or of the cycle that is chosen."""
-        return (self.desk.fits[self.report_of.value] / "report.html").read_text(encoding="utf-8")
-
-    def _outputs(self) -> None:
-        self.problem, self.progress, self.compiling = text_pane(), text_pane(), text_pane()
-        self.understood, self.ending = text_pane(), text_pane()
-        self.misfit, self.comparison, self.report = text_pane(), text_pane(), text_pane()
-        self.understood.object = paragraph("There is no test yet.", "soft")
-        self.ending.object = paragraph("There is no fit yet.", "soft")
-
-    def _react(self) -> None:
-        self.upload.on_msg(self._received)
-        self.chosen.param.watch(self._choose, "value")
-        self.check.on_click(self._check)
-        self.as_before.on_click(self._fill_as_before)
-        self.run.on_click(self._run)
-        self.stop.on_click(self._stop)
-        self.back.on_click(self._back)
-        self.beside.param.watch(self._compare, "value")
+        self.as_before = button(
+            "Fill in as for the file before", self._fill_as_before, visible=False
+        )
+        self.check = button("Check the test", self._check)
+        lists = {"model": models(), "relaxation": [*range(RELAXATIONS)]}
+        self.options = {name: Field(name, lists.get(name), **STYLE) for name in (*SHOWN, *FOLDED)}
+        self.model, _, self.relaxation, self.cycle = (self.options[n].widget for n in SHOWN)
+        self.cycle.visible = False
+        self.run = button("Fit", self._run, "primary", disabled=True)
+        self.stop = button("Stop, and keep the best", self._stop, "danger", visible=False)
+        self.back = button("Back to the fit", self._back, visible=False)
+        self.report_of = select(name="Report and curves of cycle", options=[0], visible=False)
+        self.beside = select(
+            name="Compare with a published set", options=["", *published], visible=False
+        )
         self.report_of.param.watch(self._back, "value")
-        for field in (*self.quantities.values(), self.rest, self.cycle):
+        self.beside.param.watch(self._compare, "value")
+        self.fields = (*self.quantities.values(), self.rest, self.cycle)
+        for field in self.fields:
             field.param.watch(self._edited, "value")
         for name in ("model", "drive", "relaxation", "interior_mass", "time_shift"):
             self.options[name].widget.param.watch(self._model_chosen, "value")
+        save = partial(pn.widgets.FileDownload, embed=False, auto=True, **STYLE)
+        saves = {
+            "the result folder": ("result.zip", lambda: BytesIO(self.desk.zipped())),
+            "the report": ("report.html", lambda: BytesIO(self._report().encode())),
+            "the TOML": ("test.toml", lambda: BytesIO(self.desk.toml)),
+        }
+        parts = [
+            save(label=f"Save {what}", filename=name, callback=content)
+            for what, (name, content) in saves.items()
+        ]
+        self.saves = grid(parts, 11.0)
+
+    def _report(self) -> str:
+        """Return the report of the fit, or of the chosen cycle."""
+        return (self.desk.fits[self.report_of.value] / "report.html").read_text(encoding="utf-8")
+
+    def _outputs(self) -> None:
+        """Make the places for text, which is put there already escaped."""
+        style = {"stylesheets": [TEXT], "sizing_mode": "stretch_width", "margin": (4, 0)}
+        places = [pn.pane.HTML("", **style) for _ in range(8)]
+        self.problem, self.progress, self.compiling, self.understood = places[:4]
+        self.ending, self.misfit, self.comparison, self.report = places[4:]
+        self.understood.object = soft("There is no test yet.")
+        self.ending.object = soft("There is no fit yet.")
 
     # ------------------------------------------------------------------------------- beside
 
-    def _await(self) -> None:
-        """Draw and allow again what waits for the solver to be compiled, when a part of it is."""
-        document = pn.state.curdoc
-        for part in self.first_use.parts:
-            if not part.done():
-                part.add_done_callback(lambda _: document.add_next_tick_callback(self._allow))
-
     def _allow(self) -> None:
-        """Let a fit be begun where there is something to fit, and none is running."""
+        """Enable a fit where there is a test, the solver is compiled and no fit runs."""
         compiled = self.first_use.needed(self.model.value, self.relaxation.value).done()
-        self.compiling.object = "" if compiled else busy(COMPILING)
+        self.compiling.object = "" if compiled else piece("busy", COMPILING)
         ready = self.desk.measurement is not None and compiled
         self.run.disabled = not ready or self.desk.running
 
     def _beside(
         self, pool: ThreadPoolExecutor, work: Callable[[], Any], then: Callable[[Any], None]
     ) -> None:
-        """Do what takes a while beside the server, then show it; what is asked for later wins.
+        """Work in a thread, then show the result unless more was asked for since.
 
-        What is shown changes in a turn of the document only: threads know no lock of it.
+        Results are shown in a callback of the document, whose lock threads do not hold.
         """
         self._asked[pool] += 1
         asked, document = self._asked[pool], pn.state.curdoc
@@ -250,33 +216,31 @@ class Window:
     # ------------------------------------------------------------------------------- the test
 
     def _received(self, event: Any) -> None:
-        """Read what was dropped."""
         if message(event).get("received"):
             self.chosen.value = ""
             self._read()
 
     def _choose(self, event: Any) -> None:
-        """Take a reconstruction; only those of the list can be."""
-        if event.new in self.reconstructions:
+        if event.new in self.reconstructions:  # no other path comes from a browser
             self._take(self.reconstructions[event.new])
 
     def _take(self, path: Path) -> None:
         try:
             self.desk.take(path)
         except (InputError, OSError) as error:
-            self.problem.object = paragraph(str(error), "error")
+            self.problem.object = wrong(error)
             return
         self._read()
 
     def _read(self) -> None:
-        """Fill in what a dropped TOML says, nothing for another file without one, and check.
+        """Fill in a dropped TOML, or clear the fields for another file without one, and check.
 
-        What was filled in for the file before is of its specimen; it is offered.
+        What was filled in belongs to the specimen of the file before; it is offered again.
         """
         try:
             found = self.desk.dropped_toml()
         except InputError as error:
-            self.problem.object = paragraph(str(error), "error")
+            self.problem.object = wrong(error)
             return
         self._filling = True  # one check after all of them
         if self.desk.worker is None:  # what is shown of a fit is of another test
@@ -318,22 +282,23 @@ class Window:
         """Check the test as it is filled in, and show what is understood or wrong."""
         (given, rest), cycle = self._given(), self.cycle.value or ""
         self.run.disabled = True
-        self._asked[PREPARING] += 1  # what is being prepared is of the test as it was
+        self._asked[PREPARING] += 1  # curves in preparation are of the old test
         self._beside(READING, lambda: self.desk.check(given, rest, cycle), self._show_checked)
 
     def _show_checked(self, checked: Checked | Exception) -> None:
         if isinstance(checked, Exception):
             checked = Checked(error=defect(checked))
-        self.problem.object = paragraph(checked.error, "error") if checked.error else ""
+        self.problem.object = wrong(checked.error)
         for name, field in self.quantities.items():
             field.stylesheets = [WRONG if name == checked.quantity else FIELD]
         if checked.error == BUSY:
             return
         if checked.error:
-            shown = paragraph("The test cannot be read yet: see what is wrong with it.", "soft")
-            self.understood.object = shown + excerpt_html(checked.excerpt)
+            told = soft("The test cannot be read yet: see what is wrong with it.")
+            shown = piece("excerpt", checked.excerpt) if checked.excerpt else ""
+            self.understood.object = told + shown
         else:
-            self.understood.object = f'<pre tabindex="0">{html.escape(checked.text)}</pre>'
+            self.understood.object = piece("verbatim", checked.text)
         self._allow()
         if self.desk.measurement is not None:
             there = len(self.desk.measurement.cycles)
@@ -344,7 +309,7 @@ class Window:
     # ------------------------------------------------------------------------------- the curves
 
     def _model_chosen(self, event: Any = None) -> None:
-        """Put the model's parameters over the test, read off its loop."""
+        """Show the model over the test, with values read off its loop."""
         auto = self.model.value == "auto"
         self._allow()
         self.relaxation.disabled, self.curves.sliders.ticks = auto, not auto
@@ -355,27 +320,27 @@ class Window:
             asked = parsed(self._arguments(ticked=False))
         except InputError:  # said when it is fitted
             asked = parsed([])
-        model = "bistable" if auto else self.model.value
+        model = models()[1] if auto else self.model.value
         self._turn_model(model, self.desk.measurement.cycle, **keywords(asked))
 
     def _hide_curves(self, why: str = "") -> None:
         self.curves.hide()
-        self.misfit.object = paragraph(why, "error") if why else ""
+        self.misfit.object = wrong(why)
 
     def _turn_model(
         self, model: str, cycle: int, values: Mapping[str, float] | None = None, **options: Any
     ) -> None:
-        """Put other sliders under the curves; they begin at these values, or read off the loop."""
+        """Show other sliders under the curves, at these values or at values read off the loop."""
 
         def make() -> Turning:
             self.first_use.needed(model, options["relaxation"]).result()
             made = Turning(self.desk.measured(cycle), model, values, **options)
-            made.turn({})  # loads what is compiled
+            made.turn({})  # loads the compiled code
             return made
 
         what = f"Preparing the curves of {law_in_words(model, options['relaxation'])} …"
         if self.curves.turning is None and not self.compiling.object:
-            self.misfit.object = busy(what)
+            self.misfit.object = piece("busy", what)
         else:
             self.curves.sliders.tell(what)
         self._beside(PREPARING, make, self._show_turning)
@@ -391,13 +356,11 @@ class Window:
     # ------------------------------------------------------------------------------- the fit
 
     def _arguments(self, ticked: bool = True) -> list[str]:
-        """Return the arguments of `foamfit fit` that ask for what is filled in."""
+        """Return the arguments of `foamfit fit` for what is filled in."""
         auto = self.model.value == "auto"
         hidden = {"relaxation": auto, "cycle": not self.cycle.visible}
-        given = [
-            argument for name, field in self.options.items() if not hidden.get(name)
-            for argument in field.arguments()
-        ]  # fmt: skip
+        shown = (field for name, field in self.options.items() if not hidden.get(name))
+        given = [argument for field in shown for argument in field.arguments()]
         if auto or not ticked:
             return given
         held, varied = self.curves.chosen()
@@ -409,23 +372,19 @@ class Window:
             arguments = self._arguments()
             self.desk.fit(arguments)
         except InputError as error:
-            self.progress.object = paragraph(str(error), "error")
+            self.progress.object = wrong(error)
             return
         self.run.disabled, self.stop.visible, self.stop.disabled = True, True, False
         self._hide_result("A fit is running.")
-        self._hold(True)
+        for field in (*self.fields, self.chosen, self.check):  # nothing of the test may change
+            field.disabled = True
         self._poll.start()
-
-    def _hold(self, held: bool) -> None:
-        """Let nothing of the test be changed while it is fitted."""
-        for field in (*self.quantities.values(), self.rest, self.chosen, self.check, self.cycle):
-            field.disabled = held
 
     def _hide_result(self, why: str) -> None:
         self.saves.visible = self.beside.visible = self.back.visible = False
         self.report_of.visible = False
         self.report.object = self.comparison.object = ""
-        self.ending.object = paragraph(why, "soft")
+        self.ending.object = soft(why)
 
     def _stop(self, event: Any = None) -> None:
         if self.desk.worker is not None:
@@ -433,7 +392,7 @@ class Window:
             self.stop.disabled = True
 
     def _follow(self) -> None:
-        """Show how far the fit is; when it has ended, its result."""
+        """Show the progress of the fit, and its result when it has ended."""
         worker = self.desk.worker
         if worker is None:
             return
@@ -450,49 +409,46 @@ class Window:
         told = f"{what}, {share} %"
         if news.misfit:
             told += f"; best misfit {misfits_text(news.misfit)}"
-        bar = f'<progress max="100" value="{share}" aria-label="progress of the fit"></progress>'
-        self.progress.object = bar + paragraph(told)
+        self.progress.object = piece("progress", share, told)
         self._show_best(news)
 
     def _show_best(self, news: News) -> None:
-        """Draw the curves of the best so far, and put the sliders there."""
+        """Draw the curves of the best point so far, and move the sliders there."""
         if not news.values or self.desk.measurement is None:
             return
         now = self.curves.turning
         there = None if now is None else (now.law, now.drive, now.problem.measurement.cycle)
         if there != (law_in_words(news.model, news.relaxation), news.drive, news.cycle):
-            self._turn_fitted(news.model, news.relaxation, news.drive, news.cycle, news.values)
-            return
-        self.curves.put(news.values)
+            self._turn_fitted(news)
+        else:
+            self.curves.put(news.values)
 
-    def _turn_fitted(
-        self, model: str, relaxation: int, drive: str, cycle: int, values: Mapping[str, float]
-    ) -> None:
-        """Put the curves of the fit there that was begun last, at these values."""
+    def _turn_fitted(self, news: News) -> None:
+        """Show the curves of the last fit at the values of a report."""
         assert self.desk.worker is not None
         assert self.desk.measurement is not None
         options = keywords(parsed(self.desk.worker.job.arguments))
-        options |= {"relaxation": relaxation, "drive": drive}
-        self._turn_model(model, cycle or self.desk.measurement.cycle, values, **options)
+        options |= {"relaxation": news.relaxation, "drive": news.drive}
+        cycle = news.cycle or self.desk.measurement.cycle
+        self._turn_model(news.model, cycle, news.values, **options)
 
     def _ended(self) -> None:
         """Show the result of the fit, or why there is none."""
         self._allow()
         self.stop.visible = False
-        self.progress.object = ENDED
-        self._hold(False)
+        self.progress.object = piece("ended")
+        for field in (*self.fields, self.chosen, self.check):
+            field.disabled = False
         if self.desk.result is None:
-            self.ending.object = paragraph(self.desk.ending(), "error")
+            self.ending.object = wrong(self.desk.ending())
             return
         told, picture = self.desk.told, self.desk.result / "cycles.png"
-        self.ending.object = paragraph(f"In a terminal: {self.desk.command}", "soft")
-        self.ending.object += f'<pre tabindex="0">{html.escape(told)}</pre>' if told else ""
+        self.ending.object = soft(f"In a terminal: {self.desk.command}")
+        if told:
+            self.ending.object += piece("verbatim", told)
         if told and picture.is_file():
-            content = base64.b64encode(picture.read_bytes()).decode()
-            self.ending.object += (
-                '<img alt="Loops of the cycles, and their parameters by cycle" '
-                f'src="data:image/png;base64,{content}">'
-            )
+            png = base64.b64encode(picture.read_bytes()).decode()
+            self.ending.object += piece("cycles", png)
         fits = [*self.desk.fits]
         self.saves.visible = True
         self.beside.visible = self.back.visible = bool(fits)
@@ -503,18 +459,15 @@ class Window:
         self._back()
 
     def _back(self, event: Any = None) -> None:
-        """Show the report of the fit, and put the sliders back to it."""
-        if self.report_of.value not in self.desk.fits:
+        """Show the report of the fit, and move the sliders back to it."""
+        cycle = self.report_of.value
+        if cycle not in self.desk.fits:
             return
-        self.report.object = (
-            '<iframe sandbox="" title="Report of the fit: figures, parameters with their states, '
-            f'notes" srcdoc="{html.escape(self._report())}"></iframe>'
-        )
-        fit = load_result(self.desk.fits[self.report_of.value])
+        self.report.object = piece("report", self._report())
+        fit = load_result(self.desk.fits[cycle])
         values = {name: one["value"] for name, one in fit["parameters"].items()}
-        self._turn_fitted(
-            fit["model"], fit["relaxation"], fit["drive"], self.report_of.value, values
-        )
+        place = {name: fit[name] for name in ("model", "relaxation", "drive")}
+        self._turn_fitted(News(cycle=cycle, values=values, **place))
 
     def _compare(self, event: Any) -> None:
         if not event.new:
@@ -522,47 +475,42 @@ class Window:
             return
         try:
             text = self.desk.compared(event.new, self.report_of.value)
-            self.comparison.object = f'<pre tabindex="0">{html.escape(text)}</pre>'
+            self.comparison.object = piece("verbatim", text)
         except InputError as error:
-            self.comparison.object = paragraph(str(error), "error")
+            self.comparison.object = wrong(error)
 
 
 def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Take from options of the command those on which the curves of a model hang."""
+    """Return the options on which the curves of a model depend."""
     return {one: asked[one] for one in ("drive", "relaxation", "interior_mass", "time_shift")}
 
 
-def busy(text: str) -> str:
-    """Write what is being done, under a bar that moves."""
-    return f'<progress aria-label="busy"></progress>{paragraph(text, "soft")}'
+def models() -> list[str]:
+    """Return the models that are listed: each law alone, on a linear spring, and twice."""
+    alone = [kind for kind in laws.kinds() if laws.law(kind).hysteretic]
+    return ["auto", *alone, *(f"linear+{one}" for one in alone), *(f"{one}+{one}" for one in alone)]
 
 
 def send_at_once() -> None:
-    """Let no message of this window wait until the one before is acknowledged, 40 ms later.
+    """Send messages of this window without waiting for acknowledgements (40 ms each).
 
-    A curve is several small ones. Bokeh has no public way to its sockets; without it they are late.
+    Bokeh has no public way to its sockets; if this fails, curves come late.
     """
     with suppress(AttributeError):
         for connection in pn.state.curdoc.session_context.session._subscribed_connections:
             connection._socket.set_nodelay(True)
 
 
+def soft(text: str) -> str:
+    """Write a text as a soft paragraph."""
+    return piece("paragraph", text, "soft")
+
+
+def wrong(error: object) -> str:
+    """Write an error as a paragraph, nothing for none."""
+    return piece("paragraph", str(error), "error") if str(error) else ""
+
+
 def defect(error: Exception) -> str:
-    """Say that what happened should not."""
+    """Say that an error is a defect."""
     return f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."
-
-
-def excerpt_html(excerpt: Excerpt | None) -> str:
-    """Show rows of a file as a table, the wrong cell, row or column marked."""
-    if excerpt is None:
-        return ""
-    lines = []
-    for k, (number, cells) in enumerate(zip(excerpt.numbers, excerpt.cells, strict=True)):
-        row = [f'<th scope="row">{number}</th>']
-        for j, cell in enumerate(cells):
-            hit = excerpt.column in (None, j) if excerpt.row == k else False
-            hit = hit or (excerpt.row is None and excerpt.column == j)
-            mark = ' class="wrong"' if hit else ""
-            row.append(f"<td{mark}>{html.escape(cell)}</td>")
-        lines.append(f"<tr>{''.join(row)}</tr>")
-    return f'<div class="wide" tabindex="0"><table>{"".join(lines)}</table></div>'

@@ -1,6 +1,6 @@
-"""The measured curves, those of springs over them, and a slider for each parameter.
+"""Measured curves, simulated ones over them, and a slider for each parameter.
 
-The page and the notebook `turn_the_parameters` show the same ones.
+The page and the notebook `turn_the_parameters` show the same panels.
 """
 
 from __future__ import annotations
@@ -16,20 +16,14 @@ from bokeh.models import Band, ColumnDataSource, LabelSet, Range1d
 from bokeh.plotting import figure
 
 from foamfit.page.turning import PANELS, Drawn, Row, Turning
-from foamfit.page.widgets import Sliders, message
+from foamfit.page.widgets import Sliders, message, piece
 from foamfit.report.figures import GREY, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
 from foamfit.text import percent
 
-MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a curve, of a measured one
-LEGEND = (
-    '<p style="margin: 0; font: .9rem system-ui, sans-serif; color: #1d2327">'
-    f'<svg width="12" height="12" aria-hidden="true"><circle cx="6" cy="6" r="3" fill="white" '
-    f'stroke="{GREY}"/></svg> measured &ensp; <svg width="22" height="12" aria-hidden="true">'
-    f'<path d="M1 6H21" stroke="{VERMILION}" stroke-width="2"/></svg> springs</p>'
-)
-ASIDE = {"C1": -22}  # px from a point to its name, which is at the right edge
+MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a simulated curve, and of a measured one
+ASIDE = {"C1": -22}  # px from a point at the right edge to its name
 NOTHING = np.empty(0), np.empty(0)
 AXES = {  # of each panel: x and y, with the SI units of both
     "stress_time": (("time", "s"), ("stress", "Pa")),
@@ -39,9 +33,9 @@ AXES = {  # of each panel: x and y, with the SI units of both
 
 
 def grid(parts: list[Any], width: float) -> pn.Column:
-    """Put parts side by side, none narrower than so many rem; hidden at first.
+    """Put parts side by side, each at least so many rem wide; hidden at first.
 
-    What is hidden is the column around it: a part that says itself how it is laid out stays.
+    The column around them is what is hidden, as a grid itself would stay visible.
     """
     style = (
         ":host { display: grid; gap: .4rem; "
@@ -56,29 +50,27 @@ class Curves:
 
     def __init__(self, turning: Turning | None = None) -> None:
         self.turning: Turning | None = None
-        self.held: dict[str, bool] = {}  # what was ticked by hand: whether a fit holds it
+        self.held: dict[str, bool] = {}  # by parameter: whether the user's tick holds it in a fit
         self._rows: dict[str, Row] = {}
         self._scales: dict[str, tuple[float, float]] = {}
         self._measured = {name: ColumnDataSource({"x": [], "y": []}) for name in PANELS}
-        # One source for all panels: one message for a move.
+        # One source for all panels makes one message per move.
         self._turned = ColumnDataSource({f"{name}_{axis}": [] for name in PANELS for axis in "xy"})
         self._points = ColumnDataSource({"x": [], "y": [], "name": [], "aside": []})
         self._figures = {name: self._figure(name) for name in PANELS}
         self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
-        # With the lock of the document, which a message does not always come with.
+        # With the lock of the document, which not every message holds.
         self.sliders.on_msg(lambda event: pn.state.execute(partial(self._moved, event), True))
-        legend = pn.pane.HTML(LEGEND, sizing_mode="stretch_width", margin=0)
-        self._panels = grid(
-            [pn.pane.Bokeh(one, sizing_mode="stretch_width") for one in self._figures.values()],
-            14.5,
-        )
-        self._panels.insert(0, legend)  # of all panels: one of a figure's own is drawn each time
-        self.view = pn.Column(self._panels, self.sliders, sizing_mode="stretch_width", margin=0)
+        wide: dict[str, Any] = {"sizing_mode": "stretch_width"}
+        legend = pn.pane.HTML(piece("legend", GREY, VERMILION), margin=0, **wide)
+        self._panels = grid([pn.pane.Bokeh(one, **wide) for one in self._figures.values()], 14.5)
+        self._panels.insert(0, legend)  # a figure's own would be redrawn each time
+        self.view = pn.Column(self._panels, self.sliders, margin=0, **wide)
         if turning is not None:
             self.show(turning)
 
     def show(self, turning: Turning) -> None:
-        """Put another model or test there, with sliders of its own."""
+        """Show another model or test, with its sliders."""
         self.turning = turning
         self._rows = {row.name: row for row in turning.rows}
         self._show_measured()
@@ -94,15 +86,15 @@ class Curves:
         self.sliders.show({n: v / rows[n].factor for n, v in values.items() if n in rows})
 
     def hide(self) -> None:
-        """Take everything away."""
+        """Hide everything."""
         self.sliders.tell("")
         self.turning, self._rows, self.sliders.rows = None, {}, []
         self._panels.visible = False
 
     def chosen(self) -> tuple[dict[str, float], list[str]]:
-        """Return what a fit is to hold, with its values (SI), and what it is to vary.
+        """Return what a fit is to hold, with values (SI), and what it is to vary.
 
-        Left out is what it holds at this value, or varies, by itself.
+        Parameters that it holds at this value, or varies, by default are left out.
         """
         held, varied = dict[str, float](), list[str]()
         if self.turning is None:
@@ -117,27 +109,28 @@ class Curves:
 
     def _figure(self, name: str) -> Any:
         made = figure(
-            height=270, sizing_mode="stretch_width", title=CURVES[name], output_backend="canvas",
-            tools="pan,box_zoom,reset", toolbar_location="right",
-            x_range=Range1d(0.0, 1.0), y_range=Range1d(0.0, 1.0),
-        )  # fmt: skip
-        made.scatter("x", "y", source=self._measured[name], size=5, fill_color="white",
-                     line_color=GREY)  # fmt: skip
-        # What moves lies on a canvas of its own: axes and measured curves are not drawn again.
-        # Annotations are cut off there at the frame, glyphs are not; a band of no width is a line.
-        line = f"{name}_y"
-        made.add_layout(Band(
-            base=f"{name}_x", lower=line, upper=line, source=self._turned, level="overlay",
-            line_color=VERMILION, line_width=2, line_alpha=1.0, fill_alpha=0.0,
-        ))  # fmt: skip
+            title=CURVES[name],
+            height=270,
+            sizing_mode="stretch_width",
+            output_backend="canvas",
+            tools="pan,box_zoom,reset",
+            toolbar_location="right",
+            x_range=Range1d(0.0, 1.0),
+            y_range=Range1d(0.0, 1.0),
+        )
+        measured = {"source": self._measured[name], "line_color": GREY}
+        made.scatter("x", "y", size=5, fill_color="white", **measured)
+        # Moving curves have a canvas of their own, so axes and measured curves are not redrawn.
+        # The frame clips annotations there, not glyphs; a band without width is a line.
+        above = {"source": self._turned, "level": "overlay", "line_color": VERMILION}
+        ends = {"base": f"{name}_x", "lower": f"{name}_y", "upper": f"{name}_y"}
+        made.add_layout(Band(line_width=2, line_alpha=1.0, fill_alpha=0.0, **above, **ends))
         if name == "stress_strain":
             at: dict[str, Any] = {"x": "x", "y": "y", "source": self._points, "level": "overlay"}
-            made.add_layout(LabelSet(
-                text=value("\u25cf"), text_align="center", text_baseline="middle", **at
-            ))  # fmt: skip
-            made.add_layout(LabelSet(
-                text="name", x_offset="aside", y_offset=-15, text_font_size="9pt", **at
-            ))  # fmt: skip
+            centred = {"text_align": "center", "text_baseline": "middle"}
+            made.add_layout(LabelSet(text=value("\u25cf"), **centred, **at))
+            beside = {"x_offset": "aside", "y_offset": -15, "text_font_size": "9pt"}
+            made.add_layout(LabelSet(text="name", **beside, **at))
         made.toolbar.logo = None
         made.toolbar.autohide = True
         return made
@@ -158,17 +151,15 @@ class Curves:
             some = slice(None, None, -(-len(there[0]) // MOST_MARKERS))
             x, y = there[0] / fx, there[1] / fy
             self._measured[name].data = {"x": x[some], "y": y[some]}
-            # They stay while parameters are turned: what moves is the curve alone.
+            # The axes keep their ranges while parameters change.
             for limits, values, beyond in ((made.x_range, x, 0.04), (made.y_range, y, 0.15)):
                 more = beyond * float(np.ptp(values))
-                limits.update(
-                    start=float(values.min()) - more, end=float(values.max()) + more,
-                    reset_start=float(values.min()) - more, reset_end=float(values.max()) + more,
-                )  # fmt: skip
+                low, high = float(values.min()) - more, float(values.max()) + more
+                limits.update(start=low, end=high, reset_start=low, reset_end=high)
         self._panels.visible = True
 
     def _moved(self, event: Any) -> None:
-        """Draw the curves of the parameters that were moved; note what was ticked."""
+        """Draw the curves for sliders that were moved; note ticks."""
         told = message(event)
         moves, held = (
             one if isinstance(one, dict) else {} for one in (told.get("moves"), told.get("held"))
@@ -185,7 +176,7 @@ class Curves:
             self.sliders.drawn()
 
     def _draw(self, moves: Mapping[str, float]) -> None:
-        """Send the arrays of the curves alone; the figures stay as they are."""
+        """Send only the arrays of the curves."""
         assert self.turning is not None
         drawn = self.turning.turn(moves)
         data = dict[str, Any]()
@@ -194,7 +185,7 @@ class Curves:
             fx, fy = self._scales.get(name, (1.0, 1.0))
             some = slice(None, None, -(-len(x) // MOST_DRAWN) or 1)
             data |= {f"{name}_x": x[some] / fx, f"{name}_y": y[some] / fy}
-        # Of one length, as a source has it, and no finer than pixels are.
+        # A source needs arrays of one length; single precision resolves a pixel.
         sent = {name: np.full(max(map(len, data.values())), np.nan, np.float32) for name in data}
         for name, values in data.items():
             sent[name][: len(values)] = values
@@ -218,6 +209,6 @@ class Curves:
 
 
 def misfits_text(misfit: Mapping[str, float | None]) -> str:
-    """Name the misfits of the three panels that are there."""
+    """Return the misfits of the panels in words."""
     shown = {CURVES[name]: misfit.get(name) for name in PANELS}
     return ", ".join(f"{name} {percent(off)}" for name, off in shown.items() if off is not None)

@@ -1,7 +1,6 @@
-"""What one window works on: its files, the test read from them, and its fit.
+"""The work of one window: its files, the test read from them, and its fit.
 
-Everything lies in a folder of the window's own, which goes with the window. Two windows share
-nothing.
+Everything lies in a folder of the window, which is removed with it. Windows share nothing.
 """
 
 from __future__ import annotations
@@ -13,74 +12,54 @@ import shutil
 import tomllib
 import unicodedata
 import zipfile
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
-from foamfit.cli.options import cycles_of
+import tomli_w
+
+from foamfit.cli.fitting import cycles_of
 from foamfit.data.csv_file import read_test
-from foamfit.data.csv_table import find_table, read_text
 from foamfit.data.describe import describe
 from foamfit.data.energy import audit
 from foamfit.data.measurement import Measurement
+from foamfit.data.tables.csv_table import find_table, read_text
 from foamfit.data.toml_file import toml_beside
 from foamfit.errors import InputError
-from foamfit.page.worker import Job, Worker, parsed
+from foamfit.page.worker import Job, Worker, end_all, parsed
 from foamfit.report.comparison import compare, comparison_text
+from foamfit.springs import laws
 from foamfit.text import listed
 
 LARGEST = 64 * 1024 * 1024  # bytes of a file that is dropped
 LONGEST = 80  # characters of the name of a file
 BUSY = "A fit is running; stop it before anything of the test is changed."
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
-# Rows and columns of a file that are shown around a cell that is wrong.
+# Rows on each side, columns, and characters of a cell shown around a wrong cell.
 AROUND, ACROSS, CELL = 2, 8, 24
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """A quantity that is filled in: its place in the TOML, what it is called, an example."""
-
-    section: str
-    key: str
-    label: str
-    example: str
-
-    @property
-    def name(self) -> str:
-        """Its name as the sentences of `read_test` give it."""
-        return f"[{self.section}] {self.key}"
-
-
-QUANTITIES = (
-    Quantity("specimen", "height", "Specimen height", "1.19 mm"),
-    Quantity("specimen", "diameter", "Specimen diameter", "5 mm"),
-    Quantity("specimen", "area", "or its area", "19.6 mm^2"),
-    Quantity("specimen", "mass", "Specimen mass (optional)", "5.56 mg"),
-    Quantity("striker", "mass", "Striker mass (optional)", "7 g"),
-    Quantity("striker", "velocity", "Striker velocity (optional)", "1.75 m/s"),
-)
-
-
-@dataclass(frozen=True)
-class Excerpt:
-    """Some rows of a file around what is wrong in it; `row` and `column` are marked, from 0."""
-
-    numbers: list[int]
-    cells: list[list[str]]
-    row: int | None
-    column: int | None
+# Quantities to fill in, by their names in messages: label and example.
+QUANTITIES = {
+    "[specimen] height": ("Specimen height", "1.19 mm"),
+    "[specimen] diameter": ("Specimen diameter", "5 mm"),
+    "[specimen] area": ("or its area", "19.6 mm^2"),
+    "[specimen] mass": ("Specimen mass (optional)", "5.56 mg"),
+    "[striker] mass": ("Striker mass (optional)", "7 g"),
+    "[striker] velocity": ("Striker velocity (optional)", "1.75 m/s"),
+}
+# Rows of a file around an error: their numbers, and their cells, each with whether it is wrong.
+Excerpt = list[tuple[int, list[tuple[str, bool]]]]
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What was understood of a test, or the sentence that says why not and what it is about."""
+    """What was understood of a test, or why it cannot be read, and which quantity is wrong."""
 
     text: str = ""
     error: str = ""
     quantity: str = ""
-    excerpt: Excerpt | None = None
+    excerpt: Excerpt = field(default_factory=list)
 
 
 class Desk:
@@ -90,7 +69,8 @@ class Desk:
         self.folder = folder
         folder.mkdir(mode=0o700)
         self.csv: Path | None = None
-        self.replaced = False  # whether the file has taken the place of another, not read since
+        self.dropped: bytes | None = None  # a TOML that was not read yet
+        self.replaced = False  # whether the file replaced another and was not read since
         self.measurement: Measurement | None = None
         self.worker: Worker | None = None
         self._fits = 0
@@ -98,15 +78,15 @@ class Desk:
     def close(self) -> None:
         """End the fit and remove the folder."""
         if self.worker is not None:
-            self.worker.kill()
+            end_all(self.worker.process)
         shutil.rmtree(self.folder, ignore_errors=True)
 
     # ------------------------------------------------------------------------------- files
 
     def receive(self, name: str, content: bytes) -> str:
-        """Keep a file that was dropped under a name that is safe, which is returned.
+        """Keep a dropped file under a safe name, which is returned.
 
-        InputError if it is too large or of no kind that is read.
+        InputError if it is too large or not a table.
         """
         if self.running:
             raise InputError(BUSY)
@@ -115,7 +95,7 @@ class Desk:
         name = safe_name(name)
         suffix = Path(name).suffix.lower()
         if suffix == ".toml":
-            (self.folder / "dropped.toml").write_bytes(content)
+            self.dropped = content
             return name
         if suffix not in TABLES:
             raise InputError(
@@ -132,26 +112,24 @@ class Desk:
     def take(self, csv: Path) -> None:
         """Copy a test that is on this machine, and the TOML beside it, onto the desk.
 
-        Only the command and the list of reconstructions name such a file, never the page.
+        Only the command and the list of reconstructions name such a file, never the browser.
         """
         if csv.stat().st_size > LARGEST:
             raise InputError(too_large(csv.name))
-        self.receive(f"{csv.stem}.csv" if csv.suffix.lower() not in TABLES else csv.name,
-                     csv.read_bytes())  # fmt: skip
+        known = csv.suffix.lower() in TABLES
+        self.receive(csv.name if known else f"{csv.stem}.csv", csv.read_bytes())
         toml = toml_beside(csv)
         if toml.is_file():
-            (self.folder / "dropped.toml").write_bytes(toml.read_bytes())
+            self.dropped = toml.read_bytes()
 
     def dropped_toml(self) -> tuple[dict[str, str], str] | None:
         """Split the TOML that was dropped last into quantities and the rest; None if there is none.
 
-        It is read once. InputError if it is no TOML.
+        It is read once. InputError if it is not valid.
         """
-        place = self.folder / "dropped.toml"
-        if not place.is_file():
+        if self.dropped is None:
             return None
-        raw = place.read_bytes()
-        place.unlink()
+        raw, self.dropped = self.dropped, None
         try:
             return split_toml(raw.decode("utf-8-sig"))
         except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
@@ -174,11 +152,11 @@ class Desk:
             toml.write_text(join_toml(quantities, rest), encoding="utf-8")
             alone, several = cycles_of(cycle.strip() or None)
             measurement = read_test(self.csv, toml, several[0] if several else alone)
-            # By its own name: the folder of the window means nothing to who reads it.
+            # By its own name: the folder of the window means nothing to a user.
             text = describe(replace(measurement, path=Path(self.csv.name)), audit(measurement))
         except InputError as error:
             told = self._plain(str(error))
-            quantity = next((q.name for q in QUANTITIES if f"{q.name} " in told), "")
+            quantity = next((name for name in QUANTITIES if f"{name} " in told), "")
             if "[specimen] needs a diameter" in told:
                 quantity = "[specimen] diameter"
             excerpt = excerpt_of(self.csv, told)
@@ -187,7 +165,7 @@ class Desk:
         return Checked(text)
 
     def measured(self, cycle: int) -> Measurement:
-        """Return a cycle of the test that was checked last, or that its fit has read."""
+        """Return a cycle of the test that was checked last."""
         assert self.csv is not None
         assert self.measurement is not None
         if cycle == self.measurement.cycle:
@@ -196,11 +174,11 @@ class Desk:
 
     @property
     def toml(self) -> bytes:
-        """The TOML as it is filled in."""
+        """The TOML as filled in."""
         return b"" if self.csv is None else self.csv.with_suffix(".toml").read_bytes()
 
     def _plain(self, text: str) -> str:
-        """Leave the folder of the window out of a sentence."""
+        """Remove the folder of the window from a sentence."""
         for folder in (self.folder / "test", self.folder):
             text = text.replace(f"{folder}/", "").replace(f"{folder}\\", "")
         return text
@@ -208,7 +186,7 @@ class Desk:
     # ------------------------------------------------------------------------------- the fit
 
     def fit(self, arguments: list[str]) -> Worker:
-        """Begin a fit of the test as it was checked last, with arguments of `foamfit fit`."""
+        """Start a fit of the test that was checked last, with arguments of `foamfit fit`."""
         if self.csv is None or self.measurement is None:
             raise InputError("There is no test that can be read yet; see what is wrong with it.")
         if self.running:
@@ -216,9 +194,9 @@ class Desk:
         parsed(arguments)
         self._fits += 1
         folder = self.folder / f"fit-{self._fits}"
-        toml = folder.with_suffix(".toml")  # as it is now, whatever is filled in later
+        toml = folder.with_suffix(".toml")  # the page may change it later
         toml.write_bytes(self.toml)
-        job = Job(str(self.csv), str(toml), str(folder), arguments)
+        job = Job(str(self.csv), str(toml), str(folder), arguments, laws.texts())
         self.worker = Worker(job)
         return self.worker
 
@@ -236,31 +214,31 @@ class Desk:
 
     @property
     def fits(self) -> dict[int, Path]:
-        """The folders with a fit of the last result by the number of their cycle; 0 = the one."""
+        """The folders of the last result's fits by cycle; 0 for a single fit."""
         if self.result is None:
             return {}
         cycles = {int(one.name.split("-")[1]): one for one in self.result.glob("cycle-*")}
         return dict(sorted(cycles.items())) or {0: self.result}
 
     def ending(self) -> str:
-        """Say how the last fit ended, "" where it has a result."""
+        """Say why the last fit has no result, "" if it has one."""
         assert self.worker is not None
         return self._plain(self.worker.ended or "")
 
     @property
     def command(self) -> str:
-        """What asks for the last fit in a terminal, where the TOML lies beside the file."""
+        """The command of the last fit in a terminal, with the TOML beside the file."""
         assert self.csv is not None
         assert self.worker is not None
         return shlex.join(["foamfit", "fit", self.csv.name, *self.worker.job.arguments])
 
     @property
     def told(self) -> str:
-        """What the command prints of several cycles, "" of one fit."""
+        """The text that the command prints on several cycles, "" for one fit."""
         return "" if self.worker is None else self.worker.told
 
     def zipped(self) -> bytes:
-        """The result folder as a ZIP, with the TOML of the test."""
+        """Return the result folder as a ZIP, with the TOML of the test."""
         assert self.result is not None
         content = io.BytesIO()
         with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -270,7 +248,7 @@ class Desk:
         return content.getvalue()
 
     def compared(self, published: str, cycle: int = 0) -> str:
-        """A fit of the result beside a published set, as `foamfit compare` prints it."""
+        """Return a fit beside a published set, as `foamfit compare` prints it."""
         if cycle not in self.fits:
             raise InputError("There is no fit yet; run one to compare it.")
         return self._plain(comparison_text(compare([self.fits[cycle]], published)))
@@ -285,7 +263,7 @@ def too_large(name: str) -> str:
 
 
 def safe_name(name: str) -> str:
-    """Return a name of one file, without a folder, of characters that mean nothing to a shell."""
+    """Return a file name without folder, of characters that are harmless in a shell."""
     name = unicodedata.normalize("NFKC", name).replace("\\", "/").rsplit("/", 1)[-1]
     name = re.sub(r"[^\w.()+-]+", "_", name).lstrip("._-")
     stem, dot, suffix = name.rpartition(".")
@@ -298,111 +276,72 @@ def safe_name(name: str) -> str:
 
 
 def split_toml(text: str) -> tuple[dict[str, str], str]:
-    """Split a TOML into the quantities of the page, by their names, and a TOML of the rest."""
+    """Split a TOML into the quantities of the page, by name, and a TOML of the rest."""
     document = tomllib.loads(text)
     found = {}
-    for q in QUANTITIES:
-        section = document.get(q.section)
-        if isinstance(section, dict) and isinstance(section.get(q.key), str | int | float):
-            found[q.name] = str(section.pop(q.key))
+    for name in QUANTITIES:
+        table, key = name[1:].split("] ")
+        section = document.get(table)
+        if isinstance(section, dict) and isinstance(section.get(key), str | int | float):
+            found[name] = str(section.pop(key))
             if not section:
-                document.pop(q.section)
-    return found, _written(document)
+                document.pop(table)
+    return found, tomli_w.dumps(document)
 
 
 def join_toml(quantities: Mapping[str, str], rest: str) -> str:
-    """Join the quantities that are filled in to a TOML of the rest; InputError if that is none."""
+    """Join the quantities that are filled in to a TOML of the rest; InputError if invalid."""
     try:
         document = tomllib.loads(rest)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(f"The further TOML is no valid TOML: {error}.") from None
-    for q in QUANTITIES:
-        value = quantities.get(q.name, "").strip()
-        if not value:
-            continue
-        section = document.setdefault(q.section, {})
-        if not isinstance(section, dict):
-            raise InputError(f"The further TOML: {q.section} must be a table, [{q.section}].")
-        if q.key in section:
-            raise InputError(f"The further TOML: {q.name} is filled in above, too; give it once.")
-        section[q.key] = value
-    return _written(document)
-
-
-def _written(document: Mapping[str, Any]) -> str:
-    """Write a TOML: single values first, then a table for each section."""
-    lines = [f"{_key(k)} = {_toml(v)}" for k, v in document.items() if not isinstance(v, dict)]
-    for name, section in document.items():
-        if isinstance(section, dict):
-            lines += ["", f"[{_key(name)}]"]
-            lines += [f"{_key(k)} = {_toml(v)}" for k, v in section.items()]
-    return "\n".join(lines).strip() + "\n" if lines else ""
-
-
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml(name)
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return '"' + re.sub(r"[\x00-\x1f\x7f]", lambda c: f"\\u{ord(c[0]):04x}", escaped) + '"'
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(k)} = {_toml(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return str(value)
+    for name in QUANTITIES:
+        if value := quantities.get(name, "").strip():
+            table, key = name[1:].split("] ")
+            section = document.setdefault(table, {})
+            if not isinstance(section, dict):
+                raise InputError(f"The further TOML: {table} must be a table, [{table}].")
+            if key in section:
+                raise InputError(f"The further TOML: {name} is filled in above, too; give it once.")
+            section[key] = value
+    return tomli_w.dumps(document)
 
 
 # ------------------------------------------------------------------------- what is wrong, and where
 
 
-def excerpt_of(path: Path, sentence: str) -> Excerpt | None:
-    """Return the rows around the cell that a sentence of `read_test` names; None if it names none.
+def excerpt_of(path: Path, sentence: str) -> Excerpt:
+    """Return the headers and the rows around the cell that a sentence of `read_test` names.
 
-    A sentence that names no row is about the columns: the first rows are shown then.
+    A sentence without a row is about a column, if any: the first rows are shown then.
     """
     try:
         text = read_text(path, "")
     except InputError:
-        return None
+        return []
     lines = text.raw.decode(text.encoding, errors="replace").splitlines()
-    separator, header = _separator(path, lines)
-    row = re.search(r"\brow (\d+)", sentence)
-    at = int(row[1]) - 1 if row else None
-    first = header if at is None else max(at - AROUND, header)
-    some = range(first, min(first + 2 * AROUND + 1, len(lines)))
-    numbers = [header, *(n for n in some if n != header)]
-    cells = [_split(lines[n], separator) for n in numbers if n < len(lines)]
-    if not cells:
-        return None
-    column = _column(cells[0], sentence)
-    shift = 0 if column is None else max(0, column - ACROSS + 1)
-    shown = [[cell[:CELL] for cell in line[shift : shift + ACROSS]] for line in cells]
-    numbers = numbers[: len(shown)]
-    marked = numbers.index(at) if at in numbers else None
-    return Excerpt([n + 1 for n in numbers], shown, marked, column and column - shift)
-
-
-def _separator(path: Path, lines: Iterable[str]) -> tuple[str, int]:
-    """Return separator and line of the headers, as the reader finds them, or a guess."""
     try:
-        table = find_table(read_text(path, ""), set())
+        table = find_table(text, set())
+        separator, header = table.separator, max(table.header_row - 1, 0)
     except InputError:
-        head = "\n".join(list(lines)[:20])
-        return max(("\t", ";", ","), key=head.count), 0
-    return table.separator, max(table.header_row - 1, 0)
+        separator, header = max("\t;,", key="\n".join(lines[:20]).count), 0
+    found = re.search(r"\brow (\d+)", sentence)
+    row = int(found[1]) - 1 if found else None
+    first = header if row is None else max(row - AROUND, header)
+    some = range(first, min(first + 2 * AROUND + 1, len(lines)))
+    cells = {
+        n: [cell.strip().strip('"') for cell in lines[n].split(separator)]
+        for n in dict.fromkeys([header, *some])
+    }
+    headers = enumerate(cells[header])
+    column = next((k for k, name in headers if name and f"'{name}'" in sentence), None)
+    left = 0 if column is None else max(0, column - ACROSS + 1)
 
+    def wrong(n: int, k: int) -> bool:
+        """Whether a cell is the wrong one, or in the row or column that is wrong as a whole."""
+        return {row, column} != {None} and row in (n, None) and column in (k, None)
 
-def _split(line: str, separator: str) -> list[str]:
-    return [cell.strip().strip('"') for cell in line.split(separator)]
-
-
-def _column(headers: list[str], sentence: str) -> int | None:
-    """Return the column that a sentence names in quotation marks, the first if several."""
-    for k, header in enumerate(headers):
-        if header and f"'{header}'" in sentence:
-            return k
-    return None
+    return [
+        (n + 1, [(line[k][:CELL], wrong(n, k)) for k in range(left, min(left + ACROSS, len(line)))])
+        for n, line in cells.items()
+    ]

@@ -35,14 +35,14 @@ class Field:
             made["value"] = "" if self.default is None else self.default
             self.widget = pn.widgets.Select(**made)
         elif option.is_flag:
-            # A group of one: a single tick of this library has no label that is read aloud.
+            # A group of one: screen readers do not read the label of Panel's single checkbox.
             self.widget = pn.widgets.CheckBoxGroup(options=[self.label], **style)
         else:
             shown = "" if self.default is None else str(self.default)
             self.widget = pn.widgets.TextInput(value=shown, **made)
 
     def arguments(self) -> list[str]:
-        """Return the arguments that say what is filled in; none where it is the default."""
+        """Return the arguments for what is filled in; none for the default."""
         value = self.widget.value
         if isinstance(value, list):
             return [self.flag] if value else []

@@ -8,9 +8,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from foamfit.page.worker import end_all, with_package
 from foamfit.solve import cache
+from foamfit.springs.model import Model
 
-# One after the other: what a bistable spring needs, and what springs with memory need; of each a
-# model, its relaxation, and a loop that is there when all is.
+# Compiled one after the other, for springs without memory and with it: a model, its relaxation, and
+# the loop that is cached last.
 COMPILED = (("bistable", 0, "integrate"), ("microscale", 1, "relaxed_along"))
 COMPILE = """from foamfit.solve.precompile import at_first_use
 with at_first_use({!r}, {}, lambda: None) as compile_rest:
@@ -18,9 +19,9 @@ with at_first_use({!r}, {}, lambda: None) as compile_rest:
 
 
 class FirstUse:
-    """What compiles, once after installation, what curves and fits need: processes of their own.
+    """Compiles what curves and fits need, once after installation, in other processes.
 
-    In this one the page would not answer meanwhile.
+    The page answers meanwhile.
     """
 
     def __init__(self) -> None:
@@ -30,8 +31,10 @@ class FirstUse:
         self.parts = [pool.submit(self._compile, *part) for part in COMPILED]
 
     def needed(self, model: str, relaxation: int) -> Future[None]:
-        """What must be done before a model is simulated."""
-        memory = model == "auto" or "microscale" in model or relaxation > 0
+        """Return what must be done before a model is simulated."""
+        memory = (
+            model == "auto" or relaxation or any(one.remembers for one in Model.parse(model).laws)
+        )
         return self.parts[-1 if memory else 0]
 
     def _compile(self, model: str, relaxation: int, loop: str) -> None:

@@ -1,8 +1,7 @@
-"""The address of the page: on this machine alone, known to who was given it, and for no other page.
+"""The server of the page: for this machine alone, and only for those who know the address.
 
-Every request is looked at before anything else sees it: its Host and its Origin must be the page's
-own (another site that a name leads here, or that sends its visitors' browsers here, is refused),
-and its path begins with a random token.
+Every request is checked first: its Host and its Origin must be the page's own, which refuses DNS
+rebinding and requests from other sites, and its path must begin with a random token.
 """
 
 from __future__ import annotations
@@ -33,74 +32,53 @@ from foamfit.page.first_use import FirstUse
 from foamfit.terminal import say
 
 HOST = "127.0.0.1"
-UNUSED = 20_000  # ms after which the desk of a closed window is removed
+UNUSED = 20_000  # ms until the desk of a closed window is removed
 HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Cache-Control": "no-store",
 }
-REFUSED = "This page is for the address that foamfit page has printed; open that.\n"
-
-
-class Refusal(httputil.HTTPMessageDelegate):
-    """Answer a request with 403, whatever it is."""
-
-    def __init__(self, connection: httputil.HTTPConnection) -> None:
-        self.connection = connection
-
-    def finish(self) -> None:
-        """Answer, once all of the request has come."""
-        body = REFUSED.encode()
-        head = httputil.HTTPHeaders(
-            {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)),
-             "Connection": "close"} | HEADERS
-        )  # fmt: skip
-        line = httputil.ResponseStartLine("HTTP/1.1", 403, "Forbidden")
-        self.connection.write_headers(line, head, body)
-        self.connection.finish()
-
-
-class Guard(routing.Router):
-    """Let through what has the page's own Host, Origin and token only."""
-
-    def __init__(self, behind: web.Application, port: int, token: str) -> None:
-        self.behind, self.token = behind, token
-        self.host = f"{HOST}:{port}"
-
-    def find_handler(
-        self, request: httputil.HTTPServerRequest, **kwargs: Any
-    ) -> httputil.HTTPMessageDelegate | None:
-        """Return what answers a request."""
-        origins = request.headers.get_list("Origin")
-        own = request.headers.get_list("Host") == [self.host]
-        own = own and all(origin == f"http://{self.host}" for origin in origins)
-        given = request.path.split("/")[1] if "/" in request.path else ""
-        if own and secrets.compare_digest(given.encode(), self.token.encode()):
-            return self.behind.find_handler(request, **kwargs)
-        assert request.connection is not None
-        return Refusal(request.connection)
+REFUSED = "This page is for the address that foamfit page has printed; open that."
 
 
 @web.stream_request_body
-class Receive(web.RequestHandler):
-    """Take a file that was dropped in a window, no larger than is said, onto its desk."""
-
-    def initialize(self, desks: dict[str, Desk]) -> None:
-        """Know the desks of all windows by their random names."""
-        self.desks = desks
-        self.content = bytearray()
+class Handler(web.RequestHandler):
+    """Refuses every request without reading its body."""
 
     def set_default_headers(self) -> None:
-        """Let nothing be guessed, kept or framed."""
+        """Forbid sniffing, caching and framing."""
         for name, value in HEADERS.items():
             self.set_header(name, value)
+
+    def prepare(self) -> None:
+        """Answer before the body is read."""
+        self.refuse(403, REFUSED)
+
+    def data_received(self, chunk: bytes) -> None:
+        """Ignore a part of the body."""
+
+    def refuse(self, code: int, sentence: str) -> None:
+        """Answer with a sentence, and close the connection."""
+        self.set_status(code)
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.set_header("Connection", "close")
+        self.finish(sentence + "\n")
+
+
+class Receive(Handler):
+    """Takes a file that was dropped in a window onto its desk, if it is not too large."""
+
+    def initialize(self, desks: dict[str, Desk]) -> None:
+        """Take the desks of all windows by their random names."""
+        self.desks = desks
+        self.content = bytearray()
 
     def prepare(self) -> None:
         """Refuse what is too large before it is sent."""
         length = self.request.headers.get("Content-Length", "")
         if self.request.method == "POST" and (not length.isdecimal() or int(length) > LARGEST):
-            self._refuse(413, too_large(self.get_query_argument("name", "The file")))
+            self.refuse(413, too_large(self.get_query_argument("name", "The file")))
 
     def data_received(self, chunk: bytes) -> None:
         """Take a part of the file."""
@@ -111,20 +89,34 @@ class Receive(web.RequestHandler):
         """Keep the file."""
         desk = self.desks.get(window)
         if desk is None:
-            return self._refuse(404, "This window is closed; load the page again.")
+            return self.refuse(404, "This window is closed; load the page again.")
         try:
             name = desk.receive(self.get_query_argument("name", "test.csv"), bytes(self.content))
         except InputError as error:
-            return self._refuse(400, str(error))
+            return self.refuse(400, str(error))
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(name)
         return None
 
-    def _refuse(self, code: int, sentence: str) -> None:
-        self.set_status(code)
-        self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.set_header("Connection", "close")
-        self.finish(sentence + "\n")
+
+class Guard(routing.Router):
+    """Lets through only requests with the page's own Host, Origin and token."""
+
+    def __init__(self, behind: web.Application, port: int, token: str) -> None:
+        self.behind, self.token = behind, token
+        self.host = f"{HOST}:{port}"
+        self.refusing = web.Application([(".*", Handler)])
+
+    def find_handler(
+        self, request: httputil.HTTPServerRequest, **kwargs: Any
+    ) -> httputil.HTTPMessageDelegate | None:
+        """Return the handler of a request."""
+        origins = request.headers.get_list("Origin")
+        own = request.headers.get_list("Host") == [self.host]
+        own = own and all(origin == f"http://{self.host}" for origin in origins)
+        given = request.path.split("/")[1] if "/" in request.path else ""
+        own = own and secrets.compare_digest(given.encode(), self.token.encode())
+        return (self.behind if own else self.refusing).find_handler(request, **kwargs)
 
 
 class Page:
@@ -138,21 +130,26 @@ class Page:
         self.test = test
         self.first_use = FirstUse()
         self.server = get_server(
-            {"/": self._window}, port=self.port, address=HOST, show=False, start=False,
-            title={"/": "foamfit"}, prefix=f"/{self.token}",
+            {"/": self._window},
+            port=self.port,
+            address=HOST,
+            show=False,
+            start=False,
+            title={"/": "foamfit"},
+            prefix=f"/{self.token}",
             websocket_origin=f"{HOST}:{self.port}",
             extra_patterns=[("/receive/([A-Za-z0-9_-]+)", Receive, {"desks": self.desks})],
             unused_session_lifetime_milliseconds=UNUSED,
             check_unused_sessions_milliseconds=UNUSED // 4,
             http_server_kwargs={"max_body_size": 2 * LARGEST},
-        )  # fmt: skip
-        # Before Bokeh's own application sees anything; it has no public way to stand in front.
+        )
+        # In front of Bokeh's own application, which has no public way for that.
         self.server._http.request_callback = Guard(self.server._tornado, self.port, self.token)
         self.server.start()
 
     @property
     def address(self) -> str:
-        """Where the page is, with the token that opens it."""
+        """The address of the page, with its token."""
         return f"http://{HOST}:{self.port}/{self.token}/"
 
     def close(self) -> None:
@@ -202,7 +199,7 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
 
 
 def _pass_over_closed_windows(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Report what went wrong in a task, but that a window was closed while a curve was sent."""
+    """Report errors in tasks, except that a window was closed while a curve was sent."""
     if not isinstance(context.get("exception"), StreamClosedError | WebSocketClosedError):
         loop.default_exception_handler(context)
 

@@ -1,4 +1,4 @@
-"""The curves of parameters that are turned by hand, over those that were measured."""
+"""Curves of parameters that are changed by hand, over the measured ones."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -19,20 +19,19 @@ from foamfit.fitting.starts import curve_starts, smooth_loop
 from foamfit.one_model import Keywords, Options
 from foamfit.report.readable import readable_unit
 from foamfit.results import law_in_words
-from foamfit.springs.laws import BistableSpring
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 
-MOST_SAMPLES = 1500  # of a curve that is drawn again at every move
-WIDE = 4.0  # times its value that a slider reaches
-# Of each panel: its curve, and what it is drawn over.
+MOST_SAMPLES = 1500  # of a curve that every move of a slider draws again
+WIDE = 4.0  # a slider reaches to so many times the value
+# The panels, in their order.
 PANELS = ("stress_time", "displacement_time", "stress_strain")
 
 
 @dataclass(frozen=True)
 class Row:
-    """A parameter to be turned: its value in a unit in which it reads well, and its limits there.
+    """A parameter with a slider: its value and limits in a readable unit.
 
-    `low` and `high` are the ends of the slider, `least` and `most` what is admissible.
+    `low` and `high` are the ends of the slider, `least` and `most` the admissible limits.
     """
 
     name: str
@@ -43,12 +42,12 @@ class Row:
     high: float
     least: float
     most: float
-    held: bool = False  # a fit does not vary it unless it is told to
+    held: bool = False  # whether a fit holds it by default
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Curves at some parameters, by the name of their panel, x beside y; or why there are none."""
+    """Curves (x, y) by the name of their panel at some parameters, or why there are none."""
 
     curves: dict[str, tuple[Array, Array]]
     misfit: dict[str, float | None]
@@ -58,13 +57,16 @@ class Drawn:
 
 
 class Turning:
-    """A model over a test: its parameters, and its curves wherever they are turned to."""
+    """A model over a test: its parameters, and its curves at whatever values these are given."""
 
     def __init__(
-        self, measurement: Measurement, model: str, values: Mapping[str, float] | None = None,
+        self,
+        measurement: Measurement,
+        model: str,
+        values: Mapping[str, float] | None = None,
         **options: Unpack[Keywords],
-    ) -> None:  # fmt: skip
-        """Begin at these values (SI), or else at those read off the loop; options as of a fit."""
+    ) -> None:
+        """Start at these values (SI), or at those read off the loop; options as of a fit."""
         thin = thinned(measurement)
         self.samples = thin.rows.used, _size(thin)
         self.problem: Problem = Options(**options).problem(thin, model)
@@ -73,7 +75,7 @@ class Turning:
 
     @property
     def drive(self) -> str:
-        """What drives the chain."""
+        """The drive of the chain."""
         return self.problem.objective.drive
 
     @property
@@ -83,14 +85,14 @@ class Turning:
 
     @property
     def named(self) -> dict[str, float]:
-        """The values (SI) by their names, in the numbers of the file."""
+        """The values (SI) by name; times and zeros are those of the file."""
         told = self.values + self.problem.origins
         return dict(zip(self.problem.names, told.tolist(), strict=True))
 
     def _own(self, name: str) -> bool:
-        """Whether a parameter is turned: it does not follow from others or the specimen.
+        """Whether a parameter has a slider: nothing else gives it, and it is not of the record.
 
-        Nor is it one of the record's own, such as the contact time, which is for a fit to find.
+        The contact time, for example, is of the record.
         """
         if name in NUISANCE and name != "time_shift":
             return False
@@ -100,7 +102,7 @@ class Turning:
         return self.problem.params[name].expr is None
 
     def _at(self, values: Array, moves: Mapping[str, float]) -> Array:
-        """Put some values into a vector; what hangs on them by expressions follows."""
+        """Put some values into a vector; parameters that depend on them by expressions follow."""
         values, problem = values.copy(), self.problem
         for name, value in moves.items():
             if name in problem.index and math.isfinite(value):
@@ -110,7 +112,7 @@ class Turning:
         return values if complete is None else complete(values)
 
     def turn(self, moves: Mapping[str, float]) -> Drawn:
-        """Turn some parameters (SI) and return the curves that follow."""
+        """Change some parameters (SI) and return the curves."""
         problem = self.problem
         self.values = values = self._at(self.values, moves)
         named = self.named
@@ -118,58 +120,34 @@ class Turning:
             simulated = problem.objective.simulate(values, everything=True)
         except SimulationError as error:
             return Drawn({}, {}, named, error=self._why(error))
-        curves, misfit = self._curves(simulated.curves), problem.objective.misfit(simulated)
-        return Drawn(curves, misfit, named, self._points())
+        m, drive, found = problem.measurement, self.drive, simulated.curves
+        without_time = found.get("stress_strain")  # along the measured motion
+        stress = m.stress if drive == "stress" else found.get("stress_time", without_time)
+        moved = m.displacement if drive == "displacement" else found.get("displacement_time")
+        curves = {n: xy for n, xy in self._panels(stress, moved).items() if n in self.measured}
+        return Drawn(curves, problem.objective.misfit(simulated), named, self._points())
 
     def _points(self) -> dict[str, tuple[float, float]]:
-        """Where the branches of a single bistable spring meet, by the names of the paper."""
+        """Return where the branches of a single spring meet, by the names of the paper."""
         model = self.problem.model
-        if model.kinds != ("bistable",) or model.relaxation:
+        if len(model.kinds) > 1 or model.relaxation:
             return {}
-        spring = model.springs(self.values[: len(model.names)])[0]
-        assert isinstance(spring, BistableSpring)
-        ends = {
-            "A1": (spring.eps_a, spring.sigma_a), "C1": (spring.eps_hat_c, spring.sigma_hat_c),
-            "C2": (spring.eps_c, spring.sigma_c), "A2": (spring.eps_hat_a, spring.sigma_hat_a),
-        }  # fmt: skip
-        # A2 is missing where the branches e and a do not meet.
-        return {n: (x, y) for n, (x, y) in ends.items() if x is not None and y is not None}
+        return model.springs(self.values[: len(model.names)])[0].corners
 
     @cached_property
     def measured(self) -> dict[str, tuple[Array, Array]]:
-        """The measured curves by the name of their panel, in SI, as far as they are there."""
-        m = self.problem.measurement
-        curves: dict[str, Array | None] = {
-            "stress_time": None if m.time is None else m.stress,
-            "displacement_time": None if m.time is None else m.displacement,
-            "stress_strain": None if m.displacement is None else m.stress,
-        }
-        return {n: (self._along(n, m.displacement), y) for n, y in curves.items() if y is not None}
+        """The measured curves by the name of their panel, in SI."""
+        return self._panels(self.problem.measurement.stress, self.problem.measurement.displacement)
 
-    def _curves(self, found: dict[str, Array]) -> dict[str, tuple[Array, Array]]:
-        """Give each panel its curve: of the loop that of the run, where the run has both."""
-        m, drive = self.problem.measurement, self.drive
-        stress = m.stress if drive == "stress" else found.get("stress_time")
-        moved = m.displacement if drive == "displacement" else found.get("displacement_time")
-        if stress is None:  # no time: along the measured motion
-            stress = found.get("stress_strain")
-        there = {"stress_time": stress, "displacement_time": moved, "stress_strain": stress}
-        return {
-            name: (self._along(name, moved), y)
-            for name, y in there.items()
-            if y is not None and name in self.measured and (moved is not None or "time" in name)
-        }
-
-    def _along(self, panel: str, moved: Array | None) -> Array:
+    def _panels(self, stress: Array | None, moved: Array | None) -> dict[str, tuple[Array, Array]]:
+        """Return the curves (x, y) of a stress (Pa) and a displacement (m) by panel."""
         m = self.problem.measurement
-        if panel != "stress_strain":
-            assert m.time is not None  # no panel in time without it
-            return m.time
-        assert moved is not None
-        return moved / m.specimen.height
+        strain = None if moved is None else moved / m.specimen.height
+        pairs = zip(PANELS, (m.time, m.time, strain), (stress, moved, stress), strict=True)
+        return {n: (x, y) for n, x, y in pairs if x is not None and y is not None}
 
     def _why(self, error: SimulationError) -> str:
-        """Name the parameter that is not admissible, where one is."""
+        """Say which parameter is inadmissible, if one is."""
         model = self.problem.model
         try:
             model.springs(self.values[: len(model.names)])
@@ -178,7 +156,7 @@ class Turning:
         return str(error)
 
     def _guess(self) -> Array:
-        """Begin at the best of the fit's own starts, read off the measured loop."""
+        """Return the best of the starts that a fit reads off the measured loop."""
         problem, space = self.problem, self.problem.space()
         if problem.measurement.displacement is None:
             return problem.vector()
@@ -200,33 +178,28 @@ class Turning:
         if split_name(name)[1] == "time_shift":
             low, high = parameter.min, parameter.max
         low, high = max(low, parameter.min), min(high, parameter.max)
-        return Row(
-            name, shown, factor, value / factor, low / factor, high / factor,
-            parameter.min / factor, parameter.max / factor, held=not parameter.vary,
-        )  # fmt: skip
+        value, low, high, least, most = (
+            one / factor for one in (value, low, high, parameter.min, parameter.max)
+        )
+        return Row(name, shown, factor, value, low, high, least, most, held=not parameter.vary)
 
 
 def thinned(measurement: Measurement) -> Measurement:
-    """Leave out samples evenly where there are more than can be drawn at once."""
+    """Return the test with no more samples than can be drawn at once, evenly chosen."""
     count = _size(measurement)
     if count <= MOST_SAMPLES:
         return measurement
     keep = np.unique(np.linspace(0, count - 1, MOST_SAMPLES).astype(int))
-
-    def some(values: Array | None) -> Array | None:
-        return None if values is None else values[keep]
-
-    outliers = {
-        channel: replace(found, left_out=found.left_out[keep])
-        for channel, found in measurement.outliers.items()
+    outliers = measurement.outliers.items()
+    thin: dict[str, Any] = {
+        "outliers": {name: replace(one, left_out=one.left_out[keep]) for name, one in outliers}
     }
-    return replace(
-        measurement, time=some(measurement.time), stress=some(measurement.stress),
-        displacement=some(measurement.displacement), acceleration=some(measurement.acceleration),
-        outliers=outliers, block=1,
-        interior={node: values[keep] for node, values in measurement.interior.items()},
-        sampled={channel: taken[keep] for channel, taken in measurement.sampled.items()},
-    )  # fmt: skip
+    for name in ("interior", "sampled"):
+        thin[name] = {key: values[keep] for key, values in getattr(measurement, name).items()}
+    for name in ("time", "stress", "displacement", "acceleration"):
+        values = getattr(measurement, name)
+        thin[name] = None if values is None else values[keep]
+    return replace(measurement, block=1, **thin)
 
 
 def _size(measurement: Measurement) -> int:

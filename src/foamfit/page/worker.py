@@ -1,7 +1,7 @@
-"""A fit in a process of its own: begun, watched and stopped by the page.
+"""A fit in a process of its own, which the page starts, watches and stops.
 
-The process reads a job as one line of JSON and answers in lines of JSON; Ctrl-C (SIGINT) stops its
-search, which keeps the best point, as in the terminal.
+The process reads a job as one line of JSON and answers in lines of JSON; SIGINT stops its search,
+which keeps the best point, as Ctrl-C does in a terminal.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ import tempfile
 import threading
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from foamfit.cli.progress import Progress
+from foamfit.cli.progress import APART, Progress, Watcher
 from foamfit.errors import InputError, SimulationError, as_signalled
 
 if TYPE_CHECKING:
@@ -27,24 +28,24 @@ if TYPE_CHECKING:
     from foamfit.fitting.problem import Problem
 
 PACKAGE = Path(__file__).parent.parent
-OFTEN = 0.2  # s between two lines of a fit
 COMPILING = "compiling the solver, once after installation"
 STOPPED_EARLY = "The fit was stopped before anything was found; start it again."
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be fitted, where the result goes, and the arguments of `foamfit fit`."""
+    """The test to fit, the folder of the result, and the arguments of `foamfit fit`."""
 
     csv: str
     toml: str
     folder: str
     arguments: list[str] = field(default_factory=list)
+    laws: dict[str, str] = field(default_factory=dict)  # the texts of law files, by path
 
 
 @dataclass(frozen=True)
 class News:
-    """What a fit has told last; `values` are by the names of the parameters of `model`, SI."""
+    """The last report of a fit; `values` are the parameters of `model` by name, SI."""
 
     fraction: float = 0.0
     what: str = "starting"
@@ -57,13 +58,13 @@ class News:
 
 
 def with_package() -> dict[str, str]:
-    """The environment of a process that is to find this very package."""
+    """Return the environment of a process that imports this very package."""
     paths = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
     return os.environ | {"PYTHONPATH": paths.rstrip(os.pathsep)}
 
 
 def end_all(process: subprocess.Popen[Any]) -> None:
-    """End a process that leads a session at once, and what it has begun to compile in."""
+    """Kill a process that leads a session, with all that it started."""
     if process.poll() is None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -71,68 +72,56 @@ def end_all(process: subprocess.Popen[Any]) -> None:
 
 
 class Worker:
-    """A running fit, as the page sees it: the last news, and how it ended."""
+    """A running fit as the page sees it: its last report, and how it ended."""
 
     def __init__(self, job: Job) -> None:
         self.job, self.news = job, News()
-        self.began = time.monotonic()
         self.stopping = False
         self.told = ""  # what the command prints of several cycles
-        self._done: str | None = None  # the sentence with which it ended, "" where all is well
+        self.ended: str | None = None  # then why there is no result, "" if there is one
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed when the process ends)
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             [sys.executable, "-m", "foamfit.page.worker"],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True,
-            encoding="utf-8", env=with_package(),
-            start_new_session=True,  # Ctrl-C in the terminal of the page is not for this one
-        )  # fmt: skip
-        assert self._process.stdin is not None
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            encoding="utf-8",
+            env=with_package(),
+            start_new_session=True,  # Ctrl-C in the terminal of the page does not reach it
+        )
+        assert self.process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.write(json.dumps(vars(job)) + "\n")
-            self._process.stdin.close()
+            self.process.stdin.write(json.dumps(vars(job)) + "\n")
+            self.process.stdin.close()
         threading.Thread(target=self._listen, daemon=True).start()
 
-    @property
-    def pid(self) -> int:
-        """The number of the process."""
-        return self._process.pid
-
-    @property
-    def ended(self) -> str | None:
-        """None while it runs; then "" where a result is written, or else why there is none."""
-        return self._done
-
     def stop(self) -> None:
-        """End the search; the best point is kept, concluded and written."""
-        if not self.stopping and self._process.poll() is None:
+        """End the search; the result of the best point is written."""
+        if not self.stopping and self.process.poll() is None:
             self.stopping = True
-            self._process.send_signal(signal.SIGINT)
-
-    def kill(self) -> None:
-        """End the process at once."""
-        end_all(self._process)
+            self.process.send_signal(signal.SIGINT)
 
     def _listen(self) -> None:
-        """Read what the process tells until it ends."""
-        assert self._process.stdout is not None
+        """Read the reports of the process until it ends."""
+        assert self.process.stdout is not None
         done: str | None = None
-        for line in self._process.stdout:
+        for line in self.process.stdout:
             try:
                 told = json.loads(line)
-            except ValueError:  # what some library has printed, or half a line of one that died
+            except ValueError:  # printed by some library, or half a line
                 continue
             if "ended" in told:
                 done, self.told = told["ended"], told.get("told", "")
             else:
                 self.news = News(**told)
-        code = self._process.wait()
-        self._process.stdout.close()
+        code = self.process.wait()
+        self.process.stdout.close()
         done = self._why(code) if done is None else done
         self._errors.close()
-        self._done = done
+        self.ended = done
 
     def _why(self, code: int) -> str:
-        """Say how a process ended that has not said it itself."""
+        """Say how a process ended that did not say so itself."""
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
         last = lines[-1].strip() if lines else ""
@@ -146,60 +135,39 @@ class Worker:
 # --------------------------------------------------------------------- in the process of the fit
 
 
-class _Teller(Progress):
-    """What the page is told of a fit, a few times a second."""
+class _Teller(Watcher):
+    """Reports a fit to the page a few times a second."""
 
     def __init__(self) -> None:
         super().__init__(says=False)
-        self.watch = self._watch
         self.told: dict[str, Any] = {}
-        self._best: tuple[Problem, Array] | None = None
-        self._last = 0.0
+        self._said = 0.0
 
-    def progress(self, fraction: float, what: str) -> None:
-        """Take how far the fit is."""
+    def progress(self, fraction: float, what: str, *, now: bool = False) -> None:
+        """Report the share done, `now` or if the last report is some time ago."""
         self.told |= {"fraction": fraction, "what": what}
-        self._tell()
+        if now and self._best is not None:
+            self._next = 0.0
+        self.look()
+        if now or time.monotonic() - self._said >= APART:
+            self._say()
 
-    def _watch(self, problem: Problem, values: Array) -> None:
-        """Take the best point so far."""
-        self._best = problem, values
-        self._tell()
+    def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
+        """Report the parameters and misfits of the best point so far."""
+        named = zip(problem.names, (values + problem.origins).tolist(), strict=True)
+        self.told |= {
+            "model": problem.model.name,
+            "relaxation": problem.model.relaxation,
+            "drive": problem.objective.drive,
+            "cycle": problem.measurement.cycle,
+            "values": dict(named),
+            "misfit": misfit,
+        }
+        self._say()
 
-    def compiling(self) -> None:
-        """Tell that the solver is compiled first."""
-        self.finish(COMPILING, 0.0)
-
-    def finish(self, what: str, fraction: float = 1.0) -> None:
-        """Tell the last of what was found, and what comes after it."""
-        self.told |= {"fraction": fraction, "what": what}
-        self._last = 0.0
-        self._tell()
-
-    def _tell(self) -> None:
-        now = time.monotonic()
-        if now - self._last < OFTEN:
-            return
-        self._last = now
-        if self._best is not None:
-            self.told |= _standing(*self._best)
-            self._best = None
+    def _say(self) -> None:
+        self._said = time.monotonic()
         _say(self.told)
-
-
-def _standing(problem: Problem, values: Array) -> dict[str, Any]:
-    """Return parameters and misfits of a point; nothing of it is counted as a step of the fit."""
-    misfit = problem.objective.look(values, everything=True)
-    if misfit is None:
-        return {}
-    return {
-        "model": problem.model.name,
-        "relaxation": problem.model.relaxation,
-        "drive": problem.objective.drive,
-        "cycle": problem.measurement.cycle,
-        "values": dict(zip(problem.names, (values + problem.origins).tolist(), strict=True)),
-        "misfit": misfit,
-    }
 
 
 def _say(told: dict[str, Any]) -> None:
@@ -211,19 +179,22 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
     import click
 
     from foamfit.cli.fit import fit as command
+    from foamfit.cli.options import Output
 
+    # What a browser sends names no law file: that is code.
+    own = click.Command("fit", params=[one for one in command.params if one.name != "law"])
     try:
-        context = command.make_context("fit", ["TEST.csv", *arguments])
+        context = own.make_context("fit", ["TEST.csv", *arguments])
     except click.ClickException as error:
         raise InputError(error.format_message()) from None
-    others = {"test", "specimen", "out", "no_report", "as_json", "quiet", "verbose"}
+    others = {"test", "specimen", "verbose", *Output.__dataclass_fields__} - {"figure_width"}
     return {name: value for name, value in context.params.items() if name not in others}
 
 
 def _run(job: Job) -> tuple[str, str]:
-    """Fit and write the result; returns "" or why there is none, and what is told of cycles."""
+    """Fit and write the result; returns "" or why there is none, and the text on cycles."""
     try:
-        from foamfit.cli.fit import fit_as_asked
+        from foamfit.cli.fitting import fit_as_asked
         from foamfit.report.studies.cycles import cycles_text
         from foamfit.results import Fit
         from foamfit.solve.precompile import at_first_use
@@ -231,7 +202,8 @@ def _run(job: Job) -> tuple[str, str]:
 
         teller, asked = _Teller(), parsed(job.arguments)
         width = asked.pop("figure_width")
-        with at_first_use(asked["model"], asked["relaxation"], teller.compiling) as compile_rest:
+        tell = partial(teller.progress, 0.0, COMPILING, now=True)
+        with at_first_use(asked["model"], asked["relaxation"], tell) as compile_rest:
 
             def begin(_: float | None) -> contextlib.AbstractContextManager[Progress]:
                 compile_rest()
@@ -240,7 +212,7 @@ def _run(job: Job) -> tuple[str, str]:
             with as_signalled():
                 found = fit_as_asked(Path(job.csv), Path(job.toml), asked, begin)
         with without_ctrl_c():
-            teller.finish("writing the report")
+            teller.progress(1.0, "writing the report", now=True)
             found.save(job.folder, figure_width=width)
             told = "" if isinstance(found, Fit) else cycles_text(found)
     except (InputError, SimulationError) as error:
@@ -251,10 +223,12 @@ def _run(job: Job) -> tuple[str, str]:
 
 
 def main() -> None:
-    """Do the job that stands on stdin."""
+    """Do the job on stdin."""
+    from foamfit.springs import laws
     from foamfit.terminal import ending_cleanly
 
     job = Job(**json.loads(sys.stdin.readline()))
+    laws.load_texts(job.laws)
     with ending_cleanly():
         ended, told = _run(job)
     _say({"ended": ended, "told": told})

@@ -23,7 +23,7 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
     """
     drawn = dict(draw_all(result)) if figures is None else figures
     plain = result.to_json_dict()
-    springs = {f"s{i}": spring for i, spring in enumerate(result.chain.springs, start=1)}
+    springs = result.springs
     return page(
         "report",
         result=result,

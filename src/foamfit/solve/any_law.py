@@ -350,32 +350,49 @@ class AnyLawPlan(NamedTuple):
     ) -> tuple[Array, Array]:
         """Difference of displacements and base stress over a step of one direction.
 
-        Upwards alone from what is zero.
+        It is one-sided at a limit of what the law admits, and at zero.
+
+        Raises
+        ------
+        SimulationError
+            If neither side can be followed.
         """
         spring, what = way
         count = len(self.laws[spring].names)
         places = {OWN_ETA: count - 1, OWN_HEIGHT: -1, DRAG: -1}
         place = places.get(what, count + what - OWN_RELAXATION if what > DRAG else what)
         value = {OWN_HEIGHT: heights[spring], DRAG: drag}.get(what, rows[spring, place])
+        own = self.laws[spring].params
+        size = self._peak(found) if what < len(own) and own[what].unit == "Pa" else 1.0
         zero = {OWN_ETA: self._damping(found), DRAG: self._damping(found) / self.height}
-        step = RELATIVE * abs(value) or ABSOLUTE * zero.get(what, 1.0)
+        step = RELATIVE * abs(value) or ABSOLUTE * zero.get(what, size)
 
-        def beside(by: float) -> Followed:
+        def beside(by: float) -> Followed | None:
             moved, higher = rows.copy(), np.array(heights, dtype=float)
             if what == OWN_HEIGHT:
                 higher[spring] += by
             elif what != DRAG:
                 moved[spring, place] += by
-            return self.follow(moved, higher, drag + by * (what == DRAG), found.parts)
+            try:
+                return self.follow(moved, higher, drag + by * (what == DRAG), found.parts)
+            except SimulationError:
+                return None
 
-        above, below = beside(step), beside(-step) if value else found
-        step *= 2.0 if value else 1.0
-        return (above.nodes - below.nodes) / step, (above.stress - below.stress) / step
+        above = beside(step)
+        below = beside(-step) if value or above is None else None
+        width = step * ((above is not None) + (below is not None))
+        if width == 0.0:
+            raise SimulationError("the law admits no value beside this one")
+        above, below = above or found, below or found
+        return (above.nodes - below.nodes) / width, (above.stress - below.stress) / width
 
     def _damping(self, found: Followed) -> float:
         """Damping that would carry the whole stress, Pa·s."""
-        lasts = float(self.time[-1] - self.time[0]) or 1.0
-        return max(float(np.abs(found.stress).max()), 1.0) * lasts
+        return self._peak(found) * (float(self.time[-1] - self.time[0]) or 1.0)
+
+    def _peak(self, found: Followed) -> float:
+        """Largest stress, Pa."""
+        return max(float(np.abs(found.stress).max()), 1.0)
 
 
 def _miss(one: Array, other: Array) -> float:

@@ -54,7 +54,7 @@ class Response:
     Attributes
     ----------
     time : (n_t,) array
-        s.
+        Times of the samples, s.
     displacement : (n_springs, n_t) array
         Downward displacement w_i of the node above each spring, m.
     base_stress : (n_t,) array
@@ -62,9 +62,10 @@ class Response:
     height : float
         Overall height H, m.
     contact_end : float or None
-        When an impact's base stress returned to zero, s; None if it has not, or in other drives.
+        Time at which the base stress of an impact returned to zero, s; None if it has not, or in
+        other drives.
     solver : str
-        "closed form", "first order" or "second order": the least that the scene needs.
+        "closed form", "first order" or "second order": the simplest that the scene needs.
     method : str
         "closed form", "Taylor series" (explicit steps), "aggregate" (the same, for many springs
         that carry one stress) or "Radau IIA" (implicit steps, where light masses or dashpots make
@@ -75,7 +76,7 @@ class Response:
     steps : int
         Steps of the integrator; 0 for the closed form.
     sensitivities : dict of str to Sensitivity
-        Derivatives by the parameters that were asked for; one that does not exist is said to be
+        Derivatives by the requested parameters; one that exists on one side only is marked
         `one_sided`.
     """
 
@@ -283,27 +284,27 @@ def simulate(
     chain : Chain
         Springs, heights, area, masses, onsite damper.
     drive : Impact, StressDrive or DisplacementDrive
-        An impact starts at t = 0 (before, the striker is on its way); the sampled drives start
-        from rest at t[0] and are linear between samples, where a dashpot feels the mean rate.
+        An impact starts at t = 0 (before that, the striker approaches). The sampled drives start
+        from rest at t[0] and are linear between samples; a dashpot feels the mean rate.
     t : (n_t,) array
         Samples, s, increasing.
     rtol : float
-        Wanted error of displacement and base stress relative to their range.
+        Allowed error of displacement and base stress, relative to their range.
     sensitivities : sequence of str
-        Parameters by which the response is differentiated: s1_k0 … s2_eta, s1_height, site_eta,
+        Parameters for which derivatives are computed: s1_k0 … s2_eta, s1_height, site_eta,
         and s1_g1, s1_tau1, … of relaxation terms.
 
     Returns
     -------
     Response
-        Past the end of contact the base stress is zero and the chain flies with the striker.
+        After the end of contact the base stress is zero and the chain flies with the striker.
 
     Raises
     ------
     ValueError
         If something is not admissible; the message names it.
     SimulationError
-        If the scene has no finite answer, or none to the wanted error; the message says why.
+        If the scene has no finite solution, or none within `rtol`; the message says why.
     """
     check_scene(chain, drive)
     if not 1e-14 <= as_number(rtol, "rtol") <= 1e-1:

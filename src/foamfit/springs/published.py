@@ -118,7 +118,7 @@ def _foam_2() -> PublishedSet:
 
 
 class _Sets(dict[str, PublishedSet]):
-    """Published sets by their names; a name that is none of them is refused with those that are."""
+    """The published parameter sets by name; an unknown name is refused with a list of the names."""
 
     def __missing__(self, name: object) -> PublishedSet:
         raise KeyError(f"there is no published set {name!r}; there are {', '.join(self)}")

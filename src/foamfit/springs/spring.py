@@ -151,6 +151,10 @@ class Spring(ABC):
         """Named points of the loop, strain and stress (Pa); a law may have none."""
         return {}
 
+    def fraction_along(self, stress: ArrayLike) -> Array | None:
+        """Fraction of micro-springs that has snapped along a stress history (Pa), if it has any."""
+        return None
+
     def stress(self, strain: ArrayLike) -> Array:
         """Stress (Pa) along a strain history, shape (n,), from rest.
 

@@ -6,12 +6,17 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    wait,
+)
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from numbers import Integral
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Literal, Unpack
 
 from foamfit.data.toml_file import motion_file, toml_beside
@@ -20,8 +25,9 @@ from foamfit.files import is_left, read_whole, reason, sweep
 from foamfit.fitting import nuisance
 from foamfit.one_model import Keywords, Options
 from foamfit.report.figures import TWO, inches
-from foamfit.report.folder import BATCH_FILES, MARKS, is_written
-from foamfit.report.studies.batch import OPEN, REFUSED, Row, table, write_page, write_summary
+from foamfit.report.folder import BATCH_FILES, MARKS, check_target, is_written
+from foamfit.report.studies import batch as tables
+from foamfit.report.studies.batch import Row
 from foamfit.results import law_in_words
 from foamfit.solve import cache, precompile
 from foamfit.springs.model import Model
@@ -35,7 +41,7 @@ from foamfit.study.batch_work import (
     stored,
     work,
 )
-from foamfit.study.processes import FITS, PAGES, EndedError, Processes, cores
+from foamfit.study.processes import FITS, PAGES, EndedError, Processes, check_jobs, cores
 from foamfit.study.test_files import find_tests
 from foamfit.terminal import without_ctrl_c
 from foamfit.text import counted
@@ -50,6 +56,13 @@ MOST_AHEAD, MOST_BYTES = 1000, 2**28
 PAUSE, SHARE = 5.0, 50.0
 Tests = str | Path | Iterable[str | Path]
 Cycles = int | Sequence[int] | Literal["all"] | None
+
+
+class BatchKeywords(Keywords, total=False):
+    """The options of a fit, and parameters that it holds or varies."""
+
+    fix: Mapping[str, float] | None
+    vary: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -81,15 +94,15 @@ class Batch:
         found = list[Row]()
         for name, path in self.tests:
             again = "not fitted yet, because the batch was ended before; call it again"
-            found += self.rows.get(name) or (Row(name, str(path), OPEN, again),)
+            found += self.rows.get(name) or (Row(name, str(path), tables.OPEN, again),)
         return found
 
     def save(self) -> None:
         """Write summary.csv and summary.html."""
         rows = self.summary
-        write_summary(rows, self.out)
+        tables.write_summary(rows, self.out)
         law = law_in_words(self.recipe.model, self.recipe.options.get("relaxation", 0))
-        write_page(rows, self.out, f"{self.out.resolve().name}: {law}")
+        tables.write_page(rows, self.out, f"{self.out.resolve().name}: {law}")
 
 
 def batch(
@@ -102,12 +115,10 @@ def batch(
     fresh: bool = False,
     specimen: str | Path | None = None,
     cycle: Cycles = None,
-    fix: Mapping[str, float] | None = None,
-    vary: Sequence[str] = (),
     report: bool = True,
     figure_width: str = TWO,
     progress: Progress | None = None,
-    **options: Unpack[Keywords],
+    **options: Unpack[BatchKeywords],
 ) -> pd.DataFrame:
     """Fit every test on its own, in parallel; a result folder for each and one summary.
 
@@ -137,8 +148,6 @@ def batch(
     cycle : int, sequence of int or "all", optional
         The cycle of each record; several are fitted as `foamfit.fit_cycles` does, and each is a
         row of the summary.
-    fix, vary : optional
-        Parameters to hold at a value (SI), and to vary though they are held by default.
     report : bool
         Whether each fit has a report and figures.
     figure_width : str
@@ -147,7 +156,8 @@ def batch(
     progress : callable, optional
         Told the `State` after each test.
     options
-        As for `foamfit.fit`.
+        As for `foamfit.fit`; and ``fix``, parameters to hold at a value (SI), and ``vary``, names
+        of parameters to vary though they are held by default.
 
     Returns
     -------
@@ -159,12 +169,21 @@ def batch(
     InputError
         If the call is wrong, or a result cannot be written, as to a full disk.
     """
-    recipe = Recipe(model, {}, _cycles(cycle), fix, tuple(vary), report, figure_width)
+    fix, vary = options.pop("fix", None), tuple(options.pop("vary", ()))
+    cycles = () if cycle == "all" else cycle
+    if cycles is not None and not isinstance(cycles, int):
+        cycles = tuple(int(number) for number in cycles)
     found = run(
-        tests, recipe, out=out, executor=executor, jobs=jobs, fresh=fresh, specimen=specimen,
-        progress=progress, **options,
-    )  # fmt: skip
-    return table(found.summary)
+        tests,
+        Recipe(model, vars(Options.of("batch", options)), cycles, fix, vary, report, figure_width),
+        out=out,
+        executor=executor,
+        jobs=jobs,
+        fresh=fresh,
+        specimen=specimen,
+        progress=progress,
+    )
+    return tables.table(found.summary)
 
 
 def run(
@@ -179,11 +198,13 @@ def run(
     progress: Progress | None = None,
     **options: Unpack[Keywords],
 ) -> Batch:
-    """Do what `batch` says, and return all that is known of it."""
-    chosen = Options.of("batch", options)
+    """Do what `batch` says, and return all that is known of it.
+
+    The options of the fits are those of the recipe, or given here.
+    """
+    chosen = Options.of("batch", {**recipe.options, **options})
     recipe = replace(recipe, model=_checked(recipe, chosen), options=vars(chosen))
-    if jobs is not None and not (isinstance(jobs, Integral) and jobs >= 1):
-        raise InputError(f"jobs = {jobs!r} is not admissible; it must be a whole number from 1 up")
+    check_jobs(jobs)
     if jobs is not None and executor is not None:
         raise InputError("jobs and an executor exclude each other; leave one of them out")
     inches(recipe.width)  # refuses what is no width
@@ -201,13 +222,6 @@ def run(
     with _executor(executor, jobs, made) as runner:
         _Run(made, runner, executor is not None, fresh, progress or (lambda _: None)).all()
     return made
-
-
-def _cycles(cycle: Cycles) -> int | tuple[int, ...] | None:
-    """Return one cycle, several, or () for all."""
-    if cycle is None or isinstance(cycle, int):
-        return cycle
-    return () if cycle == "all" else tuple(int(number) for number in cycle)
 
 
 def _checked(recipe: Recipe, options: Options) -> str:
@@ -237,20 +251,15 @@ def _checked(recipe: Recipe, options: Options) -> str:
 
 def check_out(out: Path) -> None:
     """Raise InputError unless a folder is free, or holds nothing but what foamfit wrote."""
+    if not out.is_dir():
+        check_target(out)
+        return
     try:
-        if not out.is_dir():
-            if os.path.lexists(out):
-                raise InputError(f"{out} is a file; choose a new or an empty folder")
-            there = next(path for path in out.resolve().parents if path.exists())
-            if not there.is_dir():
-                raise InputError(f"{out} cannot be written: {there} is a file")
-        else:
-            there = out.resolve()
-            for path in sorted(out.iterdir()):
-                _check_foreign(out, path)
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise InputError(f"{out} cannot be written: Permission denied in {there}")
-    except (OSError, RuntimeError) as error:  # also a link to itself
+        for path in sorted(out.iterdir()):
+            _check_foreign(out, path)
+        if not os.access(out, os.W_OK | os.X_OK):
+            raise PermissionError(0, f"Permission denied in {out.resolve()}")
+    except OSError as error:
         raise InputError(f"{out} cannot be written: {reason(error)}") from None
 
 
@@ -284,15 +293,11 @@ def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator
         with precompile.side_by_side() as finish:
             finish()
     count = min(jobs or cores(), max(len(made.tests), 1))
-    pool = Processes(count, (*FITS, *(PAGES if made.recipe.pages else ())))
     try:
-        yield pool
-    except BaseException:
-        pool.stop()
+        with Processes(count, (*FITS, *(PAGES if made.recipe.pages else ()))) as pool:
+            yield pool
+    finally:
         sweep(made.out.resolve(), [name for name, _ in made.tests])
-        raise
-    pool.shutdown()
-    sweep(made.out.resolve(), [name for name, _ in made.tests])
 
 
 class _Run:
@@ -303,7 +308,6 @@ class _Run:
     ) -> None:
         self.batch, self.executor = made, executor
         self.foreign, self.fresh, self.progress = foreign, fresh, progress
-        self.ready = SimpleQueue[Future[Outcome]]()
         self.waiting = dict[Future[Outcome], tuple[str, Path, int]]()
         self.ahead = 0  # bytes that wait
         self.fitted = self.wrong = 0
@@ -316,14 +320,12 @@ class _Run:
             for i, (name, path) in enumerate(self.batch.tests):
                 self._begin(name, path)
                 while len(self.waiting) >= MOST_AHEAD or self.ahead >= MOST_BYTES:
-                    self._collect(wait=True)
-                while self._collect(wait=False):
-                    pass
-                if i == 0 and not self.foreign and self._is_cold():
-                    while self.waiting:  # one compiles, for all
-                        self._collect(wait=True)
+                    self._collect(1.0)
+                self._collect(0.0)
+                while i == 0 and not self.foreign and self._is_cold() and self.waiting:
+                    self._collect(1.0)  # one compiles, for all
             while self.waiting:
-                self._collect(wait=True)
+                self._collect(1.0)
         except BaseException:
             for future in self.waiting:
                 future.cancel()
@@ -335,8 +337,8 @@ class _Run:
     def _is_cold(self) -> bool:
         """Whether the first fit compiles what the others need too."""
         recipe = self.batch.recipe
-        memory = "microscale" in recipe.model or recipe.options["relaxation"] > 0
-        memory = memory or recipe.model == "auto"
+        memory = recipe.model == "auto" or recipe.options["relaxation"] > 0
+        memory = memory or any(law.remembers for law in Model.parse(recipe.model).laws)
         return memory and not cache.compiled("integrate_with_memory")
 
     def _begin(self, name: str, path: Path) -> None:
@@ -356,15 +358,8 @@ class _Run:
             self._keep(name, moved)
             return
         content = (data, settings, motion) if self.foreign and data else None
-        task = Task(
-            name,
-            path,
-            toml,
-            made.recipe,
-            mark,
-            None if self.foreign else folder.absolute(),
-            content,
-        )
+        out = None if self.foreign else folder.absolute()
+        task = Task(name, path, toml, made.recipe, mark, out, content)
         try:
             future = self.executor.submit(work, task)
         except (BrokenExecutor, RuntimeError) as error:
@@ -372,15 +367,16 @@ class _Run:
         size = len(data) + len(motion or b"") if content else 0
         self.ahead += size
         self.waiting[future] = (name, path, size)
-        future.add_done_callback(self.ready.put)
 
-    def _collect(self, *, wait: bool) -> bool:
-        """Take one fit that is done; returns whether there was one."""
-        try:
-            future = self.ready.get(timeout=1.0) if wait else self.ready.get_nowait()
-        except Empty:
-            self._save_sometimes()
-            return False
+    def _collect(self, seconds: float) -> None:
+        """Take the fits that are done, waiting for one so long."""
+        done, _ = wait(self.waiting, seconds, FIRST_COMPLETED) if self.waiting else ((), ())
+        for future in [one for one in self.waiting if one in done]:
+            self._take(future)
+        self._save_sometimes()
+
+    def _take(self, future: Future[Outcome]) -> None:
+        """Take one fit that is done."""
         name, path, size = self.waiting.pop(future)
         self.ahead -= size
         try:
@@ -388,19 +384,19 @@ class _Run:
         except (BrokenExecutor, CancelledError) as error:
             raise self._ended(error) from error
         except Exception as error:
-            self._keep(name, (Row(name, str(path), REFUSED, _lost(error)),))
-            return True
-        if outcome.unwritten is None and outcome.files is not None:
+            self._keep(name, (Row(name, str(path), tables.REFUSED, _lost(error)),))
+            return
+        unwritten = outcome.unwritten
+        if unwritten is None and outcome.files is not None:
             try:
                 put(outcome.files, self.batch.out / name)
             except InputError as error:
-                outcome = replace(outcome, unwritten=str(error))
-        if outcome.unwritten is not None:
-            raise InputError(f"{outcome.unwritten}; {self._done_words()}")
+                unwritten = str(error)
+        if unwritten is not None:
+            raise InputError(f"{unwritten}; {self._done_words()}")
         self.fitted += 1
         self._keep(name, outcome.rows)
         self._save_sometimes()
-        return True
 
     def _keep(self, name: str, rows: tuple[Row, ...]) -> None:
         made = self.batch

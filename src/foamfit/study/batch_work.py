@@ -30,6 +30,7 @@ from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
 from foamfit.report.studies.batch import REFUSED, Row, Sketch, row_of
 from foamfit.report.studies.cycles import write_cycles
+from foamfit.springs import laws
 from foamfit.study.cycles import fit_cycles
 
 SCHEMA = 1
@@ -53,6 +54,7 @@ class Recipe:
     vary: tuple[str, ...] = ()
     pages: bool = True
     width: str = TWO  # of the figures
+    laws: Mapping[str, str] = field(default_factory=laws.texts)  # texts of the user's law files
 
     def params(self, test: Measurement) -> lmfit.Parameters | None:
         """The parameters of a test, as `fix` and `vary` want them; None for what fit chooses."""
@@ -105,6 +107,8 @@ def settings_key(recipe: Recipe) -> str:
     """
     parts = asdict(replace(recipe, pages=True)) | {"foamfit": version("foamfit")}
     del parts["width"]
+    if texts := parts.pop("laws"):
+        parts["laws"] = sorted(texts.values())
     return json.dumps(parts, sort_keys=True)
 
 
@@ -148,6 +152,7 @@ def work(task: Task) -> Outcome:
             f"{platform.node()} has foamfit {own}, the call came from {task.version}"
         )
     with _ALONE:
+        laws.load_texts(task.recipe.laws)
         rows, write = _fitted(task)
         record = {
             "schema": SCHEMA,
@@ -222,9 +227,14 @@ def _several(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write
     assert isinstance(recipe.cycles, tuple)
     # Not together, which takes longer than all of them: the summary has a row for each.
     found = fit_cycles(
-        path, toml, cycles=recipe.cycles or None, model=recipe.model, params=recipe.params,
-        together=False, **recipe.options,
-    )  # fmt: skip
+        path,
+        toml,
+        cycles=recipe.cycles or None,
+        model=recipe.model,
+        params=recipe.params,
+        together=False,
+        **recipe.options,
+    )
 
     def row(number: int, result: FitResult | None) -> Row:
         name = f"{task.name}/cycle-{number}"

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 SCHEMA = 1
 CURVES = ("stress_time", "displacement_time", "stress_strain")
 ENERGY = "dissipated_energy"
+Misfits = dict[str, float | None]  # of each curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,16 +60,23 @@ class FittedCycles:
         """Names of the parameters of the springs that vary in any fit."""
         fits = [one.parameters for one in self.results.values()]
         return [
-            name for name in self.names
+            name
+            for name in self.names
             if name not in NUISANCE and any(name in one and one[name].vary for one in fits)
-        ]  # fmt: skip
+        ]
 
     def rows(self) -> Iterator[list[object]]:
         """Rows of cycles.csv, the header first: SI, one row for each cycle, empty = not there."""
         head = [
-            "cycle", "start_strain", "peak_strain", "peak_stress", ENERGY,
-            *(f"misfit_{name}" for name in CURVES), "status", "error",
-        ]  # fmt: skip
+            "cycle",
+            "start_strain",
+            "peak_strain",
+            "peak_stress",
+            ENERGY,
+            *(f"misfit_{name}" for name in CURVES),
+            "status",
+            "error",
+        ]
         parts = "", "_stderr", "_lo", "_hi", "_state"
         yield [*head, *(f"{name}{part}" for name in self.names for part in parts)]
         for number in sorted({*self.results, *self.refused}):
@@ -78,23 +86,20 @@ class FittedCycles:
                 yield [number, *[None] * 7, "refused", self.refused[number], *blank]
                 continue
             m = one.measurement
-            strain = None if m.displacement is None else float(m.displacement.max())
+            strain = None if m.displacement is None else m.displacement.max() / m.specimen.height
             cells: list[object] = [
                 number,
                 m.start_strain,
-                None if strain is None else strain / m.specimen.height,
-                None if m.stress is None else float(m.stress.max()),
+                strain,
+                None if m.stress is None else m.stress.max(),
                 one.energy.get(ENERGY),
                 *(one.misfit.get(name) for name in CURVES),
                 one.status,
                 None,
             ]
             for name in self.names:
-                p = one.parameters.get(name)
-                if p is None:
-                    cells += [None] * 5
-                else:
-                    cells += [p.value, p.stderr, *(p.ci95 or (None, None)), p.state]
+                p, none = one.parameters.get(name), (None, None)
+                cells += (p.value, p.stderr, *(p.ci95 or none), p.state) if p else [None] * 5
             yield [plain(cell) for cell in cells]
 
     @property
@@ -151,7 +156,13 @@ class FittedCycles:
         }
 
 
-def loop_misfits(found: Sequence[dict[str, float | None]]) -> list[float | None]:
+def loop_misfits(found: Sequence[Misfits]) -> list[float | None]:
     """The one misfit that tells most of each fit: of the loop, else of the stress."""
     names = ("stress_strain", "stress_time", "displacement_time")
     return [next((one[n] for n in names if one.get(n) is not None), None) for one in found]
+
+
+def span_of(found: Sequence[Misfits]) -> tuple[float, float] | None:
+    """Smallest and largest misfit of some fits; None if there is none."""
+    known = [one for one in loop_misfits(found) if one is not None]
+    return (min(known), max(known)) if known else None

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Unpack
 
 import lmfit
 import numpy as np
@@ -18,12 +18,13 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.search import what_stopped
 from foamfit.one_model import Keywords, Options, Progress
+from foamfit.report import render
 from foamfit.report.figures import TWO, inches
 from foamfit.report.studies.cycles import save_cycles
 from foamfit.results import ParameterEstimate
-from foamfit.study.cycle_fits import FittedCycles, loop_misfits
+from foamfit.study.cycle_fits import FittedCycles, span_of
 from foamfit.study.shared import Group, Selection, select_own
-from foamfit.text import counted, listed, percent
+from foamfit.text import listed, percent
 from foamfit.trust.intervals import Announce
 
 # Cycles that are fitted together at most; of more the first and others at equal ratios are taken.
@@ -131,16 +132,13 @@ def _fit_together(found: CycleFits, options: Options, progress: Progress) -> Cyc
     """Add the fit of several cycles at once, where there can be one."""
     fitted = {n: one for n, one in sorted(found.results.items()) if one.status != "failed"}
     models = {one.model for one in fitted.values()}
-    why = None
-    if len(fitted) < 2:
-        why = "fewer than two cycles have a fit"
-    elif len(models) > 1:
-        why = f"they have different models ({listed(sorted(models))})"
-    elif any(one.stopped for one in fitted.values()):
-        why = "a fit was stopped before its end"
-    if why is not None:
-        sentence = f"The cycles are not fitted together, because {why}."
-        return replace(found, sentences=(sentence,))
+    reasons = {
+        "fewer than two cycles have a fit": len(fitted) < 2,
+        f"they have different models ({', '.join(sorted(models))})": len(models) > 1,
+        "a fit was stopped before its end": any(one.stopped for one in fitted.values()),
+    }
+    for why in (why for why, there in reasons.items() if there):
+        return replace(found, sentences=(f"The cycles are not fitted together, because {why}.",))
     numbers = spread(list(fitted))
     problems = [
         options.problem(fitted[n].measurement, fitted[n].model, fitted[n].params.copy())
@@ -155,7 +153,7 @@ def _fit_together(found: CycleFits, options: Options, progress: Progress) -> Cyc
         told = f"The fit of the cycles together was ended by {what_stopped(error)}."
         return replace(found, sentences=(told,))
     together = replace(found, selection=selection, together=numbers)
-    return replace(together, sentences=tuple(_sentences(together, selection)))
+    return replace(together, sentences=_sentences(together, selection))
 
 
 def spread(numbers: list[int]) -> tuple[int, ...]:
@@ -168,52 +166,18 @@ def spread(numbers: list[int]) -> tuple[int, ...]:
     return tuple(dict.fromkeys(nearest))
 
 
-def _sentences(found: CycleFits, selection: Selection) -> Iterator[str]:
-    """What the fit of several cycles says."""
-    best, first = selection.best, selection.steps[0]
-    cycles = listed(str(n) for n in found.together)
+def _sentences(found: CycleFits, selection: Selection) -> tuple[str, ...]:
+    """What the fit of several cycles says.
 
-    def shown(step: Any) -> str:
-        off = [m for m in loop_misfits(step.fits[0].misfits) if m is not None]
-        return f"{percent(min(off))} to {percent(max(off))}"
-
-    alone = [m for m in loop_misfits([found.results[n].misfit for n in found.together]) if m]
-    each = f"{percent(min(alone))} to {percent(max(alone))}" if alone else "nothing"
-    if not best.own:
-        yield (
-            f"One set of {first.n_vary} parameters describes the cycles {cycles} (misfit "
-            f"{shown(first)}; each cycle alone {each}): there is no evidence of a change."
-        )
-    else:
-        yield (
-            f"From cycle to cycle ({cycles}) {listed(best.own)} "
-            f"{'changes' if len(best.own) == 1 else 'change'}, the other "
-            f"{counted(len(best.fits[0].shared), 'parameter')} may be shared: misfit {shown(best)} "
-            f"with {best.n_vary} parameters, against {shown(first)} with {first.n_vary} where all "
-            f"are shared and {each} with {selection.n_alone} where none is."
-        )
-        yield from _trends(found, {name: best.fits[0].value(name) for name in best.own})
-    yield (
-        f"A parameter gets one value per cycle where this lowers BIC, counted with "
-        f"{selection.n_eff} effective samples: the stretches in which a cycle's own fit lies on "
-        "one side of its curve, because what that fit leaves is an error of the law rather than "
-        "noise."
-    )
-
-
-def _trends(found: CycleFits, together: dict[str, list[float]]) -> Iterator[str]:
-    """Say what rises or falls, where the cycles one by one and together agree on it.
-
-    `together` has the values of the fit of all cycles. A description of the cycles hops where a
-    parameter of theirs goes up and down again, or another way than in the fit of all.
+    There is a trend where the single fits and the fit of all cycles agree on it. Descriptions hop
+    where a parameter goes up and down again, or another way than in the fit of all cycles.
     """
-    first, last = found.together[0], found.together[-1]
-    sure, hopping, unsure = list[str](), list[str](), list[str]()
+    best, sure, hopping, unsure = selection.best, list[str](), list[str](), list[str]()
     for name in found.varied:
         each = [found.results[n].parameters[name] for n in found.together]
         side = _side(_span(each[0]), _span(each[-1]))
         steps = {_step(*pair) for pair in itertools.pairwise(each)}
-        values = together.get(name)
+        values = best.fits[0].value(name) if name in best.own else ()
         if steps >= {1, -1} or (values and side * (values[-1] - values[0]) < 0.0):
             hopping.append(name)
         elif values and side:
@@ -221,20 +185,26 @@ def _trends(found: CycleFits, together: dict[str, list[float]]) -> Iterator[str]
             sure.append(f"{name} {_change(values[0], values[-1])} (each cycle alone: {alone})")
         elif values:
             unsure.append(name)
-    if sure:
-        yield f"From cycle {first} to {last}: {listed(sure)}."
-    if hopping:
-        yield (
-            f"The descriptions of the cycles hop: {listed(hopping)} of single cycles go up and "
-            f"down by a factor of {HOP} or more, or another way than in the fit of all cycles "
-            "together. Different sets of parameters follow the loops about as well, and no trend "
-            "is said of these."
-        )
-    if unsure:
-        yield (
-            f"Of {listed(unsure)} no trend is said: the ranges of the cycles {first} and {last} "
-            "overlap, or one of them does not determine it."
-        )
+    return render.sentences(
+        "cycles_sentences",
+        cycles=listed(str(n) for n in found.together),
+        first=found.together[0],
+        last=found.together[-1],
+        own=best.own,
+        shared=len(best.fits[0].shared),
+        best={"n_vary": best.n_vary, "ends": span_of(best.fits[0].misfits)},
+        all_shared={
+            "n_vary": selection.steps[0].n_vary,
+            "ends": span_of(selection.steps[0].fits[0].misfits),
+        },
+        alone=span_of([found.results[n].misfit for n in found.together]),
+        n_alone=selection.n_alone,
+        n_eff=selection.n_eff,
+        sure=sure,
+        hopping=hopping,
+        unsure=unsure,
+        hop=HOP,
+    )
 
 
 def _span(one: ParameterEstimate) -> tuple[float, float]:

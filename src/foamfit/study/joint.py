@@ -29,19 +29,12 @@ from foamfit.report.folder import check_target, try_target
 from foamfit.report.studies.joint import save_joint
 from foamfit.results import plain
 from foamfit.springs.model import Model
+from foamfit.study import joint_fit
 from foamfit.study.joint_estimates import common_covariance, parameters_of
-from foamfit.study.joint_fit import (
-    Alternative,
-    JointFit,
-    Map,
-    choose_kinds,
-    evidence,
-    fit_jointly,
-    samples_of,
-)
+from foamfit.study.joint_fit import JointFit, Map, fit_jointly
 from foamfit.study.joint_result import Alone, JointData
-from foamfit.study.joint_words import sentences_of, warnings_of
-from foamfit.study.shared import bic
+from foamfit.study.joint_words import with_words
+from foamfit.study.shared import Group
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.study.workers import begin, workers
 from foamfit.text import counted
@@ -66,9 +59,13 @@ class JointResult(JointData):
     """Everything that a joint fit found, and how it is written; its fields are `JointData`'s."""
 
     def save(
-        self, folder: str | Path, *, jobs: int | None = None, report: bool = True,
+        self,
+        folder: str | Path,
+        *,
+        jobs: int | None = None,
+        report: bool = True,
         figure_width: str = TWO,
-    ) -> Path:  # fmt: skip
+    ) -> Path:
         """Write joint.json, joint.html, joint.png and a result folder per test; returns the folder.
 
         joint.csv holds what is plotted in joint.png. An older result there is replaced as a whole,
@@ -138,29 +135,38 @@ def joint(
     """
     began, tell = time.perf_counter(), progress or (lambda *_: None)
     study = path if isinstance(path, Study) else read_study(path)
+    study = study if seed is None else replace(study, seed=seed)
     if out is not None:
         try_target(out)
         if report:
             begin(jobs, len(study.tests), FEW_FOLDERS)
-    seed = study.seed if seed is None else seed
     options = Options(
-        drive=study.drive, seed=seed, starts=study.starts, relaxation=study.relaxation
+        drive=study.drive, seed=study.seed, starts=study.starts, relaxation=study.relaxation
     )
     tests, refused = _read(study, options, tell)
     _links(study, tests)  # refuses what cannot be, before anything is fitted
     with workers(jobs, len(tests), FEW) as each:
-        tests, vectors = _own_fits(study, options, tests, refused, each, tell)
-        best = list(vectors)
+        tests, alone = _own_fits(study, options, tests, refused, each, tell)
+        best = list(alone.vectors)
         with _kept(study, tests, best, out if keep is None else keep):
-            problems, links = [test.problem for test in tests], _links(study, tests)
-            starts, n_eff = _starts(problems, vectors), samples_of(problems, vectors)
+            links, starts = _links(study, tests), alone.starts(ONE_FOR_ALL)
+            kinds, free = _choices(tests), {n for one in alone.problems for n in one.free()}
             tell(0.5, "together")
-            choices = _choices(tests)
-            links = _chosen(study, problems, links, starts, n_eff, choices)
-            fit = fit_jointly(problems, links, starts, each=each, best=best)
+            auto = [name for name, kind in study.kinds.items() if kind == AUTO and name in free]
+            if auto:
+                links = joint_fit.choose_kinds(
+                    alone.problems, links, auto, starts, alone.n_eff, kinds
+                )
+            fit = fit_jointly(alone.problems, links, starts, each=each, best=best)
             tell(0.9, "evidence")
-            tried = _evidence(study, fit, n_eff, vectors, choices)
-            result = _conclude(study, seed, tests, fit, vectors, tried, n_eff, refused, began)
+            asked = [
+                name
+                for name in (*fit.found.shared, *fit.found.own)
+                if fit.found.links.kind(name) in RATES or name in auto
+            ]
+            tried = joint_fit.evidence(fit.found, asked, alone.n_eff, kinds, [alone.vectors])
+            result = _conclude(study, tests, fit, alone, tried, refused)
+            result = replace(result, runtime_s=time.perf_counter() - began)
     tell(1.0, "done")
     if out is not None:
         result.save(out, jobs=jobs, report=report)
@@ -254,27 +260,25 @@ def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters
 def _links(study: Study, tests: Sequence[_Test]) -> Links:
     """What each parameter is to the tests, and ln(rate/rate0) where a law of rate needs it."""
     rates = [test.rate for test in tests]
-    by_rate = [name for name, kind in study.kinds.items() if kind in RATES]
-    for name in by_rate:
-        where = f'{study.path}: [parameters] {name} = "{study.kinds[name]}"'
+    for name, kind in study.kinds.items():
+        where = f'{study.path}: [parameters] {name} = "{kind}"'
         there = [test for test in tests if name in test.problem.free()]
-        for test in there:
-            if test.rate is None:
-                raise InputError(
-                    f"{where} needs the strain rate of every test, and {test.file} has no time"
-                )
+        if kind == "scatter" and len(there) < 2:
+            raise InputError(
+                f"{where} needs two or more tests in which it varies, and there is "
+                f"{counted(len(there), 'test')}"
+            )
+        if kind not in RATES:
+            continue
+        if untimed := [test.file for test in there if test.rate is None]:
+            raise InputError(
+                f"{where} needs the strain rate of every test, and {untimed[0]} has no time"
+            )
         if not _several([test.rate for test in there]):
             rate = f"{there[0].rate:.3g} 1/s" if there else "none"
             raise InputError(
                 f"{where} needs tests at two or more rates, and all have one ({rate}); make it "
                 '"shared" or "own", or add tests'
-            )
-    for name, kind in study.kinds.items():
-        there = [test for test in tests if name in test.problem.free()]
-        if kind == "scatter" and len(there) < 2:
-            raise InputError(
-                f'{study.path}: [parameters] {name} = "scatter" needs two or more tests in which '
-                f"it varies, and there is {counted(len(there), 'test')}"
             )
     middle = _median_rate(rates)
     if middle is None:
@@ -301,10 +305,14 @@ def _several(rates: Sequence[float | None]) -> bool:
 
 
 def _own_fits(
-    study: Study, options: Options, tests: Sequence[_Test], refused: dict[str, str], each: Map,
+    study: Study,
+    options: Options,
+    tests: list[_Test],
+    refused: dict[str, str],
+    each: Map,
     tell: Progress,
-) -> tuple[list[_Test], list[Array]]:  # fmt: skip
-    """Tests that can be fitted, and the parameters that a fit of each alone finds.
+) -> tuple[list[_Test], Group]:
+    """Tests that can be fitted, and what a fit of each alone finds.
 
     A few tests, spread over the rates, are searched as `fit` searches them. The others descend from
     what these have found, and are searched too where that does not follow them as well.
@@ -335,26 +343,26 @@ def _own_fits(
     there = sorted(found)
     if len(there) < 2:
         _too_few(study, len(there), refused)
-    vectors = [found[t][0] for t in there]
+    vectors = tuple(found[t][0] for t in there)
     for t, own in zip(there, vectors, strict=True):
-        tests[t].problem.objective.weigh_motion(own)
-    return [_with_rate(tests[t], own) for t, own in zip(there, vectors, strict=True)], vectors
-
-
-def _with_rate(test: _Test, values: Array) -> _Test:
-    """The test with the rate of its own fit, where the drive leaves the motion free."""
-    objective = test.problem.objective
-    if objective.drive != "impact" or test.rate is None:
-        return test
-    moved = objective.simulate(values, everything=True).curves["displacement_time"]
-    rate = loading_rate(test.problem.measurement, moved)
-    return replace(test, rate=rate, rate_error=0.0)  # what is off in it, the fit has in its errors
+        objective = tests[t].problem.objective
+        objective.weigh_motion(own)
+        if objective.drive == "impact" and tests[t].rate is not None:
+            # The rate is that of the fitted motion: the fit's errors already include its error.
+            moved = objective.simulate(own, everything=True).curves["displacement_time"]
+            rate = loading_rate(tests[t].problem.measurement, moved)
+            tests[t] = replace(tests[t], rate=rate, rate_error=0.0)
+    kept = [tests[t] for t in there]
+    return kept, Group(tuple(test.problem for test in kept), vectors)
 
 
 def _own_fit(
-    measurement: Measurement, model: str, params: lmfit.Parameters, options: Options,
+    measurement: Measurement,
+    model: str,
+    params: lmfit.Parameters,
+    options: Options,
     near: tuple[Array, ...],
-) -> tuple[Array, float] | str:  # fmt: skip
+) -> tuple[Array, float] | str:
     """Fit one test from points nearby, or search; returns its vector and χ² per sample.
 
     Where it cannot be fitted, a sentence that says why.
@@ -375,28 +383,7 @@ def _own_fit(
     return tracker.best_values, tracker.best_cost / problem.objective.n_data
 
 
-def _starts(problems: Sequence[Problem], vectors: Sequence[Array]) -> list[list[Array]]:
-    """Where the joint fit starts: at the own fits, and at those of single tests for all."""
-    n = len(vectors)
-    chosen = np.unique(np.linspace(0, n - 1, min(n, ONE_FOR_ALL)).astype(int))
-    pairs = list(zip(problems, vectors, strict=True))
-    one_for_all = ([p.with_springs(vectors[i], own) for p, own in pairs] for i in chosen)
-    return [list(vectors), *one_for_all]
-
-
-# ------------------------------------------------------------------------------- kinds
-
-
-def _chosen(
-    study: Study, problems: Sequence[Problem], links: Links, starts: list[list[Array]], n_eff: int,
-    choices: tuple[str, ...],
-) -> Links:  # fmt: skip
-    """Links with the kinds of the parameters that evidence is to choose."""
-    free = {name for problem in problems for name in problem.free()}
-    names = [name for name, kind in study.kinds.items() if kind == AUTO and name in free]
-    if not names:
-        return links
-    return choose_kinds(problems, links, names, starts, n_eff, choices)
+# ------------------------------------------------------------------------------- the result
 
 
 def _choices(tests: Sequence[_Test]) -> tuple[str, ...]:
@@ -406,68 +393,30 @@ def _choices(tests: Sequence[_Test]) -> tuple[str, ...]:
     return tuple(kind for kind in KINDS if kind != "scatter" and (rated or kind not in RATES))
 
 
-def _evidence(
-    study: Study, fit: JointFit, n_eff: int, vectors: Sequence[Array], choices: tuple[str, ...]
-) -> tuple[tuple[Alternative, ...], dict[str, float]]:
-    """Every parameter with a law of rate, or of which evidence was to choose, as other kinds."""
-    found = fit.found
-    names = [
-        name for name in (*found.shared, *found.own)
-        if found.links.kind(name) in RATES or study.kinds.get(name) == AUTO
-    ]  # fmt: skip
-    return evidence(found, names, n_eff, choices, [list(vectors)])
-
-
-# ------------------------------------------------------------------------------- the result
-
-
 def _conclude(
-    study: Study, seed: int, tests: Sequence[_Test], fit: JointFit, vectors: Sequence[Array],
-    tried: tuple[tuple[Alternative, ...], dict[str, float]], n_eff: int,
-    refused: Mapping[str, str], began: float,
-) -> JointResult:  # fmt: skip
+    study: Study,
+    tests: Sequence[_Test],
+    fit: JointFit,
+    alone: Group,
+    tried: tuple[tuple[joint_fit.Alternative, ...], dict[str, float]],
+    refused: Mapping[str, str],
+) -> JointResult:
     """Assemble the result."""
     names = tuple(test.name for test in tests)
-    parameters = parameters_of(fit, names)
     rates = tuple(test.rate for test in tests)
     result = JointResult(
         study=study,
-        seed=seed,
         tests=names,
         files=tuple(test.file for test in tests),
         rates=rates,
         rate0=_median_rate(rates),
         fit=fit,
-        parameters=parameters,
+        parameters=parameters_of(fit, names),
         covariance=common_covariance(fit),
         evidence=tried[0],
         open_slopes=tried[1],
-        n_eff=n_eff,
-        alone=_alone(tests, vectors, n_eff),
+        n_eff=alone.n_eff,
+        alone=Alone(alone.alone, alone.n_alone, alone.bic_alone, alone.misfits),
         refused=refused,
-        status="ok",
-        warnings=(),
-        sentences=(),
-        runtime_s=time.perf_counter() - began,
     )
-    lost, warnings = warnings_of(result)
-    status = "failed" if lost else "warnings" if warnings else "ok"
-    sentences = tuple(sentences_of(result))
-    return replace(result, status=status, warnings=tuple(warnings), sentences=sentences)
-
-
-def _alone(tests: Sequence[_Test], vectors: Sequence[Array], n_eff: int) -> Alone:
-    """What the fits of the tests one by one come to."""
-    objectives = [test.problem.objective for test in tests]
-    runs = [
-        one.simulate(values, everything=True)
-        for one, values in zip(objectives, vectors, strict=True)
-    ]
-    cost = sum(
-        float(np.sum(one.compare(run, values) ** 2))
-        for one, run, values in zip(objectives, runs, vectors, strict=True)
-    )
-    n_vary = sum(len(test.problem.free()) for test in tests)
-    score = bic(cost, sum(one.n_data for one in objectives), n_vary, n_eff)
-    misfits = tuple(one.misfit(run) for one, run in zip(objectives, runs, strict=True))
-    return Alone(cost, n_vary, score, misfits)
+    return with_words(result)

@@ -9,7 +9,6 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.fitting.box import scale_in_words
-from foamfit.fitting.problem import Problem
 from foamfit.springs.parameters import NUISANCE, unit_of
 from foamfit.study.joint_fit import JointFit
 from foamfit.study.joint_result import JointParameter, TestValue
@@ -22,115 +21,115 @@ LARGEST = 300.0
 
 def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
     """Covariance of the common values and slopes, SI; see `JointData.to_json_dict`."""
-    spread, scales = fit.covariance, []
-    for name in spread.names:
-        one = fit.spreads.get(name)
-        value = math.exp(min(one.mean, LARGEST)) if one else fit.found.common.get(name, (1.0,))[0]
-        before = spread.of_common(name)[0]
-        factor = one.stderr / before if one and before > 0.0 else 1.0
-        scales.append(value * factor if fit.found.links.kind(name) == "scatter" else 1.0)
-    return spread.names, spread.matrix * np.outer(scales, scales)
+    point, scales = fit.point, []
+    for name in point.names:
+        one, scale = fit.spreads.get(name), 1.0
+        if fit.found.links.kind(name) == "scatter":
+            scale = math.exp(min(one.mean, LARGEST)) if one else fit.found.common[name][0]
+            before = point.of_common(name)[0]
+            scale *= one.stderr / before if one and before > 0.0 else 1.0
+        scales.append(scale)
+    count = len(scales)
+    return point.names, point.covariance.matrix[:count, :count] * np.outer(scales, scales)
 
 
 def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, JointParameter]:
     """All parameters of the joint fit, those of the springs first."""
     problems = fit.found.problems
-    names = (*problems[0].model.names, *NUISANCE)
-    told = [
-        name for name in names
+    return {
+        name: parameter_of(fit, tests, name)
+        for name in (*problems[0].model.names, *NUISANCE)
         if any(name in one.index and not one.is_exact(name) for one in problems)
-    ]  # fmt: skip
-    return {name: parameter_of(fit, tests, name) for name in told}
+    }
 
 
 def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParameter:
     """One parameter of the joint fit."""
-    found = fit.found
-    kind, unit = found.links.kind(name), unit_of(name)
+    found, unit, kind = fit.found, unit_of(name), fit.found.links.kind(name)
     there = [t for t, problem in enumerate(found.problems) if name in problem.free()]
-    each = _values(fit, tests, name) if kind == "own" or not there else {}
+    each = _values(fit, tests, name)
     if not there:
         value = float(np.median([one.value for one in each.values()]))
         return JointParameter("fixed", value, unit, state="fixed", why="held fixed")
     if kind == "own":
-        varied = [each[tests[t]].value for t in there]
-        return JointParameter(
-            kind, float(np.median(varied)), unit,
-            why="one value for each test; this is their median", tests=each,
-        )  # fmt: skip
+        value = float(np.median([each[tests[t]].value for t in there]))
+        why = "one value for each test; this is their median"
+        return JointParameter(kind, value, unit, why=why, tests=each)
     if kind == "scatter":
-        return _scattering(fit, tests, name)
-    first = found.problems[there[0]]
-    (value, *slope) = found.common[name]
-    stderr, freedom = fit.covariance.of_common(name)
-    span = fit.ranges.get(name)
-    judged = _judged(first, name, value, stderr, freedom, found.values[there[0]], span)
+        return _scattering(fit, name, each)
+    (value, *slope), span = found.common[name], fit.ranges.get(name)
+    one = _judged(fit, there[0], name, value, fit.point.of_common(name), span)
     words = f"one value for {counted(len(there), 'test')}"
+    words = f"at the rate of the median test; {words}" if slope else words
+    why = f"{words}: {one.why}"
+    joint = JointParameter(kind, value, unit, one.stderr, one.ci95, one.state, why, range=span)
     if not slope:
-        return replace(_estimate(kind, value, unit, judged, words), range=span)
-    b_error, b_freedom = fit.covariance.of_common(f"{name}:b")
-    half = covariance.half_width(b_error, b_freedom)
+        return joint
+    b, (error, freedom) = slope[0], fit.point.of_common(f"{name}:b")
+    half = covariance.half_width(error, freedom)
     known = math.isfinite(half)
-    one = _estimate(kind, value, unit, judged, f"at the rate of the median test; {words}")
     return replace(
-        one, tests=_values(fit, tests, name), b=slope[0], b_stderr=b_error if known else None,
-        b_ci95=(slope[0] - half, slope[0] + half) if known else None,
-        range=span, b_range=fit.ranges.get(f"{name}:b"),
-    )  # fmt: skip
+        joint,
+        tests=each,
+        b=b,
+        b_stderr=error if known else None,
+        b_ci95=(b - half, b + half) if known else None,
+        b_range=fit.ranges.get(f"{name}:b"),
+    )
 
 
-def _scattering(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParameter:
+def _scattering(fit: JointFit, name: str, tests: dict[str, TestValue]) -> JointParameter:
     """One parameter that scatters between specimens."""
-    unit, spread = unit_of(name), fit.spreads.get(name)
-    values = _values(fit, tests, name)
+    unit, spread, kind = unit_of(name), fit.spreads.get(name), "scatter"
     if spread is None:
-        (common,) = fit.found.common[name]
         why = "too few tests determine it to tell its common value"
-        return JointParameter(
-            "scatter", common, unit, state="not determined", why=why, tests=values
-        )
-    sign = -1.0 if next(iter(values.values())).value < 0.0 else 1.0
-    ends = np.minimum([spread.mean, *spread.ci95], LARGEST)
-    value, *ends = (sign * np.exp(ends)).tolist()
+        value = fit.found.common[name][0]
+        return JointParameter(kind, value, unit, state="not determined", why=why, tests=tests)
+    sign = -1.0 if next(iter(tests.values())).value < 0.0 else 1.0
+    value, *ends = (sign * np.exp(np.minimum([spread.mean, *spread.ci95], LARGEST))).tolist()
     half = 0.5 * abs(ends[1] - ends[0])
     state, why = covariance.state(value, half, abs(value), -math.inf, math.inf)
     known = state != "not determined"
     return JointParameter(
-        "scatter", value, unit, abs(value) * spread.stderr if known else None,
-        (min(ends), max(ends)) if known else None, state,
-        f"common value of {counted(spread.count, 'test')}: {why}", values,
-        spread.tau, spread.tau_stderr, spread.tau_ci95,
-    )  # fmt: skip
-
-
-_Judged = tuple[float | None, tuple[float, float] | None, str, str]
-
-
-def _estimate(kind: str, value: float, unit: str, judged: _Judged, words: str) -> JointParameter:
-    stderr, ci95, state, why = judged
-    return JointParameter(kind, value, unit, stderr, ci95, state, f"{words}: {why}")
+        kind,
+        value,
+        unit,
+        abs(value) * spread.stderr if known else None,
+        (min(ends), max(ends)) if known else None,
+        state,
+        f"common value of {counted(spread.count, 'test')}: {why}",
+        tests,
+        spread.tau,
+        spread.tau_stderr,
+        spread.tau_ci95,
+    )
 
 
 def _judged(
-    problem: Problem, name: str, value: float, stderr: float, freedom: float, values: Array,
+    fit: JointFit,
+    test: int,
+    name: str,
+    value: float,
+    known: tuple[float, float],
     span: tuple[float, float] | None = None,
-) -> _Judged:  # fmt: skip
-    """Standard error, interval, state and reason of a value; see `trust.covariance.RULE`.
+) -> TestValue:
+    """Judge a value by its standard error and degrees of freedom; see `trust.covariance.RULE`.
 
-    `span` is its range, if there is one; the state is that of the wider of the two.
+    Its scale and limits are those of a test. `span` is its range, if there is one; the state is
+    that of the wider of the two.
     """
-    parameter = problem.params[name]
-    low, high = float(parameter.min), float(parameter.max)
-    size = float(problem.sizes((name,), values)[0])
+    problem, (stderr, freedom) = fit.found.problems[test], known
+    low, high = fit.point.bests[test].limits(name)
+    size = float(problem.sizes((name,), fit.found.values[test])[0])
     half = covariance.half_width(stderr, freedom)
-    of = scale_in_words(name, value, size)
     wider, what = half, "95 % interval"
     if span is not None and 0.5 * (span[1] - span[0]) > half:
         wider, what = 0.5 * (span[1] - span[0]), "range"
+    of = scale_in_words(name, value, size)
     state, why = covariance.state(value, wider, size, low, high, of, what)
     if not half <= covariance.NOTHING * size:
-        return None, None, state, why
-    return stderr, (max(value - half, low), min(value + half, high)), state, why
+        return TestValue(value, None, None, state, why)
+    return TestValue(value, stderr, (max(value - half, low), min(value + half, high)), state, why)
 
 
 def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestValue]:
@@ -139,18 +138,16 @@ def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestV
     for t, (test, problem) in enumerate(zip(tests, found.problems, strict=True)):
         if name not in problem.index or problem.is_exact(name):
             continue
-        values, zero = found.values[t], -problem.measurement.origins.get(name, 0.0)
-        value = float(values[problem.index[name]])
-        if not problem.params[name].vary:
-            out[test] = TestValue(value - zero, None, None, "fixed", "held fixed")
-            continue
+        value = float(found.values[t][problem.index[name]])
         branch = fit.point.bests[t].unreached.get(name)
-        if branch is not None and found.links.kind(name) == "own":
+        if not problem.params[name].vary:
+            one = TestValue(value, None, None, "fixed", "held fixed")
+        elif branch is not None and found.links.kind(name) == "own":
             why = f"branch {branch} was never reached"
-            out[test] = TestValue(value, None, None, "not determined", why)
-            continue
-        error, freedom = fit.covariance.of_test(t, name)
-        stderr, ci95, state, why = _judged(problem, name, value, error, freedom, values)
-        ends = None if ci95 is None else (ci95[0] - zero, ci95[1] - zero)
-        out[test] = TestValue(value - zero, stderr, ends, state, why)
+            one = TestValue(value, None, None, "not determined", why)
+        else:
+            one = _judged(fit, t, name, value, fit.point.of_test(t, name))
+        zero = problem.measurement.origins.get(name, 0.0)
+        ends = one.ci95 and (one.ci95[0] + zero, one.ci95[1] + zero)
+        out[test] = replace(one, value=value + zero, ci95=ends)
     return out

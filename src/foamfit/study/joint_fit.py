@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from foamfit.arrays import Array
 from foamfit.errors import SimulationError
@@ -23,9 +23,9 @@ from foamfit.fitting.links import RATES, Links
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together, fit_linked
 from foamfit.springs.parameters import NUISANCE, split_name
-from foamfit.study.shared import bic, effective_samples
+from foamfit.study.shared import bic
 from foamfit.trust import covariance
-from foamfit.trust.joint_covariance import JointCovariance, JointPoint
+from foamfit.trust.joint_covariance import JointPoint
 from foamfit.trust.ranges import ALIKE, ITERATIONS, TRIALS
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.residuals.noise_process import noise_processes
@@ -42,6 +42,7 @@ SAYS_NOTHING = 5.0
 # Groups of tests that are left out in turn, and steps of a fit without one of them.
 GROUPS, REFIT = 10, 15
 Map = Callable[..., Iterable[Any]]
+Vectors = Sequence[Array]  # Parameters of each test
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,16 +64,11 @@ class JointFit:
         """The fit itself."""
         return self.point.found
 
-    @cached_property
-    def covariance(self) -> JointCovariance:
-        """Covariance of all parameters."""
-        return self.point.covariance
-
 
 def fit_jointly(
     problems: Sequence[Problem],
     links: Links,
-    starts: Sequence[Sequence[Array]],
+    starts: Sequence[Vectors],
     *,
     each: Map = map,
     best: list[Array] | None = None,
@@ -82,44 +78,60 @@ def fit_jointly(
     Arguments are those of `fitting.together.fit_linked`; `each` maps a function over what is to be
     done for each test, as `map` does. `best` is given the values of each test as they are found.
     """
-    scatter = [name for name, kind in links.kinds.items() if kind == "scatter"]
     best = [] if best is None else best
     found = fit_linked(problems, links, starts)
     best[:] = found.values
     errors = errors_of(found, each)
-    point, spreads = JointPoint(found, errors), dict[str, Spread]()
-    scatter = [name for name in scatter if name in found.own]
-    if not scatter:
-        return JointFit(point, {}, ranges_of(point, each), correlation_of(point, {}))
-    undrawn = dict[str, Array]()
-    for _ in range(ROUNDS):
-        before, inflations, pulls = spreads, dict[str, Array](), dict[str, Array]()
-        spreads = {}
+    point, undrawn, spreads = JointPoint(found, errors), dict[str, Array](), dict[str, Spread]()
+    scatter = [name for name in found.own if links.kind(name) == "scatter"]
+    for _ in range(ROUNDS if scatter else 0):
+        before, spreads = spreads, {}
+        inflations, pulls = dict[str, Array](), dict[str, Array]()
         for name in scatter:
-            matrix, bread = point.of_logarithms(name)
-            drawn = _drawn(found, name)
-            there = (np.diag(matrix) < SAYS_NOTHING**2) & np.isfinite(drawn)
-            pull = found.links.pulls.get(name, np.zeros(drawn.size))
-            (common,) = found.common[name]
-            inner = np.ix_(there, there)
-            if np.count_nonzero(there) < 2:
-                continue
-            undrawn[name] = np.full(drawn.size, np.nan)
-            undrawn[name][there] = drawn[there] + bread[inner] @ (
-                pull[there] ** 2 * (drawn[there] - math.log(common))
-            )
-            spreads[name] = common_and_spread(undrawn[name][there], matrix[inner])
-            more = np.ones(drawn.size)
-            more[there] = np.maximum(np.diag(matrix)[there] / np.diag(bread)[there], 1e-6)
-            least = LEAST_SPREAD * math.sqrt(float(np.median(np.diag(matrix)[there])))
-            inflations[name] = more
-            pulls[name] = np.sqrt(more) / max(spreads[name].tau, least)
+            if (told := _spread(point, name)) is not None:
+                undrawn[name], spreads[name], inflations[name], pulls[name] = told
         if _still(before, spreads):
             break
         found = fit_linked(problems, replace(links, pulls=pulls), [found.values])
         best[:] = found.values
         point = JointPoint(found, errors, inflations)
     return JointFit(point, spreads, ranges_of(point, each), correlation_of(point, undrawn))
+
+
+def _spread(point: JointPoint, name: str) -> tuple[Array, Spread, Array, Array] | None:
+    """What the tests say undrawn (logarithms), their spread, inflations, and the pulls of it.
+
+    None where fewer than two tests say anything.
+    """
+    found, (matrix, bread) = point.found, point.of_logarithms(name)
+    drawn = _logarithms(found, name)
+    there = (np.diag(matrix) < SAYS_NOTHING**2) & np.isfinite(drawn)
+    if np.count_nonzero(there) < 2:
+        return None
+    inner, variance = np.ix_(there, there), np.diag(matrix)[there]
+    pull = found.links.pulls.get(name, np.zeros(drawn.size))[there]
+    off = drawn[there] - math.log(found.common[name][0])
+    undrawn, inflation = np.full(drawn.size, np.nan), np.ones(drawn.size)
+    undrawn[there] = drawn[there] + bread[inner] @ (pull**2 * off)
+    spread = common_and_spread(undrawn[there], matrix[inner])
+    inflation[there] = np.maximum(variance / np.diag(bread)[there], 1e-6)
+    least = LEAST_SPREAD * math.sqrt(float(np.median(variance)))
+    return undrawn, spread, inflation, np.sqrt(inflation) / max(spread.tau, least)
+
+
+def _logarithms(found: Together, name: str) -> Array:
+    """Logarithms of a parameter in all tests; NaN where it does not vary, or vanishes."""
+    values = np.abs(np.array(found.value(name)))
+    free = np.array([name in problem.free() for problem in found.problems]) & (values > 0.0)
+    return np.log(np.where(free, values, np.nan))
+
+
+def _still(before: Mapping[str, Spread], now: Mapping[str, Spread]) -> bool:
+    """Whether no spread changed by more than `STILL` of itself."""
+    return before.keys() == now.keys() and all(
+        abs(one.tau - before[name].tau) <= STILL * max(one.tau, 1e-3 * one.stderr)
+        for name, one in now.items()
+    )
 
 
 def correlation_of(
@@ -130,44 +142,24 @@ def correlation_of(
     Of logarithms where these are what varies (`is_logarithmic`); `undrawn` has them for what
     scatters. Tests count that tell of all of these parameters; see `trust.scatter.correlation`.
     """
-    found, scales = point.found, list[Array]()
-    columns, names = list[Array](), list[str]()
+    found, columns, scales = point.found, dict[str, Array](), list[Array]()
     for name in found.own:
         if name in NUISANCE or (found.links.kind(name) == "scatter" and name not in undrawn):
             continue
         values = np.array(found.value(name))
-        logs = name in undrawn or (is_logarithmic(split_name(name)[1]) and np.all(values > 0.0))
         free = np.array([name in problem.free() for problem in found.problems])
-        own = np.where(free, np.log(values) if logs and name not in undrawn else values, np.nan)
-        columns.append(undrawn.get(name, own))
+        logs = name in undrawn or (is_logarithmic(split_name(name)[1]) and np.all(values > 0.0))
+        own = _logarithms(found, name) if logs else np.where(free, values, np.nan)
+        columns[name] = undrawn.get(name, own)
         scales.append(np.abs(values) if logs else np.ones(values.size))
-        names.append(name)
-    table = np.array(columns).reshape(len(names), len(found.problems)).T
+    names = tuple(columns)
+    table = np.reshape(list(columns.values()), (len(names), len(found.problems))).T
     there = np.flatnonzero(np.isfinite(table).all(axis=1))
     errors = np.zeros((len(names), len(names)))
     for t in there:
         scale = np.array([one[t] for one in scales])
         errors += point.own_errors(int(t), names) / np.outer(scale, scale) / there.size
-    return tuple(names), correlation(table[there], errors)
-
-
-def _drawn(found: Together, name: str) -> Array:
-    """Logarithms of a parameter in all tests; NaN where it does not vary, or vanishes."""
-    values = np.abs(np.array(found.value(name)))
-    free = np.array([name in problem.free() for problem in found.problems])
-    with np.errstate(divide="ignore"):
-        logs = np.log(values)
-    return np.where(free & np.isfinite(logs), logs, np.nan)
-
-
-def _still(before: Mapping[str, Spread], now: Mapping[str, Spread]) -> bool:
-    """Whether no spread changed by more than `STILL` of itself."""
-    if before.keys() != now.keys():
-        return False
-    return all(
-        abs(now[name].tau - before[name].tau) <= STILL * max(now[name].tau, 1e-3 * now[name].stderr)
-        for name in now
-    )
+    return names, correlation(table[there], errors)
 
 
 def errors_of(found: Together, each: Map = map) -> tuple[tuple[CurveError, ...], ...]:
@@ -205,9 +197,8 @@ def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, floa
     ways = [(name, sign) for name in shared for sign in (-1.0, 1.0)]
     held = each(_held, [point] * len(ways), *zip(*ways, strict=True)) if ways else ()
     for (name, _), end in zip(ways, held, strict=True):
-        low, high = out.get(name, (end, end))
-        (value,) = point.found.common[name]
-        out[name] = min(low, end, value), max(high, end, value)
+        ends = [end, point.found.common[name][0], *out.get(name, ())]
+        out[name] = min(ends), max(ends)
     return out
 
 
@@ -224,11 +215,23 @@ def _over_specimens(found: Together, each: Map) -> dict[str, tuple[float, float]
         values = np.array([common[name] for common in others if name in common])
         if len(values) < len(others):  # a test that alone has it says nothing of others
             continue
-        off = values - values.mean(axis=0)
-        halves = quantile * np.sqrt((1.0 - 1.0 / len(values)) * np.sum(off**2, axis=0))
+        halves = quantile * np.sqrt((len(values) - 1.0) * np.var(values, axis=0))
         for at, (value, half) in enumerate(zip(found.common[name], halves, strict=True)):
             out[f"{name}:b" if at else name] = (float(value - half), float(value + half))
     return out
+
+
+def _without(found: Together, kept: list[int]) -> Mapping[str, tuple[float, ...]] | None:
+    """What the kept tests have in common; None where they cannot be fitted alone."""
+    links = found.links.of(kept)
+    laws = any(links.kind(name) in RATES for name in found.shared)
+    if laws and links.log_rates is not None and not np.ptp(links.log_rates) > 0.0:
+        return None
+    problems, values = [found.problems[t] for t in kept], [found.values[t] for t in kept]
+    try:
+        return fit_linked(problems, links, [values], iterations=REFIT).common
+    except SimulationError:
+        return None
 
 
 def _held(point: JointPoint, name: str, sign: float) -> float:
@@ -258,27 +261,6 @@ def _held(point: JointPoint, name: str, sign: float) -> float:
     return value
 
 
-def _without(found: Together, kept: Sequence[int]) -> dict[str, tuple[float, ...]] | None:
-    """What the kept tests have in common; None where they cannot be fitted alone."""
-    links, rates = found.links, found.links.log_rates
-    some = replace(
-        links,
-        log_rates=None if rates is None else rates[kept],
-        rate_errors=None if links.rate_errors is None else links.rate_errors[kept],
-        pulls={name: pull[kept] for name, pull in links.pulls.items()},
-    )
-    laws = any(links.kind(name) in RATES for name in found.shared)
-    if laws and some.log_rates is not None and not np.ptp(some.log_rates) > 0.0:
-        return None
-    try:
-        near = [[found.values[t] for t in kept]]
-        return fit_linked(
-            [found.problems[t] for t in kept], some, near, iterations=REFIT
-        ).common  # fmt: skip
-    except SimulationError:
-        return None
-
-
 # ------------------------------------------------------------------------------- evidence
 
 
@@ -295,9 +277,8 @@ class Alternative:
 
 
 def evidence(
-    fit: Together, names: Sequence[str], n_eff: int, kinds: Sequence[str],
-    near: Sequence[Sequence[Array]],
-) -> tuple[tuple[Alternative, ...], dict[str, float]]:  # fmt: skip
+    fit: Together, names: Sequence[str], n_eff: int, kinds: Sequence[str], near: Sequence[Vectors]
+) -> tuple[tuple[Alternative, ...], dict[str, float]]:
     """Evidence for each of these kinds of each of these parameters, the others as they are.
 
     The fits start at that fit, and at the points `near`. Then the parameters whose slope by rate
@@ -313,36 +294,39 @@ def evidence(
 
 
 def choose_kinds(
-    problems: Sequence[Problem], links: Links, names: Sequence[str],
-    starts: Sequence[Sequence[Array]], n_eff: int, kinds: Sequence[str],
-) -> Links:  # fmt: skip
+    problems: Sequence[Problem],
+    links: Links,
+    names: Sequence[str],
+    starts: Sequence[Vectors],
+    n_eff: int,
+    kinds: Sequence[str],
+) -> Links:
     """Links in which each of these parameters has the kind of the least BIC.
 
     All are shared at first; in each round the change of one kind that lowers BIC most is taken. A
     law of rate is none of the kinds where the tests leave its slope open (`open_slope`).
     """
-    links = replace(links, kinds={**links.kinds, **dict.fromkeys(names, "shared")})
-    now = fit_linked(problems, links, starts)
-    score = bic(now.cost, now.n_data, now.n_vary, n_eff)
+
+    def score(one: Together) -> float:
+        return bic(one.cost, one.n_data, one.n_vary, n_eff)
+
+    now = fit_linked(problems, links.having(**dict.fromkeys(names, "shared")), starts)
     while True:
-        near = [now.values, *starts[:1]]
-        trials = list[tuple[float, Together]]()
-        for name in names:
-            for kind, one in _kinds_of(now, name, kinds, near, {}):
-                if kind != now.links.kind(name):
-                    trials.append((bic(one.cost, one.n_data, one.n_vary, n_eff), one))
-        if not trials:
+        trials = [
+            one
+            for name in names
+            for kind, one in _kinds_of(now, name, kinds, [now.values, *starts[:1]], {})
+            if kind != now.links.kind(name)
+        ]
+        found = min(trials, key=score, default=now)
+        if score(found) >= score(now):
             return now.links
-        least, found = min(trials, key=lambda trial: trial[0])
-        if least >= score:
-            return now.links
-        now, score = found, least
+        now = found
 
 
 def _kinds_of(
-    fit: Together, name: str, kinds: Sequence[str], near: Sequence[Sequence[Array]],
-    wide: dict[str, float],
-) -> Iterator[tuple[str, Together]]:  # fmt: skip
+    fit: Together, name: str, kinds: Sequence[str], near: Sequence[Vectors], wide: dict[str, float]
+) -> Iterator[tuple[str, Together]]:
     """Fits with a parameter of these kinds, and of its present one, the others as they are.
 
     A kind with which no start can be simulated is left out, and so is another law of rate than the
@@ -353,7 +337,7 @@ def _kinds_of(
         if kind in RATES and kind != mine and name in wide:
             continue
         try:
-            links = replace(fit.links, kinds={**fit.links.kinds, name: kind})
+            links = fit.links.having(**{name: kind})
             one = fit if kind == mine else fit_linked(fit.problems, links, near)
         except SimulationError:
             continue
@@ -373,22 +357,11 @@ def open_slope(fit: Together, name: str) -> float:
     """
     there = [name in problem.free() for problem in fit.problems]
     values = np.array(fit.value(name))[there]
-    if fit.links.log_rates is None or values.size < 3:
+    level = float(np.median(values))
+    if fit.links.log_rates is None or values.size < 3 or level == 0.0:
         return math.inf
     x = fit.links.log_rates[there]
-    x = x - x.mean()
-    square = float(x @ x)
-    level = float(np.median(values))
-    if not square > 0.0 or level == 0.0:
+    if not np.ptp(x) > 0.0:
         return math.inf
     logs = np.log(values / level) if np.all(values / level > 0.0) else values / level
-    logs = logs - logs.mean()
-    left = logs - x * float(x @ logs) / square
-    return covariance.half_width(
-        math.sqrt(float(left @ left) / (values.size - 2) / square), values.size - 2
-    )
-
-
-def samples_of(problems: Sequence[Problem], vectors: Sequence[Array]) -> int:
-    """Effective samples of the own fits; see `study.shared.effective_samples`."""
-    return sum(effective_samples(p, values) for p, values in zip(problems, vectors, strict=True))
+    return covariance.half_width(float(stats.linregress(x, logs).stderr), values.size - 2)

@@ -76,11 +76,12 @@ class JointParameter:
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return its part of joint.json."""
-        content = asdict(self)
-        gone = [] if self.kind == "scatter" else [*_SCATTER]
-        gone += [] if self.kind.endswith("rate") else [*_RATE]
-        gone += [] if self.tests is not None else ["tests"]
-        return {key: value for key, value in content.items() if key not in gone}
+        gone = {
+            *(() if self.kind == "scatter" else _SCATTER),
+            *(() if self.kind.endswith("rate") else _RATE),
+            *(() if self.tests is not None else ("tests",)),
+        }
+        return {key: value for key, value in asdict(self).items() if key not in gone}
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +116,18 @@ class TestFit:
         made = conclude(BestPoint(self.problem, self.values), record)
         checklist = tuple(check for check in made.checklist if check.key not in _OF_A_SEARCH)
         own = {
-            name: replace(one, systematic=made.parameters[name].systematic)
-            if name in made.parameters
-            else one
+            name: replace(one, systematic=made.parameters.get(name, one).systematic)
             for name, one in self.parameters.items()
         }
         return replace(
-            made, parameters=own, notes=(self.note, *made.notes), checklist=checklist,
-            status=status_of(checklist), warnings=warnings_of(checklist), budget=None,
-        )  # fmt: skip
+            made,
+            parameters=own,
+            notes=(self.note, *made.notes),
+            checklist=checklist,
+            status=status_of(checklist),
+            warnings=warnings_of(checklist),
+            budget=None,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +135,6 @@ class JointData:
     """Everything that a joint fit found; arrays are in the order of `tests`."""
 
     study: Study
-    seed: int
     tests: tuple[str, ...]
     files: tuple[Path, ...]
     rates: tuple[float | None, ...]  # Mean strain rate on loading, 1/s
@@ -143,12 +146,12 @@ class JointData:
     n_eff: int  # Effective samples that the evidence counts
     alone: Alone
     refused: Mapping[str, str]  # File and sentence
-    status: str
-    warnings: tuple[str, ...]
-    sentences: tuple[str, ...]
-    runtime_s: float
     # Parameters whose slope by rate the tests leave open, and by how much; see `open_slope`.
     open_slopes: Mapping[str, float] = field(default_factory=dict)
+    status: str = "ok"
+    warnings: tuple[str, ...] = ()
+    sentences: tuple[str, ...] = ()
+    runtime_s: float = 0.0
 
     @property
     def problems(self) -> tuple[Problem, ...]:
@@ -193,19 +196,14 @@ class JointData:
         for name, value in zip(problem.names, (values + problem.origins).tolist(), strict=True):
             if problem.is_exact(name):
                 continue
-            one, vary = self.parameters[name], problem.params[name].vary
-            if not vary:
-                expr = problem.params[name].expr
-                why = "held fixed" if expr is None else f"tied by {expr}"
-                out[name] = ParameterEstimate(
-                    value, None, None, one.unit, False, "fixed", why
-                )  # fmt: skip
+            one, param = self.parameters[name], problem.params[name]
+            if not param.vary:
+                why = "held fixed" if param.expr is None else f"tied by {param.expr}"
+                out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
                 continue
             at = one if one.tests is None else one.tests[self.tests[test]]
-            out[name] = ParameterEstimate(
-                value, at.stderr, at.ci95, one.unit, True, at.state or "fixed", at.why or "",
-                None if at.ci95 is None else "local covariance",
-            )  # fmt: skip
+            judged = (at.state or "fixed", at.why or "", at.ci95 and "local covariance")
+            out[name] = ParameterEstimate(value, at.stderr, at.ci95, one.unit, True, *judged)
         return out
 
     def to_json_dict(self) -> dict[str, Any]:
@@ -223,7 +221,7 @@ class JointData:
             "model": self.study.model,
             "relaxation": self.study.relaxation,
             "drive": self.drive,
-            "seed": self.seed,
+            "seed": self.study.seed,
             "status": self.status,
             "warnings": self.warnings,
             "sentences": self.sentences,
@@ -256,10 +254,9 @@ class JointData:
         """What the result folder of each test is made of."""
         others = counted(len(self.tests) - 1, "other test")
         note = f"Fitted together with {others} ({self.study.name}): intervals are those of all."
-        for t, (problem, values) in enumerate(
-            zip(self.problems, self.fit.found.values, strict=True)
-        ):
-            yield TestFit(problem, values, self.estimates(t), note, self.seed)
+        pairs = zip(self.problems, self.fit.found.values, strict=True)
+        for t, (problem, values) in enumerate(pairs):
+            yield TestFit(problem, values, self.estimates(t), note, self.study.seed)
 
     @property
     def statistics(self) -> dict[str, float | int]:
@@ -271,7 +268,7 @@ class JointData:
             "n_vary": found.n_vary,
             "chisqr": found.cost,
             "redchi": found.cost / max(found.n_data - found.n_vary, 1),
-            "n_effective": self.fit.covariance.effective,
+            "n_effective": self.fit.point.covariance.effective,
             "n_eff": self.n_eff,
             "bic": self.bic,
             "bic_alone": self.alone.bic,

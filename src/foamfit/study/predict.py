@@ -18,6 +18,7 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.curves import check_drive, check_time_shift, choose_drive
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, descend
+from foamfit.report import render
 from foamfit.report.figures import TWO, inches
 from foamfit.report.studies.prediction import save_prediction
 from foamfit.springs.parameters import unit_of
@@ -29,7 +30,7 @@ from foamfit.study.prediction.predicted import (
     PredictedParameter,
     PredictedTest,
 )
-from foamfit.text import counted, engineering, listed, percent
+from foamfit.text import engineering
 
 # Draws of the parameters; fewer say nothing of the ends of a 95 % band.
 DRAWS, FEWEST = 400, 40
@@ -106,12 +107,17 @@ def predict(
             raise InputError(f"{name} = {value!r} must be a whole number, at least {least}")
     source = read_source(result)
     measurement = test if isinstance(test, Measurement) else read_test(test)
-    rate, warnings = loading_rate(with_noise(measurement)), list[str]()
-    outside = _check_rate(source, measurement, rate, extrapolate, warnings)
-    problem = _problem(source, measurement, drive, warnings)
+    rate = loading_rate(with_noise(measurement))
+    outside = _outside(source, rate)
+    if outside and not extrapolate:
+        raise InputError(
+            f"{measurement.name}: {outside}; --extrapolate (extrapolate=True) predicts it all the "
+            "same, with a warning"
+        )
+    problem = _problem(source, measurement, drive)
     objective = problem.objective
     population = Population(source, problem.model.names, problem.measurement.specimen, rate)
-    springs = _point(population, problem, warnings)
+    springs = _point(population, problem)
     try:
         point, aligned = _aligned(problem, springs, population.scattering)
         simulated = objective.simulate(point, everything=True)
@@ -125,7 +131,32 @@ def predict(
         name: _curve(problem, name, simulated.curves[name], drawn, source, moved.get(name))
         for name in objective.counted
     }
-    _warn(source, population, curves, drawn, draws, warnings)
+    changing, count = population.scattering, population.fewest if population.scattering else 0
+    warnings = render.sentences(
+        "predicted_warnings",
+        source=source,
+        test=measurement.name,
+        rate=rate,
+        outside=outside,
+        drive=objective.drive,
+        nearest=not np.array_equal(springs, population.point),
+        few=count if changing and count < max(3, min(len(changing), FEW_TESTS)) else None,
+        scattering=changing,
+        held=population.held,
+        untold=[one.channel for one in curves.values() if one.channel not in source.misses],
+        drawn=min((len(one.values) for one in drawn.values()), default=draws),
+        draws=draws,
+    )
+    sentences = render.sentences(
+        "predicted_sentences",
+        curves=curves.values(),
+        scattering=changing,
+        trends=[name for name, slope in population.trends.items() if slope],
+        aligned=[
+            f"{name.replace('_', ' ')} {engineering(value, unit_of(name)).replace('-', '−')}"
+            for name, value in aligned.items()
+        ],
+    )
     return Prediction(
         source=source.name,
         joint=source.joint,
@@ -139,12 +170,12 @@ def predict(
         parameters=_parameters(population, springs, drawn),
         rate=rate,
         fitted_rates=source.rates,
-        extrapolated=outside,
+        extrapolated=bool(outside),
         draws=min((len(one.values) for one in drawn.values()), default=0),
         redrawn=sum(one.redrawn for one in set(drawn.values())),
         held=population.held,
-        sentences=(*_of_curves(curves), *_of_aligned(aligned, population), *_of_trends(population)),
-        warnings=tuple(warnings),
+        sentences=sentences,
+        warnings=warnings,
         aligned=aligned,
     )
 
@@ -152,38 +183,21 @@ def predict(
 # ------------------------------------------------------------------------------- the test
 
 
-def _check_rate(
-    source: Source, measurement: Measurement, rate: float | None, extrapolate: bool,
-    warnings: list[str],
-) -> bool:  # fmt: skip
-    """Refuse a rate outside the fitted ones, or warn of it; whether it is outside."""
+def _outside(source: Source, rate: float | None) -> str | None:
+    """Say how the rate of a test lies outside the fitted ones; None if it does not."""
     if rate is None or not source.rates:
-        whose = f"of {measurement.name}" if rate is None else f"at which {source.name} was fitted"
-        warnings.append(
-            f"The rate {whose} is not known, so that nobody can tell whether this is an "
-            "extrapolation in rate."
-        )
-        return False
+        return None
     low, high = min(source.rates), max(source.rates)
     if low / RATE_FACTOR <= rate <= high * RATE_FACTOR:
-        return False
+        return None
     fitted = f"{low:.3g} 1/s" if low == high else f"{low:.3g} to {high:.3g} 1/s"
-    where = (
+    return (
         f"its rate, {rate:.3g} 1/s, lies outside the fitted rates, {fitted}, by more than a factor "
         f"of {RATE_FACTOR}"
     )
-    if not extrapolate:
-        raise InputError(
-            f"{measurement.name}: {where}; --extrapolate (extrapolate=True) predicts it all the "
-            "same, with a warning"
-        )
-    warnings.append(f"An extrapolation: {where}; nothing shows that the law holds there.")
-    return True
 
 
-def _problem(
-    source: Source, measurement: Measurement, drive: str | None, warnings: list[str]
-) -> Problem:
+def _problem(source: Source, measurement: Measurement, drive: str | None) -> Problem:
     """The scene of the test under the law of the result."""
     chosen = drive or source.drive or choose_drive(measurement)
     try:
@@ -194,11 +208,6 @@ def _problem(
         raise InputError(
             f"{error}; {source.name} was fitted in this drive, --drive (drive=) chooses another"
         ) from None
-    if source.drive is not None and chosen != source.drive:
-        warnings.append(
-            f"{source.name} was fitted in the {source.drive} drive; this prediction is in the "
-            f"{chosen} drive, with the damping that was found or held there."
-        )
     inside, late = source.interior_mass and chosen == "impact", source.time_shift
     if late:
         try:
@@ -206,12 +215,18 @@ def _problem(
         except InputError:  # it was that of another record
             late = False
     return make_problem(
-        measurement, source.model.name, chosen, None, None, inside,
-        time_shift=late, relaxation=source.model.relaxation,
-    )  # fmt: skip
+        measurement,
+        source.model.name,
+        chosen,
+        None,
+        None,
+        inside,
+        time_shift=late,
+        relaxation=source.model.relaxation,
+    )
 
 
-def _point(population: Population, problem: Problem, warnings: list[str]) -> Array:
+def _point(population: Population, problem: Problem) -> Array:
     """The common values; where they are not admissible together, those of the nearest test."""
     point = population.point
     if _admissible(problem, point):
@@ -222,10 +237,6 @@ def _point(population: Population, problem: Problem, warnings: list[str]) -> Arr
             f"{population.source.where}: its common values are no admissible spring, nor are those "
             "of a test; give the result of a fit as foamfit wrote it"
         )
-    warnings.append(
-        "The medians of the own parameters are no admissible spring together; the curve is that of "
-        "the test whose values are nearest to them."
-    )
     return nearest
 
 
@@ -281,51 +292,46 @@ class _Drawn:
     redrawn: int
 
 
-def _limits(problem: Problem, point: Array) -> tuple[Array, Array]:
-    """Limits of a draw: those of a fit of the test, and the common values.
-
-    Far beyond them lie values that no test can show, from what one test left undetermined.
-    """
-    params = [problem.params[name] for name in problem.model.names]
-    point = point[: len(params)]
-    low, high = np.array([one.min for one in params]), np.array([one.max for one in params])
-    return np.minimum(low, point), np.maximum(high, point)
-
-
 def _draw(
     population: Population, problem: Problem, point: Array, draws: int, seed: int
 ) -> dict[str, _Drawn]:
     """Draws of each of the first two parts, and of both together, about a point."""
     wanted = {"parameters": population.uncertain, "scatter": bool(population.scattering)}
-    out = dict[str, _Drawn]()
-    for i, (part, there) in enumerate(wanted.items()):
-        if there:
-            rng = np.random.default_rng([seed, i])
-            out[part] = _simulate(
-                population, problem, point, draws, rng, part == "parameters", part == "scatter"
-            )
+    out = {
+        part: _simulate(population, problem, point, draws, [seed, i], {part})
+        for i, (part, there) in enumerate(wanted.items())
+        if there
+    }
     if len(out) == 2:
-        rng = np.random.default_rng([seed, 2])
-        out["both"] = _simulate(population, problem, point, draws, rng, True, True)
+        out["both"] = _simulate(population, problem, point, draws, [seed, 2], set(wanted))
     elif out:
         out["both"] = next(iter(out.values()))
     return out
 
 
 def _simulate(
-    population: Population, problem: Problem, point: Array, draws: int,
-    rng: np.random.Generator, open_: bool, scatter: bool,
-) -> _Drawn:  # fmt: skip
+    population: Population,
+    problem: Problem,
+    point: Array,
+    draws: int,
+    seed: list[int],
+    parts: set[str],
+) -> _Drawn:
     """Draw and simulate until there are so many; what is not admissible is drawn again.
 
-    What lies beyond a limit is moved there, as a fit does: to draw it again would leave one side of
-    all other parameters out. What was aligned stays as it is at the point.
+    What lies beyond the limits of a fit of the test is moved there, as a fit does: to draw it again
+    would leave one side of all other parameters out. What was aligned stays as it is at the point.
     """
+    rng, objective, tried = np.random.default_rng(seed), problem.objective, 0
     values, curves = list[Array](), list[dict[str, Array]]()
-    (low, high), objective, tried = _limits(problem, point), problem.objective, 0
+    params = [problem.params[name] for name in problem.model.names]
+    common = point[: len(params)]
+    low = np.minimum([one.min for one in params], common)
+    high = np.maximum([one.max for one in params], common)
     while len(values) < draws and tried < TRIES * draws:
         tried += 1
-        one = np.clip(population.draw(rng, open_=open_, scatter=scatter), low, high)
+        drawn = population.draw(rng, open_="parameters" in parts, scatter="scatter" in parts)
+        one = np.clip(drawn, low, high)
         try:
             simulated = objective.simulate(np.append(one, point[one.size :]))
         except SimulationError:
@@ -354,9 +360,13 @@ def _by_motion(problem: Problem, point: Array) -> dict[str, Array]:
 
 
 def _curve(
-    problem: Problem, name: str, predicted: Array, drawn: dict[str, _Drawn],
-    source: Source, by_motion: Array | None,
-) -> PredictedCurve:  # fmt: skip
+    problem: Problem,
+    name: str,
+    predicted: Array,
+    drawn: dict[str, _Drawn],
+    source: Source,
+    by_motion: Array | None,
+) -> PredictedCurve:
     """One curve with its band: quantiles of the draws, all other parts added in quadrature."""
     objective = problem.objective
     channel, n = objective.channel(name), predicted.size
@@ -401,90 +411,3 @@ def _parameters(
         )
         for i, name in enumerate(population.names)
     }
-
-
-# ------------------------------------------------------------------------------- in words
-
-
-def _warn(
-    source: Source, population: Population, curves: dict[str, PredictedCurve],
-    drawn: dict[str, _Drawn], draws: int, warnings: list[str],
-) -> None:  # fmt: skip
-    """Add what a reader of the band must know."""
-    if source.status == "failed":
-        warnings.append(f"{source.name} is no acceptable fit; see its warnings.")
-    if not source.joint:
-        warnings.append(
-            "One test tells nothing of the scatter between specimens, so the band holds none: fit "
-            "several specimens together (foamfit joint)."
-        )
-    changing = population.scattering
-    if changing and population.fewest < max(3, min(len(changing), FEW_TESTS)):
-        warnings.append(
-            f"{counted(population.fewest, 'test')} leave open how {listed(changing)} vary from "
-            "specimen to specimen, and how they do so together: the band is wide for it, and "
-            "nothing shows that it is wide enough; fit more specimens, or share more parameters."
-        )
-    if population.held:
-        many = len(population.held) > 1
-        warnings.append(
-            f"{listed(population.held)} {'are' if many else 'is'} held at "
-            f"{'their values' if many else 'its value'}: the result does not determine "
-            f"{'them' if many else 'it'}, and the band does not hold what that leaves open."
-        )
-    if untold := [curve.channel for curve in curves.values() if curve.channel not in source.misses]:
-        warnings.append(
-            f"{source.name} does not say how far its law misses the {listed(untold)} of a test, so "
-            "the band of it holds no error of the law."
-        )
-    fewest = min((len(one.values) for one in drawn.values()), default=draws)
-    if fewest < draws:
-        warnings.append(f"Only {fewest} of {draws} draws could be simulated; the band is rough.")
-
-
-def _of_trends(population: Population) -> list[str]:
-    """What own parameters do with the rate."""
-    names = [name for name, slope in population.trends.items() if slope]
-    if not names:
-        return []
-    return [
-        f"{listed(names)}, own to each test, {'changes' if len(names) == 1 else 'change'} with the "
-        "rate of the fitted tests: the mean and the scatter are those about a line against the "
-        "logarithm of the rate, at the rate of this test."
-    ]
-
-
-def _of_aligned(aligned: dict[str, float], population: Population) -> list[str]:
-    """What was fitted of the record."""
-    if not aligned:
-        return []
-    told = [
-        f"{name.replace('_', ' ')} {engineering(value, unit_of(name)).replace('-', '−')}"
-        for name, value in aligned.items()
-    ]
-    held = "as another specimen of the foam" if population.scattering else "held"
-    return [f"Aligned to the record, with the springs {held}, and no prediction: {listed(told)}."]
-
-
-def _of_curves(curves: dict[str, PredictedCurve]) -> list[str]:
-    """What the prediction says of each curve."""
-    out = []
-    for curve in curves.values():
-        widths = {part: curve.half_width_of(part) for part in curve.parts}
-        largest = max(widths, key=lambda part: widths[part])
-        half = percent(curve.half_width / curve.range)
-        out.append(
-            f"{curve.channel}: {percent(curve.inside, 3)} of "
-            f"{counted(int(curve.kept.sum()), 'sample')} lie inside the 95 % band, which is "
-            f"±{half} of the measured range in the mean, most of it by {_in_words(largest)}."
-        )
-    return out
-
-
-def _in_words(part: str) -> str:
-    """Name of a part of the band."""
-    told = {
-        "scatter": "the scatter between specimens", "law_error": "the error of the law",
-        "motion": "the noise of the motion",
-    }  # fmt: skip
-    return told.get(part, f"the {part}")

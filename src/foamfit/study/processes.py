@@ -19,10 +19,13 @@ from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExec
 from concurrent.futures import ThreadPoolExecutor as Threads
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import connection
+from numbers import Integral
 from types import ModuleType
 from typing import Any
 
+from foamfit.errors import InputError
 from foamfit.terminal import without_ctrl_c
 
 # What fits and their pages import.
@@ -45,9 +48,14 @@ class EndedError(RuntimeError):
 
 def cores() -> int:
     """Count the cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    allowed = getattr(os, "sched_getaffinity", None)  # not on every system
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
+
+
+def check_jobs(jobs: int | None) -> None:
+    """Refuse a number of processes that is none."""
+    if jobs is not None and (not isinstance(jobs, Integral) or jobs < 1):
+        raise InputError(f"jobs = {jobs!r} is not admissible; it must be a whole number from 1 up")
 
 
 def prepare(preload: Iterable[str]) -> None:
@@ -92,7 +100,7 @@ class Processes(Executor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Have a function called in one of the processes."""
-        return self._threads.submit(self._call, fn, args, kwargs)
+        return self._threads.submit(self._call, partial(fn, *args, **kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Let the calls end that are under way, and the processes then."""
@@ -102,19 +110,26 @@ class Processes(Executor):
         self._stopping.close()
         self._stop.close()
 
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """End the processes; at once if anything went wrong."""
+        if kind is None:
+            self.shutdown()
+        else:
+            self.stop()
+
     def stop(self) -> None:
         """End the processes at once, whatever they are at."""
         self._stopped = True
         self._stopping.close()
         self.shutdown(cancel_futures=True)
 
-    def _call(self, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
+    def _call(self, work: Callable[[], Any]) -> Any:
         """Call in the process of this thread; run by one of the threads."""
         for _ in range(ATTEMPTS):
             if self._stopped:
                 raise CancelledError
             try:
-                return self._submitted(fn, args, kwargs).result()
+                return self._submitted(work).result()
             except BrokenProcessPool:
                 self._here.pool.shutdown()
                 self._pools.remove(self._here.pool)
@@ -123,15 +138,17 @@ class Processes(Executor):
             raise CancelledError
         raise EndedError(f"its process ended {ATTEMPTS} times before it was done")
 
-    def _submitted(self, fn: Callable[..., Any], args: Any, kwargs: Any) -> Future[Any]:
+    def _submitted(self, work: Callable[[], Any]) -> Future[Any]:
         pool: ProcessPoolExecutor | None = getattr(self._here, "pool", None)
         if pool is not None:
-            return pool.submit(fn, *args, **kwargs)
-        pool = ProcessPoolExecutor(1, self._context, _begin, (self._stop,))
+            return pool.submit(work)
+        from foamfit.springs import laws
+
+        pool = ProcessPoolExecutor(1, self._context, _begin, (self._stop, laws.texts()))
         self._here.pool = pool
         self._pools.append(pool)
         with _starting():
-            return pool.submit(fn, *args, **kwargs)
+            return pool.submit(work)
 
 
 @contextmanager
@@ -143,10 +160,7 @@ def _starting() -> Iterator[None]:
 
 @contextmanager
 def _set(values: MutableMapping[str, Any], for_now: Mapping[str, Any]) -> Iterator[None]:
-    """Change some values of a mapping within, and no others, which another thread may change.
-
-    As `unittest.mock.patch.dict`, which takes long to import and puts the whole mapping back.
-    """
+    """Change some values of a mapping within, and no others, which another thread may change."""
     before = {name: values[name] for name in for_now if name in values}
     values.update(for_now)
     try:
@@ -157,7 +171,7 @@ def _set(values: MutableMapping[str, Any], for_now: Mapping[str, Any]) -> Iterat
             del values[name]
 
 
-def _begin(stop: connection.Connection) -> None:
+def _begin(stop: connection.Connection, law_files: Mapping[str, str]) -> None:
     """Make a process ready: Ctrl-C is for the one that started it, whose end is its own."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()  # what the imports have made stays
@@ -165,6 +179,10 @@ def _begin(stop: connection.Connection) -> None:
     logging.getLogger("foamfit").setLevel(logging.ERROR)
     warnings.simplefilter("ignore")  # NumPy's would come once for each test
     threading.Thread(target=_end_with, args=(stop,), daemon=True).start()
+    if law_files:
+        from foamfit.springs import laws
+
+        laws.load_texts(law_files)
 
 
 def _end_with(stop: connection.Connection) -> None:

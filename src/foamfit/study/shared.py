@@ -14,8 +14,9 @@ from functools import cached_property
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.fitting.links import Links
 from foamfit.fitting.problem import Problem
-from foamfit.fitting.together import Together, fit_together
+from foamfit.fitting.together import ITERATIONS, Together, fit_linked
 from foamfit.springs.parameters import NUISANCE
 
 Progress = Callable[[float, str], None]
@@ -37,19 +38,27 @@ class Group:
     vectors: tuple[Array, ...]
 
     @property
-    def starts(self) -> list[list[Array]]:
-        """Where the fits of the group start: at the own fits, and at that of one test for all."""
+    def _pairs(self) -> list[tuple[Problem, Array]]:
+        return list(zip(self.problems, self.vectors, strict=True))
+
+    def starts(self, most: int = MOST_STARTS) -> list[list[Array]]:
+        """Where joint fits start: at the own fits, and at those of so many tests for all."""
         n = len(self.vectors)
-        chosen = np.unique(np.linspace(0, n - 1, min(n, MOST_STARTS)).astype(int))
-        pairs = list(zip(self.problems, self.vectors, strict=True))
-        one_for_all = ([p.with_springs(self.vectors[i], own) for p, own in pairs] for i in chosen)
+        chosen = np.unique(np.linspace(0, n - 1, min(n, most)).astype(int))
+        one_for_all = (
+            [p.with_springs(self.vectors[i], own) for p, own in self._pairs] for i in chosen
+        )
         return [list(self.vectors), *one_for_all]
 
     @cached_property
     def n_eff(self) -> int:
         """Effective samples of the curves: see `effective_samples`."""
-        pairs = zip(self.problems, self.vectors, strict=True)
-        return sum(effective_samples(problem, values) for problem, values in pairs)
+        return sum(effective_samples(problem, values) for problem, values in self._pairs)
+
+    @property
+    def n_data(self) -> int:
+        """Samples of all tests."""
+        return sum(problem.objective.n_data for problem in self.problems)
 
     @property
     def n_alone(self) -> int:
@@ -59,8 +68,21 @@ class Group:
     @cached_property
     def alone(self) -> float:
         """Sum of squares of the own fits: what is left where nothing is shared."""
-        pairs = zip(self.problems, self.vectors, strict=True)
-        return float(sum(np.sum(p.objective.residual(values) ** 2) for p, values in pairs))
+        return float(sum(np.sum(p.objective.residual(values) ** 2) for p, values in self._pairs))
+
+    def bic(self, cost: float, n_vary: int) -> float:
+        """Bayesian information criterion of a fit of these tests; see `bic`."""
+        return bic(cost, self.n_data, n_vary, self.n_eff)
+
+    @property
+    def bic_alone(self) -> float:
+        """That of the own fits."""
+        return self.bic(self.alone, self.n_alone)
+
+    @property
+    def misfits(self) -> tuple[dict[str, float | None], ...]:
+        """Misfit of each curve of each own fit."""
+        return tuple(p.objective.look(values, everything=True) or {} for p, values in self._pairs)
 
 
 def effective_samples(problem: Problem, values: Array) -> int:
@@ -163,17 +185,14 @@ def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> 
             tell(min(count / rounds, 1.0), f"shared or own: {name}")
             trials.append(step_of(groups, (*now.own, name), near, TRIAL))
         found = min(trials, key=lambda step: step.bic)
-        starts = [
-            [list(fit.values), *group.starts] for fit, group in zip(found.fits, groups, strict=True)
-        ]
-        steps.append(_exchanged(groups, step_of(groups, found.own, starts), tell))
+        steps.append(_exchanged(groups, _finished(groups, found), tell))
         chosen += steps[-1].bic < now.bic
     n_alone = sum(group.n_alone for group in groups)
     alone = sum(group.alone for group in groups)
-    bic = sum(_bic(group, group.alone, group.n_alone) for group in groups)
     tell(1.0, "done")
     n_eff = sum(group.n_eff for group in groups)
-    return Selection(tuple(steps), chosen, n_eff, alone, n_alone, bic)
+    score = sum(group.bic_alone for group in groups)
+    return Selection(tuple(steps), chosen, n_eff, alone, n_alone, score)
 
 
 def _exchanged(groups: Sequence[Group], step: Step, tell: Progress) -> Step:
@@ -192,41 +211,42 @@ def _exchanged(groups: Sequence[Group], step: Step, tell: Progress) -> Step:
             trials += [step_of(groups, (*kept, name), near, TRIAL) for name in shared]
         best = step
         for trial in sorted(trials, key=lambda trial: trial.bic)[:PROMISING]:
-            starts = [
-                [list(fit.values), *group.starts]
-                for fit, group in zip(trial.fits, groups, strict=True)
-            ]
-            best = min(best, step_of(groups, trial.own, starts), key=lambda one: one.bic)
+            best = min(best, _finished(groups, trial), key=lambda one: one.bic)
         if best.bic >= step.bic:
             break
         step, shared = best, best.fits[0].shared
     return step
 
 
+def _finished(groups: Sequence[Group], trial: Step) -> Step:
+    """Fit to the end what was tried."""
+    pairs = zip(trial.fits, groups, strict=True)
+    starts = [[list(fit.values), *group.starts()] for fit, group in pairs]
+    return step_of(groups, trial.own, starts)
+
+
 def step_of(
-    groups: Sequence[Group], own: tuple[str, ...],
-    starts: Sequence[list[list[Array]]] | None = None, iterations: int | None = None,
-) -> Step:  # fmt: skip
+    groups: Sequence[Group],
+    own: tuple[str, ...],
+    starts: Sequence[list[list[Array]]] | None = None,
+    iterations: int = ITERATIONS,
+) -> Step:
     """Fit all groups with these own parameters.
 
-    `starts` holds those of each group, as `fit_together` takes them; by default `Group.starts`.
+    `starts` holds those of each group, as `fit_linked` takes them; by default `Group.starts`.
     """
-    starts = [group.starts for group in groups] if starts is None else starts
-    limit = {} if iterations is None else {"iterations": iterations}
+    starts = [group.starts() for group in groups] if starts is None else starts
+    names = {name for group in groups for one in group.problems for name in one.free()}
+    links = Links({name: "shared" for name in names if name not in (*own, *NUISANCE)})
     fits = tuple(
-        fit_together(group.problems, own, start, **limit)
+        fit_linked(group.problems, links, start, iterations=iterations)
         for group, start in zip(groups, starts, strict=True)
     )
-    bic = sum(_bic(group, fit.cost, fit.n_vary) for group, fit in zip(groups, fits, strict=True))
-    return Step(own, fits, bic)
+    pairs = zip(groups, fits, strict=True)
+    return Step(own, fits, sum(group.bic(fit.cost, fit.n_vary) for group, fit in pairs))
 
 
 def bic(cost: float, n_data: int, n_vary: int, n_eff: int) -> float:
     """Bayesian information criterion n_eff ln(χ²/n) + k ln(n_eff)."""
     n_eff = max(n_eff, 2)
     return n_eff * math.log(max(cost, 1e-12 * n_data) / n_data) + n_vary * math.log(n_eff)
-
-
-def _bic(group: Group, cost: float, n_vary: int) -> float:
-    n_data = sum(problem.objective.n_data for problem in group.problems)
-    return bic(cost, n_data, n_vary, group.n_eff)

@@ -18,10 +18,14 @@ from foamfit.study.test_files import find_tests
 
 # The kind that evidence chooses, and those that it chooses from.
 AUTO = "auto"
-_KEYS = (
-    "name", "tests", "model", "relaxation", "drive", "specimen", "specimens", "seed", "cycle",
-    "starts", "parameters",
-)  # fmt: skip
+_EXAMPLES = {
+    "tests": 'tests = ["runs/*.csv"]',
+    "model": 'model = "microscale"',
+    "name": 'name = "new heel"',
+    "specimen": 'specimen = "foam.toml"',
+}
+_LEAST = {"seed": 0, "cycle": 1, "starts": 1}  # of whole numbers
+_KEYS = (*_EXAMPLES, *_LEAST, "relaxation", "drive", "specimens", "parameters")
 
 
 @dataclass(frozen=True)
@@ -51,102 +55,87 @@ def read_study(path: str | Path) -> Study:
     path = Path(path)
     content = load_toml(path, "a study is a TOML with tests, model and [parameters]")
     check_keys(f"{path}:", content, _KEYS)
-    for key in ("tests", "model"):
-        if key not in content:
-            raise InputError(f"{path}: {key} is missing; give it like {_EXAMPLES[key]}")
-    patterns = content["tests"]
-    if isinstance(patterns, str):
-        patterns = [patterns]
-    if not isinstance(patterns, list) or not all(isinstance(p, str) for p in patterns):
-        raise InputError(f"{path}: tests must be a list like {_EXAMPLES['tests']}")
-    model = _model(path, content)
     try:
-        tests = tuple(find_tests(patterns, path.parent))
-    except InputError as error:
-        raise InputError(f"{path}: tests: {error}") from None
-    if len(tests) < 2:
-        raise InputError(
-            f"{path}: tests names {'one test' if tests else 'none'}; a joint fit needs at least two"
-        )
-    kinds, held = _parameters(path, content.get("parameters", {}), model)
-    return Study(
-        path=path,
-        name=_text(path, content, "name") or path.stem,
-        tests=tests,
-        specimens=_specimens(path, content, [name for name, _ in tests]),
-        model=model.name,
-        relaxation=model.relaxation,
-        drive=_drive(path, content),
-        kinds=kinds,
-        held=held,
-        seed=_whole(path, content, "seed", 0) or 0,
-        cycle=_whole(path, content, "cycle", 1),
-        starts=_whole(path, content, "starts", 1),
-    )
-
-
-_EXAMPLES = {
-    "tests": 'tests = ["runs/*.csv"]',
-    "model": 'model = "microscale"',
-    "name": 'name = "new heel"',
-    "specimen": 'specimen = "foam.toml"',
-}
-
-
-def _text(path: Path, content: Mapping[str, Any], key: str) -> str | None:
-    value = content.get(key)
-    if value is not None and (not isinstance(value, str) or not value.strip()):
-        raise InputError(f"{path}: {key} = {value!r} is no text; give it like {_EXAMPLES[key]}")
-    return value
-
-
-def _whole(path: Path, content: Mapping[str, Any], key: str, least: int) -> int | None:
-    value = content.get(key)
-    if value is not None and (type(value) is not int or value < least):
-        raise InputError(f"{path}: {key} = {value!r} must be a whole number from {least} up")
-    return value
-
-
-def _drive(path: Path, content: Mapping[str, Any]) -> str | None:
-    value = content.get("drive")
-    if value is not None and value not in DRIVES:
-        raise InputError(f"{path}: drive = {value!r} must be one of {', '.join(DRIVES)}")
-    return None if value is None else str(value)
-
-
-def _model(path: Path, content: Mapping[str, Any]) -> Model:
-    try:
-        return Model.parse(content["model"], content.get("relaxation", 0))
+        return _read(path, content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
+def _read(path: Path, content: Mapping[str, Any]) -> Study:
+    """Check the content of a study; InputError names the key."""
+    for key in ("tests", "model"):
+        if key not in content:
+            raise InputError(f"{key} is missing; give it like {_EXAMPLES[key]}")
+    for key in ("name", "specimen"):
+        value = content.get(key)
+        if value is not None and (not isinstance(value, str) or not value.strip()):
+            raise InputError(f"{key} = {value!r} is no text; give it like {_EXAMPLES[key]}")
+    for key, least in _LEAST.items():
+        value = content.get(key)
+        if value is not None and (type(value) is not int or value < least):
+            raise InputError(f"{key} = {value!r} must be a whole number from {least} up")
+    if content.get("drive") not in (None, *DRIVES):
+        raise InputError(f"drive = {content['drive']!r} must be one of {', '.join(DRIVES)}")
+    model = Model.parse(content["model"], content.get("relaxation", 0))
+    tests = _tests(path, content["tests"])
+    kinds, held = _parameters(content.get("parameters", {}), model)
+    return Study(
+        path=path,
+        name=content.get("name") or path.stem,
+        tests=tests,
+        specimens=_specimens(path, content, [name for name, _ in tests]),
+        model=model.name,
+        relaxation=model.relaxation,
+        drive=content.get("drive"),
+        kinds=kinds,
+        held=held,
+        seed=content.get("seed", 0),
+        cycle=content.get("cycle"),
+        starts=content.get("starts"),
+    )
+
+
+def _tests(path: Path, patterns: Any) -> tuple[tuple[str, Path], ...]:
+    """Names and files of the tests."""
+    patterns = [patterns] if isinstance(patterns, str) else patterns
+    if not isinstance(patterns, list) or not all(isinstance(p, str) for p in patterns):
+        raise InputError(f"tests must be a list like {_EXAMPLES['tests']}")
+    try:
+        found = find_tests(patterns, path.parent)
+    except InputError as error:
+        raise InputError(f"tests: {error}") from None
+    if len(found) < 2:
+        raise InputError(
+            f"tests names {'one test' if found else 'none'}; a joint fit needs at least two"
+        )
+    return tuple(found)
+
+
 def _specimens(path: Path, content: Mapping[str, Any], names: list[str]) -> tuple[Path | None, ...]:
     """The TOML of each test: its own in [specimens], else that of all; None = beside the test."""
-    common = _text(path, content, "specimen")
     own = content.get("specimens", {})
     if not isinstance(own, dict):
-        raise InputError(f'{path}: specimens must be a table of tests, like {names[0]} = "a.toml"')
-    check_keys(f"{path}: [specimens]", own, names)
+        raise InputError(f'specimens must be a table of tests, like {names[0]} = "a.toml"')
+    check_keys("[specimens]", own, names)
     for name, value in own.items():
         if not isinstance(value, str):
-            raise InputError(f"{path}: [specimens] {name} = {value!r} must be the name of a TOML")
-    given = [own.get(name, common) for name in names]
+            raise InputError(f"[specimens] {name} = {value!r} must be the name of a TOML")
+    given = [own.get(name, content.get("specimen")) for name in names]
     return tuple(None if one is None else path.parent / one for one in given)
 
 
-def _parameters(path: Path, table: Any, model: Model) -> tuple[dict[str, str], dict[str, float]]:
+def _parameters(table: Any, model: Model) -> tuple[dict[str, str], dict[str, float]]:
     """Kinds, and held values, of the parameters that are named."""
     if not isinstance(table, dict):
-        raise InputError(f'{path}: parameters must be a table, like s1_k0 = "shared"')
+        raise InputError('parameters must be a table, like s1_k0 = "shared"')
     kinds, held = dict[str, str](), dict[str, float]()
     for name, value in table.items():
-        where = f"{path}: [parameters] {name}"
+        where = f"[parameters] {name}"
         if name not in (*model.names, *NUISANCE):
+            with_terms = f" with relaxation = {model.relaxation}" if model.relaxation else ""
             raise InputError(
-                f"{where} is not a parameter of the model {model.name}"
-                f"{f' with relaxation = {model.relaxation}' if model.relaxation else ''}; its "
-                f"parameters are {', '.join(model.names)}"
+                f"{where} is not a parameter of the model {model.name}{with_terms}; its parameters "
+                f"are {', '.join(model.names)}"
             )
         if name in NUISANCE and value in (*KINDS, AUTO) and value != "own":
             raise InputError(

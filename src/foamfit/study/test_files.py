@@ -67,7 +67,7 @@ def find_tests(
 
 
 def _whole(path: Path) -> Path:
-    """Absolute path of a file without links; `resolve` refuses one that leads to itself."""
+    """Absolute path of a file; `Path.resolve` refuses a link that leads to itself."""
     return Path(os.path.realpath(path))
 
 

@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from foamfit.errors import InputError
-from foamfit.study.processes import PAGES, Processes, cores, prepare
+from foamfit.study.processes import PAGES, Processes, check_jobs, cores, prepare
 
 # Modules that every process needs, and by which most of its start is gone: they are imported once.
 _NEEDED = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
@@ -21,8 +20,7 @@ def begin(jobs: int | None, count: int, few: int) -> None:
 
 def _wanted(jobs: int | None, count: int, few: int) -> int:
     """How many processes; one is this one."""
-    if jobs is not None and (type(jobs) is not int or jobs < 1):
-        raise InputError(f"jobs = {jobs!r} is not admissible; it must be a whole number from 1 up")
+    check_jobs(jobs)
     return 1 if count <= few else min(cores() if jobs is None else jobs, count)
 
 
@@ -37,10 +35,5 @@ def workers(jobs: int | None, count: int, few: int) -> Iterator[Callable[..., It
     if wanted < 2:
         yield map
         return
-    pool = Processes(wanted, _NEEDED)
-    try:
+    with Processes(wanted, _NEEDED) as pool:
         yield pool.map
-    except BaseException:
-        pool.stop()
-        raise
-    pool.shutdown()

@@ -5,6 +5,7 @@ All that is concluded from a fit reads this: one plain simulation and one with s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,7 +18,7 @@ from foamfit.fitting.losses import influence, soften
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.trust import covariance
-from foamfit.trust.covariance import Covariance
+from foamfit.trust.covariance import Block, Covariance, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.residuals.noise_process import noise_processes, parts
 
@@ -25,14 +26,14 @@ from foamfit.trust.residuals.noise_process import noise_processes, parts
 def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:
     """Weights of slopes and pseudo-residuals whose least squares have the covariance of a loss.
 
-    With the mean m of ψ'(r) over each curve (so many samples in `sizes`): √m and ψ(r)/√m. The
-    normal matrix of the slopes so weighted is half the curvature of the cost, and the covariance of
-    their least squares that of an M-estimate (Huber 1981, Robust Statistics, section 7.6). Under
-    the linear loss they are one and the residuals, as those of priors behind the curves always are.
+    With the mean m of ψ'(r) over each curve (of `sizes` samples): √m and ψ(r)/√m. The normal matrix
+    of the slopes so weighted is half the curvature of the cost, and the covariance of their least
+    squares that of an M-estimate (Huber 1981, Robust Statistics, section 7.6). Under the linear
+    loss they are one and the residuals, as for priors, which follow the curves, under any loss.
     """
     psi, slope = influence(residual, loss)
     weights, data = np.ones(residual.size), sum(sizes)
-    psi = np.append(psi[:data], residual[data:])
+    psi[data:] = residual[data:]
     for part in parts(sizes):
         weights[part] = max(float(slope[part].mean()), 0.05) ** 0.5
     return weights, psi / weights
@@ -42,7 +43,7 @@ def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Arra
 class BestPoint:
     """A point of the parameters (SI), usually the best one, and what holds locally there.
 
-    `chosen` are the parameters whose uncertainty is asked for; by default those that vary and
+    `chosen` are the parameters whose uncertainty is wanted; by default those that vary and
     whose branch was reached.
     """
 
@@ -57,8 +58,19 @@ class BestPoint:
 
     @cached_property
     def residual(self) -> Array:
-        """Residual of curves and priors before its loss gives way to large ones."""
+        """Residual of curves and priors before the loss reduces large ones."""
         return self.problem.objective.compare(self.simulated, self.values)
+
+    @cached_property
+    def soft(self) -> Array:
+        """Residual of curves and priors, softened by the loss."""
+        objective = self.problem.objective
+        return soften(self.residual, objective.loss, objective.n_data)
+
+    @cached_property
+    def cost(self) -> float:
+        """Sum of squares of the softened residual."""
+        return float(self.soft @ self.soft)
 
     @cached_property
     def unreached(self) -> dict[str, str]:
@@ -67,15 +79,35 @@ class BestPoint:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the k parameters whose uncertainty is asked for."""
+        """Names of the k parameters whose uncertainty is wanted."""
         if self.chosen is not None:
             return self.chosen
         return tuple(name for name in self.problem.free() if name not in self.unreached)
+
+    @property
+    def index(self) -> dict[str, int]:
+        """Place of each parameter in `values`."""
+        return self.problem.index
+
+    @cached_property
+    def places(self) -> NDArray[np.intp]:
+        """Places of the k parameters in `values`."""
+        return np.array([self.index[name] for name in self.names], dtype=np.intp)
 
     @cached_property
     def sizes(self) -> Array:
         """Their characteristic sizes, (k,)."""
         return self.problem.sizes(self.names, self.values)
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Limits of a parameter, SI."""
+        parameter = self.problem.params[name]
+        return float(parameter.min), float(parameter.max)
+
+    @cached_property
+    def box(self) -> Array:
+        """Lower and upper limits of the k parameters, SI, (2, k)."""
+        return np.array([self.limits(name) for name in self.names]).reshape(-1, 2).T
 
     @cached_property
     def jacobian(self) -> Array:
@@ -83,7 +115,7 @@ class BestPoint:
         return self.problem.linear.slopes(self.values, self.names)
 
     @cached_property
-    def _weighted(self) -> tuple[Array, Array]:
+    def weighted(self) -> tuple[Array, Array]:
         """Jacobian and residual whose least squares have the covariance of the loss."""
         objective = self.problem.objective
         weights, pseudo = m_estimate(self.residual, objective.sizes, objective.loss)
@@ -91,12 +123,12 @@ class BestPoint:
 
     @cached_property
     def errors(self) -> tuple[CurveError, ...]:
-        """What the residual of each counted curve is made of: noise, or an error of the law too.
+        """Whether the residual of each counted curve is noise, or holds an error of the law too.
 
         The noise of a driving stress comes through the springs as slow waves of the displacement,
-        which look like an error of the law and are none.
+        which look like an error of the law but are none.
         """
-        jacobian, pseudo = self._weighted
+        jacobian, pseudo = self.weighted
         scaled, objective = jacobian * self.sizes, self.problem.objective
         if objective.drive == "stress":
             noise = noise_processes(pseudo, scaled, objective.sizes)
@@ -108,60 +140,34 @@ class BestPoint:
         """Whether the law misses more of some curve than its noise."""
         return any(error.found for error in self.errors)
 
+    def block(self, errors: Sequence[CurveError]) -> Block:
+        """Its part in a covariance, by the errors of its curves; as estimated with the loss."""
+        jacobian, pseudo = self.weighted
+        return Block(
+            jacobian * self.sizes,
+            pseudo,
+            self.problem.objective.sizes,
+            [error.noise for error in errors],
+            np.eye(len(self.names)),
+            self.gradient if any(error.found for error in errors) else None,
+            (np.abs(self.box - self.values[self.places]) / self.sizes).T,
+        )
+
+    def gradient(self, places: NDArray[np.intp], step: Array) -> Array:
+        """Half the gradient of the cost by some of the parameters, all scaled, at a step of them.
+
+        The step ends at their limits.
+        """
+        at, sizes, (low, high) = self.places[places], self.sizes[places], self.box[:, places]
+        values = self.values.copy()
+        values[at] = np.clip(values[at] + step * sizes, low, high)
+        slopes = self.problem.slopes(values, tuple(self.names[i] for i in places)) * sizes
+        return np.asarray(slopes.T @ self.problem.objective.residual(values))
+
     @cached_property
     def spread(self) -> Covariance:
         """Their local covariance, as estimated with the loss."""
-        jacobian, pseudo = self._weighted
-        noise, curves = [error.noise for error in self.errors], self.problem.objective.sizes
-        plain = covariance.covariance(jacobian, pseudo, curves, self.sizes, noise)
-        if not self.misfits:
-            return plain
-        held = self._held(jacobian, pseudo, plain)
-        if held.all():
-            return plain
-        free = np.flatnonzero(~held)
-
-        def gradient(step: Array) -> Array:
-            values = self.values.copy()
-            places = [self.index[self.names[i]] for i in free]
-            low, high = np.array([self.limits(self.names[i]) for i in free]).T
-            values[places] = np.clip(values[places] + step * self.sizes[free], low, high)
-            names = tuple(self.names[i] for i in free)
-            slopes = self.problem.slopes(values, names) * self.sizes[free]
-            return np.asarray(slopes.T @ self.problem.objective.residual(values))
-
-        bent = covariance.covariance(
-            jacobian[:, free], pseudo, curves, self.sizes[free], noise, gradient
-        )
-        return plain.with_some(free, bent)
-
-    def _held(self, jacobian: Array, residual: Array, spread: Covariance) -> NDArray[np.bool_]:
-        """Parameters that the residual presses to a limit by more than its noise could, (k,)."""
-        pull = jacobian.T @ residual
-        noise = zip(spread.noise, parts(self.problem.objective.sizes), strict=True)
-        sure = np.sum([process.forms(jacobian[part]) for process, part in noise], axis=0)
-        sure += np.sum(jacobian[self.problem.objective.n_data :] ** 2, axis=0)
-        limits = np.array([self.limits(name) for name in self.names])
-        there = self.values[[self.index[name] for name in self.names]]
-        near = np.abs(limits.T - there) <= covariance.AT_LIMIT * self.sizes
-        outward = np.where(near[0], pull, np.where(near[1], -pull, 0.0))
-        return np.asarray(outward > 1.96 * np.sqrt(sure))
-
-    @cached_property
-    def soft(self) -> Array:
-        """Residual of curves and priors, softened by the loss."""
-        objective = self.problem.objective
-        return soften(self.residual, objective.loss, objective.n_data)
-
-    @cached_property
-    def cost(self) -> float:
-        """Sum of squares of the residual, softened by the loss."""
-        return float(self.soft @ self.soft)
-
-    @property
-    def index(self) -> dict[str, int]:
-        """Place of each parameter in `values`."""
-        return self.problem.index
+        return Uncertainty((self.block(self.errors),), self.sizes).covariance
 
     @cached_property
     def quantiles(self) -> Array:
@@ -175,17 +181,10 @@ class BestPoint:
 
     @cached_property
     def known(self) -> list[str]:
-        """Parameters of which the local interval says anything."""
+        """Parameters that the local interval does not leave undetermined."""
         told = self.halves <= covariance.NOTHING * self.sizes
         return [name for name, known in zip(self.names, told, strict=True) if known]
 
-    def limits(self, name: str) -> tuple[float, float]:
-        """Limits of a parameter, SI."""
-        parameter = self.problem.params[name]
-        return float(parameter.min), float(parameter.max)
-
-    def along(self, name: str) -> Array:
-        """Change of all k parameters per change of one, as their correlation has it, (k,)."""
-        column = self.names.index(name)
-        row = self.spread.matrix[:, column]
-        return np.asarray(np.nan_to_num(row / row[column]))
+    def rises(self, residual: Array) -> Array:
+        """Rise of the cost at another point, from its softened residual, as χ² of each, (k,)."""
+        return np.asarray((float(residual @ residual) - self.cost) / self.spread.inflation)

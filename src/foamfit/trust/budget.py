@@ -1,9 +1,9 @@
 """What the ± of the TOML does to the parameters, and what their uncertainty is made of.
 
-Height, area, masses and the scales of the channels are no noise: every sample of a test has the
+Height, area, masses and the scales of the channels are not noise: every sample of a test has the
 same error of them. The response of the best point to each is that of Gauss and Newton,
-Δθ = −(JᵀJ)⁺ Jᵀ Δr, with the residual made anew for a test in which that quantity alone differs.
-A stress is taken for a force over the area, and a strain for a motion over the height, whichever of
+Δθ = −(JᵀJ)⁺ Jᵀ Δr, with the residual computed for a test in which that quantity alone differs.
+A stress counts as a force over the area, and a strain as a motion over the height, whichever of
 them the file has.
 """
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -29,10 +30,17 @@ from foamfit.trust.covariance import AT_LIMIT, SINGULAR
 STEP = 1e-4
 # Change of a parameter over the largest one, both over their scales, that counts as none.
 ROUNDING = 1e-6
-# Nuisance parameters by what they contribute to.
+# Nuisance parameters by the source of uncertainty to which they contribute.
 _CONTACT = (nuisance.CONTACT_TIME, *nuisance.ZEROS)
 _STRIKER = (*nuisance.STRIKER, nuisance.TIME_SHIFT)
-_SOURCES = {"specimen_mass": "mass", "striker_mass": "mass", "velocity": "velocity", "area": "area"}
+# Quantities of a test: where they stand, and the source of uncertainty that they are.
+_QUANTITIES = {
+    "height": ("specimen", "height", "height"),
+    "area": ("specimen", "area", "area"),
+    "specimen_mass": ("specimen", "mass", "mass"),
+    "striker_mass": ("striker", "mass", "mass"),
+    "velocity": ("striker", "velocity", "velocity"),
+}
 
 
 def responses(best: BestPoint) -> dict[str, Array]:
@@ -49,6 +57,14 @@ def responses(best: BestPoint) -> dict[str, Array]:
     }
 
 
+def _value(test: Measurement, quantity: str) -> float:
+    """Value of a quantity of the TOML, SI; 1 of a scale, whose ± is a share."""
+    if quantity.startswith("height_"):
+        return (test.specimen.heights or ())[int(quantity.removeprefix("height_")) - 1]
+    owner, field, _ = _QUANTITIES.get(quantity, ("", "", ""))
+    return float(getattr(getattr(test, owner, None), field, None) or 1.0)
+
+
 def response(best: BestPoint, quantity: str, share: float) -> Array:
     """Change of all parameters (n_values,), SI, where a quantity is larger by a share of itself."""
     problem, step = best.problem, min(share, STEP)
@@ -60,16 +76,14 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
     slope = influence(best.residual[: problem.objective.n_data], problem.objective.loss)[1]
     root = np.sqrt(np.append(np.maximum(slope, 0.0), np.ones(len(problem.objective.priors))))
     scaled = best.jacobian * best.sizes * root[:, None]
-    places = [best.index[name] for name in best.names]
-    limits, there = np.array([*map(best.limits, best.names)]).reshape(-1, 2), best.values[places]
     # What lies at a limit stays there.
-    held = np.abs(limits - there[:, None]).min(axis=1, initial=np.inf) <= AT_LIMIT * best.sizes
-    scaled[:, held] = 0.0
+    off = np.abs(best.box - best.values[best.places]).min(axis=0, initial=np.inf)
+    scaled[:, off <= AT_LIMIT * best.sizes] = 0.0
     steps = -np.linalg.pinv(scaled, rcond=SINGULAR) @ (root * moved)
     rounding = ROUNDING * np.max(np.abs(steps), initial=0.0)
     steps = np.where(np.abs(steps) > rounding, steps, 0.0) * best.sizes
     moves = np.zeros((best.values.size, len(best.names)))
-    moves[places, np.arange(len(places))] = 1.0
+    moves[best.places, np.arange(len(best.names))] = 1.0
     moves = problem.space().follow(best.values, moves, 1e-5 * best.sizes)
     return np.asarray((0.5 * (high - low) + moves @ steps) * (share / step))
 
@@ -100,19 +114,14 @@ def changed(test: Measurement, quantity: str, share: float) -> Measurement:
 
     The noise of a channel, and the error of its zero, change as the channel does.
     """
-    by, specimen, striker = 1.0 + share, test.specimen, test.striker
-    if quantity == "height":
-        return replace(test, specimen=replace(specimen, height=by * specimen.height))
-    if quantity == "area":
-        test = replace(test, specimen=replace(specimen, area=by * specimen.area))
-        return _scaled(test, "stress", 1.0 / by)
-    if quantity == "specimen_mass" and specimen.mass:
-        return replace(test, specimen=replace(specimen, mass=by * specimen.mass))
-    if quantity == "striker_mass" and striker and striker.mass:
-        test = replace(test, striker=replace(striker, mass=by * striker.mass))
-        return _scaled(test, "stress", by) if test.braked else test
-    if quantity == "velocity" and striker and striker.velocity:
-        return replace(test, striker=replace(striker, velocity=by * striker.velocity))
+    by, (name, field, _) = 1.0 + share, _QUANTITIES.get(quantity, ("", "", ""))
+    owner: Any = getattr(test, name, None)
+    if value := getattr(owner, field, None):
+        larger: dict[str, Any] = {name: replace(owner, **{field: by * value})}
+        test = replace(test, **larger)
+        if quantity == "area":
+            return _scaled(test, "stress", 1.0 / by)
+        return _scaled(test, "stress", by) if quantity == "striker_mass" and test.braked else test
     if not quantity.endswith("_scale"):
         return test
     channel = quantity.removesuffix("_scale").replace("velocity", "displacement")
@@ -135,15 +144,6 @@ def _scaled(test: Measurement, channel: str, by: float) -> Measurement:
     return replace(test, noise=noise, zeros=zeros, **{channel: by * values})
 
 
-def _value(test: Measurement, quantity: str) -> float:
-    """Value of a quantity of the TOML, SI; 1 of a scale, whose ± is a share."""
-    if quantity.startswith("height_"):
-        return (test.specimen.heights or ())[int(quantity.removeprefix("height_")) - 1]
-    owner = test.striker if quantity in nuisance.STRIKER else test.specimen
-    name = "mass" if quantity.endswith("mass") else quantity
-    return float(getattr(owner, name, None) or 1.0)
-
-
 def make_budget(
     best: BestPoint, estimates: Mapping[str, ParameterEstimate]
 ) -> tuple[dict[str, ParameterEstimate], Budget | None]:
@@ -162,8 +162,8 @@ def make_budget(
         row = dict.fromkeys(SOURCES, 0.0)
         row |= {source: one.stderr * share for source, share in shares.items()}
         for quantity, change in moved.items():
-            source = _SOURCES.get(quantity, "calibration")
-            source = "height" if quantity.startswith("height") else source
+            kind = "height" if quantity.startswith("height_") else quantity
+            *_, source = _QUANTITIES.get(kind, ("calibration",))
             row[source] = math.hypot(row[source], float(change[best.index[name]]))
         if one.range is not None:
             row["law"] = 0.5 * (one.range[1] - one.range[0]) / 1.96

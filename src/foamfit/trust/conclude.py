@@ -1,16 +1,15 @@
-"""What to say of the best point: estimates, states, statistics, and the result itself."""
+"""The result at the best point: estimates with their states, statistics and notes."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
-from foamfit.arrays import Array
 from foamfit.data.cycles import inner_loops
 from foamfit.data.describe import noise_sentences
 from foamfit.data.energy import audit
@@ -20,18 +19,19 @@ from foamfit.fitting.box import scale_in_words
 from foamfit.fitting.branches import visited
 from foamfit.fitting.curves import MOTION_CURVES
 from foamfit.fitting.losses import LOSSES
-from foamfit.fitting.objective import MODEL_ERROR, Objective, Simulated
-from foamfit.fitting.problem import Problem
+from foamfit.fitting.objective import MODEL_ERROR, Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstimate, Switch
-from foamfit.springs.parameters import split_name, unit_of
+from foamfit.springs import laws
+from foamfit.springs.parameters import any_param, split_name, unit_of
 from foamfit.text import engineering, listed, percent
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import make_budget
-from foamfit.trust.checklist import MAY_VANISH, Findings, make_checklist, status_of, warnings_of
+from foamfit.trust.checklist import Findings, make_checklist, may_vanish, status_of, warnings_of
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
+from foamfit.trust.sentences import say
 
 # Factor between an interval and the local one from which on the local standard error is given up.
 ASTRAY = 2.0
@@ -42,7 +42,13 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
     problem, objective, simulated = best.problem, best.problem.objective, best.simulated
     measurement, specimen = problem.measurement, problem.measurement.specimen
     intervals = Intervals() if intervals is None else intervals
-    insight = look(best, _left_over(best)) if best.names else None
+    insight = None
+    if best.names:  # one standard deviation of what is left of each curve, its correlation counted
+        left = {
+            name: math.sqrt(max(process.variance * process.tau, 1e-300)) / objective.factor(name)
+            for name, process in zip(objective.counted, best.spread.noise, strict=True)
+        }
+        insight = look(best, left)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals))
     balance, misfit = audit(measurement), objective.misfit(simulated)
     checklist = make_checklist(Findings(best, estimates, misfit, record, balance, intervals))
@@ -75,9 +81,9 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
                 for name, node in objective.interior.items()
             },
         ),
-        switches=_switches(problem, simulated),
+        switches=_switches(best),
         correlation=Correlation(best.names, best.spread.correlation) if best.names else None,
-        notes=(*_notes(best), *_noise_notes(objective), *intervals.notes),
+        notes=(*problem.notes, *_notes(best), *_noise_notes(objective), *intervals.notes),
         checklist=checklist,
         insight=insight,
         stopped=record.stopped,
@@ -94,160 +100,127 @@ def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[st
     """Noise of each counted curve, how it is known, its scale, and the residuals over it.
 
     `errors` are those of the counted curves, or none if nothing varies. `law_error` is the RMS of
-    what the law misses beyond the noise, SI, None where it misses nothing else;
-    `law_error_evidence` by how much the Bayesian information criterion is for it.
+    the law's error beside the noise, SI, None if there is none; `law_error_evidence` is by how much
+    the Bayesian information criterion favours it.
     """
     objective, found = best.problem.objective, {}
     known = dict(zip(objective.counted, errors, strict=True)) if errors else {}
     for name, rms in objective.rms(best.residual).items():
         level, error = objective.noise(name), known.get(name)
-        law = error is not None and error.found
         found[name] = asdict(level) | {
             "scale": objective.scale[name],
             "range": float(np.ptp(objective.measured[name])),
-            "law_error": error.law / objective.factor(name) if error and law else None,
+            "law_error": error.law / objective.factor(name) if error and error.found else None,
             "law_error_evidence": error.evidence if error else None,
             "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
         }
     return found
 
 
-def _noise_notes(objective: Objective) -> list[str]:
+def _noise_notes(objective: Objective) -> Iterator[str]:
     """What the noise is, what the residuals are counted in, and which samples are left out."""
-    measurement = objective.measurement
-    told = [f"Noise of {sentence}" for sentence in noise_sentences(measurement)]
+    for sentence in noise_sentences(objective.measurement):
+        yield f"Noise of {sentence}"
     counted = objective.counted
     floored = [name for name in counted if objective.scale[name] > objective.noise(name).sigma]
-    if floored:
-        told.append(
-            f"{', '.join(floored)}: residuals count in units of {MODEL_ERROR:.1%} of the range, "
-            "which is more than the estimated noise, so that no channel outweighs another by an "
-            "error of the model; reduced χ² is in these units."
-        )
-    else:
-        told.append("Residuals count in units of the noise: at its floor the reduced χ² is 1.")
-    for channel, outliers in measurement.outliers.items():
+    key = "floored" if floored else "noise"
+    yield say("note", key, curves=", ".join(floored), share=MODEL_ERROR)
+    for channel, outliers in objective.measurement.outliers.items():
         if outliers.at.size:
-            told.append(f"{outliers.at.size} outliers of the {channel} are not fitted.")
+            yield say("note", "outliers", count=outliers.at.size, channel=channel)
     if objective.time_shift and objective.drive != "impact":
-        told.append("time_shift: a foam whose stress relaxes looks as if its motion were late.")
+        yield say("note", "late")
     if objective.loss != "linear":
-        told.append(
-            f"The loss is {objective.loss}: residuals past {LOSSES[objective.loss]:g} of their "
-            "units count less than their squares; χ² is that of the loss."
-        )
-    return told
+        yield say("note", "loss", loss=objective.loss, width=LOSSES[objective.loss])
 
 
-def _notes(best: BestPoint) -> list[str]:
+def _notes(best: BestPoint) -> Iterator[str]:
     """What was left out of the model, and what it would change."""
-    problem, simulated = best.problem, best.simulated
-    objective, specimen = problem.objective, problem.measurement.specimen
-    single = len(problem.model.kinds) == 1
-    told = [*problem.notes, *_inner_loops(best)]
-    unseen = [name for name in MOTION_CURVES if name not in objective.counted]
-    off = [(name.replace("_", "-"), objective.off(simulated, name)) for name in unseen]
-    there = [f"the {name} curve is {share:.1%} of its range off" for name, share in off if share]
-    if problem.measurement.motion == INTEGRATED and there:
-        told.append(
-            "The motion was integrated from the force, so it is no second measurement and has no "
-            f"misfit; against it {' and '.join(there)}."
-        )
-    if single and problem.measurement.interior:
-        names = ", ".join(map(interior_channel, sorted(problem.measurement.interior)))
-        told.append(f"A single spring has no mass inside, so {names} is left out.")
+    yield from _inner_loops(best)
+    test, simulated, objective = best.problem.measurement, best.simulated, best.problem.objective
+    single = len(best.problem.model.kinds) == 1
+    off = [
+        say("note", "off", curve=name.replace("_", "-"), share=share)
+        for name in MOTION_CURVES
+        if name not in objective.counted and (share := objective.off(simulated, name))
+    ]
+    if test.motion == INTEGRATED and off:
+        yield say("note", "integrated", curves=" and ".join(off))
+    if single and test.interior:
+        inside = map(interior_channel, sorted(test.interior))
+        yield say("note", "inside", names=", ".join(inside))
     if objective.drive == "stress":
-        told.append(
-            "The driving stress is smoothed by a parabola over a twenty-fifth of the samples."
-        )
+        yield say("note", "smoothed")
     if single or objective.drive != "impact" or objective.interior_mass:
-        return told
-    left_out = "The interior masses are left out"
-    if specimen.mass is None:
-        return [
-            *told, f"{left_out}; with [specimen] mass foamfit could say what they would change."
-        ]  # fmt: skip
+        return
+    if test.specimen.mass is None:
+        yield say("note", "mass")
+        return
     try:
         other = replace(objective, interior_mass=True).simulate(best.values).curves
     except SimulationError as error:
-        return [*told, f"{left_out}; with them the simulation ends: {error}."]
+        yield say("note", "ends", error=error)
+        return
     spoken = {"stress_time": "the base stress", "displacement_time": "the displacement"}
-    changes = [
-        f"{spoken.get(name, name.removesuffix('_time'))} by {_share(curve, other[name])}"
-        for name, curve in simulated.curves.items()
-        if name != "stress_strain" and name in other
-    ]
-    return [
-        *told,
-        f"{left_out}; the specimen's {specimen.mass * 1e6:.3g} mg between the springs would change "
-        f"{' and '.join(changes)} (RMS over range).",
-    ]
+    changes = []
+    for name, curve in simulated.curves.items():
+        if name != "stress_strain" and name in other:
+            share = float(np.sqrt(np.mean((curve - other[name]) ** 2)) / np.ptp(curve))
+            size = "less than 0.01 %" if share < 1e-4 else percent(share)
+            changes.append(f"{spoken.get(name, name.removesuffix('_time'))} by {size}")
+    mass = test.specimen.mass * 1e6
+    yield say("note", "masses", mass=mass, changes=" and ".join(changes))
 
 
-def _inner_loops(best: BestPoint) -> list[str]:
+def _inner_loops(best: BestPoint) -> Iterator[str]:
     """Say what a partial unloading leaves in the residuals of a law that has no inner loops."""
-    test, kinds = best.problem.measurement, best.problem.model.kinds
-    curve = best.simulated.curves.get("stress_strain")
-    if "bistable" not in kinds or "microscale" in kinds or curve is None:
-        return []
+    test, curve = best.problem.measurement, best.simulated.curves.get("stress_strain")
+    own = [law for law in best.problem.model.laws if law.hysteretic]
+    if not own or curve is None or any(law.inner_loops for law in own):
+        return
     assert test.displacement is not None  # there is a curve along it
     assert test.stress is not None
-    loops = inner_loops(test.displacement)
-    squares = (curve - test.stress) ** 2
-    inside = np.zeros(squares.size, dtype=bool)
-    for first, stop in loops:
+    squares, inside, spans = (curve - test.stress) ** 2, np.zeros(curve.size, dtype=bool), []
+    for first, stop in inner_loops(test.displacement):
         inside[first:stop] = True
-    total = float(squares.sum())
-    if not loops or total == 0.0:
-        return []
-    ends = [(first, min(stop, squares.size - 1)) for first, stop in loops]
-    spans = [f"from sample {first} to {stop}" for first, stop in ends]
-    if test.time is not None:
-        spans = [f"from {engineering(test.time[a], 's')} to {engineering(test.time[b], 's')}"
-                 for a, b in ends]  # fmt: skip
-    return [
-        f"The motion turns back below its peak ({listed(spans)}): these {percent(inside.mean())} "
-        f"of the samples hold {percent(float(squares[inside].sum()) / total)} of the squared "
-        "residuals of stress-strain. Bistable springs have no inner loops; microscale springs do."
-    ]
-
-
-def _share(one: Array, two: Array) -> str:
-    off = float(np.sqrt(np.mean((one - two) ** 2)) / np.ptp(one))
-    return "less than 0.01 %" if off < 1e-4 else percent(off)
+        ends = first, min(stop, curve.size - 1)
+        told = [f"sample {ends[0]}", f"{ends[1]}"]
+        if test.time is not None:
+            told = [engineering(test.time[at], "s") for at in ends]
+        spans.append(f"from {told[0]} to {told[1]}")
+    if spans and (total := float(squares.sum())) > 0.0:
+        share = float(squares[inside].sum()) / total
+        samples, held = percent(float(inside.mean())), percent(share)
+        with_loops = [law for law in map(laws.law, laws.kinds()) if law.inner_loops]
+        none, others = (
+            listed(dict.fromkeys(f"{law.title}s" for law in some)) for some in (own, with_loops)
+        )
+        none = none[0].upper() + none[1:]
+        facts = {"spans": listed(spans), "samples": samples, "squares": held}
+        yield say("note", "loops", none=none, others=others, **facts)
 
 
 def _estimates(
     best: BestPoint, insight: Insight | None, intervals: Intervals
 ) -> dict[str, ParameterEstimate]:
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
-    out = {}
-    for i, name in enumerate(best.problem.names):
-        if best.problem.is_exact(name):
+    problem, out = best.problem, {}
+    for name, value in zip(problem.names, best.values.tolist(), strict=True):
+        if problem.is_exact(name):
             continue
-        value, parameter, unit = float(best.values[i]), best.problem.params[name], unit_of(name)
+        parameter = problem.params[name]
         if name in best.names:
             assert insight is not None
-            out[name] = _varied(best, name, insight, intervals)
-        elif parameter.vary:
-            branch, spring = best.unreached[name], split_name(name)[0] + 1
-            why = f"branch {branch} of spring {spring} was never reached"
-            out[name] = ParameterEstimate(value, None, None, unit, True, "not determined", why)
+            one = _varied(best, name, insight, intervals)
         else:
-            why = "held fixed" if parameter.expr is None else f"tied by {parameter.expr}"
-            out[name] = ParameterEstimate(value, None, None, unit, False, "fixed", why)
-        parameter.stderr = out[name].stderr
-    origins = best.problem.measurement.origins
-    return {name: one.counted_from(-origins.get(name, 0.0)) for name, one in out.items()}
-
-
-def _left_over(best: BestPoint) -> dict[str, float]:
-    """One standard deviation of what is left of each curve, SI, its correlation counted."""
-    objective = best.problem.objective
-    return {
-        name: math.sqrt(max(process.variance * process.tau, 1e-300)) / objective.factor(name)
-        for name, process in zip(objective.counted, best.spread.noise, strict=True)
-    }
+            vary, spring = bool(parameter.vary), split_name(name)[0] + 1
+            state, key = ("not determined", "unreached") if vary else ("fixed", "held")
+            key, branch = "tied" if parameter.expr else key, best.unreached.get(name)
+            why = say("why", key, branch=branch, spring=spring, expression=parameter.expr)
+            one = ParameterEstimate(value, None, None, unit_of(name), vary, state, why)
+        parameter.stderr = one.stderr
+        out[name] = one.counted_from(-problem.measurement.origins.get(name, 0.0))
+    return out
 
 
 def _varied(
@@ -256,45 +229,46 @@ def _varied(
     """Estimate of a parameter that was varied and whose branch was reached."""
     (low, high), column = best.limits(name), best.names.index(name)
     problem, value, unit = best.problem, float(best.values[best.index[name]]), unit_of(name)
-    stderr, half = float(best.spread.stderr[column]), float(best.halves[column])
+    half, method = float(best.halves[column]), intervals.methods.get(name, "local covariance")
     local = (value - half, value + half)
     # Percentiles of refits, or of a chain, may all lie to one side of the best point.
     given = (*intervals.ends.get(name, local), value)
     ends = min(given), max(given)
-    # Within the limits, which cut both.
     made, by_local = (min(pair[1], high) - max(pair[0], low) for pair in (ends, local))
     ratio = made / by_local if by_local > 0.0 else math.nan
-    method = intervals.methods.get(name, "local covariance")
-    # refits that stall in a long minimum make a profile narrow: the wider interval is taken
+    # Refits that stall in a long minimum make a profile narrow: the wider interval is taken.
     stalled = ratio < 1.0 / ASTRAY and method == "profile likelihood"
     ends = local if stalled else ends
     span = intervals.ranges.get(name)
-    if span is not None:  # of a point a little off, if that was improved last
+    if span is not None:  # it may be that of the point before the last improvement
         span = min(span[0], value), max(span[1], value)
     state, why = state_of(name, value, ends, insight, (low, high), span)
     if state == "determined" and problem.objective.interior_mass:
-        state, why = "weak", "the vibration of the interior mass leaves other minima; " + why
+        state, why = "weak", say("why", "vibration", why=why)
     elif state == "determined" and name in intervals.elsewhere:
         there = intervals.elsewhere[name] + problem.measurement.origins.get(name, 0.0)
         told = engineering(there, unit) if unit else f"{there:.3g}"
-        state, why = "weak", f"it is {told} at a minimum that fits almost as well; {why}"
+        state, why = "weak", say("why", "elsewhere", there=told, why=why)
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
     if name in intervals.doubtful:
-        why += "; its interval is local, though the cost is no parabola there"
+        why = say("why", "doubtful", why=why)
     if stalled:
-        method = "local covariance"
-        why += "; its profile is much narrower and was not taken"
+        method, why = "local covariance", say("why", "stalled", why=why)
     elif name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf):
-        why += "; the local standard error does not give it"
-    ci95 = (max(ends[0], low), min(ends[1], high))
+        why = say("why", "astray", why=why)
+    ci95, stderr = (max(ends[0], low), min(ends[1], high)), float(best.spread.stderr[column])
     return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method, span)
 
 
 def state_of(
-    name: str, value: float, ends: tuple[float, float], insight: Insight,
-    limits: tuple[float, float], span: tuple[float, float] | None = None,
-) -> tuple[str, str]:  # fmt: skip
+    name: str,
+    value: float,
+    ends: tuple[float, float],
+    insight: Insight,
+    limits: tuple[float, float],
+    span: tuple[float, float] | None = None,
+) -> tuple[str, str]:
     """State of a parameter that varies and whose branch is reached, and the reason in one sentence.
 
     `ends` are those of its 95 % interval, not cut at its `limits`; NaN or infinite where the data
@@ -303,29 +277,28 @@ def state_of(
     what = "95 % interval"
     if span is not None and span[1] - span[0] > ends[1] - ends[0]:
         ends, what = span, "range"
-    size, short = float(insight.sizes[insight.names.index(name)]), split_name(name)[1]
-    unit = unit_of(name)
-    half = 0.5 * (ends[1] - ends[0])
+    size = float(insight.sizes[insight.names.index(name)])
+    unit, half = unit_of(name), 0.5 * (ends[1] - ends[0])
     half = half if math.isfinite(half) else math.nan
-    state, why = covariance.state(
-        value, half, size, *limits, scale_in_words(name, value, size), what
-    )
+    of = scale_in_words(name, value, size)
+    state, why = covariance.state(value, half, size, *limits, of, what)
     if state == "not determined":
-        reason = why if math.isfinite(half) else "the curves do not depend on it"
+        reason = why if math.isfinite(half) else say("why", "independent")
         return state, insight.combination(name, covariance.NOTHING / 1.96) or reason
     at_bound = value in limits and value != 0.0
-    if short in MAY_VANISH and ends[0] <= 0.0 <= ends[1] and not at_bound:
-        side, end = ("lower", ends[0]) if short == "dsigma" else ("upper", ends[1])
+    if may_vanish(name) and ends[0] <= 0.0 <= ends[1] and not at_bound:
+        below = any_param(split_name(name)[1]).admissible == "zero or negative"
+        side, end = ("lower", ends[0]) if below else ("upper", ends[1])
         bound = engineering(end, unit).replace("Pa s", "Pa·s").replace("-", "−")
-        where = "lies at its limit 0" if value == 0.0 else "is consistent with zero"
-        return "weak", f"it {where}; {side} bound {bound} ({what.removesuffix(' interval')})"
+        key, what = "at_zero" if value == 0.0 else "zero", what.removesuffix(" interval")
+        return "weak", say("why", key, side=side, bound=bound, what=what)
     if state == "determined":
         return state, why
-    past = [ends[0] <= limits[0], ends[1] >= limits[1]]
+    past = ends[0] <= limits[0], ends[1] >= limits[1]
     if any(past) and "open" not in why:
         limit = limits[past.index(True)]
         told = engineering(limit, unit) if unit else f"{limit:g}"
-        why += f", open on one side: it reaches its limit {told}"
+        why = say("why", "open", why=why, limit=told)
     together = insight.combination(name, covariance.WEAK / 1.96) or insight.companion(name)
     return state, f"{why}; {together}" if together else why
 
@@ -354,16 +327,16 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
     }
 
 
-def _switches(problem: Problem, simulated: Simulated) -> tuple[Switch, ...]:
+def _switches(best: BestPoint) -> tuple[Switch, ...]:
     """Place the switches of the fitted response on its curves."""
-    motion, clock = simulated.motion, problem.objective.time
-    laws = problem.model.laws
+    motion, clock = best.simulated.motion, best.problem.objective.time
+    own, timed = best.problem.model.laws, best.problem.measurement.time is not None
     return tuple(
         Switch(
             spring=int(spring) + 1,
-            source=laws[int(spring)].named_branch(int(left)),
-            target=laws[int(spring)].named_branch(int(entered)),
-            time=None if problem.measurement.time is None else float(when),
+            source=own[int(spring)].named_branch(int(left)),
+            target=own[int(spring)].named_branch(int(entered)),
+            time=float(when) if timed else None,
             displacement=float(np.interp(when, clock, motion.displacement[-1])),
             stress=float(np.interp(when, clock, motion.base_stress)),
         )

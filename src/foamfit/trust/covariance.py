@@ -1,8 +1,9 @@
 """How sure the identified parameters are: covariance, intervals, and which are determined at all.
 
-An interval tells where the best that the law can do would lie if the test were measured again. So
+An interval tells where the best that the law can do would lie if the tests were measured again. So
 the covariance has the noise alone in it, correlated as it is (`noise_process`); an error of the law
-(`law_error`) only changes how the best point follows the noise.
+(`law_error`) only changes how the best point follows the noise. One test is the case of a single
+block whose parameters are the unknowns.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,72 +84,292 @@ class Covariance:
         return replace(self, matrix=matrix, inflation=inflation, freedom=freedom)
 
 
+@dataclass(frozen=True, eq=False)
+class Block:
+    """One test in a covariance; everything is scaled, so that directions compare.
+
+    The covariance is that of m unknowns. Those of one test are its k parameters themselves; what
+    several tests have in common, one unknown for all, its parameters follow.
+    """
+
+    jacobian: Array  # (n, k): Slopes of its curves, one after the other, then of priors
+    residual: Array  # (n,)
+    sizes: tuple[int, ...]  # Samples of each curve; what is behind them are priors of unit variance
+    noise: Sequence[NoiseProcess]  # Of each curve
+    through: Array  # (k, m): How its parameters follow the unknowns
+    # Jᵀr of some parameters (their places) at a step of these off the best point; None where the
+    # law misses no more than noise, so that the curvature is JᵀJ.
+    gradient: Callable[[NDArray[np.intp], Array], Array] | None = None
+    room: Array | None = None  # (k, 2): How far they are above and below their limits
+    # (k,): What one standard error of a quantity that is taken for exact does to its parameters.
+    given: Array | None = None
+
+    @cached_property
+    def axes(self) -> tuple[Array, Array]:
+        """Orthonormal columns (n, r), and what leads from parameters to them (r, k): J is both."""
+        left, singular, vt = np.linalg.svd(self.jacobian, full_matrices=False)
+        seen = singular > SINGULAR * max(float(singular.max(initial=0.0)), 1e-300)
+        return left[:, seen], singular[seen, None] * vt[seen]
+
+    @cached_property
+    def steps(self) -> Array:
+        """Parameters that lead to each of the orthonormal columns, (k, r)."""
+        rows = self.axes[1]
+        return np.asarray(rows.T / np.sum(rows**2, axis=1))
+
+    @cached_property
+    def meat(self) -> Array:
+        """Covariance of the noise along the orthonormal columns, (r, r)."""
+        left = self.axes[0]
+        pairs = zip(self.noise, parts(self.sizes), strict=True)
+        inner = np.sum([left[p].T @ one.times(left[p]) for one, p in pairs], axis=0)
+        rest = left[sum(self.sizes) :]
+        return np.asarray(inner + rest.T @ rest)
+
+    @property
+    def effective(self) -> float:
+        """Effective number of samples."""
+        return float(sum(n / one.tau for n, one in zip(self.sizes, self.noise, strict=True)))
+
+    def doubt(self, mix: Array) -> Array:
+        """Variance of the variances that the noise makes along `mix` (r, m), (m,)."""
+        left = self.axes[0]
+        pairs = zip(self.noise, parts(self.sizes), strict=True)
+        return np.asarray(np.sum([one.doubt(left[p], mix) for one, p in pairs], axis=0))
+
+    def without(self, held: NDArray[np.bool_]) -> Block:
+        """The block with some of the unknowns held."""
+        rows = np.flatnonzero(~(self.through[:, held] != 0.0).any(axis=1))
+        full = self.gradient
+        return replace(
+            self,
+            jacobian=self.jacobian[:, rows],
+            through=self.through[np.ix_(rows, ~held)],
+            gradient=full and (lambda places, step: full(rows[places], step)),
+            given=None if self.given is None else self.given[rows],
+        )
+
+    def curvature(self, spread: Array) -> Array:
+        """Curvature of half the cost along the orthonormal columns, (r, r), where JᵀJ is one.
+
+        By differences of the gradient, one standard error to either side along the principal axes
+        of `spread` (r, r), the covariance there.
+        """
+        none = np.eye(len(spread))
+        if self.gradient is None or not len(spread):
+            return none
+        power, axes = np.linalg.eigh(0.5 * (spread + spread.T))
+        axes = axes * np.sqrt(np.maximum(power, 1e-12 * power.max()))
+        every = np.arange(self.jacobian.shape[1])
+        change = [
+            0.5 * (self.gradient(every, step) - self.gradient(every, -step))
+            for step in (self.steps @ axes).T
+        ]
+        try:
+            found = np.linalg.solve(axes.T, np.array(change) @ self.steps)
+        except np.linalg.LinAlgError:
+            return none
+        return np.asarray(0.5 * (found + found.T))
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Directions of m unknowns along which the residuals of all tests together have unit slopes.
+
+    `drawn` (d, m) are the slopes of further residuals, of so much variance each (d,).
+    """
+
+    blocks: tuple[Block, ...]
+    drawn: tuple[Array, Array] | None = None
+
+    @cached_property
+    def _solved(self) -> tuple[Array, Array]:
+        rows = [block.axes[1] @ block.through for block in self.blocks]
+        rows += [] if self.drawn is None else [self.drawn[0]]
+        left, singular, vt = np.linalg.svd(np.concatenate(rows), full_matrices=False)
+        seen = singular > SINGULAR * max(float(singular.max(initial=0.0)), 1e-300)
+        return left[:, seen], vt[seen].T / singular[seen]
+
+    @property
+    def root(self) -> Array:
+        """Unknowns that lead to each of the directions, (m, s)."""
+        return self._solved[1]
+
+    @cached_property
+    def lost(self) -> NDArray[np.bool_]:
+        """Unknowns of which the tests say nothing, (m,)."""
+        along = self.root / np.maximum(np.linalg.norm(self.root, axis=0), 1e-300)
+        return np.asarray(np.sum(along**2, axis=1) < 1.0 - 1e-6)
+
+    @cached_property
+    def lefts(self) -> list[Array]:
+        """The directions along the orthonormal columns of each test, (r, s)."""
+        ends = np.cumsum([len(block.axes[1]) for block in self.blocks])
+        return np.split(self._solved[0], ends)[: len(self.blocks)]
+
+    @cached_property
+    def axes(self) -> Array:
+        """Principal axes of the covariance of the noise, one deviation long, (s, s)."""
+        pairs = zip(self.lefts, self.blocks, strict=True)
+        rows = [block.meat @ left for left, block in pairs]
+        rows += [] if self.drawn is None else [self.drawn[1][:, None] * self.pulled]
+        meat = self._solved[0].T @ np.concatenate(rows)
+        power, axes = np.linalg.eigh(0.5 * (meat + meat.T))
+        least = 1e-12 * power.max(initial=0.0)  # no variance is negative
+        return np.asarray(axes * np.sqrt(np.maximum(power, least)))
+
+    @property
+    def pulled(self) -> Array:
+        """The directions along what is drawn, (d, s)."""
+        return self._solved[0][sum(map(len, self.lefts)) :]
+
+    @cached_property
+    def curvatures(self) -> tuple[Array, ...]:
+        """`Block.curvature` of each test."""
+        spreads = [left @ self.axes for left in self.lefts]
+        pairs = zip(self.blocks, spreads, strict=True)
+        return tuple(block.curvature(one @ one.T) for block, one in pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class Sandwich:
+    """Covariance H⁻¹ JᵀΣJ H⁻¹ of m unknowns with Σ the noise of the curves of all tests, scaled.
+
+    H is JᵀJ, or with `curvatures` (of each test, along its `Block.axes`) that of half the cost,
+    which a residual that is no noise changes (White 1982, Econometrica 50, 1). `bend` (m, m) is
+    what the bend of `Block.through` adds to H.
+    """
+
+    frame: Frame
+    bend: Array | None = None
+    curvatures: tuple[Array, ...] | None = None
+
+    @cached_property
+    def _bread(self) -> Array:
+        """H⁻¹ along the directions; where there is no curvature, that of JᵀJ."""
+        root = self.frame.root
+        out = np.eye(root.shape[1])
+        if self.curvatures is None:
+            return out
+        pairs = zip(self.frame.lefts, self.curvatures, strict=True)
+        more = [(curved - np.eye(len(curved))) @ left for left, curved in pairs]
+        out += np.concatenate(self.frame.lefts).T @ np.concatenate(more)
+        out += 0.0 if self.bend is None else root.T @ self.bend @ root
+        values, vectors = np.linalg.eigh(0.5 * (out + out.T))
+        return np.asarray((vectors / np.where(values > FLATTEST, values, 1.0)) @ vectors.T)
+
+    @cached_property
+    def inverse(self) -> Array:
+        """H⁻¹, (m, m); zero where the tests say nothing."""
+        root = self.frame.root
+        return root @ self._bread @ root.T
+
+    @cached_property
+    def matrix(self) -> Array:
+        """The covariance, (m, m); NaN where the tests say nothing."""
+        spread = self.frame.root @ self._bread @ self.frame.axes
+        out = spread @ spread.T
+        for t, (left, block) in enumerate(zip(self.frame.lefts, self.frame.blocks, strict=True)):
+            if block.given is not None and block.given.any():
+                moved = block.axes[1] @ block.given
+                moved = moved if self.curvatures is None else self.curvatures[t] @ moved
+                pull = self.frame.root @ self._bread @ left.T @ moved
+                out = out + np.outer(pull, pull)
+        out[self.frame.lost, :] = out[:, self.frame.lost] = np.nan
+        return out
+
+    def covariance(self, scales: Array) -> Covariance:
+        """Covariance of the unknowns in SI, by their scales (m,)."""
+        back, m = self._bread @ self.frame.root.T, scales.size
+        variance, doubt, most = np.zeros((3, m))
+        there = np.array([(block.through != 0.0).any(axis=0) for block in self.frame.blocks])
+        own = there & (there.sum(axis=0) == 1)
+        effective = sum(block.effective for block in self.frame.blocks)
+        for left, block, mine in zip(self.frame.lefts, self.frame.blocks, own, strict=True):
+            mix = left @ back
+            variance += np.einsum("ij,ij->j", mix, block.meat @ mix)
+            doubt += block.doubt(mix)
+            most[mine] = block.effective - np.count_nonzero(mine)
+        most[~own.any(axis=0)] = effective - m
+        if self.frame.drawn is not None:
+            mix = self.frame.pulled @ back
+            variance += self.frame.drawn[1] @ mix**2
+        known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
+        return Covariance(
+            self.matrix * np.outer(scales, scales),
+            np.diag(self.matrix) / np.where(self.frame.lost, np.nan, np.diag(self.inverse)),
+            np.minimum(known, np.maximum(most, 1.0)),
+            effective,
+            tuple(one for block in self.frame.blocks for one in block.noise),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """What the noise leaves uncertain of m unknowns at the best point of one test or several."""
+
+    blocks: tuple[Block, ...]
+    scales: Array  # (m,)
+    drawn: tuple[Array, Array] | None = None
+    bend: Array | None = None
+
+    @property
+    def errs(self) -> bool:
+        """Whether the law misses more of some test than noise."""
+        return any(block.gradient for block in self.blocks)
+
+    @cached_property
+    def plain(self) -> Sandwich:
+        """As if the law had no error."""
+        return Sandwich(Frame(self.blocks, self.drawn))
+
+    @cached_property
+    def held(self) -> NDArray[np.bool_]:
+        """Unknowns that the residuals press to a limit by more than their noise could, (m,)."""
+        pull, sure = np.zeros((2, self.scales.size))
+        near = np.zeros((2, self.scales.size), dtype=bool)
+        for block in self.blocks:
+            slopes = block.axes[1] @ block.through
+            pull += block.through.T @ (block.jacobian.T @ block.residual)
+            sure += np.einsum("ij,ij->j", slopes, block.meat @ slopes)
+            if block.room is not None:
+                near |= (block.room.T <= AT_LIMIT) @ (block.through != 0.0)
+        outward = np.where(near[0], pull, np.where(near[1], -pull, 0.0))
+        return np.asarray(outward > 1.96 * np.sqrt(sure))
+
+    @cached_property
+    def bent(self) -> Sandwich:
+        """With the curvature of the cost, what is pressed to a limit held."""
+        free, frame = ~self.held, self.plain.frame
+        if self.held.any():
+            drawn = None if self.drawn is None else (self.drawn[0][:, free], self.drawn[1])
+            frame = Frame(tuple(block.without(self.held) for block in self.blocks), drawn)
+        bend = None if self.bend is None else self.bend[np.ix_(free, free)]
+        return Sandwich(frame, bend, frame.curvatures)
+
+    @cached_property
+    def covariance(self) -> Covariance:
+        """Covariance of the unknowns, SI."""
+        plain = self.plain.covariance(self.scales)
+        if not self.errs or self.held.all():
+            return plain
+        free = np.flatnonzero(~self.held)
+        return plain.with_some(free, self.bent.covariance(self.scales[free]))
+
+
 def covariance(
-    jacobian: Array,
-    residual: Array,
-    sizes: tuple[int, ...],
-    sizes_of: Array,
-    noise: Sequence[NoiseProcess] | None = None,
-    gradient: Callable[[Array], Array] | None = None,
+    jacobian: Array, residual: Array, sizes: tuple[int, ...], sizes_of: Array
 ) -> Covariance:
-    """Covariance H⁻¹ JᵀΣJ H⁻¹ with Σ the noise of each curve (by default `noise_processes`).
+    """Covariance of the least squares of one test, its noise read off the residual.
 
     `residual` (n,) and `jacobian` (n, k) are those of the best point, so many samples of each curve
-    as in `sizes` and behind them priors of unit variance;
-    `sizes_of` (k,) are the scales of the parameters, so that directions compare. H
-    is JᵀJ, or with `gradient` the derivative of Jᵀr, which a residual that is no noise changes
-    (White 1982, Econometrica 50, 1): `gradient` gives Jᵀr (k,) at a step (k,), both scaled, off the
-    best point; it is asked one standard error to either side along the principal axes.
+    as in `sizes` and behind them priors of unit variance; `sizes_of` (k,) are the scales of the
+    parameters.
     """
     scaled = jacobian * sizes_of
-    noise = noise_processes(residual, scaled, sizes) if noise is None else noise
-    left, singular, vt = np.linalg.svd(scaled, full_matrices=False)
-    seen = singular > SINGULAR * max(float(singular[0]), 1e-300)
-    left, root = left[:, seen], vt[seen].T / singular[seen]
-    curves = list(zip(noise, parts(sizes), strict=True))
-    inner = np.sum([left[part].T @ process.times(left[part]) for process, part in curves], axis=0)
-    rest = left[sum(sizes) :]  # priors, of unit variance
-    inner = inner + rest.T @ rest
-    power, axes = np.linalg.eigh(0.5 * (inner + inner.T))
-    least = 1e-12 * power.max(initial=0.0)  # no variance is negative
-    axes = axes * np.sqrt(np.maximum(power, least))
-    bread = np.eye(len(axes))
-    if gradient is not None and len(axes):
-        bread = _bread(gradient, root, axes)
-    spread = root @ bread @ axes
-    matrix, inverse = spread @ spread.T, root @ bread @ root.T
-    lost = np.any(np.abs(vt[~seen]) > 1e-3, axis=0)
-    matrix[lost, :] = np.nan
-    matrix[:, lost] = np.nan
-    effective = sum(n / process.tau for n, process in zip(sizes, noise, strict=True))
-    errors = left @ bread @ root.T  # of the estimates, by the noise of each sample
-    variance = np.sum([process.forms(errors[part]) for process, part in curves], axis=0)
-    variance = variance + np.sum(errors[sum(sizes) :] ** 2, axis=0)
-    doubt = np.sum([process.doubt(errors[part]) for process, part in curves], axis=0)
-    known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
-    return Covariance(
-        matrix * np.outer(sizes_of, sizes_of),
-        np.diag(matrix) / np.where(lost, np.nan, np.diag(inverse)),
-        np.minimum(known, max(effective - len(matrix), 1.0)),
-        float(effective),
-        tuple(noise),
-    )
-
-
-def _bread(gradient: Callable[[Array], Array], root: Array, axes: Array) -> Array:
-    """H⁻¹ in coordinates in which JᵀJ is one; along what has no curvature, that of JᵀJ.
-
-    `root` (k, m) leads from these coordinates to scaled steps, `axes` (m, m) are the steps.
-    """
-    steps = (root @ axes).T
-    change = np.array([0.5 * (gradient(step) - gradient(-step)) for step in steps]).T
-    try:
-        curvature = np.linalg.solve(axes.T, (root.T @ change).T)
-    except np.linalg.LinAlgError:
-        return np.eye(len(axes))
-    values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
-    values = np.where(values > FLATTEST, values, 1.0)
-    return np.asarray((vectors / values) @ vectors.T)
+    noise = noise_processes(residual, scaled, sizes)
+    block = Block(scaled, residual, sizes, noise, np.eye(sizes_of.size))
+    return Uncertainty((block,), sizes_of).covariance
 
 
 def half_width(stderr: float, freedom: float) -> float:

@@ -1,151 +1,148 @@
 """What speaks for a model: AICc and BIC where the noise is reached, else what it predicts.
 
-AICc and BIC go by the samples and the parameters that count: neither correlated residuals nor
+AICc and BIC count the effective samples and parameters: neither correlated residuals nor
 combinations of parameters that the curves do not fix are evidence. They take the residuals for
-noise. Where every model leaves an error of its own, they do not hold; then models are compared by
+noise, so they do not hold where every model has an error of its own; then models are compared by
 how well they predict blocks of the test that are held back.
+
+Cross-validation in blocks (Burman, Chow & Nolan 1994, Biometrika 81, 351): neighbouring residuals
+are alike where a law does not follow a foam, so single samples held back would be predicted by
+their neighbours. Contiguous blocks in time are held back instead, each in turn; the parameters are
+fitted to the rest from the best point on, and the whole history is simulated, so that the blocks
+are predicted with the state in which the test enters them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
+from foamfit.fitting import levenberg
 from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.losses import soften, softness
+from foamfit.fitting.search import Tracker
 from foamfit.results import Fit, rung_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
-from foamfit.trust.prediction import misfit_of
-from foamfit.trust.residuals.noise_process import autocorrelation_time
+from foamfit.trust.residuals.noise_process import autocorrelation_time, parts
 from foamfit.trust.residuals.residual_tests import neighbours_test, runs_test
 
-# Residuals are structureless where neither test of their order rejects it at this level.
-LEVEL = 0.05
-# Below this level the order of the residuals is an error of the model for sure: one true model in
-# twenty or ten fails `LEVEL` by chance, hardly one this.
-SURE = 1e-4
+# Residuals are random where neither test of their order rejects it at the first level. Below the
+# second their order is an error of the model for sure: one true model in twenty or ten fails the
+# first by chance, hardly one the second.
+LEVEL, SURE = 0.05, 1e-4
 # By how much AICc and BIC must both fall for a richer model to be preferred: "strong" evidence of
 # Kass & Raftery (1995), J. Am. Stat. Assoc. 90, 773.
 MARGIN = 6.0
 # Where no model reaches the noise: by what share each further parameter of a richer model must
 # lower the predicted misfit for it to be preferred.
 SHARE = 0.03
-# A model that follows the curves so many times worse than another of as many parameters is not
-# chosen, whatever it predicts.
+# A model whose misfit is this many times that of another with as many parameters is not chosen,
+# whatever it predicts.
 WORSE = 2.0
 # Below this misfit (over the range) residuals are the simulation's own error.
 EXACT = 1e-5
+# Blocks in time: an eighth of a loop takes a whole feature of it away (the turning point, the first
+# stress), so that the prediction is a matter of chance; from two dozen on the ranking is stable.
+BLOCKS = 24
+# Levenberg-Marquardt steps of the fit without one block, which ends when two in a row gain less
+# than a share.
+STEPS, ENOUGH = 20, 1e-3
 
 
-@dataclass(frozen=True, eq=False)
+def misfit_of(best: BestPoint, residual: Array) -> float:
+    """RMS over the measured ranges of all counted curves, of a residual as the objective has it."""
+    objective = best.problem.objective
+    spans = np.repeat([objective.span(name) for name in objective.counted], objective.sizes)
+    return math.sqrt(float(np.mean((residual / spans) ** 2)))
+
+
+def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
+    """RMS over the measured ranges of the samples of each block, predicted from the others.
+
+    Raises
+    ------
+    SearchStoppedError
+        If the time (`time.monotonic`) is past the deadline.
+    """
+    # With counts of its own, and each sample for itself: weighed residuals mix what is held back.
+    problem, objective = best.problem, replace(best.problem.objective, weighing=None)
+    space, tracker = problem.space(), Tracker(objective, deadline)
+    block = np.arange(objective.time.size) * BLOCKS // objective.time.size
+    of_sample = np.concatenate([block[objective.kept(name)] for name in objective.counted])
+    of_sample = np.append(of_sample, np.full(len(objective.priors), BLOCKS))  # none of a block
+    start, predicted = space.encode(best.values), np.empty(of_sample.size)
+    for held in range(BLOCKS):
+        rest = of_sample != held
+
+        def residual(point: Array, rest: Array = rest) -> Array:
+            return np.asarray(tracker.residual(space.decode(point))[rest])
+
+        def jacobian(point: Array, rest: Array = rest) -> Array:
+            values = space.decode(point)
+            moves = space.slopes(point, values)
+            return np.asarray(objective.jacobian_along(values, moves)[rest])
+
+        end = levenberg.descend(residual, jacobian, start, space.box, STEPS, enough=ENOUGH)
+        there = objective.residual(space.decode(end.point))
+        predicted[~rest] = there[~rest]
+    return misfit_of(best, predicted[: objective.n_data])
+
+
+@dataclass(eq=False)
 class Tried:
-    """A fitted model: its result, "with" or "without" damping, its best point, and its run time."""
+    """A fitted model: its result, "with" or "without" damping, its best point, and its run time.
+
+    `predicted` is the RMS over the range of samples that were held back, None where the time did
+    not allow it; `misfit` that of all samples, not less than the simulation's own error, like the
+    chi-square `chisqr`. `residual` (n_data,) is in the order of its `curves`, and `grams` are JᵀJ
+    of each curve, J the derivative by relative changes, (n_curves, k, k).
+    """
 
     result: Fit
     damping: str
     best: BestPoint
     seconds: float
-    # RMS over the range of samples that were held back; None where the time did not allow it.
     predicted: float | None = None
 
-    @property
-    def counted(self) -> tuple[str, ...]:
-        """Names of the curves."""
-        return self.best.problem.objective.counted
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Samples of each curve."""
-        return self.best.problem.objective.sizes
-
-    @cached_property
-    def residual(self) -> Array:
-        """At the best point, curve after curve, (n_data,)."""
-        objective = self.best.problem.objective
-        return soften(self.best.residual[: objective.n_data], objective.loss)
-
-    @cached_property
-    def spans(self) -> tuple[float, ...]:
-        """Measured range of each curve, in the unit of its residual."""
-        return tuple(self.best.problem.objective.span(name) for name in self.counted)
+    def __post_init__(self) -> None:
+        """Compute all that the comparison needs."""
+        best, objective = self.best, self.best.problem.objective
+        self.name = rung_name(self.result.model, self.damping, self.result.relaxation)
+        self.varied = sum(item.vary for item in self.result.parameters.values())
+        self.counted, self.sizes = objective.counted, objective.sizes
+        self.spans = [objective.span(name) for name in self.counted]  # in the unit of the residual
+        self.residual = soften(best.residual[: objective.n_data], objective.loss)
+        slices = parts(self.sizes)
+        self.curves = [self.residual[part] for part in slices]
+        self.taus = [autocorrelation_time(curve) for curve in self.curves]
+        soft = softness(best.residual, objective.loss)
+        jacobian = soft[:, None] * best.jacobian * best.sizes
+        self.grams = np.array([jacobian[part].T @ jacobian[part] for part in slices])
+        pairs = zip(self.sizes, self.spans, strict=True)
+        floor = sum(n * (EXACT * span) ** 2 for n, span in pairs)
+        self.chisqr = max(float(self.residual @ self.residual), floor)
+        self.misfit = max(misfit_of(best, self.residual), EXACT)
+        # p-values of all curves together (Bonferroni)
+        self.runs_p, self.neighbours_p = (
+            min(1.0, len(self.sizes) * min(map(test, self.curves)))
+            for test in (runs_test, neighbours_test)
+        )
+        least = min(self.runs_p, self.neighbours_p)
+        self.structureless = self.chisqr <= floor or least >= LEVEL  # only noise is left
+        self.errs = self.chisqr > floor and least < SURE  # an error of the model is left for sure
 
     @property
     def places(self) -> list[NDArray[np.str_]]:
         """Branches that the springs are on at each counted sample of each curve."""
-        objective = self.best.problem.objective
         words = branch_of_samples(self.best.problem, self.best.simulated)
-        return [words[objective.kept(name)] for name in self.counted]
-
-    @cached_property
-    def grams(self) -> Array:
-        """JᵀJ of each curve, J the derivative by relative changes, (n_curves, k, k)."""
-        objective = self.best.problem.objective
-        jacobian = self.best.jacobian * self.best.sizes
-        jacobian = jacobian * softness(self.best.residual, objective.loss)[:, None]
-        parts = np.split(jacobian[: objective.n_data], np.cumsum(self.sizes)[:-1])
-        return np.array([part.T @ part for part in parts])
-
-    @property
-    def name(self) -> str:
-        """Model, relaxation and damping in words."""
-        return rung_name(self.result.model, self.damping, self.result.relaxation)
-
-    @property
-    def curves(self) -> list[Array]:
-        """Residual of each curve."""
-        return np.split(self.residual, np.cumsum(self.sizes)[:-1])
-
-    @property
-    def floor(self) -> float:
-        """Chi-square of the simulation's own error."""
-        return sum(n * (EXACT * span) ** 2 for n, span in zip(self.sizes, self.spans, strict=True))
-
-    @property
-    def chisqr(self) -> float:
-        """Chi-square, not less than that of the simulation's own error."""
-        return max(float(self.residual @ self.residual), self.floor)
-
-    @cached_property
-    def taus(self) -> list[float]:
-        """Autocorrelation time of each curve, samples."""
-        return [autocorrelation_time(part) for part in self.curves]
-
-    @property
-    def runs_p(self) -> float:
-        """p-value of the runs tests of all curves together (Bonferroni)."""
-        return min(1.0, len(self.sizes) * min(runs_test(part) for part in self.curves))
-
-    @property
-    def neighbours_p(self) -> float:
-        """p-value of the neighbours tests of all curves together (Bonferroni)."""
-        return min(1.0, len(self.sizes) * min(neighbours_test(part) for part in self.curves))
-
-    @property
-    def structureless(self) -> bool:
-        """Whether nothing but noise is left."""
-        return self.chisqr <= self.floor or min(self.runs_p, self.neighbours_p) >= LEVEL
-
-    @property
-    def errs(self) -> bool:
-        """Whether an error of the model is left for sure."""
-        return self.chisqr > self.floor and min(self.runs_p, self.neighbours_p) < SURE
-
-    @cached_property
-    def misfit(self) -> float:
-        """RMS over the range, all curves together, not less than the simulation's own error."""
-        return max(misfit_of(self.best, self.residual), EXACT)
-
-    @property
-    def varied(self) -> int:
-        """How many parameters vary."""
-        return sum(item.vary for item in self.result.parameters.values())
+        return [words[self.best.problem.objective.kept(name)] for name in self.counted]
 
     def states(self, state: str) -> tuple[str, ...]:
         """Names of the parameters in a state."""
@@ -207,7 +204,7 @@ def criteria(one: Tried, reference: Tried) -> Criteria:
 
 @dataclass(frozen=True)
 class Score:
-    """What the comparison by prediction goes by: parameters, fitted and predicted misfit."""
+    """What a comparison by prediction uses: parameters, fitted and predicted misfit."""
 
     varied: int
     misfit: float
@@ -233,10 +230,9 @@ class Decision:
     best: int
     criteria: tuple[Criteria, ...]
     by_prediction: bool  # Else by AICc and BIC
-    # Of each model: the chosen one of those before it, from the fewest parameters up; None of the
-    # first.
+    # Of each model: the best of those with fewer parameters, None of the first; another that
+    # follows the curves better with no more parameters, if any.
     before: tuple[int | None, ...]
-    # Of each model: another that follows the curves better with no more parameters, if any.
     ruled_out_by: tuple[int | None, ...]
 
 
@@ -257,16 +253,11 @@ def decide(scores: Sequence[Score], criteria: Sequence[Criteria], by_prediction:
         for i, one in enumerate(scores)
     ]
     best: int | None = None
+    judged: Sequence[Any] = scores if by_prediction else criteria
     for i in sorted(range(len(scores)), key=lambda i: scores[i].varied):
         before[i] = best
-        if rulers[i] is not None:
-            continue
-        if best is None:
+        if rulers[i] is None and (best is None or judged[i].beats(judged[best])):
             best = i
-        elif by_prediction:
-            best = i if scores[i].beats(scores[best]) else best
-        else:
-            best = i if criteria[i].beats(criteria[best]) else best
     assert best is not None  # the model of the least misfit and fewest parameters is not ruled out
     return Decision(best, tuple(criteria), by_prediction, tuple(before), tuple(rulers))
 

@@ -1,8 +1,8 @@
-"""What a test can tell of its parameters: sensitivities, information, directions.
+"""What a test says about its parameters: sensitivities, information, directions.
 
-Everything here is local: it holds at one point of the parameters, before a fit (a start) or after
-it. Sensitivities are in standard deviations of the noise per relative change of a parameter (over
-its scale, `fitting.box.Scales.of_parameter`), so that parameters and curves can be compared.
+Everything here is local: it holds at one point of the parameters, a start value or the best point.
+Sensitivities are in standard deviations of the noise per relative change of a parameter (over its
+scale, `fitting.box.Scales.of_parameter`), so that parameters and curves can be compared.
 """
 
 from __future__ import annotations
@@ -19,35 +19,33 @@ from foamfit.fitting.box import scale_in_words
 from foamfit.fitting.branches import Section, sections
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import listed, percent
+from foamfit.trust.sentences import say
 
 if TYPE_CHECKING:
     from foamfit.trust.best_point import BestPoint
 
-# Shares of a direction below which a parameter has no part in it, and of the largest below which
-# it is not named.
-PART, NAMED = 0.05, 0.3
-# Parameters of a joint change that are named at most.
-MOST = 3
+# Share of a direction below which a parameter has no part in it, share of the largest part below
+# which it is not named, and how many parameters of a joint change are named at most.
+PART, NAMED, MOST = 0.05, 0.3, 3
 # Times and zeros count from an arbitrary origin: their powers mean nothing.
 OF_NO_POWER = set(NUISANCE) - {"velocity", "striker_mass"}
 
 
 @dataclass(frozen=True, eq=False)
 class Insight:
-    """The sensitivities of all counted curves to the parameters that they can tell of."""
+    """Sensitivities of all counted curves to the parameters of which they can tell anything."""
 
-    names: tuple[str, ...]  # (k,): Parameters that vary and whose branch was reached
-    # (k,): Where they stand and their scales, SI.
-    values: Array
-    sizes: Array
-    curves: tuple[str, ...]  # Counted curves, in the order of the rows of `scaled`
-    clock: Array  # (n_samples,): Time of the samples, s; their number where the test has no time
-    timed: bool  # Whether the clock is a time
-    # (len(curves): By how many standard deviations of its noise a curve moves, sample by sample, if
-    # a parameter changes by its scale; to first order. Zero at samples that are not counted.
+    names: tuple[str, ...]  # (k,): parameters that vary and whose branch was reached
+    values: Array  # (k,), SI
+    sizes: Array  # (k,): their scales, SI
+    curves: tuple[str, ...]  # in the order of the rows of `scaled`
+    clock: Array  # (n_samples,): time of the samples, s; their number where the test has no time
+    timed: bool  # whether the clock is a time
+    # (n_curves * n_samples, k): by how many standard deviations of its noise a curve moves, sample
+    # by sample, if a parameter changes by its scale; zero at samples that are not counted.
     scaled: Array
-    sections: tuple[Section, ...]  # The stretches of the run between switches
-    silent: tuple[str, ...] = ()  # Parameters that vary but whose branch was never reached
+    sections: tuple[Section, ...]  # the stretches of the run between switches
+    silent: tuple[str, ...] = ()  # parameters that vary but whose branch was never reached
 
     @cached_property
     def _directions(self) -> tuple[Array, Array]:
@@ -63,18 +61,19 @@ class Insight:
         with np.errstate(divide="ignore"):
             return np.where(singular > tiny, 1.0 / singular, np.inf), vt
 
-    @property
-    def stderr(self) -> Array:
-        """Standard errors that the noise alone leaves, SI, (k,); infinite if undetermined."""
-        return np.sqrt(self._variance) * self.sizes
-
     @cached_property
     def _variance(self) -> Array:
+        """Variance of each relative value, (k,); infinite where the curves do not tell it."""
         errors, vt = self._directions
         seen = np.isfinite(errors)
         out = (vt[seen] ** 2 * errors[seen, None] ** 2).sum(axis=0)
         out[np.any(np.abs(vt[~seen]) > 1e-3, axis=0)] = np.inf
         return np.asarray(out)
+
+    @property
+    def stderr(self) -> Array:
+        """Standard errors due to the noise alone, SI, (k,); infinite if undetermined."""
+        return np.sqrt(self._variance) * self.sizes
 
     @property
     def correlation(self) -> Array:
@@ -87,33 +86,33 @@ class Insight:
 
     def stderr_with(self, quieter: str, factor: float = 0.5) -> Array:
         """Standard errors, SI, (k,), if the noise of one curve were `factor` of what it is."""
-        n = self.clock.size
         scaled = self.scaled.copy()
-        at = self.curves.index(quieter)
-        scaled[at * n : (at + 1) * n] /= factor
+        scaled[self._rows(quieter)] /= factor
         return replace(self, scaled=scaled).stderr
 
     def along(self, name: str, curve: str) -> Array:
         """Sensitivity of one curve to one parameter, (n_samples,)."""
-        n, at = self.clock.size, self.curves.index(curve)
-        return np.asarray(self.scaled[at * n : (at + 1) * n, self.names.index(name)])
+        return np.asarray(self.scaled[self._rows(curve), self.names.index(name)])
+
+    def _rows(self, curve: str) -> slice:
+        at = self.curves.index(curve) * self.clock.size
+        return slice(at, at + self.clock.size)
 
     def shares(self) -> tuple[tuple[tuple[str, str], ...], Array]:
         """Parts (curve, branches), and the share of each in the information on a parameter.
 
         The information on a parameter, all others free, is the square of what is left of its column
-        of sensitivities once the other columns are taken out of it (Frisch and Waugh 1933,
+        of sensitivities once the other columns are projected out (Frisch and Waugh 1933,
         Econometrica 1, 387); being a sum over samples it is shared out among them. Each row of the
         shares (k, n_parts) adds up to one; NaN for a parameter that the curves do not tell.
         """
-        n, columns, parts = self.clock.size, [], []
-        labels = np.full(n, "", object)
-        for section in self.sections:
-            labels[section.start : section.stop] = section.branches
+        columns, parts = [], []
         squares = np.linalg.pinv(self.scaled, rcond=1e-12) ** 2  # (k, n): own parts, rescaled
-        for c, curve in enumerate(self.curves):
+        for curve in self.curves:
+            own = squares[:, self._rows(curve)]
             for label in dict.fromkeys(section.branches for section in self.sections):
-                columns.append(squares[:, c * n : (c + 1) * n][:, labels == label].sum(axis=1))
+                spans = [slice(s.start, s.stop) for s in self.sections if s.branches == label]
+                columns.append(np.sum([own[:, span].sum(axis=1) for span in spans], axis=0))
                 parts.append((curve, label))
         shares = np.array(columns).T
         shares[~np.isfinite(self._variance)] = np.nan
@@ -135,21 +134,17 @@ class Insight:
         if not self.names:
             return ""
         error, parts = self.weakest()
-        name = next(iter(parts))
-        at = self.names.index(name)
-        told, of = f"parameter is {name}", scale_in_words(name, self.values[at], self.sizes[at])
+        name, unseen = next(iter(parts)), error > 1e3
         if len(parts) > 1:
             joint = listed(f"{name} ({part:+.2g})" for name, part in parts.items())
-            told = f"combination is a joint relative change of {joint.replace('-', '−')}"
-            of = ""
-        known = f"its standard error is {percent(error)}" + (f" of {of}" if of else "")
-        known = "the curves do not depend on it" if error > 1e3 else known
-        told = f"The least determined {told}: {known}."
-        if not self.silent:
-            return told
-        return (
-            f"{listed(self.silent)} cannot be determined: no branch they act on was reached. {told}"
-        )
+            key, scale = "free" if unseen else "combination", ""
+        else:
+            at = self.names.index(name)
+            key, joint = "alone" if unseen else "parameter", name
+            scale = scale_in_words(name, self.values[at], self.sizes[at])
+        joint, known = joint.replace("-", "−"), percent(error)
+        told = say("least", key, name=name, names=joint, error=known, scale=scale)
+        return say("least", "silent", names=listed(self.silent), told=told) if self.silent else told
 
     def combination(self, name: str, loose: float) -> str:
         """Say what the data fix instead of a parameter; "" if it is loose by itself.
@@ -171,12 +166,12 @@ class Insight:
         left, singular, _ = np.linalg.svd(free[:, group].T, full_matrices=True)
         names, moving = [self.names[i] for i in group], int(np.sum(singular > NAMED))
         if moving == len(group):
-            return f"the curves determine no combination of {listed(names)}"
+            return say("why", "nothing", names=listed(names))
         counted = set(names) & OF_NO_POWER or not np.all(self.values[group] != 0.0)
         if moving == len(group) - 1 and not counted:
             # d ln|p| = (size/p) dx, so exponents are the weights of x times p/size.
             powers = left[:, -1] * (self.values / self.sizes)[group]
-            return f"the data fix only {_product(names, powers)}"
+            return say("why", "product", product=_product(names, powers))
         change = (free[:, me] * np.minimum(errors[errors > loose], 1e6) ** 2) @ free
         change = change / change[me]
         change[me] = 0.0
@@ -184,16 +179,17 @@ class Insight:
         parts = [i for i in order if abs(change[i]) > NAMED * abs(change[order[0]])]
         told = ", ".join(f"{self.names[i]} ({change[i]:+.2g})" for i in parts[:MOST])
         more = f" and {len(parts) - MOST} more" if len(parts) > MOST else ""
-        return f"compensated by {told.replace('-', '−')}{more} (relative changes)"
+        return say("why", "compensated", names=told.replace("-", "−") + more)
 
-    def companion(self, name: str, correlation: float = 0.9) -> str:
+    def companion(self, name: str, least: float = 0.9) -> str:
         """Name the parameter that one is correlated with; "" if no correlation is that strong."""
-        row = np.nan_to_num(self.correlation[self.names.index(name)])
-        row[self.names.index(name)] = 0.0
+        me = self.names.index(name)
+        row = np.nan_to_num(self.correlation[me])
+        row[me] = 0.0
         at = int(np.argmax(np.abs(row)))
-        if abs(row[at]) < correlation:
+        if abs(row[at]) < least:
             return ""
-        return f"correlated with {self.names[at]} (r = {row[at]:.2f})".replace("-", "−")
+        return say("why", "correlated", name=self.names[at], r=row[at]).replace("-", "−")
 
 
 def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
@@ -226,12 +222,11 @@ def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
 def _product(names: list[str], powers: Array) -> str:
     """Write Π p_i^e_i with the largest power 1: "s2_k0·s1_k0^0.43/s1_height^0.57"."""
     powers = powers / powers[np.argmax(np.abs(powers))]
-    above: list[str] = []
-    below: list[str] = []
+    sides: dict[bool, list[str]] = {True: [], False: []}
     for name, power in sorted(zip(names, powers, strict=True), key=lambda item: -abs(item[1])):
         shown = f"{abs(power):.2f}".rstrip("0").rstrip(".")
         if abs(power) >= PART:
-            part = name if shown == "1" else f"{name}^{shown}"
-            (above if power > 0.0 else below).append(part)
-    under = "·".join(below)
-    return "·".join(above) + (f"/({under})" if len(below) > 1 else f"/{under}" if below else "")
+            sides[bool(power > 0.0)].append(name if shown == "1" else f"{name}^{shown}")
+    above, below = ("·".join(sides[side]) for side in (True, False))
+    below = f"({below})" if len(sides[False]) > 1 else below
+    return f"{above}/{below}" if below else above

@@ -1,7 +1,7 @@
 """The 95 % intervals of a fit: which are made, how, and what is said of them.
 
-The local covariance takes the cost for a parabola. Where branches a and d are about equally stiff
-it is none: it is flat along ε_a, with several shallow minima. There the cost itself is asked.
+The local covariance assumes that the cost is a parabola. Where branches a and d are about equally
+stiff it is not: it is flat along ε_a, with several shallow minima. There the cost itself is used.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
@@ -22,6 +21,7 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import PLACED, Tracing, departures
 from foamfit.trust.resample import bootstrap, check_emcee, mcmc, walkers
 from foamfit.trust.residuals.noise_process import parts
+from foamfit.trust.sentences import say
 
 # The default profiles a parameter if the root of the cost departs from a straight line by this
 # share at the end of its local interval.
@@ -32,9 +32,10 @@ REFITS, ENOUGH_DRAWS, MOST_DRAWS = 9, 40, 100_000
 # Evaluations of a refit, and its slopes.
 EVALUATIONS, SLOPES = 6.0, 0.6
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
-# noise makes so much of a difference in three tests of a thousand.
+# noise makes that much difference in three tests of a thousand.
 HARDLY_WORSE = 1.5
 Announce = Callable[[str], None]
+Minima = Sequence[tuple[Array, Array]]  # points at which descents ended, and their residuals
 
 
 @dataclass(frozen=True)
@@ -85,21 +86,24 @@ def assess(
     tracker = Tracker(best.problem.objective, deadline, best_cost=best.cost, pulse=pulse)
     known = best.known
     if not known:
-        none = "The test determines no parameter, so no intervals were made."
+        none = say("interval", "nothing")
         return Intervals(warnings=() if choice.method == "auto" else (none,))
-    if choice.method == "bootstrap":
-        return _by_bootstrap(best, choice, tracker, announce)
-    if choice.method == "mcmc":
-        return _by_mcmc(best, choice, tracker, announce)
+    if choice.method in ("bootstrap", "mcmc"):
+        made = _by_bootstrap if choice.method == "bootstrap" else _by_mcmc
+        return made(best, choice, tracker, announce)
     if choice.method == "profile":
-        announce(_cost_told(best, "profile likelihood", REFITS * len(known)))
+        count = REFITS * len(known)
+        told = _seconds(best, count)
+        announce(say("interval", "refits", what="profile likelihood", count=count, seconds=told))
         return _by_profiles(best, known, minima, tracker, math.inf)
+    others = [(point, tracker.consider(point)) for point in minima]
     far = np.abs(departures(best)).max(axis=1, initial=0.0)
-    far[_elsewhere(best, minima, tracker)] = np.inf
+    for point, residual in others:  # one within the cut, outside of the local interval
+        apart = np.abs(point - best.values)[best.places] / best.spread.stderr
+        far[(best.rises(residual) < best.quantiles**2) & (apart > best.quantiles)] = np.inf
     order = sorted(known, key=lambda name: -far[best.names.index(name)])
     bent = [name for name in order if far[best.names.index(name)] > BENT]
-    made = _with_minima(best, _by_profiles(best, bent, minima, tracker, budget), minima, tracker)
-    return replace(made, elsewhere=_hardly_worse(best, made, minima, tracker))
+    return _with_minima(best, _by_profiles(best, bent, minima, tracker, budget), others)
 
 
 def evaluations_of(best: BestPoint, choice: Choice) -> float:
@@ -114,92 +118,55 @@ def evaluations_of(best: BestPoint, choice: Choice) -> float:
     return 0.0
 
 
-def _with_minima(
-    best: BestPoint, made: Intervals, minima: Sequence[Array], tracker: Tracker
-) -> Intervals:
-    """Intervals that hold the other minima which other noise could have made the best."""
-    if made.better is not None:
-        return made
-    ends, methods = dict(made.ends), dict(made.methods)
-    halves_at = _law_halves if best.misfits else _halves
-    for point in minima:
-        halves = halves_at(best, point, tracker)
-        for column, name in enumerate(best.names):
-            if name not in best.known or not math.isfinite(halves[column]):
-                continue
-            value, there = best.values[best.index[name]], point[best.index[name]]
-            half = best.halves[column]
-            low, high = ends.get(name, (value - half, value + half))
-            wider = min(low, there - halves[column]), max(high, there + halves[column])
-            if wider[1] - wider[0] > (1.0 + PLACED) * (high - low):
-                ends[name] = wider
-                methods[name] = "other minima"
-    return replace(made, ends=ends, methods=methods)
+def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
+    """Intervals that hold the other minima which other noise could have made the best.
 
-
-def _hardly_worse(
-    best: BestPoint, made: Intervals, minima: Sequence[Array], tracker: Tracker
-) -> dict[str, float]:
-    """Values further outside of an interval than it is wide at minima that are hardly worse."""
-    out: dict[str, float] = {}
-    for point in minima if not best.misfits else ():
-        residual = tracker.consider(point)
-        rise = (float(residual @ residual) - best.cost) / best.spread.inflation
-        for column, name in enumerate(best.names):
-            if (
-                name not in best.known
-                or rise[column] > (HARDLY_WORSE * best.quantiles[column]) ** 2
-            ):
-                continue
-            value, there = best.values[best.index[name]], float(point[best.index[name]])
-            half = best.halves[column]
-            low, high = made.ends.get(name, (value - half, value + half))
-            if max(low - there, there - high) > high - low:
-                out.setdefault(name, there)
-    return out
-
-
-def _law_halves(best: BestPoint, point: Array, tracker: Tracker) -> Array:
-    """What the values at another minimum are uncertain by beside an error of the law, (k,).
-
-    There two minima differ by more than noise: of the difference of their costs the noise e makes
-    2 eᵀd, with d the difference of their residuals. NaN where it could not have made this the best.
+    A value much farther off, at a minimum that is hardly worse than the best, is named beside them.
     """
-    residual = tracker.consider(point)
-    apart = (residual - best.soft)[:, None]
-    objective = best.problem.objective
-    noise = zip(best.spread.noise, parts(objective.sizes), strict=True)
-    spread = sum(float(process.forms(apart[p])[0]) for process, p in noise)
-    spread += float(np.sum(apart[objective.n_data :] ** 2))
-    near = float(residual @ residual) - best.cost <= 1.96 * 2.0 * math.sqrt(spread)
-    return best.halves if near else np.full(best.halves.shape, np.nan)
+    ends, methods, elsewhere = dict(made.ends), dict(made.methods), dict[str, float]()
+    known = [(column, best.names[column]) for column in map(best.names.index, best.known)]
+
+    def interval(column: int, name: str) -> tuple[float, float]:
+        value, half = float(best.values[best.index[name]]), float(best.halves[column])
+        return ends.get(name, (value - half, value + half))
+
+    for point, residual in minima:
+        halves = _halves(best, point, residual)
+        for column, name in known:
+            if math.isfinite(half := float(halves[column])):
+                there, (low, high) = float(point[best.index[name]]), interval(column, name)
+                wider = min(low, there - half), max(high, there + half)
+                if wider[1] - wider[0] > (1.0 + PLACED) * (high - low):
+                    ends[name], methods[name] = wider, "other minima"
+    for point, residual in () if best.misfits else minima:
+        near = best.rises(residual) <= (HARDLY_WORSE * best.quantiles) ** 2
+        for column, name in known:
+            there, (low, high) = float(point[best.index[name]]), interval(column, name)
+            if near[column] and max(low - there, there - high) > high - low:
+                elsewhere.setdefault(name, there)
+    return replace(made, ends=ends, methods=methods, elsewhere=elsewhere)
 
 
-def _halves(best: BestPoint, point: Array, tracker: Tracker) -> Array:
-    """Halves of the local intervals at another minimum, (k,), as far as its cost is in the cut.
+def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
+    """Half widths of the intervals at another minimum, (k,); NaN if noise cannot make it the best.
 
-    The cost is taken for a parabola about that minimum too; NaN where it is above the cut.
+    The cost is taken for a parabola about that minimum too. Beside an error of the law two minima
+    differ by more than noise: of the difference of their costs the noise e makes 2 eᵀd, with d the
+    difference of their residuals.
     """
-    residual = tracker.consider(point)
-    rises = (float(residual @ residual) - best.cost) / best.spread.inflation
-    left = 1.0 - rises / best.quantiles**2
+    if best.misfits:
+        apart, objective = (residual - best.soft)[:, None], best.problem.objective
+        noise = zip(best.spread.noise, parts(objective.sizes), strict=True)
+        spread = float(np.sum(apart[objective.n_data :] ** 2))  # of priors, of unit variance
+        spread += sum(float(process.forms(apart[part])[0]) for process, part in noise)
+        near = float(residual @ residual) - best.cost <= 1.96 * 2.0 * math.sqrt(spread)
+        return best.halves if near else np.full(best.halves.shape, np.nan)
+    left = 1.0 - best.rises(residual) / best.quantiles**2
     if not np.any(left > 0.0):
         return np.full(left.shape, np.nan)
     there = BestPoint(best.problem, point, best.names)
     with np.errstate(invalid="ignore"):
         return np.where(left > 0.0, there.halves * np.sqrt(left), np.nan)
-
-
-def _elsewhere(best: BestPoint, minima: Sequence[Array], tracker: Tracker) -> NDArray[np.bool_]:
-    """Parameters that another minimum within the cut puts outside of their local interval, (k,)."""
-    places = [best.index[name] for name in best.names]
-    out = np.zeros(len(places), dtype=bool)
-    for point in minima:
-        residual = tracker.consider(point)
-        rise = (float(residual @ residual) - best.cost) / best.spread.inflation
-        apart = np.abs(point - best.values)[places] / best.spread.stderr
-        out |= (rise < best.quantiles**2) & (apart > best.quantiles)
-    return out
 
 
 def _by_profiles(
@@ -216,11 +183,12 @@ def _by_profiles(
     wanted, better = list(names), None
     for name in (*names, *best.known):
         met = _met(best, name, [one for other, one in tracings.items() if other != name])
-        begun = name in tracings
         if name not in wanted:
-            if not _outside(best, name, met):
+            at, half = best.index[name], best.halves[best.names.index(name)] * (1.0 + PLACED)
+            if not any(abs(point[at] - best.values[at]) > half for point in met):
                 continue
             wanted.append(name)
+        begun = name in tracings
         if tracker.objective.evaluations >= allowed and not begun:
             continue
         tracing = tracings.setdefault(name, Tracing(best, name, tracker))
@@ -231,12 +199,9 @@ def _by_profiles(
     profiles = tuple(tracing.profile for tracing in tracings.values())
     ends = {p.name: p.ci95 for p in profiles if p.complete}
     left = tuple(name for name in wanted if name not in ends)
-    warnings = tuple(
-        f"The profiles were stopped by {p.stopped}: {len(ends)} of {len(wanted)} were done, and "
-        f"the intervals of {', '.join(left)} are local."
-        for p in profiles
-        if p.stopped
-    )
+    facts = {"done": len(ends), "count": len(wanted), "names": ", ".join(left)}
+    stopped = [p.stopped for p in profiles if p.stopped]
+    warnings = tuple(say("interval", "profiles", by=by, **facts) for by in stopped)
     methods = dict.fromkeys(ends, "profile likelihood")
     return Intervals(ends, methods, profiles, left, warnings=warnings, better=better)
 
@@ -247,43 +212,35 @@ def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]
     highest = best.quantiles[column] ** 2 * best.spread.inflation[column]
     refits = [one for tracing in tracings for one in tracing.refits]
     points = [one.point for one in refits if one.cost - best.cost < highest]
-    if not points:
-        return []
-    return [min(points, key=lambda point: point[at]), max(points, key=lambda point: point[at])]
-
-
-def _outside(best: BestPoint, name: str, points: Sequence[Array]) -> bool:
-    """Whether one of the points is outside of a local interval."""
-    at, half = best.index[name], best.halves[best.names.index(name)] * (1.0 + PLACED)
-    return any(abs(point[at] - best.values[at]) > half for point in points)
+    points.sort(key=lambda point: float(point[at]))
+    return [points[0], points[-1]] if points else []
 
 
 def _by_bootstrap(
     best: BestPoint, choice: Choice, tracker: Tracker, announce: Announce
 ) -> Intervals:
-    announce(_cost_told(best, "block bootstrap", choice.draws))
-    drawn = bootstrap(best, choice.draws, choice.seed, tracker)
-    note = f"Block bootstrap: {len(drawn.values)} of {choice.draws} refits."
-    if drawn.stopped:
-        note += f" It was stopped by {drawn.stopped}."
-    if len(drawn.values) < ENOUGH_DRAWS:
-        return Intervals(warnings=(note + " These are too few, so the intervals are local.",))
-    return _percentiles(best, drawn.values, "block bootstrap", note, drawn.stopped is None)
+    what, count = "block bootstrap", choice.draws
+    seconds = _seconds(best, count)
+    announce(say("interval", "refits", what=what, count=count, seconds=seconds))
+    drawn, stopped = bootstrap(best, count, choice.seed, tracker)
+    note = say("interval", "bootstrap", done=len(drawn), count=count)
+    if stopped:
+        note = say("interval", "stopped", told=note, by=stopped)
+    if len(drawn) < ENOUGH_DRAWS:
+        return Intervals(warnings=(say("interval", "few", told=note),))
+    return _percentiles(best, drawn, what, note, stopped is None)
 
 
 def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker, announce: Announce) -> Intervals:
     count = (choice.draws + 1) * walkers(best)
-    announce(f"Markov chain: {count} simulations, about {count * _seconds(best)[0]:.2g} s")
+    seconds = _seconds(best, count, evaluations=1.0, slopes=0.0)
+    announce(say("interval", "simulations", count=count, seconds=seconds))
     chain = mcmc(best, choice.draws, choice.seed, tracker)
     note = chain.sentence()
     if len(chain.samples) < ENOUGH_DRAWS:
-        return Intervals(warnings=(note + " The intervals are local.",))
+        return Intervals(warnings=(say("interval", "none", told=note),))
     lost = ", ".join(name for name in best.names if name not in best.known)
-    if lost:
-        note += (
-            f" The test does not determine {lost}: the chain samples them with a flat prior within "
-            "their limits, and they have no interval."
-        )
+    note = say("interval", "lost", told=note, names=lost) if lost else note
     fine = chain.converged and chain.stopped is None
     return _percentiles(best, chain.samples, "MCMC", note, fine)
 
@@ -299,19 +256,13 @@ def _percentiles(best: BestPoint, drawn: Array, method: str, note: str, fine: bo
     return Intervals(ends, dict.fromkeys(ends, method), notes=notes, warnings=warnings)
 
 
-def _seconds(best: BestPoint) -> tuple[float, float]:
-    """Seconds of one evaluation of the residual and of its slopes."""
-    problem = best.problem
-    began = time.perf_counter()
+def _seconds(
+    best: BestPoint, count: int, *, evaluations: float = EVALUATIONS, slopes: float = SLOPES
+) -> float:
+    """Expected run time of refits, s, from three evaluations and one set of slopes."""
+    problem, began = best.problem, time.perf_counter()
     for _ in range(3):
         problem.objective.residual(best.values)
     middle = time.perf_counter()
     problem.slopes(best.values, best.names)
-    return (middle - began) / 3.0, time.perf_counter() - middle
-
-
-def _cost_told(best: BestPoint, what: str, refits: int) -> str:
-    """Announcement of so many refits."""
-    evaluation, slopes = _seconds(best)
-    seconds = refits * (EVALUATIONS * evaluation + SLOPES * slopes)
-    return f"{what}: {refits} refits, about {seconds:.2g} s"
+    return count * (evaluations * (middle - began) / 3 + slopes * (time.perf_counter() - middle))

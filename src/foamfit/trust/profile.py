@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,33 +30,17 @@ PLACED = 0.02
 BETTER = 0.01
 
 
-def profile(
-    best: BestPoint, name: str, tracker: Tracker | None = None, minima: Sequence[Array] = ()
-) -> Profile:
-    """Follow the least cost along a parameter to both sides; see `Tracing.follow`."""
-    tracing = Tracing(best, name, Tracker(best.problem.objective) if tracker is None else tracker)
-    tracing.follow(minima)
-    return tracing.profile
-
-
-@dataclass(eq=False)
 class _Side:
-    """One side of a profile: down (-1) or up (+1)."""
+    """One side of a profile, down (-1) or up (+1): refits from the best point outward."""
 
-    best: BestPoint
-    name: str
-    refit: Refit
-    sign: float
-
-    def __post_init__(self) -> None:
-        """Begin at the best point."""
-        best = self.best
-        self.column, self.place = best.names.index(self.name), best.index[self.name]
-        self.unit = float(best.spread.inflation[self.column])
+    def __init__(self, refit: Refit, name: str, sign: float) -> None:
+        best = refit.best
+        self.refit, self.sign, self.place = refit, sign, best.index[name]
+        self.column = best.names.index(name)
         self.quantile = float(best.quantiles[self.column])
         self.half = float(best.halves[self.column])
-        self.refits = [self.refit.start()]
-        self.limit = best.limits(self.name)[0 if self.sign < 0 else 1]
+        self.limit = best.limits(name)[0 if sign < 0 else 1]
+        self.refits = [refit.start()]
 
     def value(self, at: Iterate) -> float:
         """Where the parameter was held."""
@@ -66,11 +48,31 @@ class _Side:
 
     def rise(self, at: Iterate) -> float:
         """Rise of the cost as a χ²."""
-        return (at.cost - self.best.cost) / self.unit
+        best = self.refit.best
+        return (at.cost - best.cost) / float(best.spread.inflation[self.column])
 
     def root(self, at: Iterate) -> float:
         """Root of the rise, straight along a parabola."""
         return math.sqrt(max(self.rise(at), 0.0))
+
+    @property
+    def better(self) -> bool:
+        """Whether a better point than the best was met."""
+        return min(map(self.rise, self.refits)) < -BETTER * self.quantile**2
+
+    def bracket(self) -> tuple[Iterate, Iterate | None]:
+        """The outermost refit below the cut, and the next one; none if the profile is open."""
+        last = max(i for i, at in enumerate(self.refits) if self.root(at) < self.quantile)
+        return self.refits[last], self.refits[last + 1] if last + 1 < len(self.refits) else None
+
+    @property
+    def bound(self) -> float:
+        """Where the root of the rise crosses that of the cut; where it never does, the limit."""
+        inner, outer = self.bracket()
+        if outer is None:
+            return self.limit
+        share = (self.quantile - self.root(inner)) / (self.root(outer) - self.root(inner))
+        return self.value(inner) + share * (self.value(outer) - self.value(inner))
 
     def follow(self, minima: Sequence[Array]) -> None:
         """Go outward until well beyond the cut and place the crossing; go on beyond the minima.
@@ -79,12 +81,10 @@ class _Side:
         """
         if len(self.refits) == 1:
             self._outward()
-            self._inward()
-        reach = PLACED * self.half
         for point in sorted(minima, key=lambda point: -self.sign * float(point[self.place])):
-            value = float(point[self.place])
-            edge = self.value(self.refits[-1]) if self.is_open else self.bound
-            if self.better or self.sign * (value - edge) <= reach:
+            value, open_ = float(point[self.place]), self.bracket()[1] is None
+            edge = self.value(self.refits[-1]) if open_ else self.bound
+            if self.better or self.sign * (value - edge) <= PLACED * self.half:
                 break
             found = self.refit.run(point, (self.column, value))
             if found is not None and self.rise(found) < self.quantile**2:
@@ -92,10 +92,9 @@ class _Side:
                 inside = [at for at in self.refits if self.sign * (self.value(at) - value) < 0.0]
                 self.refits = [*inside, found]
                 self._outward()
-                self._inward()
 
     def _outward(self) -> None:
-        """Go on from the outermost refit until well beyond the cut."""
+        """Go on from the outermost refit until well beyond the cut, and place its crossing."""
         step, refused = 0.5 * self.half, 0
         for _ in range(OUTWARD):
             last = self.refits[-1]
@@ -112,60 +111,31 @@ class _Side:
                 break
             if self.root(found) - self.root(last) < 0.35 * self.quantile:
                 step *= 1.6
-
-    def _inward(self) -> None:
-        """Place the outermost crossing of the cut."""
         for _ in range(INWARD):
-            inner, outer = self._bracket()
+            inner, outer = self.bracket()
             if outer is None or self.better:
                 break
             miss = min(abs(self.root(at) - self.quantile) for at in (inner, outer))
-            found = None
-            if miss > PLACED * self.quantile:
-                found = self._hold(self.bound, inner)
-            if found is None:
+            placed = miss <= PLACED * self.quantile
+            if placed or (found := self._hold(self.bound, inner)) is None:
                 break
             self.refits.append(found)
             self.refits.sort(key=lambda at: self.sign * self.value(at))
-
-    @property
-    def better(self) -> bool:
-        """Whether a better point than the best was met."""
-        return min(map(self.rise, self.refits)) < -BETTER * self.quantile**2
 
     def _hold(self, value: float, near: Iterate) -> Iterate | None:
         """Refit with the parameter held, starting from a refit near by; None if nothing is found.
 
         The others follow to first order; where that cannot be simulated they stay.
         """
-        shift = np.zeros(len(self.best.names))
-        shift[self.column] = (value - self.value(near)) / self.best.sizes[self.column]
-        ahead = near.residual + near.jacobian @ shift
+        shift = np.zeros(len(self.refit.best.names))
+        shift[self.column] = (value - self.value(near)) / self.refit.best.sizes[self.column]
+        ahead = near.gradient + near.normal @ shift
         held = np.arange(shift.size) == self.column
-        for step in (shift + damped_step(ahead, near.jacobian, 1e-9, held), shift):
-            found = self.refit.run(self.refit.moved(near, step), (self.column, value))
+        for step in (shift + damped_step(ahead, near.normal, 1e-9, held), shift):
+            found = self.refit.run(self.refit.moved(near.point, step), (self.column, value))
             if found is not None:
                 return found
         return None
-
-    def _bracket(self) -> tuple[Iterate, Iterate | None]:
-        """The outermost refit below the cut, and the next one."""
-        last = max(i for i, at in enumerate(self.refits) if self.root(at) < self.quantile)
-        return self.refits[last], self.refits[last + 1] if last + 1 < len(self.refits) else None
-
-    @property
-    def bound(self) -> float:
-        """Where the root of the rise crosses that of the cut; where it never does, the limit."""
-        inner, outer = self._bracket()
-        if outer is None:
-            return self.limit
-        share = (self.quantile - self.root(inner)) / (self.root(outer) - self.root(inner))
-        return self.value(inner) + share * (self.value(outer) - self.value(inner))
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the cost never reached the cut."""
-        return self._bracket()[1] is None
 
 
 class Tracing:
@@ -174,11 +144,11 @@ class Tracing:
     def __init__(self, best: BestPoint, name: str, tracker: Tracker) -> None:
         """Begin at the best point."""
         refit = Refit(best, tracker)
-        self.low, self.high = (_Side(best, name, refit, sign) for sign in (-1.0, 1.0))
+        self.name, self.sides = name, [_Side(refit, name, sign) for sign in (-1.0, 1.0)]
         self.stopped: str | None = None
         self._turned = False
 
-    def follow(self, minima: Sequence[Array]) -> None:
+    def follow(self, minima: Sequence[Array] = ()) -> None:
         """Follow the least cost to both sides, past the 95 % cut.
 
         The adjusted likelihood ratio: the rise of the cost over `Covariance.inflation` is χ² with
@@ -187,37 +157,38 @@ class Tracing:
         they are within the cut, whatever barrier lies between. It is incomplete if the deadline or
         Ctrl-C ended it: `ci95` is then that of what was done.
         """
+        low, high = self.sides
         try:
-            self.low.follow(minima)
+            low.follow(minima)
             self._turned = True
-            self.high.follow(minima)
+            high.follow(minima)
         except STOPPING as error:
             self.stopped = what_stopped(error)
 
     @property
     def refits(self) -> list[Iterate]:
         """All refits in the order of the parameter."""
-        return self.low.refits[::-1] + self.high.refits[1:]
+        return self.sides[0].refits[::-1] + self.sides[1].refits[1:]
 
     @property
     def better(self) -> Array | None:
         """A point that is better than the best."""
         least = min(self.refits, key=lambda at: at.cost)
-        return least.point if self.low.better or self.high.better else None
+        return least.point if any(side.better for side in self.sides) else None
 
     @property
     def profile(self) -> Profile:
         """What was found so far."""
-        low, high = self.low, self.high
+        low, high = self.sides
         return Profile(
-            name=low.name,
+            name=self.name,
             values=np.array([low.value(at) for at in self.refits]),
             rises=np.array([low.rise(at) for at in self.refits]),
             points=np.array([at.point for at in self.refits]),
             cut=low.quantile**2,
             ci95=(low.bound, high.bound if self._turned else high.value(high.refits[0])),
-            open_low=low.is_open,
-            open_high=high.is_open or not self._turned,
+            open_low=low.bracket()[1] is None,
+            open_high=high.bracket()[1] is None or not self._turned,
             stopped=self.stopped,
         )
 
@@ -230,34 +201,32 @@ def departures(best: BestPoint) -> Array:
     Given is the root of the rise over what a parabola has, less one; zero where a limit is next to
     the best point, infinite where nothing can be simulated.
     """
-    refit = Refit(best, Tracker(best.problem.objective))
-    start = refit.start()
+    refit, k = Refit(best, Tracker(best.problem.objective)), len(best.names)
+    start, out = refit.start(), np.zeros((k, 2))
     normal = start.jacobian.T @ start.jacobian
-    out = np.zeros((len(best.names), 2))
-    for i, name in enumerate(best.names):
-        others = np.arange(len(best.names)) != i
+
+    def least(residual: Array, others: NDArray[np.intp]) -> float:
+        """Sum of squares after one linear step of the other parameters."""
         inverse = np.linalg.pinv(normal[np.ix_(others, others)], rcond=1e-10, hermitian=True)
-        own = start.jacobian[:, others]
-        here = _least(start.residual, own, inverse)
+        slope = start.jacobian[:, others].T @ residual
+        return float(residual @ residual - slope @ inverse @ slope)
+
+    for i, (value, limits) in enumerate(zip(best.values[best.places], best.box.T, strict=True)):
+        others = np.delete(np.arange(k), i)
         stderr, half = float(best.spread.stderr[i]), float(best.halves[i])
-        value = best.values[best.index[name]]
-        low, high = best.limits(name)
-        for side, to_limit in enumerate((value - low, high - value)):
+        column = best.spread.matrix[:, i]
+        along = np.nan_to_num(column / column[i]) / best.sizes
+        for side, sign in enumerate((-1.0, 1.0)):
+            to_limit = abs(limits[side] - value)
             if not to_limit > 0.05 * half:
                 continue
             out[i, side] = np.inf
             for share in (1.0, 0.5, 0.25):
                 shift = min(share * half, to_limit)
-                along = best.along(name) * (-shift if side == 0 else shift) / best.sizes
-                residual = refit.residual(refit.moved(start, along))
+                residual = refit.residual(refit.moved(start.point, sign * shift * along))
                 if residual is not None:
-                    rise = (_least(residual, own, inverse) - here) / best.spread.inflation[i]
-                    out[i, side] = math.sqrt(max(rise, 0.0)) * stderr / shift - 1.0
+                    rise = least(residual, others) - least(start.residual, others)
+                    root = math.sqrt(max(rise / best.spread.inflation[i], 0.0))
+                    out[i, side] = root * stderr / shift - 1.0
                     break
     return out
-
-
-def _least(residual: Array, own: Array, inverse: NDArray[Any]) -> float:
-    """Sum of squares after one linear step of some parameters, from the inverse of their normal."""
-    slope = own.T @ residual
-    return float(residual @ residual - slope @ inverse @ slope)

@@ -1,8 +1,8 @@
 """What the error of a law leaves open: parameters that follow the curves about as well.
 
-Where a law misses part of the curves, its best point depends on what is asked of it: another weight
-of the samples, a window of them, another minimum of the cost. The range of a parameter is the hull
-of its values over such descriptions.
+Where a law misses part of the curves, its best point depends on the weights of the samples, the
+window of time that is fitted and on the minimum of the cost that is found. The range of a
+parameter is the hull of its values over such descriptions.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ def alike(
     samples, moved back towards the best point where they miss too much. After `budget` evaluations
     no further refit is begun.
     """
-    rise, refit = tolerance(best), Refit(best, tracker)
-    refit.enough = 0.01 * rise
+    most, refit = tolerance(best), Refit(best, tracker)
+    refit.enough = 0.01 * most
     allowed = tracker.objective.evaluations + budget
-    out = [best.values, *(point for point in minima if _rise(best, refit, point) <= rise)]
-    start = refit.start()
-    inverse = np.linalg.pinv(start.jacobian.T @ start.jacobian, rcond=1e-12, hermitian=True)
-    for column, name in enumerate(best.names):
-        for sign, limit in zip((-1.0, 1.0), best.limits(name), strict=True):
+    out = [best.values, *(point for point in minima if refit.rise(point) <= most)]
+    jacobian = refit.start().jacobian
+    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-12, hermitian=True)
+    for column, row in enumerate(inverse):
+        for limit, sign in zip(best.box[:, column], (-1.0, 1.0), strict=True):
             if tracker.objective.evaluations < allowed:
-                out += _held(best, refit, column, sign, limit, inverse[column], rise)
+                out += _held(refit, column, sign, float(limit), row, most)
     for weights in _weights(best):
         if tracker.objective.evaluations < allowed:
-            out += _towards(best, refit, weights, rise)
+            out += _towards(refit, weights, most)
     return out
 
 
@@ -92,20 +92,11 @@ def left_open(
         if new and tracker.objective.evaluations < allowed:
             found = refit.run(point, iterations=DESCENT)
             further += [] if found is None else [found.point]
-    values = np.array(points)[:, refit.places] + 0.0  # no -0
+    values = np.array(points)[:, best.places] + 0.0  # no -0
     ends = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
-    better, gain = tracker.best_values, best.cost - tracker.best_cost
-    lowest = refit.enough / ENOUGH * BETTER  # of a cut
-    return Open(
-        dict(zip(best.names, ends, strict=True)),
-        tuple(further),
-        better if gain > lowest else None,
-    )
-
-
-def _rise(best: BestPoint, refit: Refit, point: Array) -> float:
-    residual = refit.residual(point)
-    return math.inf if residual is None else float(residual @ residual) - best.cost
+    lower = best.cost - tracker.best_cost > refit.enough / ENOUGH * BETTER  # of a cut
+    better = tracker.best_values if lower else None
+    return Open(dict(zip(best.names, ends, strict=True)), tuple(further), better)
 
 
 def _weights(best: BestPoint) -> Iterator[Array]:
@@ -123,37 +114,42 @@ def _weights(best: BestPoint) -> Iterator[Array]:
         yield np.where(np.concatenate([*kept, priors]), HEAVIER, 1.0)
 
 
-def _towards(best: BestPoint, refit: Refit, weights: Array, rise: float) -> list[Array]:
+def _towards(refit: Refit, weights: Array, most: float) -> list[Array]:
     """Refit with other weights, moved towards the best point until it follows the curves."""
+    best, share = refit.best, 1.0
     found = refit.run(best.values, weights=weights, iterations=ITERATIONS)
     if found is None:
         return []
-    step, share = refit.taken(found.point), 1.0
+    step = (found.point - best.values)[best.places] / best.sizes
     for _ in range(TRIALS):
-        point = refit.moved(refit.start(), share * step)
-        missed = _rise(best, refit, point)
-        if missed <= rise:
+        point = refit.moved(best.values, share * step)
+        missed = refit.rise(point)
+        if missed <= most:
             return [point]
-        share *= min(max(math.sqrt(rise / missed), 0.3), 0.9) if math.isfinite(missed) else 0.5
+        share *= _nearer(most, missed, 0.9)
     return []
 
 
 def _held(
-    best: BestPoint, refit: Refit, column: int, sign: float, limit: float, along: Array, rise: float
+    refit: Refit, column: int, sign: float, limit: float, along: Array, most: float
 ) -> list[Array]:
     """Refit with one parameter held as far off as the curves are followed about as well."""
-    size, value = best.sizes[column], best.values[refit.places[column]]
+    best = refit.best
+    size, value = best.sizes[column], best.values[best.places[column]]
     if not along[column] > 0.0:
         return []
-    off = min(math.sqrt(rise * along[column]), abs(limit - value) / size)
-    for _ in range(TRIALS):
-        if off <= 0.0:
-            break
-        point = refit.moved(refit.start(), sign * off * along / along[column])
+    off = min(math.sqrt(most * along[column]), abs(limit - value) / size)
+    for _ in range(TRIALS if off > 0.0 else 0):
+        point = refit.moved(best.values, sign * off * along / along[column])
         hold = (column, value + sign * off * size)
         found = refit.run(point, hold, iterations=ITERATIONS)
         missed = math.inf if found is None else found.cost - best.cost
-        if found is not None and missed <= rise:
+        if found is not None and missed <= most:
             return [found.point]
-        off *= min(max(math.sqrt(rise / missed), 0.3), 0.8) if math.isfinite(missed) else 0.5
+        off *= _nearer(most, missed, 0.8)
     return []
+
+
+def _nearer(most: float, missed: float, largest: float) -> float:
+    """Factor of a step whose rise was too large; the rise is about the square of the step."""
+    return min(max(math.sqrt(most / missed), 0.3), largest) if math.isfinite(missed) else 0.5

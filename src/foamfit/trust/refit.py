@@ -10,11 +10,8 @@ from foamfit.arrays import Array
 from foamfit.fitting.levenberg import Iterate, descend
 from foamfit.fitting.losses import soften, softness
 from foamfit.fitting.search import Tracker
-from foamfit.springs.law import least_eps_star
 from foamfit.trust.best_point import BestPoint
 
-# Largest drop of the stress from A1 to C2 over the stress at A1.
-LAST_DROP = 0.999
 # A refit ends where the expected gain of the cost is below this share of the 95 % cut, or after so
 # many steps. Refits that end earlier depend on where they began, and so on rounding.
 ENOUGH, STEPS = 1e-6, 40
@@ -31,19 +28,9 @@ class Refit:
     shift: Array | float = 0.0
 
     def __post_init__(self) -> None:
-        """Lay out the scaled parameters."""
-        best, index = self.best, self.best.index
-        self.places = np.array([index[name] for name in best.names])
-        self.low, self.high = np.array([best.limits(name) for name in best.names]).T
-        self.complete = best.problem.space().complete
-        self.drops = [
-            ([index[own + "k0"], index[own + "eps_a"]], index[own + "dsigma"])
-            for own in (name.removesuffix("dsigma") for name in best.names if "_dsigma" in name)
-        ]
-        self.stars = [
-            ([index[own + "k0"], index[own + "kc"]], index[own + "eps_star"])
-            for own in (name.removesuffix("eps_star") for name in best.names if "_eps_star" in name)
-        ]
+        """Find the box of the parameters and the gain at which a refit ends."""
+        best = self.best
+        self.space = best.problem.space()
         cuts = best.quantiles**2 * best.spread.inflation  # NaN where the test says nothing
         self.enough = ENOUGH * float(min(cuts[np.isfinite(cuts)], default=1.0))
 
@@ -66,24 +53,20 @@ class Refit:
         residual = self.tracker.residual(point, self.shift)
         return residual if self.tracker.objective.failures == failures else None
 
-    def point(self, scaled: Array, low: Array, high: Array) -> Array:
+    def rise(self, point: Array) -> float:
+        """Rise of the cost from the best point; infinite where nothing can be simulated."""
+        residual = self.residual(point)
+        return np.inf if residual is None else float(residual @ residual) - self.best.cost
+
+    def point(self, scaled: Array, box: Array) -> Array:
         """Vector of all parameters from the scaled ones, moved between these limits (SI)."""
         point = self.best.values.copy()
-        point[self.places] = np.clip(scaled * self.best.sizes, low, high)
-        for sigma_a, drop in self.drops:  # no spring's stress at C2 falls below zero
-            k0, eps_a = point[sigma_a]
-            point[drop] = max(point[drop], -LAST_DROP * k0 * eps_a / (1.0 - eps_a))
-        for stiffnesses, star in self.stars:  # branch c never lies before branch a
-            point[star] = max(point[star], least_eps_star(*point[stiffnesses]))
-        return self.complete(point)
+        point[self.best.places] = np.clip(scaled * self.best.sizes, *box)
+        return self.space.admit(point, self.best.places[box[0] == box[1]])
 
-    def moved(self, at: Iterate, step: Array) -> Array:
-        """Point that is off an iterate by a scaled step, within the limits."""
-        return self.point(at.point[self.places] / self.best.sizes + step, self.low, self.high)
-
-    def taken(self, point: Array) -> Array:
-        """Scaled step from the best point to another one."""
-        return np.asarray((point - self.best.values)[self.places] / self.best.sizes)
+    def moved(self, at: Array, step: Array) -> Array:
+        """Point that is off another by a scaled step, within the limits."""
+        return self.point(at[self.best.places] / self.best.sizes + step, self.best.box)
 
     def run(
         self,
@@ -97,28 +80,26 @@ class Refit:
 
         `weights` (n_data,) multiply the squares. Returns None if the start cannot be simulated.
         """
-        root = np.sqrt(weights)
-        rows = np.reshape(root, (-1, 1))
         problem, names, sizes = self.best.problem, self.best.names, self.best.sizes
-        low, high = self.low.copy(), self.high.copy()
+        root, box = np.sqrt(weights), self.best.box.copy()
         if hold is not None:
-            low[hold[0]] = high[hold[0]] = hold[1]
+            box[:, hold[0]] = hold[1]
 
-        def point(scaled: Array) -> Array:
-            return self.point(scaled, low, high)
+        def residual(scaled: Array) -> Array:
+            return np.asarray(root * self.tracker.residual(self.point(scaled, box), self.shift))
 
         def jacobian(scaled: Array) -> Array:
-            slopes: Array = problem.linear.slopes(point(scaled), names) * rows
+            point = self.point(scaled, box)
+            slopes: Array = problem.linear.slopes(point, names) * np.reshape(root, (-1, 1))
             if problem.objective.loss == "linear":
                 return slopes * sizes
-            differences = problem.objective.differences(point(scaled)) - self.shift
-            return self._jacobian(differences, slopes)
+            return self._jacobian(problem.objective.differences(point) - self.shift, slopes)
 
-        scaled = np.clip(start[self.places], low, high) / sizes
-        if self.residual(point(scaled)) is None:
+        scaled = np.clip(start[self.best.places], *box) / sizes
+        if self.residual(self.point(scaled, box)) is None:
             return None
+        limits = box[0] / sizes, box[1] / sizes
         end = descend(
-            lambda scaled: root * self.tracker.residual(point(scaled), self.shift), jacobian,
-            scaled, (low / sizes, high / sizes), iterations, least=self.enough, damping=1e-6,
-        )  # fmt: skip
-        return replace(end, point=point(end.point))
+            residual, jacobian, scaled, limits, iterations, least=self.enough, damping=1e-6
+        )
+        return replace(end, point=self.point(end.point, box))

@@ -6,15 +6,18 @@ import importlib.util
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
-from foamfit.trust.best_point import BestPoint, m_estimate
+from foamfit.trust.best_point import BestPoint
 from foamfit.trust.refit import Refit
-from foamfit.trust.residuals.noise_process import NoiseProcess
+from foamfit.trust.residuals.noise_process import NoiseProcess, parts
+from foamfit.trust.sentences import say
 
 # Farthest that a walker of a Markov chain begins from the best point along a direction that the
 # test does not fix, over the scales of the parameters; and how often its way there is halved where
@@ -34,40 +37,34 @@ def block_length(process: NoiseProcess, n: int) -> int:
     return int(min(max(round(length), 1), max(n // 4, 1)))
 
 
-def _scaled_residual(residual: Array, process: NoiseProcess, like: Array, length: int) -> Array:
-    """Residual of one curve for circular blocks of it (Politis & Romano 1992).
+def _source(
+    residual: Array, like: Array, process: NoiseProcess, law: bool
+) -> Callable[[np.random.Generator], Array]:
+    """What draws the noise of one curve: its process beside an error of the law, else its residual.
 
-    A factor corrects that residuals are smaller than the noise was, which was read off `like`, and
-    that blocks break correlation at their ends: sums over the curve vary as those of its noise.
+    From the residual, circular blocks with random starts (Politis & Romano 1992). A factor corrects
+    that residuals are smaller than the noise was, which was read off `like`, and that blocks break
+    correlation at their ends: sums over the curve vary as those of its noise.
     """
+    n, length = residual.size, block_length(process, residual.size)
     lags = process.autocovariance(length) / process.variance
     within = 1.0 + 2.0 * float((1.0 - np.arange(1, length) / length) @ lags[1:])
     power = max(float(np.var(like)), 1e-300)
     factor = process.variance / power * max(process.tau / within, 1.0)
-    return np.asarray((residual - residual.mean()) * math.sqrt(factor))
+    scaled = (residual - residual.mean()) * math.sqrt(factor)
+
+    def blocks(rng: np.random.Generator) -> Array:
+        starts = rng.integers(0, n, -(-n // length))
+        return np.asarray(scaled[((starts[:, None] + np.arange(length)) % n).ravel()[:n]])
+
+    return partial(process.draw, n) if law else blocks
 
 
-def _draw(residual: Array, length: int, rng: np.random.Generator) -> Array:
-    """As many samples as the residual has, from circular blocks with random starts."""
-    n = residual.size
-    starts = rng.integers(0, n, -(-n // length))
-    drawn = (starts[:, None] + np.arange(length)) % n
-    return np.asarray(residual[drawn.ravel()[:n]])
-
-
-@dataclass(frozen=True, eq=False)
-class Refits:
+class Refits(NamedTuple):
     """Parameters refitted to resampled data: (m, k) values (SI), and what ended them early."""
 
     values: Array
-    stopped: str | None = None
-
-
-def _misfits(best: BestPoint) -> Array:
-    """Residuals of the curves that hold an error of the law, zero for the others, (n_data,)."""
-    pairs = zip(best.problem.objective.sizes, best.errors, strict=True)
-    found = np.concatenate([np.full(size, error.found) for size, error in pairs])
-    return np.where(found, best.residual[: found.size], 0.0)
+    stopped: str | None
 
 
 def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = None) -> Refits:
@@ -82,32 +79,23 @@ def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = 
     objective = best.problem.objective
     tracker = Tracker(objective) if tracker is None else tracker
     rng = np.random.default_rng([seed, 1])
-    ends = np.cumsum(objective.sizes)
-    priors = len(objective.priors)
-    _, pseudo = m_estimate(best.residual, objective.sizes, objective.loss)
-    sources = []
-    for n, part, like, process in zip(
-        objective.sizes, np.split(best.residual, ends)[:-1], np.split(pseudo, ends)[:-1],
-        best.spread.noise, strict=True,
-    ):  # fmt: skip
-        length = block_length(process, n)
-        sources.append((_scaled_residual(part, process, like, length), length))
-    kept = _misfits(best)
+    priors, pseudo = len(objective.priors), best.weighted[1]
+    sources, fitted = [], best.residual[: objective.n_data].copy()
+    for part, process, error in zip(
+        parts(objective.sizes), best.spread.noise, best.errors, strict=True
+    ):
+        sources.append(_source(best.residual[part], pseudo[part], process, error.found))
+        if error.found:
+            fitted[part] = 0.0
     out: list[Array] = []
     stopped = None
     try:
         for _ in range(draws):
-            drawn = [
-                process.draw(part.size, rng) if error.found else _draw(part, length, rng)
-                for (part, length), error, process in zip(
-                    sources, best.errors, best.spread.noise, strict=True
-                )
-            ]
-            left = best.residual[: objective.n_data] - kept - np.concatenate(drawn)
+            left = fitted - np.concatenate([draw(rng) for draw in sources])
             refit = Refit(best, tracker, np.append(left, rng.standard_normal(priors)))
             end = refit.run(best.values)
             assert end is not None  # the best point can be simulated
-            out.append(end.point[refit.places])
+            out.append(end.point[best.places])
     except STOPPING as error:
         stopped = what_stopped(error)
     return Refits(np.array(out).reshape(-1, len(best.names)), stopped)
@@ -117,13 +105,12 @@ def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = 
 class MarkovChain:
     """A Markov chain of the parameters."""
 
-    samples: Array  # (m, k): Draws after the burn-in, all walkers, SI
-    # Steps of each walker, and how many of the first were left out.
-    steps: int
-    burn_in: int
-    walkers: int  # Number of walkers
-    autocorrelation: float  # Integrated autocorrelation time of the slowest parameter, steps
-    stopped: str | None = None  # What ended it before its steps were done
+    samples: Array  # (m, k): draws after the burn-in, all walkers, SI
+    steps: int  # of each walker
+    burn_in: int  # the first of them, which were left out
+    walkers: int
+    autocorrelation: float  # integrated autocorrelation time of the slowest parameter, steps
+    stopped: str | None = None  # what ended it before its steps were done
 
     @property
     def converged(self) -> bool:
@@ -134,11 +121,8 @@ class MarkovChain:
         """What the autocorrelation says of the chain."""
         times = (self.steps - self.burn_in) / self.autocorrelation
         enough = "enough" if self.converged else "too short: at least 50 are needed"
-        return (
-            f"Markov chain of {self.walkers} walkers and {self.steps} steps, the first "
-            f"{self.burn_in} left out: {times:.0f} autocorrelation times of the slowest parameter, "
-            f"which is {enough}." + (f" It was stopped by {self.stopped}." if self.stopped else "")
-        )
+        told = say("interval", "chain", **vars(self), times=times, enough=enough)
+        return say("interval", "stopped", told=told, by=self.stopped) if self.stopped else told
 
 
 def check_emcee() -> None:
@@ -165,18 +149,18 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     check_emcee()
     import emcee
 
-    tracker = Tracker(best.problem.objective) if tracker is None else tracker
-    refit = Refit(best, tracker)
-    start = refit.start()
+    objective = best.problem.objective
+    refit = Refit(best, Tracker(objective) if tracker is None else tracker)
+    low, high = best.box
     variances = [process.variance * process.tau for process in best.spread.noise]
-    weights = np.repeat(1.0 / np.array(variances), best.problem.objective.sizes)
-    weights = np.append(weights, np.ones(len(best.problem.objective.priors)))
+    weights = np.repeat(1.0 / np.array(variances), objective.sizes)
+    weights = np.append(weights, np.ones(len(objective.priors)))
 
     def log_probability(scaled: Array) -> float:
-        point = start.point.copy()
-        point[refit.places] = scaled * best.sizes
-        inside = np.all((point[refit.places] >= refit.low) & (point[refit.places] <= refit.high))
-        residual = refit.residual(refit.complete(point)) if inside else None
+        point = best.values.copy()
+        own = point[best.places] = scaled * best.sizes
+        inside = np.all((own >= low) & (own <= high))
+        residual = refit.residual(refit.space.complete(point)) if inside else None
         return -0.5 * float(weights @ residual**2) if residual is not None else -np.inf
 
     count, k = walkers(best), len(best.names)
@@ -188,7 +172,7 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     steps_done: list[Array] = []  # emcee would allocate all of them at once
     stopped = None
     try:
-        begin = _begin(best, refit, log_probability, count, np.random.default_rng([seed, 2]))
+        begin = _begin(best, log_probability, count, np.random.default_rng([seed, 2]))
         if begin is None:
             stopped = "the best point, next to which nothing can be simulated"
         else:
@@ -199,31 +183,32 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     except STOPPING as error:
         stopped = what_stopped(error)
     done = len(steps_done)
-    burn_in = done // 5
-    chain = np.array(steps_done[burn_in:]).reshape(-1, count, k)
+    chain = np.array(steps_done[done // 5 :]).reshape(-1, count, k)
     with np.errstate(invalid="ignore", divide="ignore"):  # of a walker that never moved
         times = emcee.autocorr.integrated_time(chain, tol=0, quiet=True) if done > 10 else [np.inf]
     slowest = float(np.max(np.nan_to_num(times, nan=np.inf)))
-    return MarkovChain(chain.reshape(-1, k) * best.sizes, done, burn_in, count, slowest, stopped)
+    return MarkovChain(chain.reshape(-1, k) * best.sizes, done, done // 5, count, slowest, stopped)
 
 
 def _begin(
-    best: BestPoint, refit: Refit, log_probability: Callable[[Array], float], count: int,
+    best: BestPoint,
+    log_probability: Callable[[Array], float],
+    count: int,
     rng: np.random.Generator,
-) -> Array | None:  # fmt: skip
+) -> Array | None:
     """Points about the best one at which walkers begin, scaled, (count, k); None if there are none.
 
     Half a standard error away along what the test fixes, no more than `FARTHEST` along the rest.
     """
     noise = max(process.variance * process.tau for process in best.spread.noise)
     _, singular, axes = np.linalg.svd(best.jacobian * best.sizes, full_matrices=False)
-    reach = 0.5 * math.sqrt(noise) / np.maximum(singular, 1e-300)
-    low, high = refit.low / best.sizes, refit.high / best.sizes
-    middle = best.values[refit.places] / best.sizes
+    reach = np.minimum(0.5 * math.sqrt(noise) / np.maximum(singular, 1e-300), FARTHEST)
+    low, high = best.box / best.sizes
     begin = []
     for _ in range(count):
-        away = (np.minimum(reach, FARTHEST) * rng.standard_normal(reach.size)) @ axes
+        away = (reach * rng.standard_normal(reach.size)) @ axes
         for halving in range(HALVINGS):
+            middle = best.values[best.places] / best.sizes
             drawn = np.clip(middle + 0.5**halving * away, low, high)
             if np.isfinite(log_probability(drawn)):
                 begin.append(drawn)

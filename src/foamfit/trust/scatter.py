@@ -34,45 +34,6 @@ class Spread:
     count: int
 
 
-@dataclass(frozen=True, eq=False)
-class _Estimates:
-    """Estimates in the directions in which their errors are independent."""
-
-    values: Array
-    ones: Array
-    variances: Array
-
-    @classmethod
-    def of(cls, values: Array, errors: Array) -> _Estimates:
-        variances, axes = np.linalg.eigh(0.5 * (errors + errors.T))
-        variances = np.maximum(variances, 1e-12 * max(float(variances[-1]), 1e-300))
-        return cls(axes.T @ values, axes.sum(axis=0), variances)
-
-    def mean(self, tau2: float) -> tuple[float, float]:
-        """Generalised mean at a spread, and the inverse of its variance."""
-        weights = 1.0 / (self.variances + tau2)
-        precision = float(weights @ self.ones**2)
-        return float(weights @ (self.ones * self.values)) / precision, precision
-
-    def q(self, tau2: float) -> float:
-        """Sum of squares about the mean in units of the errors and the spread."""
-        rest = self.values - self.mean(tau2)[0] * self.ones
-        return float(np.sum(rest**2 / (self.variances + tau2)))
-
-    def criterion(self, tau2: float) -> float:
-        """Twice the negative logarithm of the restricted likelihood."""
-        bent = math.log(self.mean(tau2)[1])
-        return float(np.sum(np.log(self.variances + tau2))) + bent + self.q(tau2)
-
-    def information(self, tau2: float) -> float:
-        """Expected information on τ²: half the trace of PP."""
-        weights = 1.0 / (self.variances + tau2)
-        total = float(weights @ self.ones**2)
-        once, twice = weights**2 * self.ones**2, weights**3 * self.ones**2
-        trace = float(np.sum(weights**2)) - 2.0 * float(twice.sum()) / total
-        return 0.5 * (trace + (float(once.sum()) / total) ** 2)
-
-
 def common_and_spread(values: Array, errors: Array) -> Spread:
     """Common value and spread of estimates (n,) with errors of covariance (n, n), n at least 2.
 
@@ -80,33 +41,51 @@ def common_and_spread(values: Array, errors: Array) -> Spread:
     t of n-1 degrees of freedom; that of the spread is the generalised Q profile (Viechtbauer 2007,
     Stat. Med. 26, 37): Q(τ²) has the χ² distribution of n-1 degrees of freedom.
     """
-    n, seen = values.size, _Estimates.of(values, errors)
-    scale = float(np.var(values, ddof=1))
-    least = SMALLEST**2 * float(seen.variances[0])
-    most = max(LARGEST**2 * scale, 2.0 * least)
+    n = values.size
+    # In the directions in which the errors are independent.
+    variances, axes = np.linalg.eigh(0.5 * (errors + errors.T))
+    variances = np.maximum(variances, 1e-12 * max(float(variances[-1]), 1e-300))
+    seen, ones = axes.T @ values, axes.sum(axis=0)
+
+    def mean(tau2: float) -> tuple[float, float]:
+        """Generalised mean at a spread, and the inverse of its variance."""
+        weights = 1.0 / (variances + tau2)
+        precision = float(weights @ ones**2)
+        return float(weights @ (ones * seen)) / precision, precision
+
+    def q(tau2: float) -> float:
+        """Sum of squares about the mean in units of the errors and the spread."""
+        return float(np.sum((seen - mean(tau2)[0] * ones) ** 2 / (variances + tau2)))
+
+    def criterion(tau2: float) -> float:
+        """Twice the negative logarithm of the restricted likelihood."""
+        return float(np.sum(np.log(variances + tau2))) + math.log(mean(tau2)[1]) + q(tau2)
+
+    least = SMALLEST**2 * float(variances[0])
+    most = max(LARGEST**2 * float(np.var(values, ddof=1)), 2.0 * least)
     grid = np.geomspace(max(least, 1e-9 * most), most, 40)
-    costs = [seen.criterion(0.0), *(seen.criterion(float(tau2)) for tau2 in grid)]
-    at, tau2 = int(np.argmin(costs)), 0.0
+    costs = [criterion(0.0), *map(criterion, grid)]
+    at, tau2, error = int(np.argmin(costs)), 0.0, None
     if at > 0:
-        ends = np.log([grid[max(at - 2, 0)], grid[min(at, grid.size - 1)]])
-        found = minimize_scalar(
-            lambda u: seen.criterion(math.exp(u)), bounds=tuple(ends), method="bounded",
-            options={"xatol": 1e-8},
-        )  # fmt: skip
-        tau2 = math.exp(float(found.x))
-        tau2 = tau2 if seen.criterion(tau2) < costs[0] else 0.0
-    mean, precision = seen.mean(tau2)
-    stderr = math.sqrt(seen.q(tau2) / (n - 1) / precision)
+        ends = (math.log(grid[max(at - 2, 0)]), math.log(grid[min(at, grid.size - 1)]))
+        best = minimize_scalar(
+            lambda u: criterion(math.exp(u)), bounds=ends, method="bounded", options={"xatol": 1e-8}
+        )
+        tau2 = math.exp(float(best.x)) if best.fun < costs[0] else 0.0
+    if tau2 > 0.0:  # from the expected information on τ², half the trace of PP
+        weights = 1.0 / (variances + tau2)
+        once, twice = (float(np.sum(weights**power * ones**2)) for power in (2, 3))
+        total = float(weights @ ones**2)
+        trace = float(np.sum(weights**2)) - 2.0 * twice / total + (once / total) ** 2
+        error = 0.5 / math.sqrt(max(0.5 * trace, 1e-300) * tau2)
+    middle, precision = mean(tau2)
+    stderr = math.sqrt(q(tau2) / (n - 1) / precision)
     half = float(stats.t.ppf(0.975, n - 1)) * stderr
-    ends95 = tuple(
-        math.sqrt(_crossing(seen.q, float(stats.chi2.ppf(p, n - 1)), most)) for p in (0.975, 0.025)
+    low, high = (
+        math.sqrt(_crossing(q, float(stats.chi2.ppf(p, n - 1)), most)) for p in (0.975, 0.025)
     )
-    error = None
-    if tau2 > 0.0:
-        error = 0.5 / math.sqrt(max(seen.information(tau2), 1e-300) * tau2)
-    return Spread(
-        mean, stderr, (mean - half, mean + half), math.sqrt(tau2), error, (ends95[0], ends95[1]), n
-    )
+    ci95, tau_ci95 = (middle - half, middle + half), (low, high)
+    return Spread(middle, stderr, ci95, math.sqrt(tau2), error, tau_ci95, n)
 
 
 def _crossing(q: Callable[[float], float], level: float, most: float) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import copyreg
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -26,6 +26,7 @@ from foamfit.springs.spring import LawSpring, Relaxation
 ENTRY_POINTS = "foamfit.laws"
 _LAWS = {law.kind: law for law in (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)}
 _OWN = tuple(_LAWS)  # laws that the kernels know
+_TEXTS: dict[str, str] = {}  # of the law files that were loaded, by path
 _asked_packages: list[bool] = []
 
 
@@ -118,28 +119,52 @@ def load_file(path: str | Path) -> tuple[Law, ...]:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a Python file that defines a Law")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: the file cannot be read ({error})") from None
+    found = _run(str(path), text)
+    _TEXTS[str(path)] = text
+    return found
+
+
+def texts() -> dict[str, str]:
+    """Return the texts of the law files that were loaded, by path, for `load_texts`."""
+    return dict(_TEXTS)
+
+
+def load_texts(given: Mapping[str, str]) -> None:
+    """Make the laws known that another process has loaded from files; see `load_file`."""
+    for path, text in given.items():
+        if _TEXTS.get(path) != text:
+            _run(path, text)
+            _TEXTS[path] = text
+
+
+def _run(path: str, text: str) -> tuple[Law, ...]:
+    """Run the text of a law file and register its laws, all or none."""
     before = dict(_LAWS)
-    name = f"foamfit_law_{path.stem}"
-    spec = importlib.util.spec_from_loader(name, loader=None, origin=str(path))
+    name = f"foamfit_law_{Path(path).stem}"
+    spec = importlib.util.spec_from_loader(name, loader=None, origin=path)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
-    module.__file__ = str(path)
+    module.__file__ = path
     sys.modules[name] = module
     try:
-        exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), module.__dict__)
+        exec(compile(text, path, "exec"), module.__dict__)
         given = [one for one in vars(module).values() if isinstance(one, Law)]
-        found = {one.kind: one for one in given if one.kind not in _OWN}
-        for one in found.values():
-            register(one)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except Exception as error:
+        kinds_of = {one.kind: one for one in given if one.kind not in _OWN}
+        found = tuple(register(one) for one in kinds_of.values())
+    except (Exception, SystemExit) as error:
+        _LAWS.clear()
+        _LAWS.update(before)
+        if isinstance(error, InputError):
+            raise InputError(f"{path}: {error}") from None
         what = f"{type(error).__name__}: {error}".splitlines()[0]
         raise InputError(f"{path}: the file cannot be run ({what})") from None
     if not found:
         raise InputError(f"{path}: the file defines no law; make a foamfit.Law at its top level")
-    _LAWS.update({kind: one for kind, one in before.items() if kind not in found})
-    return tuple(found.values())
+    return found
 
 
 def _load_packages() -> None:

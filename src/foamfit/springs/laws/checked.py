@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.springs.laws import followed
-from foamfit.springs.laws.record import ADMISSIBLE, COMMON, Between, Functions, Law, Param
+from foamfit.springs.laws.record import ADMISSIBLE, COMMON, EPS, Between, Functions, Law, Param
 
 SCALES = {"one": 1.0, "strain": 0.5, "stress": 1e6, "slope": 2e6, "damping": 1e3, "duration": 1e-3}
 _UP = np.linspace(0.0, 0.5, 101)
@@ -72,9 +73,43 @@ def _missing(law: Law) -> str | None:
     return f"the function {absent[0]} is missing" if absent else None
 
 
+def _overrun(law: Law, values: Array) -> str | None:
+    """What is wrong with the length of row and state.
+
+    Compiled functions check no index, and would write into the memory of others: so the law is
+    first followed as it was written.
+    """
+    given = law.functions if isinstance(law.functions, Functions) else law.functions()
+    written: list[Any] = [getattr(one, "py_func", one) for one in given]
+    plain = Functions(*written)
+    if any(one.__module__.startswith("foamfit.") for one in written):
+        return None  # the paper's laws call what Python cannot
+    columns, states = followed.sizes_of(law)
+    row, state = np.zeros(columns), np.zeros(states)
+    try:
+        with np.errstate(all="ignore"):
+            plain.fill(values, row)
+            plain.begin(row, state)
+            for strain in TRIED[:: TRIED.size // 8]:
+                for _ in range(len(law.branches)):
+                    if plain.leaves(row, state, strain):
+                        plain.switch(row, state, strain > state[EPS])
+                plain.settle(row, state, strain)
+    except IndexError:
+        return (
+            f"a function goes beyond the {columns} numbers of row or the {states} of state; give "
+            "the law as many columns and states as it uses"
+        )
+    except Exception:
+        return None  # the trial of the compiled functions says what is wrong
+    return None
+
+
 def _trial(law: Law) -> str | None:
     """What is wrong along a loading and unloading at start values."""
     values = start_values(law)
+    if (wrong := _overrun(law, values)) is not None:
+        return wrong
     shown = ", ".join(f"{n} = {v:g}" for n, v in zip(law.own, values, strict=True))
     try:
         if followed.row_of(law, values) is None:

@@ -1,7 +1,6 @@
-"""What a result says of a law: read from fit.json or joint.json, or from their content.
+"""What a result says of a law: read from fit.json or joint.json.
 
-The files are the contract: a result in memory is read as its file would be, so that both give the
-same numbers.
+A result in memory is read by the content of its file, so that both give the same numbers.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from foamfit.fitting.curves import DRIVES
 from foamfit.fitting.links import RATES
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.report.folder import load_result
-from foamfit.results import SCHEMA
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name
 
@@ -35,7 +33,7 @@ _UNCOUNTED = {
 
 
 class HasContent(Protocol):
-    """A result in memory: it gives the content of its file."""
+    """A result in memory."""
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of its file."""
@@ -68,10 +66,7 @@ class Identified:
 
 
 class Miss(NamedTuple):
-    """How far a curve of a fitted test was missed, and its noise if that is known.
-
-    Both are over the measured range: the RMS, and one standard deviation.
-    """
+    """Misfit (RMS) of a curve of a fitted test and its noise, both over the measured range."""
 
     misfit: float
     noise: float | None
@@ -103,8 +98,7 @@ class Source:
     def law_error(self, channel: str, noise: float) -> float:
         """RMS of what the law missed of the fitted tests beyond their noise, over the range.
 
-        `noise` stands for that of a test whose noise the result does not tell: one standard
-        deviation over the range.
+        `noise` (over the range) is taken for tests whose noise the result does not tell.
         """
         squares = [
             max(miss.misfit**2 - (noise if miss.noise is None else miss.noise) ** 2, 0.0)
@@ -127,15 +121,15 @@ def read_source(result: HasContent | str | Path) -> Source:
         If there is no result, or it lacks what a prediction needs; the message names the key.
     """
     if isinstance(result, str | Path):
-        path = _file(Path(result))
-        return _source(load_result(path), str(result))
+        return _source(_Item(load_result(_file(Path(result))), str(result)))
     if not hasattr(result, "to_json_dict"):
         raise InputError(
             f"a prediction is made from a result of fit or joint or the path of one, not from "
             f"a {type(result).__name__}"
         )
     content = result.to_json_dict()
-    return _source(content, str(content.get("test") or content.get("name") or "the result"))
+    where = content.get("test") or content.get("name") or "the result"
+    return _source(_Item(content, str(where)))
 
 
 def _file(path: Path) -> Path:
@@ -149,50 +143,84 @@ def _file(path: Path) -> Path:
     return path / "fit.json"
 
 
-def _source(content: Mapping[str, Any], where: str) -> Source:
-    if content.get("schema") != SCHEMA:
-        raise InputError(f"{where} has schema {content.get('schema')}, not {SCHEMA}")
+@dataclass(frozen=True)
+class _Item:
+    """An object of a JSON file, and what messages call it."""
+
+    content: Any
+    where: str
+
+    def get(self, key: str) -> Any:
+        """Value of a key; None if the item is no object, or does not have it."""
+        return self.content.get(key) if isinstance(self.content, Mapping) else None
+
+    def item(self, key: str) -> _Item:
+        """What stands under a key."""
+        return _Item(self.get(key), f"{self.where}: {key}")
+
+    def items(self, key: str) -> dict[str, _Item]:
+        """The items of an object that must be there."""
+        found = self.get(key)
+        if not isinstance(found, Mapping):
+            raise InputError(f"{self.where} has no object '{key}', which a prediction needs")
+        return {name: _Item(value, f"{self.where}: {name}") for name, value in found.items()}
+
+    @property
+    def number(self) -> float:
+        """The item as a finite number."""
+        value = self.content
+        known = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (known and math.isfinite(value)):
+            raise InputError(f"{self.where} is {value!r}; it must be a number")
+        return float(value)
+
+    @property
+    def maybe(self) -> float | None:
+        """The item as a number, if there is one."""
+        return None if self.content is None else self.number
+
+    @property
+    def error(self) -> float | None:
+        """The item as a standard error; None if there is none, or it is zero."""
+        number = self.maybe
+        if number is not None and number < 0.0:
+            raise InputError(f"{self.where} is {self.content!r}; it must not be negative")
+        return number or None
+
+    @property
+    def pair(self) -> Pair | None:
+        """The item as the ends of an interval; None if there is none, or a side is open."""
+        if self.content is None:
+            return None
+        if not isinstance(self.content, list | tuple) or len(self.content) != 2:
+            raise InputError(f"{self.where} is {self.content!r}; it must be two numbers")
+        low, high = (_Item(end, self.where).maybe for end in self.content)
+        return None if low is None or high is None else (low, high)
+
+
+def _source(given: _Item) -> Source:
+    """What the content of fit.json or joint.json says."""
+    where, content = given.where, given.content
     if not isinstance(content.get("parameters"), Mapping) or "model" not in content:
         raise InputError(
             f"{where} is not the result of a fit or of a joint fit (fit.json, joint.json)"
         )
-    joint = "tests" in content
-    relaxation = content.get("relaxation", 0)
+    joint, drive = "tests" in content, content.get("drive")
     try:
-        model = Model.parse(content["model"], relaxation)
+        model = Model.parse(content["model"], content.get("relaxation", 0))
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    drive = content.get("drive")
     if drive not in (*DRIVES, None) or (drive is None and not joint):
         raise InputError(f"{where}: drive is {drive!r}; it must be one of {', '.join(DRIVES)}")
-    tests = _mapping(content, "tests", where) if joint else {}
-    data = content.get("data")
-    single = data.get("rate") if isinstance(data, Mapping) and not joint else None
-    given = {name: one.get("rate") for name, one in tests.items() if isinstance(one, Mapping)}
+    tests = given.items("tests") if joint else {"": given}
     rates = {
-        name: None if rate is None else _number(rate, f"{where}: rate")
-        for name, rate in (given if joint else {"": single}).items()
+        name: (one if joint else one.item("data")).item("rate").maybe for name, one in tests.items()
     }
-    # What a record does not say exactly is its own, and no other test's.
-    parameters = {
-        name: _parameter(item, joint, rates, f"{where}: {name}")
-        for name, item in content["parameters"].items()
-        if name not in NUISANCE
-    }
-    for name in model.names:
-        if name in parameters:
-            continue
-        if split_name(name)[1] != "eta":
-            raise InputError(f"{where} has no parameter {name}, which its model {model.name} has")
-        parameters[name] = Identified("fixed", 0.0)
-    if unknown := [name for name in parameters if name not in model.names]:
-        raise InputError(f"{where}: {unknown[0]} is no parameter of its model {model.name}")
-    rate0 = content.get("rate0")
+    parameters = _parameters(given, model, joint, rates)
     names, correlation = _correlation(
-        content, "covariance" if joint else "correlation", "matrix", parameters, where
+        given, *(("covariance", "matrix") if joint else ("correlation", "matrix")), parameters
     )
-    changing, together = _correlation(content, "specimens", "correlation", parameters, where)
-    fits = list(tests.values()) if joint else [content]
+    changing, together = _correlation(given, "specimens", "correlation", parameters)
     return Source(
         name=str(content.get("name" if joint else "test") or where),
         where=where,
@@ -202,131 +230,106 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
         interior_mass=bool(content.get("interior_mass", False)),
         status=str(content.get("status")),
         rates=tuple(rate for rate in rates.values() if rate),
-        rate0=None if rate0 is None else _number(rate0, f"{where}: rate0"),
+        rate0=given.item("rate0").maybe,
         parameters=parameters,
         names=names,
         correlation=correlation,
-        misses=_misses([one for one in fits if isinstance(one, Mapping)], where),
+        misses=_misses(list(tests.values())),
         time_shift=TIME_SHIFT in content["parameters"],
         changing=changing,
         together=together,
     )
 
 
-def _parameter(
-    item: object, joint: bool, rates: Mapping[str, float | None], where: str
-) -> Identified:
+def _parameters(
+    given: _Item, model: Model, joint: bool, rates: Mapping[str, float | None]
+) -> dict[str, Identified]:
+    """The parameters of the springs: nuisance parameters are those of one record."""
+    found = {
+        name: _parameter(item, joint, rates)
+        for name, item in given.items("parameters").items()
+        if name not in NUISANCE
+    }
+    for name in model.names:
+        if name not in found and split_name(name)[1] != "eta":
+            raise InputError(
+                f"{given.where} has no parameter {name}, which its model {model.name} has"
+            )
+    if unknown := [name for name in found if name not in model.names]:
+        raise InputError(f"{given.where}: {unknown[0]} is no parameter of its model {model.name}")
+    return {name: Identified("fixed", 0.0) for name in model.names} | found
+
+
+def _parameter(item: _Item, joint: bool, rates: Mapping[str, float | None]) -> Identified:
     """One parameter of fit.json or joint.json; `rates` are those of the tests."""
-    if not isinstance(item, Mapping):
-        raise InputError(f"{where} is {item!r}; it must be an object with a value")
+    if not isinstance(item.content, Mapping):
+        raise InputError(f"{item.where} is {item.content!r}; it must be an object with a value")
     kind = item.get("kind") if joint else "shared" if item.get("vary") else "fixed"
     if kind not in KINDS:
-        raise InputError(f"{where}: kind is {kind!r}; it must be one of {', '.join(KINDS)}")
-    tests, of_rates = tuple[float, ...](), tuple[float | None, ...]()
+        raise InputError(f"{item.where}: kind is {kind!r}; it must be one of {', '.join(KINDS)}")
+    tests = dict[str, _Item]()
     if kind in ("own", "scatter"):
-        given = _mapping(item, "tests", where)
-        each = {name: one if isinstance(one, Mapping) else {} for name, one in given.items()}
+        tests = item.items("tests")
         # the spread is that of the tests that determine it
-        sure = {name: one for name, one in each.items() if one.get("stderr") is not None}
-        if kind == "scatter" and len(sure) > 1:
-            each = sure
-        tests = tuple(_number(one.get("value"), f"{where}: tests") for one in each.values())
-        of_rates = tuple(rates.get(name) for name in each)
-    scatter = item.get("scatter") if kind == "scatter" else 0.0
+        sure = {name: one for name, one in tests.items() if one.get("stderr") is not None}
+        tests = sure if kind == "scatter" and len(sure) > 1 else tests
     return Identified(
         kind,
-        _number(item.get("value"), f"{where}: value"),
-        _positive(item.get("stderr"), f"{where}: stderr"),
-        _pair(item.get("ci95"), f"{where}: ci95"),
-        _pair(item.get("range"), f"{where}: range"),
+        item.item("value").number,
+        item.item("stderr").error,
+        item.item("ci95").pair,
+        item.item("range").pair,
         item.get("state"),
-        _number(item.get("b"), f"{where}: b") if kind in RATES else 0.0,
-        _positive(item.get("b_stderr"), f"{where}: b_stderr"),
-        _pair(item.get("b_ci95"), f"{where}: b_ci95"),
-        _number(scatter, f"{where}: scatter"),
-        tests,
-        of_rates,
+        item.item("b").number if kind in RATES else 0.0,
+        item.item("b_stderr").error,
+        item.item("b_ci95").pair,
+        item.item("scatter").number if kind == "scatter" else 0.0,
+        tuple(one.item("value").number for one in tests.values()),
+        tuple(rates.get(name) for name in tests),
     )
 
 
 def _correlation(
-    content: Mapping[str, Any], key: str, of: str, parameters: Mapping[str, Identified], where: str
+    given: _Item, key: str, of: str, parameters: Mapping[str, Identified]
 ) -> tuple[tuple[str, ...], Array]:
     """Correlation of the parameters that are named, from that or a covariance; 0 if unknown."""
-    if content.get(key) is None:
+    if given.get(key) is None:
         return (), np.empty((0, 0))
-    item = _mapping(content, key, where)
-    names = item.get("names")
+    given.items(key)  # refuses what is no object
+    names = given.item(key).get("names")
+    names = names if isinstance(names, list) else [None]
+    known = {*parameters, *NUISANCE}
     try:
-        matrix = np.array(item.get(of), dtype=float).reshape(len(names or ()), -1)
+        matrix = np.reshape(np.array(given.item(key).get(of), dtype=float), (len(names),) * 2)
+        there = all(str(name).removesuffix(":b") in known for name in names)
     except (TypeError, ValueError):
-        matrix = np.empty((0, 0))
-    known = isinstance(names, list) and all(
-        isinstance(name, str) and name.removesuffix(":b") in (*parameters, *NUISANCE)
-        for name in names
-    )
-    if not known or matrix.shape != (len(names or ()), len(names or ())):
+        there = False
+    if not there:
         raise InputError(
-            f"{where}: {key} must have the names of parameters and a square matrix of as many rows"
+            f"{given.where}: {key} must have the names of parameters and a square matrix of as "
+            "many rows"
         )
-    kept = [i for i, name in enumerate(names or ()) if name not in NUISANCE]
-    names, matrix = [(names or ())[i] for i in kept], matrix[np.ix_(kept, kept)]
+    kept = [i for i, name in enumerate(names) if name not in NUISANCE]
+    matrix = matrix[np.ix_(kept, kept)]
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = np.sqrt(np.diag(matrix))
         matrix = matrix / np.outer(scale, scale)
-    matrix = np.clip(np.where(np.isfinite(matrix), matrix, 0.0), -1.0, 1.0)
+    matrix = np.clip(np.nan_to_num(matrix, posinf=0.0, neginf=0.0), -1.0, 1.0)
     np.fill_diagonal(matrix, 1.0)
-    return tuple(names), 0.5 * (matrix + matrix.T)
+    return tuple(names[i] for i in kept), 0.5 * (matrix + matrix.T)
 
 
-def _misses(fits: list[Mapping[str, Any]], where: str) -> dict[str, tuple[Miss, ...]]:
+def _misses(tests: list[_Item]) -> dict[str, tuple[Miss, ...]]:
     """By how much the counted curves of each channel were missed, test by test."""
     found = dict[str, list[Miss]]()
-    for fit in fits:
-        misfits, noise = fit.get("misfit"), fit.get("noise")
-        for curve, misfit in (misfits if isinstance(misfits, Mapping) else {}).items():
-            if misfit is None or curve in _UNCOUNTED.get(str(fit.get("drive")), ()):
+    for test in tests:
+        misfits = test.items("misfit") if test.get("misfit") else {}
+        for curve, misfit in misfits.items():
+            if misfit.content is None or curve in _UNCOUNTED.get(str(test.get("drive")), ()):
                 continue
-            level = noise.get(curve) if isinstance(noise, Mapping) else None
-            level = level if isinstance(level, Mapping) else {}
-            share = None
-            if level.get("range"):
-                range_ = _number(level["range"], f"{where}: range of {curve}")
-                share = _number(level.get("sigma"), f"{where}: sigma of {curve}") / range_
+            noise, share = test.item("noise").item(curve), None
+            if noise.get("range"):
+                share = noise.item("sigma").number / noise.item("range").number
             channel = "stress" if curve.startswith("stress") else curve.removesuffix("_time")
-            off = _number(misfit, f"{where}: misfit of {curve}")
-            found.setdefault(channel, []).append(Miss(off, share))
+            found.setdefault(channel, []).append(Miss(misfit.number, share))
     return {channel: tuple(each) for channel, each in found.items()}
-
-
-def _mapping(content: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
-    item = content.get(key)
-    if not isinstance(item, Mapping):
-        raise InputError(f"{where} has no object '{key}', which a prediction needs")
-    return item
-
-
-def _number(value: object, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where} is {value!r}; it must be a number")
-    return float(value)
-
-
-def _positive(value: object, where: str) -> float | None:
-    if value is None:
-        return None
-    number = _number(value, where)
-    if number < 0.0:
-        raise InputError(f"{where} is {value!r}; it must not be negative")
-    return number or None
-
-
-def _pair(value: object, where: str) -> Pair | None:
-    if value is None:
-        return None
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        raise InputError(f"{where} is {value!r}; it must be two numbers")
-    if any(end is None for end in value):  # open on one side
-        return None
-    low, high = (_number(end, where) for end in value)
-    return low, high

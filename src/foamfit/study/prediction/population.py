@@ -12,13 +12,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Specimen
 from foamfit.errors import InputError
 from foamfit.fitting.box import is_logarithmic
-from foamfit.fitting.links import RATES, law
+from foamfit.fitting.links import RATES, factor
 from foamfit.springs.parameters import split_name
 from foamfit.study.prediction.identified import Identified, Pair, Source
 from foamfit.trust.scatter import correlation
@@ -43,7 +44,7 @@ class Population:
 
     def __post_init__(self) -> None:
         """Refuse a law of rate where there is no rate."""
-        laws = [name for name, one in self._items if one.kind in RATES]
+        laws = [name for name, one in self._known.items() if one.kind in RATES]
         if laws and (self.rate is None or self.source.rate0 is None):
             raise InputError(
                 f"{laws[0]} follows a law of rate, and the rate "
@@ -52,23 +53,22 @@ class Population:
             )
 
     @property
-    def _items(self) -> list[tuple[str, Identified]]:
-        return [(name, self.source.parameters[name]) for name in self.names]
+    def _known(self) -> dict[str, Identified]:
+        return {name: self.source.parameters[name] for name in self.names}
 
     @cached_property
-    def _log_rate(self) -> float:
-        """Logarithm of the rate over the reference rate; 0 where no law needs it."""
-        if self.rate is None or not self.source.rate0:
-            return 0.0
-        return math.log(self.rate / self.source.rate0)
+    def _uncertain(self) -> list[str]:
+        """Parameters that vary and have a common value."""
+        return [name for name, one in self._known.items() if one.kind not in ("own", "fixed")]
 
     @cached_property
     def held(self) -> tuple[str, ...]:
         """Parameters that vary, that nothing is known of, and that stay at their values."""
+        parameters = self.source.parameters
         return tuple(
             name
-            for name, one in self._items
-            if one.kind not in ("own", "fixed") and one.stderr is None and one.span is None
+            for name in self._uncertain
+            if parameters[name].stderr is None and parameters[name].span is None
         )
 
     # ------------------------------------------------------------------ what the result leaves open
@@ -80,27 +80,18 @@ class Population:
         What a result leaves undetermined is correlated with other parameters: where it stays at its
         value, these have the spread that is left to them then.
         """
-        named = [name for name, one in self._items if one.kind not in ("own", "fixed")]
-        sloped = [f"{name}:b" for name, one in self._items if one.b_stderr]
-        free = [name for name in named if name not in self.held] + sloped
-        known = {name: i for i, name in enumerate(self.source.names)}
-        matrix = np.eye(len(free))
-        there = [i for i, name in enumerate(free) if name in known]
-        places = [known[free[i]] for i in there]
-        r = self.source.correlation
-        inner = r[np.ix_(places, places)]
-        if gone := [known[name] for name in self.held if name in known]:
-            across = r[np.ix_(places, gone)]
-            inner = (
-                inner - across @ np.linalg.pinv(r[np.ix_(gone, gone)], hermitian=True) @ across.T
-            )
-        if there:
-            matrix[np.ix_(there, there)] = inner
-        changing = {name: i for i, name in enumerate(self.scattering)}
-        mine = [i for i, name in enumerate(free) if name in changing]  # means of what scatters
-        if mine:
-            places = [changing[free[i]] for i in mine]
-            matrix[np.ix_(mine, mine)] = self._correlation[np.ix_(places, places)]
+        free = [name for name in self._uncertain if name not in self.held]
+        free += [f"{name}:b" for name, one in self._known.items() if one.b_stderr]
+        there, places = _places(free, self.source.names)
+        gone = _places(self.held, self.source.names)[1]
+        r, matrix = self.source.correlation, np.eye(len(free))
+        inner, across = r[np.ix_(places, places)], r[np.ix_(places, gone)]
+        if gone.size:
+            told = np.linalg.pinv(r[np.ix_(gone, gone)], hermitian=True)
+            inner = inner - across @ told @ across.T
+        matrix[np.ix_(there, there)] = inner
+        mine, places = _places(free, self.scattering)  # means of what scatters
+        matrix[np.ix_(mine, mine)] = self._correlation[np.ix_(places, places)]
         return tuple(free), _root(matrix)
 
     @property
@@ -110,12 +101,11 @@ class Population:
 
     def _placed(self, name: str, z: float) -> float:
         """Value of an uncertain quantity at a standard normal z."""
+        one = self.source.parameters[name.removesuffix(":b")]
         if name.endswith(":b"):
-            one = self.source.parameters[name.removesuffix(":b")]
             assert one.b_stderr is not None
             return one.b + z * one.b_stderr * _wider(one.b_ci95, one.b_stderr)
-        one, short = self.source.parameters[name], split_name(name)[1]
-        positive = is_logarithmic(short) or one.kind in ("scatter", *RATES)
+        positive = is_logarithmic(split_name(name)[1]) or one.kind in ("scatter", *RATES)
         if one.stderr is None:
             assert one.span is not None
             low, high = one.span
@@ -134,7 +124,7 @@ class Population:
         """Parameters that change from specimen to specimen."""
         return tuple(
             name
-            for name, one in self._items
+            for name, one in self._known.items()
             if (one.kind == "scatter" and one.scatter > 0.0)
             or (one.kind == "own" and np.ptp(one.tests) > 0.0)
         )
@@ -148,14 +138,12 @@ class Population:
         """
         names, own = self.scattering, self._own
         out = np.eye(len(names))
-        known = {name: i for i, name in enumerate(self.source.changing)}
-        there = [i for i, name in enumerate(names) if name in known]
-        places = [known[names[i]] for i in there]
+        there, places = _places(names, self.source.changing)
         out[np.ix_(there, there)] = self.source.together[np.ix_(places, places)]
-        if own.slopes.any() or not set(own.names) <= known.keys():
-            places = [names.index(name) for name in own.names]
-            none = np.zeros((len(places), len(places)))
-            out[np.ix_(places, places)] = correlation(own.off, none)
+        if own.slopes.any() or not set(own.names) <= set(self.source.changing):
+            there, places = _places(names, own.names)
+            alone = correlation(own.off, np.zeros((places.size, places.size)))
+            out[np.ix_(there, there)] = alone[np.ix_(places, places)]
         return out
 
     @property
@@ -201,16 +189,9 @@ class Population:
     @property
     def point(self) -> Array:
         """The common values, at the rate of the test."""
-        found = {name: self._at_rate(name, one.value, one.b) for name, one in self._items}
-        for name, mean, slope in zip(
-            self._own.names, self._own.mean, self._own.slopes, strict=True
-        ):
-            if slope:  # the median over the tests is that of no rate
-                found[name] = self._from_own(name, mean)
-        return self._vector(found)
-
-    def _from_own(self, name: str, value: float) -> float:
-        return _exp(value) if self._in_logarithms(name) else float(value)
+        pairs = zip(self.trends.items(), self._own.mean, strict=True)
+        # Where there is a trend, the median over the tests is that of no rate.
+        return self._vector({name: mean for (name, slope), mean in pairs if slope})
 
     def nearest(self, admissible: Callable[[Array], bool]) -> Array | None:
         """Values with the own parameters of the admissible test nearest to their means."""
@@ -219,10 +200,8 @@ class Population:
             return None
         scale = np.maximum(np.sqrt(np.mean(own.off**2, axis=0)), 1e-300)
         for row in own.off[np.argsort(np.sum((own.off / scale) ** 2, axis=1))]:
-            values = {name: self._at_rate(name, one.value, one.b) for name, one in self._items}
-            for name, value in zip(own.names, own.mean + row, strict=True):
-                values[name] = self._from_own(name, value)
-            if admissible(found := self._vector(values)):
+            found = self._vector(dict(zip(own.names, own.mean + row, strict=True)))
+            if admissible(found):
                 return found
         return None
 
@@ -232,15 +211,11 @@ class Population:
         Parameters change together from specimen to specimen. Their spreads are known from n tests:
         the deviates are Student's t with n - 1 degrees of freedom.
         """
-        values = {name: one.value for name, one in self._items}
-        slopes = {name: one.b for name, one in self._items}
+        values, own = dict[str, float](), dict[str, float]()
         if open_:
             free, root = self._open
-            for name, z in zip(free, root @ rng.standard_normal(len(free)), strict=True):
-                if name.endswith(":b"):
-                    slopes[name.removesuffix(":b")] = self._placed(name, float(z))
-                else:
-                    values[name] = self._placed(name, float(z))
+            pairs = zip(free, (root @ rng.standard_normal(len(free))).tolist(), strict=True)
+            values = {name: self._placed(name, z) for name, z in pairs}
         if scatter:
             freedom = max(self.fewest - 1 - bool(self._own.slopes.any()), 1)
             tail = math.sqrt(freedom / rng.chisquare(freedom))
@@ -248,19 +223,26 @@ class Population:
             for name, z in zip(self.scattering, drawn.tolist(), strict=True):
                 one = self.source.parameters[name]
                 if one.kind == "scatter":
-                    values[name] *= _exp(one.scatter * z)
+                    values[name] = values.get(name, one.value) * _exp(one.scatter * z)
                 else:
-                    values[name] = self._from_own(name, self._own.at(name, z))
-        return self._vector(
-            {name: self._at_rate(name, value, slopes[name]) for name, value in values.items()}
-        )
+                    own[name] = self._own.at(name, z)
+        return self._vector(own, values)
 
-    def _at_rate(self, name: str, value: float, b: float) -> float:
-        kind = self.source.parameters[name].kind
-        return law(kind, value, b, self._log_rate) if kind in RATES else value
+    def _vector(self, own: dict[str, float], drawn: dict[str, float] | None = None) -> Array:
+        """Values in their order, at the rate and the height of the test.
 
-    def _vector(self, values: dict[str, float]) -> Array:
-        """Flat vector, with the heights of a chain those of the test's specimen."""
+        `own` are those of own parameters as `_Own` has them, `drawn` other values and slopes by
+        rate. The heights of a chain are those of the specimen, or keep their shares of its height.
+        """
+        drawn, values = drawn or {}, dict[str, float]()
+        for name, one in self._known.items():
+            value = drawn.get(name, one.value)
+            if name in own:
+                value = _exp(own[name]) if self._in_logarithms(name) else float(own[name])
+            if one.kind in RATES and self.rate is not None and self.source.rate0:
+                x = math.log(self.rate / self.source.rate0)
+                value *= factor(one.kind, drawn.get(f"{name}:b", one.b), x)[0]
+            values[name] = value
         heights = [name for name in self.names if name.endswith("_height")]
         if heights and self.specimen.heights is not None:
             values |= dict(zip(heights, self.specimen.heights, strict=True))
@@ -291,9 +273,12 @@ class _Own:
 
     @classmethod
     def of(
-        cls, names: tuple[str, ...], columns: list[Array], rates: tuple[float | None, ...],
+        cls,
+        names: tuple[str, ...],
+        columns: list[Array],
+        rates: tuple[float | None, ...],
         rate: float | None,
-    ) -> _Own:  # fmt: skip
+    ) -> _Own:
         """Means and deviations of the columns (n,), one for each name."""
         if not names:
             return cls((), np.empty(0), np.empty(0), np.empty((0, 0)), np.empty(0), 1)
@@ -306,17 +291,14 @@ class _Own:
             x = np.log(known)
             at, x = math.log(rate) - x.mean(), x - x.mean()
             square = float(x @ x)
-            if square > n * SAME_RATE**2:
-                steep = x @ off / square
-                left = off - np.outer(x, steep)
-                gain = n * np.log(
-                    np.maximum(np.sum(off**2, axis=0), 1e-300)
-                    / np.maximum(np.sum(left**2, axis=0), 1e-300)
-                ) - math.log(n)
-                sure = gain > EVIDENCE
-                slopes = np.where(sure, steep, 0.0)
-                mean, off = mean + slopes * at, np.where(sure, left, off)
-                leverage = leverage + sure * at**2 / square
+            steep = x @ off / max(square, 1e-300)
+            left = off - np.outer(x, steep)
+            squares = np.maximum([np.sum(off**2, axis=0), np.sum(left**2, axis=0)], 1e-300)
+            gain = n * np.log(squares[0] / squares[1]) - math.log(n)
+            sure = (gain > EVIDENCE) & (square > n * SAME_RATE**2)
+            slopes = np.where(sure, steep, 0.0)
+            mean, off = mean + slopes * at, np.where(sure, left, off)
+            leverage = leverage + np.where(sure, at**2 / max(square, 1e-300), 0.0)
         freedom = max(n - 1 - bool(np.any(slopes)), 1)
         return cls(names, mean, slopes, off, np.sqrt(1.0 + leverage), freedom)
 
@@ -327,15 +309,22 @@ class _Own:
         return float(self.mean[i] + self.wider[i] * spread * z)
 
 
+def _places(
+    names: tuple[str, ...] | list[str], among: tuple[str, ...]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Which of the names stand among others, and where there."""
+    pairs = [(i, among.index(name)) for i, name in enumerate(names) if name in among]
+    there, places = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+    return there, places
+
+
 def _wider(ci95: Pair | None, stderr: float) -> float:
     """How much wider a 95 % interval is than that of a normal distribution with this error.
 
     Few degrees of freedom widen it, and a cost that is no parabola; a limit that cuts it does not
     make it narrower.
     """
-    if ci95 is None:
-        return 1.0
-    return max(1.0, 0.5 * (ci95[1] - ci95[0]) / (NORMAL * stderr))
+    return 1.0 if ci95 is None else max(1.0, 0.5 * (ci95[1] - ci95[0]) / (NORMAL * stderr))
 
 
 def _root(correlation: Array) -> Array:

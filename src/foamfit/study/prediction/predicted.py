@@ -51,6 +51,11 @@ class PredictedCurve:
         """Half of the band, mean over the samples that count."""
         return float(np.mean(0.5 * (self.hi - self.lo)[self.kept]))
 
+    @property
+    def widest(self) -> str:
+        """The part that makes the band widest."""
+        return max(self.parts, key=self.half_width_of)
+
     def half_width_of(self, part: str) -> float:
         """Half of the band that a part alone would give, mean over the samples that count."""
         return float(np.mean(self.parts[part][self.kept])) if part in self.parts else 0.0

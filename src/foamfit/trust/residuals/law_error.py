@@ -1,7 +1,7 @@
 """Noise or error of the law: what the residual of each curve is made of.
 
 What a law cannot follow is left in the residual and is the same whenever the test is measured
-again: it is no noise. It shows as slow waves, a peak of the spectrum at low frequencies that falls
+again: it is not noise. It shows as slow waves, a peak of the spectrum at low frequencies that falls
 faster beyond than noise does. Where there is evidence for such a peak, the noise is read off the
 frequencies beyond it; elsewhere the residual is the noise.
 """
@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import dct
@@ -23,13 +25,13 @@ from foamfit.trust.residuals.noise_process import (
     parts,
 )
 
-# RMS of an error of the law that is told from that of the simulation, in units of the residual.
+# Least RMS of an error of the law, in units of the residual: below it is that of the simulation.
 SMALLEST = 2e-3
 # Frequencies (half waves in the record) that stand alone, and the ratio of the bands beyond them.
 ALONE, BAND = 64, 1.06
-# An error of the law has its corner at so many half waves at most. Beyond it the spectrum falls as
-# the frequency to the power of minus twice the steepness (a kink leaves 2, noise of first order
-# has 1); up to it, it rises as twice the rise: a fit takes what is slow.
+# The most half waves in the record at which an error of the law has its corner. Beyond it the
+# spectrum falls as the frequency to the power of minus twice the steepness (a kink leaves 2, noise
+# of first order has 1); up to it, it rises as twice the rise, because a fit takes what is slow.
 LAST_CORNER, STEEPNESS, RISES = 60.0, (1.5, 2.0, 3.0), (0.0, 1.0, 2.0)
 # Corner of noise on top of white noise, as a share of the frequencies: slower noise of that kind
 # cannot be told from an error of the law.
@@ -59,12 +61,8 @@ class CurveError:
         return self.law > 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Sum:
-    """A spectrum as the sum of an error of the law (or none), red noise (or none) and white noise.
-
-    `law`, `red` and `white` are (b,).
-    """
+class _Sum(NamedTuple):
+    """A spectrum as the sum of an error of the law, red noise and white noise, each (b,)."""
 
     criterion: float  # Bayesian information criterion
     law: Array
@@ -117,12 +115,9 @@ class _Spectrum:
     def peaks(self) -> Array:
         """Spectra of an error of the law: a fall beyond a corner, and a rise or none up to it."""
         corners = np.geomspace(1.0, LAST_CORNER, 16)
-        out = []
-        for rise in RISES:
-            up = (self.frequency / corners[:, None]) ** (2.0 * rise)
-            out += [up * self.fall(corners, steep + rise) for steep in STEEPNESS]
-        # The fit took nothing of what it left.
-        return np.concatenate(out) / self.left
+        rising = {rise: (self.frequency / corners[:, None]) ** (2.0 * rise) for rise in RISES}
+        out = [up * self.fall(corners, s + rise) for rise, up in rising.items() for s in STEEPNESS]
+        return np.concatenate(out) / self.left  # the fit took nothing of what it left
 
     def sum(self, laws: Array, reds: Array, *, floor: bool = True) -> _Sum:
         """The sum of the least criterion of one of these laws, one of these reds and white noise.
@@ -182,13 +177,15 @@ def _curve_error(residual: Array, basis: Array, own: NoiseProcess) -> CurveError
     none, fast = np.zeros((1, seen.frequency.size)), np.geomspace(FAST * n, n, 12)
     reds = [seen.fall(fast, order) for order in (1.0, 2.0)]
     first = seen.sum(none, seen.first_order(ANY), floor=False)
-    alone = min([seen.sum(none, red) for red in (none, *reds)] + [first], key=_criterion)
+    alone = min(
+        [seen.sum(none, red) for red in (none, *reds)] + [first], key=attrgetter("criterion")
+    )
     laws, firsts = seen.peaks(), seen.first_order(VISIBLE)
     both = []
     for red in (none, seen.sum(none, firsts, floor=False).red[None]):
         both.append(seen.sum(laws, red, floor=not red.any()))
         both.append(seen.sum(both[-1].law[None], firsts, floor=False))
-    found = min(both, key=_criterion)
+    found = min(both, key=attrgetter("criterion"))
     evidence = alone.criterion - found.criterion
     noise = found.red + found.white
     process = _process(seen, noise, max(float(seen.count @ (found.law < noise)), 1.0))
@@ -196,10 +193,6 @@ def _curve_error(residual: Array, basis: Array, own: NoiseProcess) -> CurveError
     if evidence <= 0.0 or size < SMALLEST:
         return CurveError(own, evidence)
     return CurveError(process, evidence, size)
-
-
-def _criterion(spectrum: _Sum) -> float:
-    return spectrum.criterion
 
 
 def _process(seen: _Spectrum, noise: Array, samples: float) -> NoiseProcess:

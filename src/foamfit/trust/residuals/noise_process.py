@@ -20,7 +20,7 @@ MOST_ORDERS, LARGEST, CORRECTIONS = 10, 0.995, 4
 
 
 def parts(sizes: tuple[int, ...]) -> list[slice]:
-    """Slices of the curves in a residual, of which they have so many samples each."""
+    """Slices of the curves in a residual, from their numbers of samples."""
     ends = np.cumsum(sizes)
     return [slice(int(end - size), int(end)) for size, end in zip(sizes, ends, strict=True)]
 
@@ -37,67 +37,75 @@ class NoiseProcess:
 
     def autocovariance(self, n: int) -> Array:
         """Autocovariance at the lags 0 … n-1."""
-        size = 4 * max(n, 256)
-        transfer = np.abs(np.fft.rfft(np.append(1.0, -self.coefficients), size)) ** -2
-        lags = np.fft.irfft(transfer)[:n]
+        lags = self._response(4 * max(n, 256))[:n]
         return np.asarray(lags * (self.variance / lags[0]))
+
+    def _response(self, size: int) -> Array:
+        """Autocovariance at `size` lags if the driving white noise has unit variance."""
+        transfer = np.abs(np.fft.rfft(np.append(1.0, -self.coefficients), size)) ** -2
+        return np.asarray(np.fft.irfft(transfer))
+
+    @cached_property
+    def white(self) -> float:
+        """Variance of the driving white noise over that of the process."""
+        return float(1.0 / self._response(1 << 14)[0])
 
     @cached_property
     def tau(self) -> float:
         """Autocorrelation time 1 + 2 Σ ρ_k, at least one, in samples."""
         if not self.coefficients.size:
             return 1.0
-        white = self._white_share()
-        return max(white / (1.0 - float(self.coefficients.sum())) ** 2, 1.0)
+        return max(self.white / (1.0 - float(self.coefficients.sum())) ** 2, 1.0)
 
-    def _white_share(self) -> float:
-        """Variance of the driving white noise over that of the process."""
-        size = 1 << 14
-        transfer = np.abs(np.fft.rfft(np.append(1.0, -self.coefficients), size)) ** -2
-        return float(1.0 / np.fft.irfft(transfer)[0])
+    def _circulant(self, n: int) -> Array:
+        """Eigenvalues of the circulant matrix that has the covariance of n samples in a corner."""
+        lags = self.autocovariance(n)
+        return np.asarray(np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]])))
 
     def times(self, columns: Array) -> Array:
         """Covariance matrix of n samples times the columns of an (n, k) array."""
         if not self.coefficients.size:
             return self.variance * columns
         n = len(columns)
-        lags = self.autocovariance(n)
-        around = np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]]))
-        spectrum = np.fft.rfft(columns, 2 * n, axis=0) * around[:, None]
+        spectrum = np.fft.rfft(columns, 2 * n, axis=0) * self._circulant(n)[:, None]
         product: Array = np.fft.irfft(spectrum, axis=0)[:n]
         return product
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """So many samples of normal noise, (n,)."""
-        lags = self.autocovariance(n)
-        around = np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]])).real
-        white = np.fft.rfft(rng.standard_normal(2 * n))
-        return np.asarray(np.fft.irfft(np.sqrt(np.maximum(around, 0.0)) * white)[:n])
+        root = np.sqrt(np.maximum(self._circulant(n).real, 0.0))
+        return np.asarray(np.fft.irfft(root * np.fft.rfft(rng.standard_normal(2 * n)))[:n])
 
-    def forms(self, columns: Array) -> Array:
-        """Variance lᵀΣl of the noise times each column l of an (n, k) array, (k,)."""
-        return np.asarray(np.einsum("ij,ij->j", columns, self.times(columns)))
+    def forms(self, columns: Array, mix: Array | None = None) -> Array:
+        """Variance lᵀΣl of the noise times each column l of an (n, m) product, (m,).
 
-    def doubt(self, columns: Array) -> Array:
-        """Variance of `forms`, as estimated from `samples`, (k,): the delta method.
+        The product is that of `columns` (n, k) and `mix` (k, m), by default the columns themselves.
+        """
+        inner = columns.T @ self.times(columns)
+        if mix is None:
+            return np.diag(inner)
+        return np.asarray(np.einsum("ij,ij->j", mix, inner @ mix))
+
+    def doubt(self, columns: Array, mix: Array) -> Array:
+        """Variance of `forms`, as estimated from `samples`, (m,): the delta method.
 
         Estimates of the white variance w and of φ are independent for large n. That of w has the
         variance 2w²/n of normal noise; those of φ have the covariance w Γ⁻¹/n with Γ that of p
         successive samples (Brockwell & Davis 1991, Time Series: Theory and Methods, theorem 8.1.1).
         """
         if math.isinf(self.samples):
-            return np.zeros(columns.shape[1])
-        here = self.forms(columns)
+            return np.zeros(mix.shape[1])
+        here = self.forms(columns, mix)
         out = 2.0 * here**2
         order = self.coefficients.size
         if order:
-            white = self.variance * self._white_share()
-            step = 1e-4 * (1.0 - np.max(np.abs(np.roots(np.append(1.0, -self.coefficients)))))
+            white = self.variance * self.white
+            step = 1e-4 * (1.0 - _radius(self.coefficients))
             moved = [
-                NoiseProcess(phi, white / NoiseProcess(phi, 1.0)._white_share())
+                NoiseProcess(phi, white / NoiseProcess(phi, 1.0).white)
                 for phi in self.coefficients + step * np.eye(order)
             ]
-            slopes = np.array([(other.forms(columns) - here) / step for other in moved])
+            slopes = np.array([(other.forms(columns, mix) - here) / step for other in moved])
             gamma = toeplitz(self.autocovariance(order))
             out += white * np.einsum("ik,ik->k", slopes, np.linalg.solve(gamma, slopes))
         return np.asarray(out / self.samples)
@@ -140,10 +148,10 @@ def noise_processes(
     smaller than the noise was. With the hat matrix H = QQᵀ of the fit, residuals (I-H)e have the
     expected lag sums tr S_k (I-H)Σ(I-H); the autocovariances are corrected by what Σ itself loses.
 
-    `residual` (n,) holds all curves after each other, each in the order of time, so many samples of
-    each as in `sizes`; `jacobian` (n, k) may have any scaling of its columns. Where other data took
-    part in the fit, `taken` (n, k) says what it took of these: orthogonal columns, each as long as
-    the root of the share of the noise along it.
+    `residual` (n,) holds all curves, one after the other, each in the order of time with `sizes`
+    samples; `jacobian` (n, k) may have any scaling of its columns. Where other data took part in
+    the fit, `taken` (n, k) says what it took of these: orthogonal columns, each as long as the root
+    of the share of the noise along it.
     """
     basis = basis_of(jacobian) if taken is None else _shortened(taken)
     curves = parts(sizes)
@@ -200,12 +208,14 @@ def _corrected(
     return replace(process, coefficients=coefficients, variance=float(lags[0]))
 
 
+def _radius(coefficients: Array) -> float:
+    """Largest factor from sample to sample of the waves of an autoregression."""
+    return float(np.max(np.abs(np.roots(np.append(1.0, -coefficients))), initial=0.0))
+
+
 def _damped(coefficients: Array, n: int) -> Array:
     """Coefficients of an autoregression none of whose waves lives longer than a quarter of n."""
-    if not coefficients.size:
-        return coefficients
-    radius = float(np.max(np.abs(np.roots(np.append(1.0, -coefficients)))))
-    share = min(1.0, (1.0 - 4.0 / n) / max(radius, 1e-300))
+    share = min(1.0, (1.0 - 4.0 / n) / max(_radius(coefficients), 1e-300))
     return np.asarray(coefficients * share ** np.arange(1, coefficients.size + 1))
 
 

@@ -20,8 +20,8 @@ def runs_test(residual: Array) -> float:
 
     Given n₊ positive and n₋ negative residuals in random order, the number of runs has mean
     μ = 2 n₊n₋/n + 1 and variance (μ-1)(μ-2)/(n-1), and is nearly normal (here with the correction
-    for continuity). One-sided: slow waves make few runs; noise that alternates is no structure. The
-    residuals are in the order of time; those that are exactly zero are left out.
+    for continuity). One-sided: slow waves make few runs; noise that alternates is not structure.
+    The residuals are in the order of time; those that are exactly zero are left out.
     """
     signs = residual[residual != 0.0] > 0.0
     n, positive = signs.size, int(np.count_nonzero(signs))
@@ -58,14 +58,9 @@ class Structure:
 
     # Root of the mean product of neighbouring residuals, in their unit: white noise adds nothing.
     size: float
-    # One standard deviation of what is left of a residual over the mean of its neighbours, as white
-    # noise would have it (its variance there is 3/2 of its own); by the median, which jumps do not
-    # move.
-    noise: float
-    place: str  # Branches that the springs are on, and whether on loading or unloading
-    share: float  # Share of the structure that this place holds
-    # Share of the squares of the residual there that a parabola over the samples takes off.
-    bent: float
+    place: str  # branches that the springs are on, and whether on loading or unloading
+    share: float  # of the structure, that this place holds
+    bent: float  # share of the squares there that a parabola over the samples takes off
 
     @property
     def straight(self) -> bool:
@@ -78,25 +73,14 @@ def find_structure(residual: Array, places: NDArray[np.str_]) -> Structure:
 
     `places` are as from `fitting.branches.branch_of_samples`.
     """
-    product = residual[1:] * residual[:-1]
-    rough = residual[1:-1] - 0.5 * (residual[2:] + residual[:-2])
-    sums = {str(place): float(product[places[1:] == place].sum()) for place in np.unique(places)}
+    product, here = residual[1:] * residual[:-1], places[1:]
+    sums = {str(place): float(product[here == place].sum()) for place in np.unique(places)}
     place = max(sums, key=lambda key: sums[key])
     held = sum(max(value, 0.0) for value in sums.values())
-    return Structure(
-        size=math.sqrt(max(float(product.mean()), 0.0)),
-        noise=1.4826 * float(np.median(np.abs(rough))) / math.sqrt(1.5),
-        place=place,
-        share=sums[place] / held if held > 0.0 else 0.0,
-        bent=_bent(residual[places == place]),
-    )
-
-
-def _bent(residual: Array) -> float:
-    """Share of the squares that a parabola over the samples takes off."""
-    power = float(residual @ residual)
-    if residual.size < 8 or power == 0.0:
-        return 0.0
-    base = np.vander(np.linspace(-1.0, 1.0, residual.size), 3)
-    left = residual - base @ np.linalg.lstsq(base, residual, rcond=None)[0]
-    return 1.0 - float(left @ left) / power
+    own, bent = residual[places == place], 0.0
+    if own.size >= 8 and own.any():
+        base = np.vander(np.linspace(-1.0, 1.0, own.size), 3)
+        left = own - base @ np.linalg.lstsq(base, own, rcond=None)[0]
+        bent = 1.0 - float(left @ left) / float(own @ own)
+    size = math.sqrt(max(float(product.mean()), 0.0))
+    return Structure(size, place, sums[place] / held if held > 0.0 else 0.0, bent)

@@ -21,23 +21,21 @@ class Channel(NamedTuple):
     words: tuple[str, ...]
 
 
+def _channel(si: str, unit: str, words: str) -> Channel:
+    return Channel(si, unit, tuple(words.split()))
+
+
+_MOVED = "displacement disp weg standardweg verschiebung stauchung compression"
 CHANNELS = {
-    "time": Channel("s", "ms", ("time", "t", "zeit", "prüfzeit", "testzeit", "versuchszeit")),
-    "stress": Channel("Pa", "MPa", ("stress", "sigma", "druckspannung", "spannung")),
-    "force": Channel(
-        "N", "N", ("force", "load", "f", "kraft", "standardkraft", "prüfkraft", "druckkraft")
-    ),
-    "displacement": Channel(
-        "m", "mm",
-        ("displacement", "disp", "weg", "standardweg", "verschiebung", "stauchung", "compression"),
-    ),
-    "strain": Channel("", "%", ("strain", "eps", "epsilon", "dehnung", "stauchung", "compression")),
-    "acceleration": Channel(
-        "m/s**2", "m/s^2", ("acceleration", "accel", "deceleration", "beschleunigung")
-    ),
-    "velocity": Channel("m/s", "m/s", ("velocity", "speed", "geschwindigkeit")),
-    "cycle": Channel("", "", ()),  # the number of the cycle, where [columns] names such a column
-}  # fmt: skip
+    "time": _channel("s", "ms", "time t zeit prüfzeit testzeit versuchszeit"),
+    "stress": _channel("Pa", "MPa", "stress sigma druckspannung spannung"),
+    "force": _channel("N", "N", "force load f kraft standardkraft prüfkraft druckkraft"),
+    "displacement": _channel("m", "mm", _MOVED),
+    "strain": _channel("", "%", "strain eps epsilon dehnung stauchung compression"),
+    "acceleration": _channel("m/s**2", "m/s^2", "acceleration accel deceleration beschleunigung"),
+    "velocity": _channel("m/s", "m/s", "velocity speed geschwindigkeit"),
+    "cycle": _channel("", "", ""),  # its number, where [columns] names such a column
+}
 _WORDS = {word for channel in CHANNELS.values() for word in channel.words}
 # Words that several quantities go by: the unit decides which it is.
 _BY_UNIT = {"spannung", "stauchung", "compression"}

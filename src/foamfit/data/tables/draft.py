@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from foamfit.data.columns import assign_columns, entries_of, quoted, si_factor
-from foamfit.data.csv_table import Text, find_table
-from foamfit.data.headers import CHANNELS, channel_of
+from foamfit.data.tables.columns import assign_columns, entries_of, quoted, si_factor
+from foamfit.data.tables.csv_table import Text, find_table
+from foamfit.data.tables.headers import CHANNELS, channel_of
 from foamfit.data.toml_file import LONGEST, toml_beside
 from foamfit.errors import InputError
 from foamfit.terminal import printable
@@ -43,22 +43,19 @@ def draft(text: Text) -> tuple[str, list[str]]:
     What was understood is filled in; each question is a line behind "# " with an example.
     """
     columns, name = _columns(text), printable(toml_beside(text.path).stem[:LONGEST])
-    parts = [
-        (
-            f"# {printable(text.path.name)}: what foamfit needs to know of this test.",
-            '# A line behind "# " is a question: give your value and take the "# " away.',
-            f"name = {json.dumps(name, ensure_ascii=False)}",
-        ),
-        _open(_NEEDED), _open(_IMPACT), ("[columns]", *columns), _open(_HELPS),
-    ]  # fmt: skip
-    needed = [line.removeprefix("# ") for line in columns if "  # needed" in line]
-    asked = [*_NEEDED, *(["[columns]", *needed] if needed else []), *_IMPACT]
+    head = (
+        f"# {printable(text.path.name)}: what foamfit needs to know of this test.",
+        '# A line behind "# " is a question: give your value and take the "# " away.',
+        f"name = {json.dumps(name, ensure_ascii=False)}",
+    )
+    needed, impact, helps = (
+        (section[0], *(f"# {line}" for line in section[1:]))
+        for section in (_NEEDED, _IMPACT, _HELPS)
+    )
+    parts = [head, needed, impact, ("[columns]", *columns), helps]
+    missing = [line.removeprefix("# ") for line in columns if "  # needed" in line]
+    asked = [*_NEEDED, *(["[columns]", *missing] if missing else []), *_IMPACT]
     return "\n\n".join(map("\n".join, parts)) + "\n", asked
-
-
-def _open(section: tuple[str, ...]) -> tuple[str, ...]:
-    """The lines of a section as questions."""
-    return section[0], *(f"# {line}" for line in section[1:])
 
 
 def without_toml(toml: Path, text: Text) -> InputError:

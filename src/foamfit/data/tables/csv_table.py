@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.data.headers import CHANNELS, Header, parse_header
-from foamfit.data.layouts import blanks_as_tabs, scope_of, unpacked
 from foamfit.data.measurement import MIN_ROWS, Dropped
+from foamfit.data.tables.headers import CHANNELS, Header, parse_header
+from foamfit.data.tables.layouts import blanks_as_tabs, scope_of, unpacked
 from foamfit.data.toml_file import LONGEST, read_bytes
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from foamfit.data.csv_table import Table, read_numbers
-from foamfit.data.headers import CHANNELS, WEAK, WEIGHTS, Header, channel_of, example, in_si
 from foamfit.data.measurement import Striker, interior_channel, interior_node
+from foamfit.data.tables.csv_table import Table, read_numbers
+from foamfit.data.tables.headers import CHANNELS, WEAK, WEIGHTS, channel_of, example, in_si
 from foamfit.data.toml_file import Column, Settings
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError
@@ -53,36 +53,10 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
         if named in given and twin not in given:
             found.pop(twin, None)
     # A true stress needs the cross-section that no file has.
-    stress = found.get("stress")
-    if "stress" not in given and "force" in found and stress is not None:
-        true = table.headers[stress].measure("stress")
-        found = {c: k for c, k in found.items() if c != "stress" or not true}
+    true = "stress" in found and table.headers[found["stress"]].measure("stress")
+    if true and "stress" not in given and "force" in found:
+        del found["stress"]
     return found
-
-
-def _place(table: Table, channel: str, column: str | int, toml: Path | None) -> int:
-    """Place of a column that the TOML gives by its header or its number."""
-    count = len(table.headers)
-    if isinstance(column, int):
-        if column > count:
-            wrong = f"column {column} is not in {table.path.name}, which has {count} columns"
-            raise InputError(f"{toml}: [columns] {channel}: {wrong}.")
-        return column - 1
-    places = [k for k, h in enumerate(table.headers) if h.is_named(column)]
-    if len(places) == 1:
-        return places[0]
-    more = f"nowhere in {table.path.name}, which has {table.listed}"
-    if places:
-        numbers = " or ".join(str(k + 1) for k in places)
-        more = f"twice in {table.path.name}; give its number, column = {numbers}"
-    raise InputError(f"{toml}: [columns] {channel}: column {column!r} is {more}.")
-
-
-def quoted(table: Table, k: int) -> str:
-    """A column as [columns] names it: by its header, or by its number where others are equal."""
-    text = table.headers[k].text
-    alone = table.header_row and [h.text for h in table.headers].count(text) == 1
-    return json.dumps(text, ensure_ascii=False) if alone else str(k + 1)
 
 
 def _channels(table: Table, given: dict[str, Column]) -> list[str]:
@@ -90,6 +64,32 @@ def _channels(table: Table, given: dict[str, Column]) -> list[str]:
     numbers = {int(w) for h in table.headers for w in h.words if w.isdecimal()}
     inside = {c for c in (*map(interior_channel, numbers), *given) if interior_node(c)}
     return [*CHANNELS, *sorted(inside, key=lambda c: (c not in given, interior_node(c) or 0))]
+
+
+def _place(table: Table, channel: str, column: str | int, toml: Path | None) -> int:
+    """Place of a column that the TOML gives by its header or its number."""
+    where, count = f"{toml}: [columns] {channel}: column", len(table.headers)
+    if isinstance(column, int):
+        if column <= count:
+            return column - 1
+        raise InputError(
+            f"{where} {column} is not in {table.path.name}, which has {count} columns."
+        )
+    places = [k for k, h in enumerate(table.headers) if h.is_named(column)]
+    if len(places) == 1:
+        return places[0]
+    more = f"nowhere in {table.path.name}, which has {table.listed}"
+    if places:
+        numbers = " or ".join(str(k + 1) for k in places)
+        more = f"twice in {table.path.name}; give its number, column = {numbers}"
+    raise InputError(f"{where} {column!r} is {more}.")
+
+
+def quoted(table: Table, k: int) -> str:
+    """A column as [columns] names it: by its header, or by its number where others are equal."""
+    text = table.headers[k].text
+    alone = table.header_row and [h.text for h in table.headers].count(text) == 1
+    return json.dumps(text, ensure_ascii=False) if alone else str(k + 1)
 
 
 def _clear_time(table: Table, columns: list[int]) -> list[int]:
@@ -105,7 +105,7 @@ def _clear_time(table: Table, columns: list[int]) -> list[int]:
 
 def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float:
     """Return what the numbers of column `k` are multiplied by to be SI."""
-    header = table.headers[k]
+    header, given = table.headers[k], given or _NONE
     if channel == "cycle":  # counted; pint takes "Cycles" in a header for a unit of angle
         return 1.0
     right, where = example(channel), f"{table.path}: column {table.name(k)}"
@@ -114,7 +114,6 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
             f"{where} is a {header.measure(channel)} stress, which needs the cross-section of each "
             "instant; give the force or the nominal (engineering) stress."
         )
-    given = given or _NONE
     unit = given.unit if given.unit is not None else header.unit
     over = header.text.partition("/")[2].strip()  # Weg/mm, which only the TOML calls displacement
     if unit is None and over and in_si(channel, over, given.scale_unit) is not None:
@@ -132,13 +131,19 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
     unit = unit or ""
     if not is_unit(unit, any_case=True):
         raise InputError(f"{where} has an unknown unit {unit!r}; write it like '{right}'.")
-    if given.unit is not None:
-        _check_unit(channel, header, given.unit, where)
-    one = in_si(channel, unit, given.scale_unit)
-    if is_sensitivity(channel, unit, given):
-        one = in_si(channel, unit, f"1/({given.scale_unit})")
-        assert one is not None
-        one /= given.scale**2
+    own = header.unit
+    if given.unit is not None and own is not None and is_unit(own, any_case=True):
+        stated, there = in_si(channel, given.unit), in_si(channel, own)
+        # The last word of a name may only look like a unit.
+        bracketed = there is not None or header.text.endswith((")", "]", "}"))
+        other = stated is None and given.unit.casefold() != own.casefold()
+        if bracketed and (stated != there or other):
+            raise InputError(
+                f"{where} has the unit {own!r} in its header, but [columns] {channel} says "
+                f"{given.unit!r}; leave unit out, or, if the header is wrong, correct it by scale."
+            )
+    one, inverse = in_si(channel, unit, given.scale_unit), _inverse(channel, unit, given)
+    one = inverse / given.scale**2 if inverse is not None else one
     if one is None:
         raise InputError(
             f"{where} cannot be read as {channel}: its unit {unit!r} is of another kind; "
@@ -147,35 +152,18 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
     return given.scale * one * (-1.0 if given.counts_down else 1.0)
 
 
-def is_sensitivity(channel: str, unit: str, given: Column) -> bool:
-    """Whether a scale is that of a sensor, "4 mV/N", by which its reading is divided."""
-    return (
-        in_si(channel, unit, given.scale_unit) is None
-        and bool(given.scale_unit)
-        and (in_si(channel, unit, f"1/({given.scale_unit})") is not None)
-    )
-
-
-def _check_unit(channel: str, header: Header, given: str, where: str) -> None:
-    """Refuse a unit in [columns] that contradicts the one in the header."""
-    own = header.unit
-    if own is None or not is_unit(own, any_case=True):
-        return
-    stated, there = in_si(channel, given), in_si(channel, own)
-    if there is None and not header.text.endswith((")", "]", "}")):
-        return  # the last word of a name only looks like a unit
-    if stated != there or (stated is None and given.casefold() != own.casefold()):
-        raise InputError(
-            f"{where} has the unit {own!r} in its header, but [columns] {channel} says {given!r}; "
-            "leave unit out, or, if the header is wrong, correct it by scale."
-        )
+def _inverse(channel: str, unit: str, given: Column) -> float | None:
+    """SI value of a unit over that of a scale which is a sensor's sensitivity, as "4 mV/N"."""
+    if not given.scale_unit or in_si(channel, unit, given.scale_unit) is not None:
+        return None
+    return in_si(channel, unit, f"1/({given.scale_unit})")
 
 
 def needed_columns(table: Table, columns: dict[str, int], settings: Settings) -> dict[str, int]:
     """Choose the channels worth reading; refuse a file that lacks one that nothing can replace."""
-    has, striker = set(columns), settings.striker or Striker()
-    forced = bool(has & {"stress", "force"})
-    braked = bool(has & {"acceleration", "velocity"} or (has & set(_MOTIONS) and striker.velocity))
+    has, striker, motion = set(columns), settings.striker or Striker(), settings.motion
+    forced, moved = bool(has & {"stress", "force"}), bool(has & set(_MOTIONS))
+    braked = bool(has & {"acceleration", "velocity"} or (moved and striker.velocity))
     if not forced and not ("time" in has and braked and striker.mass):
         entries = entries_of(table, has, "force", "displacement", "time")
         raise InputError(
@@ -184,11 +172,11 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
             "with a time and the [striker] mass an acceleration or a velocity will do, and with "
             "its velocity a displacement."
         )
-    helping = {"velocity"} if has & {"acceleration", *_MOTIONS} else set[str]()
+    if motion is not None:
+        _check_motion(table, columns, motion.file.name)
+    helping = {"velocity"} if moved or "acceleration" in has else set[str]()
     helping = {"velocity", "acceleration"} if forced else helping
-    if settings.motion is not None:
-        _check_motion(table, columns, settings.motion.file)
-    if has & set(_MOTIONS) or settings.motion is not None:
+    if moved or motion is not None:
         return {c: k for c, k in columns.items() if c not in helping}
     for channel in has & helping - set(settings.columns):
         try:  # these only help, so one whose unit does not say what it is can be left
@@ -206,54 +194,13 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
     return {c: k for c, k in columns.items() if c in has}
 
 
-def entries_of(table: Table, has: set[str], *channels: str) -> str:
-    """Entries of [columns] for channels that the file seems to lack, by units of its headers."""
-    entries = []
-    for channel in channels:
-        fits = (
-            k for k, header in enumerate(table.headers)
-            if header.unit and in_si(channel, header.unit) is not None
-            and all(header.rank(other) is None for other in CHANNELS)
-        )  # fmt: skip
-        k = next(fits, None)
-        column = '"…"' if k is None else quoted(table, k)
-        unit = f', unit = "{channel_of(channel).unit}"' if k is None else ""
-        entries += [f"{channel} = {{ column = {column}{unit} }}"] if channel not in has else []
-    return listed(entries)
-
-
-def left_out(table: Table, needed: dict[str, int]) -> dict[str, int]:
-    """Columns that could have been read instead of those that are: the twins and other times."""
-    found: dict[str, int] = {}
-    for channel in (c for c in needed if c in {"time", *TWINS}):
-        twin = TWINS.get(channel, channel)
-        ranks = {
-            k: rank
-            for k, header in enumerate(table.headers)
-            if k not in needed.values() and (rank := header.rank(twin)) is not None
-        }
-        if ranks and (twin not in needed or channel == "time"):
-            found[twin] = min(ranks, key=lambda k: ranks[k])
-    return found
-
-
-def scale_spreads(columns: dict[str, int], given: dict[str, Column]) -> dict[str, float]:
-    """Standard deviations of the scales of the channels that are read, each over its scale."""
-    sources = _SOURCES | {c: (c,) for c in ("velocity", "acceleration")}
-    used = {channel: next((c for c in cs if c in columns), "") for channel, cs in sources.items()}
-    if used["stress"] == "acceleration":  # then it is no channel of its own
-        del used["acceleration"]
-    spreads = {f"{channel}_scale": given.get(c, _NONE).spread for channel, c in used.items()}
-    return {name: spread for name, spread in spreads.items() if spread}
-
-
-def _check_motion(table: Table, columns: dict[str, int], file: Path) -> None:
+def _check_motion(table: Table, columns: dict[str, int], name: str) -> None:
     """Refuse a test with [motion] that has a displacement of its own, or no time."""
     own = [c for c in columns if c in _MOTIONS or interior_node(c)]
     if own:
         raise InputError(
             f"{table.path}: column {table.headers[columns[own[0]]].text!r} is a {own[0]}, but "
-            f"[motion] file = {file.name!r} has the motion; leave one of them out."
+            f"[motion] file = {name!r} has the motion; leave one of them out."
         )
     if "time" not in columns:
         raise InputError(
@@ -275,20 +222,58 @@ def motion_columns(table: Table, columns: dict[str, int]) -> dict[str, int]:
     return needed
 
 
+def entries_of(table: Table, has: set[str], *channels: str) -> str:
+    """Entries of [columns] for channels that the file seems to lack, by units of its headers."""
+    entries = []
+    unnamed = [
+        k
+        for k, header in enumerate(table.headers)
+        if header.unit and all(header.rank(channel) is None for channel in CHANNELS)
+    ]
+    for channel in channels:
+        units = ((k, table.headers[k].unit or "") for k in unnamed)
+        k = next((k for k, unit in units if in_si(channel, unit) is not None), None)
+        column = '"…"' if k is None else quoted(table, k)
+        unit = f', unit = "{channel_of(channel).unit}"' if k is None else ""
+        entries += [f"{channel} = {{ column = {column}{unit} }}"] if channel not in has else []
+    return listed(entries)
+
+
+def left_out(table: Table, needed: dict[str, int]) -> dict[str, int]:
+    """Columns that could have been read instead of those that are: the twins and other times."""
+    found: dict[str, int] = {}
+    for channel in (c for c in needed if c in {"time", *TWINS}):
+        twin = TWINS.get(channel, channel)
+        headers = ((k, h.rank(twin)) for k, h in enumerate(table.headers))
+        ranks = {k: r for k, r in headers if r is not None and k not in needed.values()}
+        if ranks and (twin not in needed or channel == "time"):
+            found[twin] = min(ranks, key=lambda k: ranks[k])
+    return found
+
+
+def scale_spreads(columns: dict[str, int], given: dict[str, Column]) -> dict[str, float]:
+    """Standard deviations of the scales of the channels that are read, each over its scale."""
+    sources = _SOURCES | {c: (c,) for c in ("velocity", "acceleration")}
+    used = {channel: next((c for c in cs if c in columns), "") for channel, cs in sources.items()}
+    if used["stress"] == "acceleration":  # then it is no channel of its own
+        del used["acceleration"]
+    spreads = {f"{channel}_scale": given.get(c, _NONE).spread for channel, c in used.items()}
+    return {name: spread for name, spread in spreads.items() if spread}
+
+
 def read_note(table: Table, needed: dict[str, int], columns: dict[str, Column]) -> str:
     """Say what is read from which column, and which columns are not used."""
     parts = []
     for channel, k in needed.items():
         given, header = columns.get(channel, _NONE), table.headers[k]
-        by = f"{given.scale:.6g} {given.scale_unit}".strip()
-        own = (given.unit or header.unit or "").casefold()
-        part = f"{channel} from {table.name(k)}" + (f" in {given.unit}" if given.unit else "")
+        by, unit = f"{given.scale:.6g} {given.scale_unit}".strip(), given.unit or header.unit or ""
         by += f" ± {percent(given.spread)}" if given.spread else ""
-        inverse = is_sensitivity(channel, given.unit or header.unit or "", given)
-        part += f" {'over the sensitivity' if inverse else 'times'} {by}" if by != "1" else ""
+        over = _inverse(channel, unit, given) is not None
+        part = f"{channel} from {table.name(k)}" + (f" in {given.unit}" if given.unit else "")
+        part += f" {'over the sensitivity' if over else 'times'} {by}" if by != "1" else ""
         part += ", counting down" if given.counts_down else ""
-        if channel == "force" and own in WEIGHTS:
-            part += f" ({WEIGHTS[own]}: the weight of that mass)"
+        if channel == "force" and unit.casefold() in WEIGHTS:
+            part += f" ({WEIGHTS[unit.casefold()]}: the weight of that mass)"
         parts.append(part)
     used = needed.values()
     rest = [repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in used]

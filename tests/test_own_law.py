@@ -1,0 +1,207 @@
+"""A law of one's own, in a file that --law names: known to every command and its processes."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from conftest import without_pictures
+from foamfit.cli import main
+from foamfit.errors import InputError
+from foamfit.springs import laws
+
+# An elastic law: what is tested is who knows it.
+LAW = """\
+import foamfit as ff
+
+EPS, SIGMA = 0, 1
+
+
+def fill(values, row):
+    row[:] = values
+    return values[0] > 0.0 and values[1] > 0.0
+
+
+def begin(row, state):
+    state[:] = 0.0
+
+
+def leaves(row, state, strain):
+    return False
+
+
+def switch(row, state, up):
+    pass
+
+
+def settle(row, state, strain):
+    state[EPS] = strain
+    state[SIGMA] = row[0] * strain + row[1] * strain**3
+
+
+LAW = ff.Law(
+    kind="cubic",
+    title="cubic spring",
+    hysteretic=False,
+    params=(
+        ff.Param("k", ("k", ""), "Pa", "slope", (1.0, "slope"), (1e-2, 1e2), "slope",
+                 example="1 MPa"),
+        ff.Param("q", ("q", ""), "Pa", "factor of the cube", (1.0, "slope"), (1e-2, 1e2), "slope",
+                 example="3 MPa"),
+    ),
+    functions=ff.Functions(fill, begin, leaves, switch, settle),
+)
+"""
+COMMANDS = ("batch", "check", "compare", "fit", "init", "joint", "page", "predict", "simulate")
+TRUE = {"s1_k": 2e5, "s1_q": 1e6}
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a law and two tests of it; what is registered goes with the test."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(laws, "_LAWS", dict(laws._LAWS))
+    monkeypatch.setattr(laws, "_TEXTS", dict(laws._TEXTS))
+    without_pictures(monkeypatch)
+    (tmp_path / "cubic.py").write_text(LAW)
+    strain = 0.5 * np.sin(np.linspace(0.0, np.pi, 61))
+    stress = TRUE["s1_k"] * strain + TRUE["s1_q"] * strain**3
+    for seed in (1, 2):
+        noise = 500.0 * np.random.default_rng(seed).standard_normal(strain.size)
+        rows = zip(np.arange(61), stress + noise, strain, strict=True)
+        text = "\n".join(["time (s),stress (Pa),strain", *(f"{t},{s},{e}" for t, s, e in rows)])
+        (tmp_path / f"t{seed}.csv").write_text(text + "\n")
+        toml = '[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n'
+        (tmp_path / f"t{seed}.toml").write_text(toml)
+    return tmp_path
+
+
+def run(*words: object) -> Result:
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+def refused(*words: object) -> str:
+    """The one sentence with which a command refuses."""
+    told = run(*words)
+    assert (told.exit_code, told.stdout) == (1, ""), told.output
+    assert re.fullmatch(r"foamfit: [^\n]+\n", told.stderr)
+    assert "defect" not in told.stderr
+    return told.stderr
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_takes_laws(command: str) -> None:
+    assert "--law FILE.py" in run(command, "--help").stdout
+
+
+def test_a_law_of_a_file_simulates(here: Path) -> None:
+    (here / "drive.csv").write_text("time (s),displacement (mm)\n0,0\n1,2\n2,4\n3,0\n")
+    (here / "scene.toml").write_text(
+        '[chain]\narea = "1 cm^2"\n[[chain.springs]]\nkind = "cubic"\nheight = "10 mm"\n'
+        'k = "0.2 MPa"\nq = "1 MPa"\n[drive]\nkind = "displacement"\nfile = "drive.csv"\n'
+    )
+    assert "kind = 'cubic'" in refused("simulate", "scene.toml")
+    assert run("simulate", "scene.toml", "--law", "cubic.py").exit_code == 0
+    stress, strain = np.loadtxt(here / "scene.csv", delimiter=",", skiprows=1).T[1:3]
+    np.testing.assert_allclose(strain, [0.0, 0.2, 0.4, 0.0], atol=1e-12)
+    np.testing.assert_allclose(stress, 2e5 * strain + 1e6 * strain**3, rtol=1e-9, atol=1e-6)
+
+
+def test_a_law_of_a_file_is_fitted_and_predicts(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = ("--model", "cubic", "--law", "cubic.py", "--starts", 2, "--out", "r", "--json")
+    told = run("fit", "t1.csv", *asked)
+    assert told.exit_code == 0, told.output
+    found = json.loads(told.stdout)["parameters"]
+    for name, true in TRUE.items():
+        assert found[name]["state"] == "determined"
+        assert found[name]["value"] == pytest.approx(true, rel=0.02)
+    monkeypatch.setattr(laws, "_LAWS", {k: v for k, v in laws._LAWS.items() if k != "cubic"})
+    assert "'cubic' is not a spring" in refused("predict", "r", "t2.csv")
+    told = run("predict", "r", "t2.csv", "--law", "cubic.py", "--json", "--no-report")
+    assert told.exit_code == 0, told.output
+    assert json.loads(told.stdout)["misfit"]["stress_strain"] < 0.01
+
+
+def test_processes_of_a_batch_know_the_law_as_it_is_now(here: Path) -> None:
+    """With another text of the law what is done is fitted again."""
+    asked = ("t1.csv", "--model", "cubic", "--law", "cubic.py", "--starts", 1, "--jobs", 1)
+    told = run("batch", *asked, "--json", "--no-report", "--out", "b")
+    assert told.exit_code == 0, told.output
+    (first,) = json.loads(told.stdout)
+    assert first["s1_q"] == pytest.approx(TRUE["s1_q"], rel=0.02)
+    (here / "cubic.py").write_text(LAW.replace("strain**3", "strain**2"))
+    told = run("batch", *asked, "--json", "--no-report", "--out", "b")
+    (second,) = json.loads(told.stdout)
+    assert second["s1_q"] != pytest.approx(first["s1_q"], rel=0.1)
+
+
+def test_the_process_of_the_page_knows_the_law(here: Path) -> None:
+    import time
+
+    from foamfit.page.desk import Desk
+
+    laws.load_file(here / "cubic.py")
+    desk = Desk(here / "window")
+    desk.take(here / "t1.csv")
+    assert not desk.check(*desk.dropped_toml()).error
+    worker = desk.fit(["--model", "cubic", "--starts", "1"])
+    end = time.monotonic() + 60.0
+    while worker.ended is None:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert worker.ended == ""
+    desk.close()
+
+
+def test_no_toml_no_result_and_no_browser_names_a_law_file(here: Path) -> None:
+    """A law file is code."""
+    from foamfit.page.worker import parsed
+
+    (here / "law.py").write_text("import pathlib\npathlib.Path('run').touch()\n")
+    (here / "scene.toml").write_text('law = "law.py"\n[chain]\npublished = "foam-2"\n')
+    assert "'law'" in refused("simulate", "scene.toml")
+    (here / "study.toml").write_text('law = "law.py"\ntests = ["t1.csv"]\nmodel = "linear"\n')
+    assert "'law'" in refused("joint", "study.toml")
+    (here / "t1.toml").write_text('law = "law.py"\n[specimen]\nheight = "1 cm"\narea = "1 cm^2"\n')
+    assert "'law'" in refused("check", "t1.csv")
+    for given in (["--law", "law.py"], ["--law=law.py"]):
+        with pytest.raises(InputError, match="--law"):
+            parsed(given)
+    with pytest.raises(InputError, match="law"):
+        parsed(["--model", "--law=law.py"]) and laws.law("--law=law.py")
+    assert not (here / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, ("none.py", "no such file")),
+        ("x = 1\n", ("none.py", "no law")),
+        ("def f(:\n", ("none.py", "cannot be run", "SyntaxError")),
+        ("raise KeyError('two\\nlines')\n", ("none.py", "cannot be run", "KeyError")),
+        (LAW.replace("= row[0] * strain", "= -row[0] * strain"), ("none.py", "cubic")),
+        (LAW.replace('kind="cubic"', 'kind="+"'), ("none.py", "+")),
+    ],
+)
+def test_what_a_law_file_does_wrong_is_one_sentence(
+    here: Path, text: str | None, words: tuple[str, ...]
+) -> None:
+    if text is not None:
+        (here / "none.py").write_text(text)
+    told = refused("check", "t1.csv", "--law", "none.py")
+    for word in words:
+        assert word in told
+    assert "cubic" not in laws.kinds()
+
+
+def test_a_law_is_loaded_before_anything_else(here: Path) -> None:
+    assert "none.py" in refused("fit", "none.csv", "--model", "rubber", "--law", "none.py")
+    assert "foamfit_law_cubic" not in sys.modules or "cubic" not in laws.kinds()
