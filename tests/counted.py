@@ -22,6 +22,7 @@ import foamfit as ff
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.fitting.problem import make_params, make_problem
 from foamfit.fitting.search import Tracker
+from foamfit.solve.explicit import taylor
 from foamfit.solve.plan import plan
 from foamfit.springs import kernels
 from foamfit.springs.chain import Drive
@@ -100,6 +101,22 @@ class Masses(np.ndarray):
         return super().__getitem__(key)
 
 
+class Numbers(np.ndarray):
+    """The numbers that explicit steps take in one array: the onsite damper is the first."""
+
+    def __getitem__(self, key: Any) -> Any:
+        value = super().__getitem__(key)
+        return CountedDrag(value) if key == 0 else value
+
+
+def integrate(*given: Any) -> Any:
+    """Take explicit steps with an onsite damper that is counted."""
+    return _integrate(*given[:4], given[4].view(Numbers), *given[5:])
+
+
+_integrate, taylor.integrate = taylor.integrate, integrate
+
+
 # Dashpots are kept with the branches of their springs: the lines that reckon with them are seen.
 DASHPOT = re.compile(r"[*/] *\(?[\w.]*(rows\[\w+, ETA|law\[\w+, DASHPOT)|, (ETA|DASHPOT)\] *[*/]")
 
@@ -114,7 +131,7 @@ def _dashpot_lines(filename: str) -> frozenset[int]:
 def tracer(frame: Any, event: str, _: Any) -> Any:
     """Count the lines run on which something is reckoned with a dashpot."""
     lines = _dashpot_lines(frame.f_code.co_filename)
-    if not lines or _module(frame.f_code.co_filename) in ("steps", "control", "vibration"):
+    if not lines or _module(frame.f_code.co_filename) in ("steps", "control", "rates"):
         return None
     if event == "line" and frame.f_lineno in lines:
         COUNTS["dashpot lines"] += 1

@@ -300,7 +300,7 @@ def test_the_data_of_a_figure_take_the_place_of_no_other_table(here: Path) -> No
     path = write(here)
     before = path.read_bytes()
     args = ("--model", "bistable", "--plot", path.with_suffix(".png"))
-    refused(here, "check", path, *args, words=(path.name, "plotted data", "name the figure"))
+    refused(here, "check", path, *args, words=(path.name, "the data of the figure", "name the figure"))
     assert path.read_bytes() == before
 
 

@@ -107,7 +107,8 @@ def settings_key(recipe: Recipe) -> str:
     """
     parts = asdict(replace(recipe, pages=True)) | {"foamfit": version("foamfit")}
     del parts["width"]
-    if texts := parts.pop("laws"):
+    texts = parts.pop("laws")
+    if any(laws.is_registered(kind) for kind in recipe.model.split("+")):
         parts["laws"] = sorted(texts.values())
     return json.dumps(parts, sort_keys=True)
 

@@ -61,7 +61,7 @@ def kinds() -> tuple[str, ...]:
 
 def is_registered(kind: str) -> bool:
     """Whether a law is none of the paper's, so that it is followed by the loops for any law."""
-    return kind not in _OWN
+    return kind in _LAWS and kind not in _OWN
 
 
 def register(law: Law) -> Law:
