@@ -300,7 +300,8 @@ def test_the_data_of_a_figure_take_the_place_of_no_other_table(here: Path) -> No
     path = write(here)
     before = path.read_bytes()
     args = ("--model", "bistable", "--plot", path.with_suffix(".png"))
-    refused(here, "check", path, *args, words=(path.name, "the data of the figure", "name the figure"))
+    words = (path.name, "the data of the figure", "name the figure")
+    refused(here, "check", path, *args, words=words)
     assert path.read_bytes() == before
 
 
