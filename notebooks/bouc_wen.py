@@ -1,4 +1,4 @@
-"""A law of one's own: Bouc-Wen hysteresis, σ = α k ε + (1 - α) k z (Wen 1976, with β = γ).
+"""A user-defined law: Bouc-Wen hysteresis, σ = α k ε + (1 - α) k z (Wen 1976, with β = γ).
 
 On loading and unloading alike dz/dε = 1 - |z/limit|^n as long as z grows in the direction of the
 motion, else 1.

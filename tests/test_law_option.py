@@ -1,4 +1,4 @@
-"""A law of one's own, in a file that --law names: known to every command and its processes."""
+"""A user-defined law, in a file that --law names: known to every command and its processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Laws of one's own: registered from a file, refused where wrong, simulated, fitted."""
+"""User-defined laws: registered from a file, refused where wrong, simulated, fitted."""
 
 from __future__ import annotations
 

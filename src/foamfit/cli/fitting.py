@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from foamfit.data.measurement import Measurement
     from foamfit.study.cycles import CycleFits
 
-# Options that are no keywords of `foamfit.fit`, and those that become its `intervals`.
+# Options that `foamfit.fit` does not take as keywords, and those that become its `intervals`.
 OF_ONE_MODEL, WAYS = ("cycle", "model", "fix", "vary"), ("profile", "bootstrap", "mcmc")
 
 

@@ -1,4 +1,4 @@
-"""Samples that are no measurements: spikes, short gaps, a clipped force, a gauge that stands still.
+"""Samples to leave out: spikes, short gaps, a clipped force, a gauge that stands still.
 
 A sample is judged by its neighbours, not by a model. A gauge that stands still while the stress
 goes on, and then jumps, shows its play where a motion turns round, or a display that is not

@@ -29,8 +29,9 @@ class Links:
 
     `kinds` has one of `KINDS` for each parameter that is named; the others are own. `log_rates`
     (n,) are ln(rate/rate0), needed by laws of rate, and `rate_errors` (n,) their standard errors
-    (none where there is none). `pulls` (n,) of a scattering parameter are the roots of the weights
-    of (ln v - ln common value)²; a parameter that is not in it is drawn to no common value.
+    (left out where the rates are exact). `pulls` (n,) of a scattering parameter are the roots of
+    the weights of (ln v - ln common value)²; a parameter without an entry is not drawn to a common
+    value.
     """
 
     kinds: Mapping[str, str]

@@ -12,7 +12,7 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.fitting.box import Space
 from foamfit.fitting.curves import smoothed
-from foamfit.springs.laws.record import Between, Law
+from foamfit.springs.laws.record import Law, Param
 from foamfit.springs.loop import Loop
 
 LOOP_SAMPLES = 240
@@ -56,7 +56,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
     assert loop.stress is not None
     model, index, laws = space.model, space.model.index, space.model.laws
     count, relaxing = len(laws), 2 * model.relaxation * sum(law.hysteretic for law in laws)
-    more = sum(max(law.marks - OWN_MARKS, 0) for law in laws if law.hysteretic)
+    more = sum(max(law.wanted_marks - OWN_MARKS, 0) for law in laws if law.hysteretic)
     marks = qmc.LatinHypercube(7 * count + more + relaxing, rng=rng).random(CURVE_STARTS)
     starts = []
     lines = [law.own == ("k0",) for law in laws]
@@ -83,7 +83,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
         for i, law in enumerate(laws):
             if lines[i]:
                 continue
-            extra = [next(rest) for _ in range(max(law.marks - OWN_MARKS, 0))]
+            extra = [next(rest) for _ in range(max(law.wanted_marks - OWN_MARKS, 0))]
             places = np.append(mark[7 * i : 7 * i + OWN_MARKS], extra)
             own = model.own(i, values)
             if law.read_off is None:
@@ -102,17 +102,16 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
 
 def _anywhere(space: Space, law: Law, marks: Array) -> Array:
     """Own parameters of a law that reads none off a loop, and no dashpot, from marks in [0, 1]."""
-    places = iter(np.resize(marks, len(law.params)))
-    out: dict[str, float] = {}
-    for param in sorted(law.params, key=lambda param: law.search_order.index(param.name)):
+    mark_of = dict(zip(law.search_order, marks, strict=False))
+
+    def chosen(param: Param) -> float:
         low, high = param.start_limits
-        u, unit = low + next(places) * (high - low), space.scales.unit(param.scale)
-        if isinstance(param.coordinate, Between):
-            first, last = param.coordinate.ends(*(out[name] for name in param.of))
-            out[param.name] = first + u * (last - first)
-        else:
-            out[param.name] = unit * float(np.exp(u) if param.is_logarithmic else u)
-    return np.array([*(out[name] for name in law.own), 0.0])
+        u = low + float(mark_of[param.name]) * (high - low)
+        if param.of:
+            return u
+        return space.scales.unit(param.scale) * float(np.exp(u) if param.is_logarithmic else u)
+
+    return np.append(law.assembled(chosen), 0.0)
 
 
 def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array]:

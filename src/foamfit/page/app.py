@@ -433,7 +433,7 @@ class Window:
         self._turn_model(news.model, cycle, news.values, **options)
 
     def _ended(self) -> None:
-        """Show the result of the fit, or why there is none."""
+        """Show the result of the fit, or why it failed."""
         self._allow()
         self.stop.visible = False
         self.progress.object = piece("ended")

@@ -192,7 +192,7 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
 
 
 def _run(job: Job) -> tuple[str, str]:
-    """Fit and write the result; returns "" or why there is none, and the text on cycles."""
+    """Fit and write the result; return "" or why the fit failed, and the text on cycles."""
     try:
         from foamfit.cli.fitting import fit_as_asked
         from foamfit.report.studies.cycles import cycles_text

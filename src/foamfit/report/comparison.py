@@ -253,7 +253,7 @@ def _correlation(content: Any, where: str) -> dict[tuple[str, str], float]:
 
 
 def published_side(name: str) -> Side:
-    """Return the parameters of a published set; InputError if there is none of that name."""
+    """Return the parameters of a published set; InputError if the name is unknown."""
     if name not in published_sets:
         known = ", ".join(published_sets)
         raise InputError(f"there is no published set '{name}'; there are {known}")
@@ -271,7 +271,7 @@ def published_side(name: str) -> Side:
 
 
 def _unpublished(side: Side) -> str:
-    """Return the first kind of spring without published parameters, "" if there is none."""
+    """Return the first kind of spring that has no published parameters, or ""."""
     laws = map(law, side.kinds)
     return next((one.kind for one in laws if one.hysteretic and not one.published), "")
 

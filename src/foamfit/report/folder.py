@@ -175,7 +175,7 @@ def is_written(path: Path, tests: Collection[str] = ()) -> bool:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """Content of a fit.json, of this version or another one; empty if it is none."""
+    """Content of a fit.json of any version; empty if the file is not a fit.json."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):  # neither UTF-8 nor JSON

@@ -76,12 +76,15 @@ def in_series(laws: tuple[Law, ...]) -> InSeries:
         return out
 
     @compiled
-    def tried(springs: Springs, sigma: float, h: float) -> float:
+    def beside(given: tuple[Springs, float], sigma: float) -> float:
         """Elongation under a stress; the springs stay where they are."""
+        springs, h = given
         trial = Springs(
             springs.rows, springs.states.copy(), springs.terms.copy(), springs.heights, springs.eta
         )
         return stretch(trial, sigma, h)
+
+    find = followed.inverse(beside)
 
     @compiled
     def elongate(springs: Springs, sigma: float, moved: float, h: float) -> float:
@@ -91,35 +94,10 @@ def in_series(laws: tuple[Law, ...]) -> InSeries:
             return step(
                 0, springs.rows[0], springs.states[0], springs.terms[0], springs.eta[0], eps, h
             )
-        low = high = sigma
-        least = most = tried(springs, sigma, h)
-        pace = 1e-3 * max(abs(sigma), 1.0)
-        for _ in range(200):
-            if least <= moved <= most:
-                break
-            if moved > most:
-                low, least, high = high, most, high + pace
-                most = tried(springs, high, h)
-            else:
-                high, most, low = low, least, low - pace
-                least = tried(springs, low, h)
-            pace *= 2.0
-        if not least <= moved <= most:
-            return math.nan
-        middle = high
-        for turn in range(200):
-            middle = 0.5 * (low + high)
-            if turn % 3 and most > least:
-                middle = low + (high - low) * (moved - least) / (most - least)
-            now = tried(springs, middle, h)
-            if now < moved:
-                low, least = middle, now
-            else:
-                high, most = middle, now
-            if now == moved or high - low <= 1e-15 * max(abs(low), abs(high)):
-                break
-        stretch(springs, middle, h)
-        return middle
+        common = find((springs, h), sigma, 1e-3 * max(abs(sigma), 1.0), 0.0, moved)
+        if math.isfinite(common):
+            stretch(springs, common, h)
+        return common
 
     @compiled
     def note(springs: Springs, j: int, nodes: Array, branches: NDArray[np.int64]) -> None:

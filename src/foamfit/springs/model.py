@@ -83,7 +83,7 @@ class Model:
 
     @cached_property
     def is_registered(self) -> bool:
-        """Whether a spring follows a law that is none of the paper's."""
+        """Whether a spring follows a registered law, not one of the paper's."""
         return any(laws.is_registered(kind) for kind in self.kinds)
 
     def param(self, name: str) -> Param:

@@ -58,18 +58,6 @@ def branch_derivative(row: Row, branch: int, own: int) -> tuple[float, float, fl
     return d_kc, d_eps_star, 0.0
 
 
-@inner
-def stress_tangent(row: Row, branch: int, eps: float, d_eps: float, own: int) -> float:
-    """Derivative of a spring's stress by its `own` parameter (or -1), by which eps moves d_eps."""
-    dk = dx0 = ds0 = 0.0
-    if 0 <= own < OWN_ETA:
-        dk, dx0, ds0 = branch_derivative(row, branch, own)
-    curved, _, x0, _ = branch_shape(row, branch)
-    x = eps - x0
-    at_rest = (x / (1.0 - x) if curved else x) * dk + ds0
-    return at_rest + slope_on(row, branch, eps) * (d_eps - dx0)
-
-
 @compiled
 def equilibrium_tangents(
     rows: Array,

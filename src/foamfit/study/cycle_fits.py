@@ -38,7 +38,7 @@ class FittedCycles:
     selection : Selection or None
         Which parameters change from cycle to cycle; `together` holds the numbers of its cycles.
     sentences : tuple of str
-        What the fit of several cycles says, or why there is none.
+        What the fit of several cycles says, or why it failed.
     """
 
     test: str

@@ -304,7 +304,7 @@ def choose_kinds(
     """Links in which each of these parameters has the kind of the least BIC.
 
     All are shared at first; in each round the change of one kind that lowers BIC most is taken. A
-    law of rate is none of the kinds where the tests leave its slope open (`open_slope`).
+    law of rate is not offered where the tests leave its slope open (`open_slope`).
     """
 
     def score(one: Together) -> float:

@@ -25,7 +25,7 @@ from foamfit.springs.spring import LawSpring, Relaxation
 
 ENTRY_POINTS = "foamfit.laws"
 _LAWS = {law.kind: law for law in (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)}
-_OWN = tuple(_LAWS)  # laws that the kernels know
+PAPER = tuple(_LAWS)  # laws that the kernels know
 _TEXTS: dict[str, str] = {}  # of the law files that were loaded, by path
 _asked_packages: list[bool] = []
 
@@ -60,8 +60,8 @@ def kinds() -> tuple[str, ...]:
 
 
 def is_registered(kind: str) -> bool:
-    """Whether a law is none of the paper's, so that it is followed by the loops for any law."""
-    return kind in _LAWS and kind not in _OWN
+    """Whether a law is not one of the paper's, so that the loops for any law follow it."""
+    return kind in _LAWS and kind not in PAPER
 
 
 def register(law: Law) -> Law:
@@ -86,7 +86,7 @@ def register(law: Law) -> Law:
     """
     from foamfit.springs.laws.checked import check
 
-    check(law, _OWN)
+    check(law, PAPER)
     if law.spring is None:
 
         def make(*values: float, relaxation: Relaxation = ()) -> LawSpring:
@@ -153,7 +153,7 @@ def _run(path: str, text: str) -> tuple[Law, ...]:
     try:
         exec(compile(text, path, "exec"), module.__dict__)
         given = [one for one in vars(module).values() if isinstance(one, Law)]
-        kinds_of = {one.kind: one for one in given if one.kind not in _OWN}
+        kinds_of = {one.kind: one for one in given if one.kind not in PAPER}
         found = tuple(register(one) for one in kinds_of.values())
     except (Exception, SystemExit) as error:
         _LAWS.clear()

@@ -15,10 +15,17 @@ from foamfit.springs.laws.record import (
     LAST_STRAIN,
     Between,
     Compared,
-    Functions,
     Law,
     Param,
     PointOf,
+)
+from foamfit.springs.laws.shared import (
+    COMPARED_ETA,
+    COMPARED_HEIGHT,
+    COMPARED_K0,
+    K0,
+    KC,
+    functions_of,
     steeper,
 )
 from foamfit.springs.loop import Loop
@@ -249,27 +256,14 @@ _DROP = Between(  # Δσ from 0 to -σ_a
     lambda k0, eps_a: ((0.0, -eps_a / (1.0 - eps_a)), (0.0, -k0 / (1.0 - eps_a) ** 2)),
 )
 _BEYOND_A1 = Between(("eps_a",), lambda eps_a: (eps_a, LAST_STRAIN), lambda eps_a: ((1.0, 0.0),))
-_STIFFNESSES = (math.log(0.3), math.log(300.0))
-
-
-def _functions() -> Functions:
-    from foamfit.springs.laws import followed
-
-    return followed.functions_of("bistable")
 
 
 LAW = Law(
     kind="bistable",
     title="bistable spring",
     params=(
-        Param(
-            "k0", ("k", "0"), "Pa", "first slope of branch a", (3.0, "slope"), (1e-3, 1e4),
-            "stress", inner=_STIFFNESSES, branch="a", example="5.5 MPa",
-        ),
-        Param(
-            "kc", ("k", "c"), "Pa", "first slope of branch c", (20.0, "slope"), (1e-2, 1e5),
-            "stress", inner=_STIFFNESSES, branch="c", example="82.5 MPa",
-        ),
+        K0,
+        KC,
         Param(
             "dsigma", ("Δσ", ""), "Pa", "stress at C2 less that at A1", (-0.1, "stress"),
             (-10.0, 0.0), "stress", _DROP, box=(0.0, 0.999), least_size=1.0,
@@ -296,7 +290,7 @@ LAW = Law(
         ),
     ),
     numbered=BRANCH_NAMES,
-    functions=_functions,
+    functions=functions_of("bistable"),
     branches={"a": "elastic", "d": "snap-buckling", "c": "densified", "e": "snap-back"},
     spring=BistableSpring,
     searched=("k0", "kc", "eps_a", "eps_c", "dsigma", "kh_plus", "kh_minus"),
@@ -317,15 +311,15 @@ LAW = Law(
         PointOf("sigma_hat_c", ("σ̂", "c"), "stress at C1", "Pa"),
     ),
     compared=(
-        Compared("k0", "MPa", ("k0",), lambda k0: k0 / 1e6),
+        COMPARED_K0,
         Compared(
             "Δσ/σ_a", "", ("dsigma", "k0", "eps_a"),
             lambda dsigma, k0, eps_a: dsigma * (1.0 - eps_a) / (k0 * eps_a),
         ),
-        Compared("η", "Pa·s", ("eta",), lambda eta: eta),
+        COMPARED_ETA,
         Compared("ε_a", "", ("eps_a",), lambda eps_a: eps_a),
         Compared("ε_c", "", ("eps_c",), lambda eps_c: eps_c),
-        Compared("h", "mm", ("height",), lambda height: height / 1e-3),
+        COMPARED_HEIGHT,
         Compared("k_h+/k0", "", ("kh_plus", "k0"), lambda slope, k0: slope / k0),
         Compared("k_h−/k0", "", ("kh_minus", "k0"), lambda slope, k0: slope / k0),
         Compared("k_c/k0", "", ("kc", "k0"), lambda kc, k0: kc / k0),

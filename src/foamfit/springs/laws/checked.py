@@ -11,7 +11,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.springs.laws import followed
-from foamfit.springs.laws.record import ADMISSIBLE, COMMON, EPS, Between, Functions, Law, Param
+from foamfit.springs.laws.record import ADMISSIBLE, COMMON, EPS, Functions, Law, Param
 
 SCALES = {"one": 1.0, "strain": 0.5, "stress": 1e6, "slope": 2e6, "damping": 1e3, "duration": 1e-3}
 _UP = np.linspace(0.0, 0.5, 101)
@@ -54,19 +54,12 @@ def _param(law: Law, param: Param) -> str | None:
 
 def start_values(law: Law) -> Array:
     """Own parameters at their start values, for a test of 1 MPa at a strain of 0.5."""
-    values: dict[str, float] = {}
-    for name in law.search_order:
-        param = law.by_name[name]
-        values[name] = param.start[0] * SCALES[param.start[1]]
-        if isinstance(param.coordinate, Between):
-            first, last = param.coordinate.ends(*(values[other] for other in param.of))
-            values[name] = first + 0.5 * (last - first)
-    return np.array([values[name] for name in law.own])
+    return law.assembled(lambda param: 0.5 if param.of else param.start[0] * SCALES[param.start[1]])
 
 
 def _missing(law: Law) -> str | None:
     """What is wrong with the functions of a record."""
-    given = law.functions if isinstance(law.functions, Functions) else law.functions()
+    given = law.loaded_functions()
     if not isinstance(given, Functions):
         return "functions must be foamfit.Functions(fill, begin, leaves, switch, settle)"
     absent = [name for name, one in given._asdict().items() if not callable(one)]
@@ -79,7 +72,7 @@ def _overrun(law: Law, values: Array) -> str | None:
     Compiled functions check no index, and would write into the memory of others: so the law is
     first followed as it was written.
     """
-    given = law.functions if isinstance(law.functions, Functions) else law.functions()
+    given = law.loaded_functions()
     written: list[Any] = [getattr(one, "py_func", one) for one in given]
     plain = Functions(*written)
     if any(one.__module__.startswith("foamfit.") for one in written):

@@ -93,7 +93,7 @@ def functions_of(kind: str) -> Functions:
 @cache
 def compiled_functions(law: Law) -> Functions:
     """Functions of a law, compiled."""
-    given: Any = law.functions if isinstance(law.functions, Functions) else law.functions()
+    given: tuple[Any, ...] = law.loaded_functions()
     return Functions(*(one if hasattr(one, "py_func") else compiled(one) for one in given))
 
 
@@ -200,6 +200,47 @@ def _chosen(functions: Sequence[Compiled]) -> Compiled:
     return choose
 
 
+def inverse(value_at: Compiled) -> Compiled:
+    """Find where value_at(given, x), which never falls with x, has a target.
+
+    find(given, start, pace, size, target) searches about `start`, first by steps of `pace`, to
+    rounding of x or of `size`, the smaller of x that count; NaN if nothing has the target.
+    """
+
+    @compiled
+    def find(given: Any, start: float, pace: float, size: float, target: float) -> float:
+        low = high = start
+        least = most = value_at(given, start)
+        for _ in range(200):  # ends between which the target lies
+            if least <= target <= most:
+                break
+            up = target > most
+            x = high + pace if up else low - pace
+            now = value_at(given, x)
+            if up:
+                low, least, high, most = high, most, x, now if now == now else math.inf
+            else:
+                low, least, high, most = x, now if now == now else -math.inf, low, least
+            pace *= 2.0
+        if not least <= target <= most:
+            return math.nan
+        x = high
+        for turn in range(200):  # false position, every third step a bisection
+            x = 0.5 * (low + high)
+            if turn % 3 and most - least < math.inf and most > least:
+                x = low + (high - low) * (target - least) / (most - least)
+            now = value_at(given, x)
+            if now < target:
+                low, least = x, now
+            else:
+                high, most = x, now
+            if now == target or high - low <= 1e-15 * max(abs(low), abs(high), size):
+                break
+        return x
+
+    return find
+
+
 @cache
 def loops_of(laws: tuple[Law, ...]) -> Loops:
     """Loops of springs of these laws, base first."""
@@ -224,41 +265,21 @@ def loops_of(laws: tuple[Law, ...]) -> Loops:
         return out + eta * (eps - from_eps) / h if h > 0.0 and eta > 0.0 else out
 
     @compiled
+    def beside(given: Any, eps: float) -> float:
+        """Stress at a strain; the spring stays where it is."""
+        i, row, state, terms, eta, h = given
+        return step(i, row, state.copy(), terms.copy(), eta, eps, h)
+
+    find = inverse(beside)
+
+    @compiled
     def to_stress(
         i: int, row: Array, state: Array, terms: Array, eta: float, sigma: float, h: float
     ) -> float:
-        trial, memory = state.copy(), terms.copy()
-        low = high = state[EPS]
-        least = most = step(i, row, trial, memory, eta, low, h)
-        pace = 1e-3
-        for _ in range(80):  # strains between which the stress lies
-            if least <= sigma <= most:
-                break
-            up = sigma > most
-            eps = high + pace if up else low - pace
-            trial[:], memory[:] = state, terms
-            now = step(i, row, trial, memory, eta, eps, h)
-            if up:
-                low, least, high, most = high, most, eps, now if now == now else math.inf
-            else:
-                low, least, high, most = eps, now if now == now else -math.inf, low, least
-            pace *= 1.6
-        if not least <= sigma <= most:
-            return math.nan
-        eps = high
-        for turn in range(200):  # false position, every third step a bisection
-            eps = 0.5 * (low + high)
-            if turn % 3 and most - least < math.inf and most > least:
-                eps = low + (high - low) * (sigma - least) / (most - least)
-            trial[:], memory[:] = state, terms
-            now = step(i, row, trial, memory, eta, eps, h)
-            if now < sigma:
-                low, least = eps, now
-            else:
-                high, most = eps, now
-            if now == sigma or high - low <= 1e-15 * max(abs(low), abs(high), 1e-3):
-                break
-        step(i, row, state, terms, eta, eps, h)
+        given = (i, row, state, terms, eta, h)
+        eps = find(given, state[EPS], 1e-3, 1e-3, sigma)
+        if math.isfinite(eps):
+            step(i, row, state, terms, eta, eps, h)
         return eps
 
     return Loops(start, step, to_stress)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 from foamfit.springs.law import BRANCH_NAMES
-from foamfit.springs.laws.record import Compared, Functions, Law, Param
+from foamfit.springs.laws.record import Law
+from foamfit.springs.laws.shared import COMPARED_ETA, COMPARED_HEIGHT, COMPARED_K0, K0, functions_of
 from foamfit.springs.spring import Relaxation, Spring, freeze_numbers
 
 
@@ -52,30 +52,19 @@ def _unilateral(k0: float, eta: float = 0.0) -> LinearSpring:
     return LinearSpring(k0, eta, unilateral=True)
 
 
-def _functions(kind: str) -> Functions:
-    from foamfit.springs.laws import followed
-
-    return followed.functions_of(kind)
-
-
 LAW = Law(
     kind="linear",
     title="linear spring",
-    params=(
-        Param(
-            "k0", ("k", "0"), "Pa", "slope", (3.0, "slope"), (1e-3, 1e4), "stress",
-            inner=(math.log(0.3), math.log(300.0)), example="60 MPa",
-        ),
-    ),
+    params=(replace(K0, what="slope", branch="", example="60 MPa"),),
     numbered=BRANCH_NAMES,
-    functions=lambda: _functions("linear"),
+    functions=functions_of("linear"),
     branches={"line": "linear"},
     hysteretic=False,
     spring=LinearSpring,
     compared=(
-        Compared("k0", "MPa", ("k0",), lambda k0: k0 / 1e6),
-        Compared("η", "Pa·s", ("eta",), lambda eta: eta),
-        Compared("h", "mm", ("height",), lambda height: height / 1e-3),
+        COMPARED_K0,
+        COMPARED_ETA,
+        COMPARED_HEIGHT,
     ),
     inner_loops=False,
     remembers=False,
@@ -83,6 +72,6 @@ LAW = Law(
 )  # fmt: skip
 UNILATERAL_LAW = replace(
     LAW, kind="unilateral", title="linear spring without tension", spring=_unilateral,
-    functions=lambda: _functions("unilateral"),
+    functions=functions_of("unilateral"),
     branches={"line": "linear", "open": "out of contact"},
 )  # fmt: skip

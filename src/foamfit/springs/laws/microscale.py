@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,16 @@ from foamfit.springs.laws.record import (
     LAST_STRAIN,
     Between,
     Compared,
-    Functions,
     Law,
     Param,
+)
+from foamfit.springs.laws.shared import (
+    COMPARED_ETA,
+    COMPARED_HEIGHT,
+    COMPARED_K0,
+    K0,
+    KC,
+    functions_of,
     steeper,
 )
 from foamfit.springs.loop import Loop
@@ -196,28 +203,15 @@ def _least_slopes(k0: float, kc: float) -> tuple[tuple[float, float], ...]:
 _BEYOND_A = Between(
     ("k0", "kc"), lambda k0, kc: (least_eps_star(k0, kc), LAST_STRAIN), _least_slopes
 )
-_STIFFNESSES = (math.log(0.3), math.log(300.0))
 _STRESSES, _SPREADS = (math.log(0.02), math.log(1.0)), (math.log(0.05), math.log(2.0))
-
-
-def _functions() -> Functions:
-    from foamfit.springs.laws import followed
-
-    return followed.functions_of("microscale")
 
 
 LAW = Law(
     kind="microscale",
     title="microscale spring",
     params=(
-        Param(
-            "k0", ("k", "0"), "Pa", "first slope of branch a", (3.0, "slope"), (1e-3, 1e4),
-            "stress", inner=_STIFFNESSES, branch="a", example="0.55 MPa",
-        ),
-        Param(
-            "kc", ("k", "c"), "Pa", "first slope of branch c", (20.0, "slope"), (1e-2, 1e5),
-            "stress", inner=_STIFFNESSES, branch="snap-through", example="0.25 MPa",
-        ),
+        replace(K0, example="0.55 MPa"),
+        replace(KC, branch="snap-through", example="0.25 MPa"),
         Param(
             "eps_star", ("ε", "*"), "", "strain at which branch c starts from zero stress",
             (0.8, "one"), (0.0, LAST_STRAIN), "one", _BEYOND_A, box=(0.0, 1.0), least_size=0.1,
@@ -241,7 +235,7 @@ LAW = Law(
         ),
     ),
     numbered=BRANCH_NAMES,
-    functions=_functions,
+    functions=functions_of("microscale"),
     branches={
         "a": "elastic, none has snapped",
         "snap-through": "micro-springs snap",
@@ -260,15 +254,15 @@ LAW = Law(
     neighbours=_neighbours,
     exchanged=(_to_stresses, _from_stresses),
     compared=(
-        Compared("k0", "MPa", ("k0",), lambda k0: k0 / 1e6),
+        COMPARED_K0,
         Compared("k_c", "MPa", ("kc",), lambda kc: kc / 1e6),
-        Compared("η", "Pa·s", ("eta",), lambda eta: eta),
+        COMPARED_ETA,
         Compared("ε_*", "", ("eps_star",), lambda star: star),
         Compared("σ₊", "MPa", ("sigma_plus",), lambda sigma: sigma / 1e6),
         Compared("s₊", "", ("spread_plus",), lambda spread: spread),
         Compared("σ₋", "MPa", ("sigma_minus",), lambda sigma: sigma / 1e6),
         Compared("s₋", "", ("spread_minus",), lambda spread: spread),
-        Compared("h", "mm", ("height",), lambda height: height / 1e-3),
+        COMPARED_HEIGHT,
     ),
     note="σ₊ and σ₋ are where half of the micro-springs have snapped on loading, and where half "
     "have snapped back on unloading. For a single spring its branches are shown too, thin and "

@@ -174,24 +174,6 @@ class Compared(NamedTuple):
     formula: Callable[..., Any]  # also of complex numbers, for its derivatives
 
 
-# k_c over the largest stress from which a search begins again.
-STEEP = np.geomspace(1.0, 1000.0, 7)
-
-
-def steeper(values: Array, kc: int, start: int, top: float, low: float) -> Iterator[Array]:
-    """Give springs with another k_c whose branch c has the same strain at the largest stress.
-
-    A steep branch c shows in few samples: where k_c alone changes, it misses them altogether. `kc`
-    and `start` are the places of k_c and of the strain where branch c begins, at the stress `low`.
-    """
-    for other in top * STEEP:
-        moved = values.copy()
-        moved[kc] = other
-        rises = [top / (k + top) - low / (k + low) for k in (values[kc], other)]
-        moved[start] += rises[0] - rises[1]
-        yield moved
-
-
 def _no_neighbours(values: Array, top: float) -> Iterator[Array]:
     return iter(())
 
@@ -296,6 +278,11 @@ class Law:
         """Its own parameters and the dashpot by their names."""
         return {param.name: param for param in (*self.params, ETA)}
 
+    @property
+    def wanted_marks(self) -> int:
+        """Number of marks that start values are made of: of a law that reads none, all of them."""
+        return self.marks if self.read_off is not None else len(self.params)
+
     @cached_property
     def search_order(self) -> tuple[str, ...]:
         """Its own parameters in an order in which each follows those that it is relative to."""
@@ -321,15 +308,25 @@ class Law:
             raise InputError(f"law '{self.kind}' is not known yet: register it first")
         return self.spring(*values, **({"relaxation": relaxation} if self.hysteretic else {}))
 
+    def loaded_functions(self) -> Functions:
+        """Functions of the law, loaded where they are not given at once."""
+        return self.functions if isinstance(self.functions, Functions) else self.functions()
+
+    def assembled(self, chosen: Callable[[Param], float]) -> Array:
+        """Own parameters from a choice for each: its place between its ends, or else its value."""
+        values: dict[str, float] = {}
+        for name in self.search_order:
+            param = self.by_name[name]
+            values[name] = chosen(param)
+            if isinstance(param.coordinate, Between):
+                first, last = param.coordinate.ends(*(values[other] for other in param.of))
+                values[name] = first + values[name] * (last - first)
+        return np.array([values[name] for name in self.own])
+
     def any_spring(self) -> Any:
         """Make some spring of the law, whatever its numbers: of it only the law counts."""
-        values = {}
-        for param in sorted(self.params, key=lambda param: self.search_order.index(param.name)):
-            values[param.name] = abs(param.start[0]) or 1.0
-            if isinstance(param.coordinate, Between):
-                first, last = param.coordinate.ends(*(values[name] for name in param.of))
-                values[param.name] = first + 0.2 * (last - first)
-        return self.make([*(values[name] for name in self.own), 0.0], ())
+        own = self.assembled(lambda param: 0.2 if param.of else abs(param.start[0]) or 1.0)
+        return self.make([*own, 0.0], ())
 
     def named_branch(self, number: int) -> str:
         """Name of a branch by its number."""

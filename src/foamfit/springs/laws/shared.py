@@ -1,0 +1,51 @@
+"""What the paper's laws have in common: stiffnesses, rows of the comparison, steep branches c."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.springs.laws.record import Compared, Functions, Param
+
+_INNER = (math.log(0.3), math.log(300.0))  # of stiffnesses over the largest stress
+K0 = Param(
+    "k0", ("k", "0"), "Pa", "first slope of branch a", (3.0, "slope"), (1e-3, 1e4), "stress",
+    inner=_INNER, branch="a", example="5.5 MPa",
+)  # fmt: skip
+KC = Param(
+    "kc", ("k", "c"), "Pa", "first slope of branch c", (20.0, "slope"), (1e-2, 1e5), "stress",
+    inner=_INNER, branch="c", example="82.5 MPa",
+)  # fmt: skip
+COMPARED_K0 = Compared("k0", "MPa", ("k0",), lambda k0: k0 / 1e6)
+COMPARED_ETA = Compared("η", "Pa·s", ("eta",), lambda eta: eta)
+COMPARED_HEIGHT = Compared("h", "mm", ("height",), lambda height: height / 1e-3)
+# k_c over the largest stress from which a search begins again.
+STEEP = np.geomspace(1.0, 1000.0, 7)
+
+
+def functions_of(kind: str) -> Callable[[], Functions]:
+    """Functions of one of the paper's laws, loaded when they are first needed."""
+
+    def load() -> Functions:
+        from foamfit.springs.laws import followed
+
+        return followed.functions_of(kind)
+
+    return load
+
+
+def steeper(values: Array, kc: int, start: int, top: float, low: float) -> Iterator[Array]:
+    """Give springs with another k_c whose branch c has the same strain at the largest stress.
+
+    A steep branch c shows in few samples: where k_c alone changes, it misses them altogether. `kc`
+    and `start` are the places of k_c and of the strain where branch c begins, at the stress `low`.
+    """
+    for other in top * STEEP:
+        moved = values.copy()
+        moved[kc] = other
+        rises = [top / (k + top) - low / (k + low) for k in (values[kc], other)]
+        moved[start] += rises[0] - rises[1]
+        yield moved
