@@ -77,6 +77,9 @@ def _switch(row: Array, state: Array, up: bool) -> None:
 _FILL = {
     "bistable": kernels.fill_bistable,
     "microscale": micro.fill_microscale,
+    "microscale, stiffening": micro.fill_stiffening,
+    "microscale, mullins": micro.fill_mullins,
+    "microscale, stiffening, mullins": micro.fill_memory,
     "linear": kernels.fill_linear,
     "unilateral": kernels.fill_unilateral,
 }
