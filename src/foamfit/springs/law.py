@@ -151,4 +151,3 @@ def most_beyond(k: float, kc: float, n: float) -> tuple[float, float]:
     sigma = 0.5 * (low + high)
     excess = -math.expm1(-math.log1p(n * sigma / k) / n) - sigma / (kc + sigma)
     return max(excess, 0.0), sigma
-

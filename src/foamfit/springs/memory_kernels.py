@@ -6,8 +6,9 @@ With p the fraction that has snapped and P the largest it has ever been,
     a(σ; k) = 1 - (1 + nσ/k)^(-1/n).
 
 Ranks w and W stand for p = Φ(w) and P = Φ(W); see `ranks`. On first loading w = W = u₊ with
-u₊ = (ln σ - ln sigma_plus)/spread_plus. What has snapped before snaps through at w = u₊ + s/spread_plus
-up to W, is held there until u₊ = W, and then first loading goes on. It snaps back at w = u₋.
+u₊ = (ln σ - ln sigma_plus)/spread_plus. What has snapped before snaps through once more at
+w = u₊ + s/spread_plus up to W, is held there until u₊ = W, and then first loading goes on. It snaps
+back at w = u₋.
 """
 
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
@@ -166,7 +167,7 @@ def at_stress(row: Row, state: Array, sigma: float) -> float:
 def _ends_of_stress(row: Row, state: Array, eps: float) -> tuple[float, float]:
     """Stresses between which the spring has a strain: those of the stiffest and softest branch."""
     n, star, stiff = row[STIFFENING], row[EPS_STAR], stress_on_a(row[STIFFENING], row[K0], eps)
-    if eps < 0.0 or not moves(int(state[BRANCH])) and state[SNAPPED] == 0.0:
+    if eps < 0.0 or (not moves(int(state[BRANCH])) and state[SNAPPED] == 0.0):
         soft = stress_on_a(n, row[K_SNAPPED], eps)
         low, high = min(stiff, soft), max(stiff, soft)
     else:
@@ -299,7 +300,7 @@ def _enter(row: Row, state: Array, branch: int, up: bool) -> None:
             state[BRANCH] = SNAP if state[NEVER] == 1.0 else AGAIN
             _no_less(row, state, HIGH)
             state[BRANCH] = A
-    elif branch == AGAIN or branch == BOTH:
+    elif branch in (AGAIN, BOTH):
         high = math.exp(row[LOG_AGAIN] + row[SPREAD_PLUS] * state[EVER])
         if (branch == AGAIN) == below:  # where both lines meet, the other one begins
             high = min(high, cross)
@@ -331,7 +332,7 @@ def _hold(row: Row, state: Array, rank: float) -> None:
 def turned(state: Array, up: bool) -> bool:
     """Whether a spring that snaps, or snaps back, is now moved the other way."""
     branch = state[BRANCH]
-    return branch == BACK if up else branch == SNAP or branch == AGAIN
+    return branch == BACK if up else branch in (SNAP, AGAIN)
 
 
 @inner
@@ -424,7 +425,7 @@ def rank_at(
         rank, branch = most, BACK if back > least else BOTH
     elif least < rank < most or rank == ever:
         branch = HELD
-    elif rank == least and branch == BACK or rank == most and branch in (SNAP, AGAIN):
+    elif (rank == least and branch == BACK) or (rank == most and branch in (SNAP, AGAIN)):
         branch = HELD  # also at an end of the held stresses that it has not passed
     if rank < LEAST_RANK:
         rank, branch = -math.inf, A
@@ -443,7 +444,7 @@ def under_stress(
     n, never = row[STIFFENING], share(-ever)
     p, rest = (share(rank), share(-rank)) if branch != A else (0.0, 1.0)
     strain, soft, _ = mixture(row, branch, p, rest, never, sigma)
-    if strain == -math.inf or branch == A and never == 1.0:
+    if strain == -math.inf or (branch == A and never == 1.0):
         return strain, soft, 0.0, 0.0, 0.0
     k = row[K0] if branch == SNAP else row[K_SNAPPED]
     one, by_ever, pace = on_a(n, k, sigma)[0], 0.0, 0.0
@@ -484,11 +485,11 @@ def strain_tangents(
     out[OF_STIFFENING] += worn * by_stiffening(n, row[K_SNAPPED], sigma)
     out[OF_SOFTENING] = worn * sigma * softer
     if moves(branch):
-        place, scale = line(row, branch)
+        scale = line(row, branch)[1]
         first = 5 if branch == BACK else 3
         out[first] = -math.exp(-(row[LOG_MINUS] if branch == BACK else row[LOG_PLUS])) / scale
         out[first + 1] = -rank / scale
-        if branch == AGAIN or branch == BOTH:
+        if branch in (AGAIN, BOTH):
             out[OF_WEAKENING] = 1.0 / scale
 
 

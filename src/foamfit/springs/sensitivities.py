@@ -117,7 +117,7 @@ def _follow(
 
 @inner
 def _moves_line(own: int) -> bool:
-    """Whether a parameter of a microscale spring moves its ranks, rather than its strain at them."""
+    """Whether a parameter moves the ranks of a microscale spring, not its strain at them."""
     return 3 <= own < OF_STRAIN or own == OF_WEAKENING
 
 

@@ -27,7 +27,6 @@ from foamfit.solve.explicit.memory import (
     RELAXED,
     SOFT,
     Memory,
-    advance_memory_tangents,
     enter_mixture,
     finish_mixture,
     keep,
@@ -687,15 +686,3 @@ def advance(s: Array, groups: int, order: int, span: float) -> None:
     for row in range(W, EPS + 1):
         for i in range(s.shape[1] if row == EPS else groups):
             s[row, i, 0] = value_at(s[row, i], order, span)
-
-
-@piece
-def advance_tangents(
-    d: SeriesTangents, groups: int, order: int, span: float, memory: Memory | None
-) -> None:
-    """Carry the derivatives of the state over a step of length `span`."""
-    for p in range(d.drag.size):
-        if d.live[p] > 0.0:
-            advance(d.series[p], groups, order, span)
-            if memory is not None:
-                advance_memory_tangents(memory, p, order, span)

@@ -373,9 +373,7 @@ def _with(*options: str) -> Law:
         all_of = _least_slopes(k0, kc, **dict(zip(also, given, strict=True)))
         return tuple(all_of[place] for place in picked)
 
-    beyond = Between(
-        ("k0", "kc", *also), lambda *given: (least(*given), LAST_STRAIN), slopes
-    )
+    beyond = Between(("k0", "kc", *also), lambda *given: (least(*given), LAST_STRAIN), slopes)
 
     def read(loop: Loop, marks: Array, scales: Any, way: int) -> Array:
         more = tuple(map(_marked, names, marks[7:]))
@@ -383,9 +381,8 @@ def _with(*options: str) -> Law:
         return _read(loop, marks, scales, more, lambda k0, kc: least(k0, kc, *given))
 
     def make(*values: float, relaxation: Relaxation = ()) -> MicroscaleSpring:
-        own, eta = values[:7], values[-1]
-        given = dict(zip(names, values[7:-1], strict=True))
-        return MicroscaleSpring(*own, eta=eta, relaxation=relaxation, **given)
+        given: dict[str, Any] = dict(zip((*LAW.own, *names, "eta"), values, strict=True))
+        return MicroscaleSpring(relaxation=relaxation, **given)
 
     kind = ", ".join((LAW.kind, *options))
     return replace(
@@ -398,7 +395,7 @@ def _with(*options: str) -> Law:
         ),
         functions=functions_of(kind),
         spring=make,
-        branches=LAW.branches | {"snap-through again": "what has snapped before snaps once more"},
+        branches={**LAW.branches, "snap-through again": "what has snapped before snaps once more"},
         searched=("k0", "kc", *names, *LAW.searched[2:]),
         read_off=read,
         marks=7 + len(names),
