@@ -5,6 +5,7 @@ curve, on the way down its unloading curve from there, so the strains are known 
 energy m v²/(2A) of the striker is ∫ s C ds up to the turn, C = Σ h dε/ds; what is left after it is
 ∫ s C ds on the way down, and the time of contact is ∫ C/v ds over both. The law of microscale
 springs is written out anew with SciPy's normal distribution; linear springs may be in series.
+On the way down what has snapped once is softer and snaps through earlier (section 8).
 """
 
 from __future__ import annotations
@@ -23,28 +24,39 @@ NODES = 40
 _X, _W = np.polynomial.legendre.leggauss(NODES)
 
 
-def _score(spring: Any, sign: str, s: Array) -> Array:
+def _score(spring: Any, sign: str, s: Array, weakened: float = 0.0) -> Array:
     place, wide = getattr(spring, f"sigma_{sign}"), getattr(spring, f"spread_{sign}")
-    return np.asarray(np.log(s / place) / wide)
+    return np.asarray((np.log(s / place) + weakened) / wide)
+
+
+def _on_a(spring: Any, k: float, s: Array) -> tuple[Array, Array]:
+    """Strain of branch a and its slope."""
+    n = spring.stiffening
+    left = (1.0 + n * s / k) ** (-1.0 / n)
+    return 1.0 - left, left / (k + n * s)
 
 
 def _compliance(spring: Any, s: Array, most: float, rising: bool) -> Array:
     """Return dε/ds of a spring at stresses s > 0 on the way up to `most`, or down from it."""
     if not hasattr(spring, "sigma_plus"):
         return np.full(s.size, 1.0 / spring.k0)
-    up, down = _score(spring, "plus", s), _score(spring, "minus", s)
     held = float(_score(spring, "plus", np.array([most]))[0])
+    a, slope = _on_a(spring, spring.k0, s)
     if rising:
-        w, wide = up, np.full(s.size, spring.spread_plus)
+        w, wide = _score(spring, "plus", s), np.full(s.size, spring.spread_plus)
+        on_a = ndtr(-w) * slope
     else:
+        up = _score(spring, "plus", s, spring.weakening)
+        down = _score(spring, "minus", s)
         back = np.maximum(up, down)
         w = np.minimum(held, back)
         wide = np.where(up >= down, spring.spread_plus, spring.spread_minus)
         wide = np.where(held < back, np.inf, wide)
-    gap = spring.eps_star + s / (spring.kc + s) - s / (spring.k0 + s)
+        a, softer = _on_a(spring, spring.k0 * math.exp(-spring.softening), s)
+        on_a = ndtr(-held) * slope + (ndtr(-w) - ndtr(-held)) * softer
+    gap = spring.eps_star + s / (spring.kc + s) - a
     density = np.exp(-0.5 * w * w) / math.sqrt(2.0 * math.pi) / (wide * s)
-    soft = ndtr(-w) * spring.k0 / (spring.k0 + s) ** 2 + ndtr(w) * spring.kc / (spring.kc + s) ** 2
-    return np.asarray(soft + gap * density)
+    return np.asarray(on_a + ndtr(w) * spring.kc / (spring.kc + s) ** 2 + gap * density)
 
 
 def _cuts(chain: Any, most: float, rising: bool) -> Array:
@@ -55,15 +67,19 @@ def _cuts(chain: Any, most: float, rising: bool) -> Array:
             continue
         for sign in ("plus",) if rising else ("plus", "minus"):
             place, wide = getattr(spring, f"sigma_{sign}"), getattr(spring, f"spread_{sign}")
+            if sign == "plus" and not rising:
+                place *= math.exp(-spring.weakening)
             cuts += list(place * np.exp(wide * np.arange(-9.0, 9.01, 0.5)))
         if rising:
             continue
         held = math.log(most / spring.sigma_plus) / spring.spread_plus
+        cuts.append(most * math.exp(-spring.weakening))
         cuts.append(spring.sigma_minus * math.exp(min(spring.spread_minus * held, 600.0)))
         apart = 1.0 / spring.spread_minus - 1.0 / spring.spread_plus
         if apart != 0.0:
             at = math.log(spring.sigma_minus) / spring.spread_minus
-            at = (at - math.log(spring.sigma_plus) / spring.spread_plus) / apart
+            at -= (math.log(spring.sigma_plus) - spring.weakening) / spring.spread_plus
+            at /= apart
             cuts.append(math.exp(min(max(at, -600.0), 600.0)))
     cuts += list(most * np.linspace(0.0, 1.0, 12))
     return np.unique([c for c in cuts if 0.0 <= c <= most])

@@ -1,6 +1,6 @@
 """Is an answer of the solver wrong anywhere? Fresh scenes, and a judge that shares nothing with it.
 
-Method. Each scene is answered by the solver and by brute force or root finding. Eleven
+Method. Each scene is answered by the solver and by brute force or root finding. Fifteen
 families are drawn at random from a seed (every scene is synthetic):
 
 - study: the ranges of scenes.py, another seed;
@@ -15,7 +15,11 @@ families are drawn at random from a seed (every scene is synthetic):
 - mixed: two to five springs of all kinds, with and without relaxation, dashpots and masses;
 - motion: two to four springs under a known motion, at least one of them microscale, with spreads
   from 1e-6 to 5, times from anywhere and steps that differ up to 1e8-fold, by root finding;
-- motion+relaxation: the same with relaxation and dashpots, by brute force.
+- motion+relaxation: the same with relaxation and dashpots, by brute force;
+- worn: one to three microscale springs that remember what has snapped (stiffening, softening,
+  weakening), in all three drives; worn+relaxation: the same with relaxation;
+- worn chain: two to five springs of all kinds, most with masses between them;
+- worn motion: as motion and motion+relaxation in turn.
 
 A tenth of those with memory ask for derivatives.
 
@@ -43,7 +47,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +55,7 @@ import numpy as np
 import pandas as pd
 from numpy.random import Generator
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
@@ -70,7 +75,8 @@ RTOLS = (1e-4, 1e-6, 1e-8)
 MOST = {"study": 4_000_000, "base": 10_000_000, "gap": 4_000_000, "turns": 4_000_000,
         "long": 20_000_000, "microscale": 4_000_000, "relaxation": 4_000_000,
         "microscale+relaxation": 4_000_000, "mixed": 4_000_000, "motion": 0,
-        "motion+relaxation": 4_000_000}  # fmt: skip
+        "motion+relaxation": 4_000_000, "worn": 4_000_000, "worn+relaxation": 4_000_000,
+        "worn chain": 4_000_000, "worn motion": 4_000_000}  # fmt: skip
 BAD, POOR = 3.0, 1.0  # error over rtol
 SLOPE_BAR = 1e-3  # error of a derivative over its range, at an rtol of up to 1e-5
 
@@ -307,6 +313,8 @@ def long(rng: Generator, number: int) -> Spec:
 
 MICROSCALE = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
 
+WORN = ("stiffening", "softening", "weakening")
+
 
 def microscale(rng: Generator, k0: float) -> Spec:
     """Draw a microscale spring of a first slope: narrow and wide spreads, loops and none."""
@@ -327,6 +335,29 @@ def microscale(rng: Generator, k0: float) -> Spec:
     }
 
 
+def worn(rng: Generator, k0: float) -> Spec:
+    """Draw a microscale spring that remembers what has snapped; one in five is extreme."""
+    spec, (n, d, s) = microscale(rng, k0), ((0.02, 50.0), 6.0, 6.0)
+    if rng.random() < 0.8:
+        (n, d, s) = (0.3, 4.0), 2.0, 1.0
+    spec["stiffening"] = 1.0 if rng.random() < 0.1 else log(rng, *n)
+    spec["softening"] = 0.0 if rng.random() < 0.15 else rng.uniform(0.0, d)
+    spec["weakening"] = 0.0 if rng.random() < 0.15 else rng.uniform(0.0, s)
+    k, kc, n = k0 * math.exp(-spec["softening"]), spec["kc"], spec["stiffening"]
+
+    def excess(log_s: float) -> float:  # of branch a over branch c
+        return -math.expm1(-math.log1p(n * math.exp(log_s)) / n) - 1.0 / (
+            1.0 + kc / k / math.exp(log_s)
+        )
+
+    grid = np.linspace(-20.0, 60.0, 801)
+    top = grid[np.argmax([excess(x) for x in grid])]
+    best = minimize_scalar(lambda x: -excess(x), bounds=(top - 0.1, top + 0.1), method="bounded")
+    least = max(0.0, -best.fun) * (1.0 + 1e-9) + 1e-12
+    spec["eps_star"] = least + (0.0 if rng.random() < 0.1 else rng.uniform(0.0, 0.6))
+    return spec
+
+
 def terms(rng: Generator, stop: float) -> list[list[float]]:
     """Draw one to three relaxation terms; one in ten has no strength."""
     return [
@@ -340,10 +371,12 @@ def room(spring: Spec) -> float:
     return 1.0 + spring.get("eps_star", 0.0)
 
 
-def remembering(rng: Generator, number: int, springs: list[Spec], relaxing: list[bool]) -> Spec:
+def remembering(
+    rng: Generator, number: int, springs: list[Spec], relaxing: list[bool], heavy: float = 0.3
+) -> Spec:
     """Put springs with memory into a chain, and load it by impact, stress or displacement."""
     k0, count = min(s["k0"] for s in springs), len(springs)
-    inertia = count > 1 and rng.random() < 0.3
+    inertia = count > 1 and rng.random() < heavy
     masses = [log(rng, 1e-6, 5e-3) if inertia else 0.0 for _ in range(count - 1)] + [0.0]
     spec = chain_of(rng, springs, log(rng, 3e-4, 2e-2), masses)
     drive = ("impact", "stress", "displacement")[number % 3]
@@ -382,7 +415,7 @@ def remembering(rng: Generator, number: int, springs: list[Spec], relaxing: list
         for i, spring in enumerate(springs, start=1):
             own = ["k0", "height"]
             if "sigma_plus" in spring:
-                own += MICROSCALE
+                own += [*MICROSCALE, *(name for name in WORN if spring.get(name))]
             elif "kc" in spring:
                 own += ["kc", "eps_a", "eps_c", "kh_plus", "kh_minus"]
             names.append(f"s{i}_{rng.choice(own)}")
@@ -393,29 +426,23 @@ def remembering(rng: Generator, number: int, springs: list[Spec], relaxing: list
     return spec | {"stop": stop, "samples": int(rng.choice([21, 101, 501]))}
 
 
-def only_microscale(rng: Generator, number: int) -> Spec:
-    k0 = log(rng, 1e5, 3e7)
-    count = int(rng.choice([1, 1, 2, 3]))
-    springs = [microscale(rng, k0 * log(rng, 0.5, 2.0)) for _ in range(count)]
-    return remembering(rng, number, springs, [False] * count)
+def alike(draw: Callable[[Generator, float], Spec], relaxes: bool) -> Callable[..., Spec]:
+    """Draw one to three springs of a kind; the first slopes of bistable ones are near k0."""
+
+    def family(rng: Generator, number: int) -> Spec:
+        k0 = log(rng, 1e5, 3e7)
+        count = int(rng.choice([1, 1, 2, 3]))
+        kind = draw if draw is not bistable or rng.random() >= 0.5 else foam
+        springs = [kind(rng, k0 * log(rng, 0.5, 2.0)) for _ in range(count)]
+        return remembering(rng, number, springs, [relaxes] * count)
+
+    return family
 
 
-def only_relaxation(rng: Generator, number: int) -> Spec:
-    k0 = log(rng, 1e5, 3e7)
-    count = int(rng.choice([1, 1, 2, 3]))
-    draw = foam if rng.random() < 0.5 else bistable
-    springs = [draw(rng, k0 * log(rng, 0.5, 2.0)) for _ in range(count)]
-    return remembering(rng, number, springs, [True] * count)
-
-
-def relaxing_microscale(rng: Generator, number: int) -> Spec:
-    k0 = log(rng, 1e5, 3e7)
-    count = int(rng.choice([1, 1, 2, 3]))
-    springs = [microscale(rng, k0 * log(rng, 0.5, 2.0)) for _ in range(count)]
-    return remembering(rng, number, springs, [True] * count)
-
-
-def mixed(rng: Generator, number: int) -> Spec:
+def mixed(
+    rng: Generator, number: int, draw: Callable[[Generator, float], Spec] = microscale,
+    heavy: float = 0.3,
+) -> Spec:  # fmt: skip
     """Springs of all kinds; at least one has memory."""
     k0 = log(rng, 1e5, 3e7)
     count = int(rng.integers(2, 6))
@@ -424,17 +451,19 @@ def mixed(rng: Generator, number: int) -> Spec:
     for i in range(count):
         kind, relaxes = rng.random(), bool(rng.random() < 0.5)
         if i == at or kind < 0.4:
-            springs.append(microscale(rng, k0 * log(rng, 0.5, 2.0)))
+            springs.append(draw(rng, k0 * log(rng, 0.5, 2.0)))
         elif kind < 0.7:
             springs.append(bistable(rng, k0 * log(rng, 0.5, 2.0)))
         else:
             springs.append(linear(rng, k0, unilateral=bool(rng.random() < 0.2)))
             relaxes = False
         relaxing.append(relaxes)
-    return remembering(rng, number, springs, relaxing)
+    return remembering(rng, number, springs, relaxing, heavy)
 
 
-def known_motion(rng: Generator, number: int) -> Spec:
+def known_motion(
+    rng: Generator, number: int, draw: Callable[[Generator, float], Spec] = microscale
+) -> Spec:
     """Springs in series, some alike, under a motion whose samples lie anywhere in time.
 
     A third starts at 0, a third at another time, and a third at 1.7e9 s with least steps of 1 µs.
@@ -444,7 +473,7 @@ def known_motion(rng: Generator, number: int) -> Spec:
     for i in range(count):
         stiff, kind = k0 * log(rng, 0.5, 2.0), rng.random()
         if i == 0 or kind < 0.5:
-            springs.append(microscale(rng, stiff))
+            springs.append(draw(rng, stiff))
             for spread in ("spread_plus", "spread_minus"):
                 springs[-1][spread] = log(rng, 1e-6, 5.0)
         elif kind < 0.75:
@@ -475,9 +504,11 @@ def known_motion(rng: Generator, number: int) -> Spec:
     return spec | {"stop": sum(spec["steps"]), "samples": samples, "judge": "roots"}
 
 
-def relaxing_motion(rng: Generator, number: int) -> Spec:
+def relaxing_motion(
+    rng: Generator, number: int, draw: Callable[[Generator, float], Spec] = microscale
+) -> Spec:
     """Let springs of `known_motion` relax, and give some of them dashpots."""
-    spec = known_motion(rng, number)
+    spec = known_motion(rng, number, draw)
     for key in ("sensitivities", "judge"):
         spec.pop(key, None)
     relaxes = rng.random() < 0.7
@@ -489,13 +520,20 @@ def relaxing_motion(rng: Generator, number: int) -> Spec:
     return spec
 
 
+def worn_motion(rng: Generator, number: int) -> Spec:
+    return (relaxing_motion if number % 2 else known_motion)(rng, number, worn)
+
+
 DRAWN: dict[str, Callable[[Generator, int], Spec]] = {
-    "base": base, "gap": gap, "turns": turns, "long": long, "microscale": only_microscale,
-    "relaxation": only_relaxation, "microscale+relaxation": relaxing_microscale, "mixed": mixed,
+    "base": base, "gap": gap, "turns": turns, "long": long,
+    "microscale": alike(microscale, False), "relaxation": alike(bistable, True),
+    "microscale+relaxation": alike(microscale, True), "mixed": mixed,
     "motion": known_motion, "motion+relaxation": relaxing_motion,
+    "worn": alike(worn, False), "worn+relaxation": alike(worn, True),
+    "worn chain": partial(mixed, draw=worn, heavy=0.7), "worn motion": worn_motion,
 }  # fmt: skip
 FAMILIES = ("study", *DRAWN)
-MEMORY = FAMILIES[5:]
+MEMORY, REMEMBERING = FAMILIES[5:11], FAMILIES[11:]
 
 
 def spec_of(family: str, number: int) -> Spec:
@@ -819,6 +857,7 @@ def main() -> None:
     ask.add_argument("--out", type=Path, default=HERE / "fresh.csv")
     ask.add_argument("--processes", type=int, default=2, choices=(1, 2))
     ask.add_argument("--scene", help="show one, as family:number")
+    ask.add_argument("--resume", action="store_true", help="keep the scenes that --out has")
     ask.add_argument("--again", type=Path, help="take the wrong scenes of this file")
     given = ask.parse_args()
     rtols = tuple(given.rtol or RTOLS)
@@ -832,12 +871,16 @@ def main() -> None:
     else:
         numbers = range(given.first, given.first + given.scenes)
         tasks = [(f, n, rtols) for f in given.family or FAMILIES for n in numbers]
-    compile_all(tuple(dict.fromkeys(family for family, *_ in tasks)))
     lines: list[dict[str, Any]] = []
+    if given.resume and given.out.exists():
+        lines = pd.read_csv(given.out).fillna({"reason": "", "method": ""}).to_dict("records")
+        done = {line["scene"] for line in lines}
+        tasks = [task for task in tasks if f"{task[0]}:{task[1]}" not in done]
+    compile_all(tuple(dict.fromkeys(family for family, *_ in tasks)))
     for found in run(tasks, given.processes):
         lines += found
         if len(lines) % (50 * len(rtols)) == 0:
-            print(f"{len(lines) // len(rtols)} of {len(tasks)}", file=sys.stderr, flush=True)
+            print(f"{len(lines) // len(rtols)} scenes", file=sys.stderr, flush=True)
             pd.DataFrame(lines).to_csv(given.out, index=False, float_format="%.6g")
     table = pd.DataFrame(lines)
     table.to_csv(given.out, index=False, float_format="%.6g")

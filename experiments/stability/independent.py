@@ -16,7 +16,10 @@ clamped or are driven carry one stress S:
 - the stress on a massless top is prescribed: S is that stress.
 
 The rank of a microscale spring that is held is a normal score w: it snaps through again where
-ln s = ln sigma_plus + spread_plus w, and back where ln s = ln sigma_minus + spread_minus w.
+ln s = ln sigma_plus + spread_plus w, and back where ln s = ln sigma_minus + spread_minus w. Where
+it remembers, W is the largest w ever: up to W it snaps through at ln s = ln sigma_plus - weakening
++ spread_plus w, beyond it as before; and branch a is σ = k ((1 - ε)^-n - 1)/n, with the softer k
+of what has snapped once for the share Φ(W) - Φ(w).
 
 The method of Dormand and Prince of order 8(5,3) takes explicit steps with compensated sums. A step
 ends at each sample, kink of the drive, end of a branch and turning point of s on a branch that
@@ -52,9 +55,10 @@ _E3, _E5 = DOP853.E3[:12].copy(), DOP853.E5[:12].copy()
 
 # Columns of a spring; those of a microscale spring beside K0, KC, ETA and H.
 K0, KC, EPS_A, EPS_C, STAR, SIG_A, SIG_C, UP, DOWN, HAT_A, HAT_C, ETA, H = range(13)
-EPS_STAR, LOG_PLUS, WIDE_PLUS, LOG_MINUS, WIDE_MINUS = 2, 3, 4, 5, 6
-# Branches; of a microscale spring: p is held; p = P+; p = raw P-; both are the same.
-A, D, C, E, LINE, ONE_SIDED, GAP, HELD, SNAP, BACK, BOTH = range(11)
+EPS_STAR, LOG_PLUS, WIDE_PLUS, LOG_MINUS, WIDE_MINUS, N, K_WORN, LOG_AGAIN = range(2, 10)
+# Branches; of a microscale spring: p is held; p = P+; p = raw P-; both are the same; and p = P+ of
+# what has snapped once. Where nothing differs then, P+ is followed on SNAP and BOTH.
+A, D, C, E, LINE, ONE_SIDED, GAP, HELD, SNAP, BACK, BOTH, AGAIN = range(12)
 # What is known of the top.
 MASS, DAMPER, STRESS, MOTION = range(4)
 # How a run ended.
@@ -81,10 +85,11 @@ class System(NamedTuple):
 
 
 class Flags(NamedTuple):
-    """Branch of each spring, and the rank up to which a microscale spring has snapped."""
+    """Branch of each spring, and the ranks up to which it has snapped, and ever had."""
 
     branch: Integers
     ranks: Array
+    most: Array
 
 
 class Tried(NamedTuple):
@@ -146,6 +151,8 @@ def row_of(spring: Any, height: float) -> tuple[list[float], int]:
     row[KC], row[EPS_STAR] = spring.kc, spring.eps_star
     row[LOG_PLUS], row[WIDE_PLUS] = math.log(spring.sigma_plus), spring.spread_plus
     row[LOG_MINUS], row[WIDE_MINUS] = math.log(spring.sigma_minus), spring.spread_minus
+    row[N], row[K_WORN] = spring.stiffening, spring.k0 * math.exp(-spring.softening)
+    row[LOG_AGAIN] = row[LOG_PLUS] - spring.weakening
     return row, HELD
 
 
@@ -203,44 +210,54 @@ def _score(p: Array, branch: int, rank: float, s: float) -> tuple[float, float]:
         return -math.inf, 0.0
     if branch == BACK:
         return (math.log(s) - p[LOG_MINUS]) / p[WIDE_MINUS], p[WIDE_MINUS]
-    return (math.log(s) - p[LOG_PLUS]) / p[WIDE_PLUS], p[WIDE_PLUS]
+    place = p[LOG_PLUS] if branch == SNAP else p[LOG_AGAIN]
+    return (math.log(s) - place) / p[WIDE_PLUS], p[WIDE_PLUS]
 
 
 @inner
-def _mixture(p: Array, branch: int, rank: float, s: float) -> tuple[float, float]:
+def _remembers(p: Array) -> bool:
+    """Whether what has snapped once differs from what has not."""
+    return p[K_WORN] < p[K0] or p[LOG_AGAIN] < p[LOG_PLUS]
+
+
+@inner
+def _on_a(n: float, k: float, s: float) -> tuple[float, float]:
+    """Strain of branch a at a stress, and its slope; infinite past the pole."""
+    if k + n * s <= 0.0:
+        return -math.inf, math.nan
+    if n == 1.0:
+        return s / (k + s), k / (k + s) ** 2
+    left = (1.0 + n * s / k) ** (-1.0 / n)
+    return -math.expm1(-math.log1p(n * s / k) / n), left / (k + n * s)
+
+
+@inner
+def _mixture(p: Array, branch: int, rank: float, most: float, s: float) -> tuple[float, float]:
     """Strain of a microscale spring at a stress, and dε/ds; infinite past the pole."""
     u, wide = _score(p, branch, rank, s)
     snapped, whole = 0.5 * math.erfc(-u / math.sqrt(2.0)), 0.5 * math.erfc(u / math.sqrt(2.0))
-    if p[K0] + s <= 0.0 or (snapped > 0.0 and p[KC] + s <= 0.0):
+    a, slope = _on_a(p[N], p[K0], s)
+    c, rise, soft, strain = 0.0, 0.0, whole * slope, whole * a
+    if branch != SNAP and most > -math.inf and p[K_WORN] < p[K0]:
+        never = min(0.5 * math.erfc(most / math.sqrt(2.0)), whole)
+        other, softer = _on_a(p[N], p[K_WORN], s)
+        soft = never * slope + (whole - never) * softer
+        strain, a = never * a + (whole - never) * other, other
+    if a == -math.inf or (snapped > 0.0 and p[KC] + s <= 0.0):
         return -math.inf, math.nan
-    a, c = s / (p[K0] + s), p[EPS_STAR] + s / (p[KC] + s)
-    soft = whole * p[K0] / (p[K0] + s) ** 2 + snapped * p[KC] / (p[KC] + s) ** 2
+    if snapped > 0.0:
+        c, rise = p[EPS_STAR] + s / (p[KC] + s), p[KC] / (p[KC] + s) ** 2
     if wide > 0.0:
         density = math.exp(-0.5 * u * u) / math.sqrt(2.0 * math.pi)
         soft += density / (wide * s) * (c - a)
-    return whole * a + snapped * c, soft
-
-
-@inner
-def _lag(p: Array, log_s: float) -> float:
-    """Score of snap-back less that of snap-through at a stress; above 0 the spring is hysteretic.
-
-    Well below every stress at -inf.
-    """
-    slope = 1.0 / p[WIDE_MINUS] - 1.0 / p[WIDE_PLUS]
-    constant = p[LOG_PLUS] / p[WIDE_PLUS] - p[LOG_MINUS] / p[WIDE_MINUS]
-    if slope == 0.0:
-        return constant
-    if log_s == -math.inf:
-        return -slope
-    return log_s * slope + constant
+    return strain + snapped * c, soft + snapped * rise
 
 
 @inner
 def _meets(p: Array) -> tuple[float, bool]:
-    """Stress at which both scores are the same, and whether the spring is hysteretic above it."""
+    """Stress at which snap-through and snap-back have one score; whether a loop lies above it."""
     slope = 1.0 / p[WIDE_MINUS] - 1.0 / p[WIDE_PLUS]
-    constant = p[LOG_PLUS] / p[WIDE_PLUS] - p[LOG_MINUS] / p[WIDE_MINUS]
+    constant = p[LOG_AGAIN] / p[WIDE_PLUS] - p[LOG_MINUS] / p[WIDE_MINUS]
     if slope == 0.0:
         return (-math.inf if constant > 0.0 else math.inf), True
     at = -constant / slope
@@ -250,28 +267,37 @@ def _meets(p: Array) -> tuple[float, bool]:
 
 
 @inner
-def _ends(p: Array, branch: int, rank: float) -> tuple[float, float, int, int]:
+def _ends(p: Array, branch: int, rank: float, most: float) -> tuple[float, float, int, int]:
     """What a branch is followed between (stress or strain), and the branches beyond."""
     if branch < HELD:
         return _bounds(p, branch)
+    if branch == SNAP and _remembers(p):
+        return -math.inf, math.inf, SNAP, SNAP
     cross, above = _meets(p)
+    differs, again = _remembers(p), p[LOG_AGAIN] + p[WIDE_PLUS] * rank
     if branch == HELD:
-        high = math.exp(p[LOG_PLUS] + p[WIDE_PLUS] * rank) if rank > -math.inf else 0.0
-        low = math.exp(p[LOG_MINUS] + p[WIDE_MINUS] * rank) if rank > -math.inf else -math.inf
-        start = p[LOG_PLUS] + p[WIDE_PLUS] * rank if rank > -math.inf else -math.inf
-        return low, high, BACK, (SNAP if _lag(p, start) > 0.0 else BOTH)
-    if branch == SNAP:
-        return -math.inf, (math.inf if above else cross), SNAP, BOTH
+        back = p[LOG_MINUS] + p[WIDE_MINUS] * rank
+        loop = back < again if rank > -math.inf else not above or cross == -math.inf
+        low, high = math.exp(min(back, again)), math.exp(again)
+        onward = BOTH if not loop else AGAIN if differs else SNAP
+        if differs and rank >= most:
+            onward, high = SNAP, math.exp(p[LOG_PLUS] + p[WIDE_PLUS] * rank)
+        low = low if low > 0.0 else -math.inf
+        return low, high, BACK if loop or not differs else BOTH, onward
     if branch == BACK:
         return (cross if above else -math.inf), math.inf, BOTH, BACK
-    return (
-        (-math.inf if above else cross), (cross if above else math.inf), BACK, SNAP,
-    )  # fmt: skip
+    low, under = (-math.inf if branch != BOTH or above else cross), BACK
+    high = cross if (branch == BOTH) == above else math.inf
+    last = math.exp(p[LOG_AGAIN] + p[WIDE_PLUS] * most) if differs else math.inf
+    if last < high:
+        return low, last, under, HELD
+    return low, high, under, BOTH if branch != BOTH else AGAIN if differs else SNAP
 
 
 @inner
-def _strain(x: float, branch: int, rank: float, p: Array) -> float:
-    return _mixture(p, branch, rank, x)[0] if branch >= HELD else x
+def _strain(x: float, flags: Flags, i: int, p: Array) -> float:
+    branch = flags.branch[i]
+    return _mixture(p, branch, flags.ranks[i], flags.most[i], x)[0] if branch >= HELD else x
 
 
 # ----------------------------------------------------------------------------- the equations
@@ -295,7 +321,7 @@ def _rates(
         p, x = springs[i], y[moving + i]
         if flags.branch[i] >= HELD:
             s = x
-            soft[i] = _mixture(p, flags.branch[i], flags.ranks[i], s)[1]
+            soft[i] = _mixture(p, flags.branch[i], flags.ranks[i], flags.most[i], s)[1]
             if not soft[i] > 0.0:
                 return False
         else:
@@ -388,13 +414,13 @@ def _over(
     moving, worst = y.size - system.relax[:, :, 0].size - flags.branch.size, -math.inf
     for i in range(flags.branch.size):
         p, branch, x = system.springs[i], flags.branch[i], y[moving + i]
-        low, high, _, _ = _ends(p, branch, flags.ranks[i])
+        low, high, _, _ = _ends(p, branch, flags.ranks[i], flags.most[i])
         unit = p[K0] if branch >= HELD else 1.0
         if branch >= HELD and max(abs(low), abs(high)) < math.inf and high > 0.0:
             unit = high
         worst = max(worst, (low - x) / unit, (x - high) / unit)
-        if branch in (SNAP, BACK):
-            way = -1.0 if branch == SNAP else 1.0
+        if branch in (SNAP, AGAIN, BACK):
+            way = 1.0 if branch == BACK else -1.0
             worst = max(worst, way * rates[moving + i] / paces[i])
     return max(worst, -base / peak) if peak > 0.0 else worst
 
@@ -417,15 +443,23 @@ def _enter(y: Array, rates: Array, moving: int, flags: Flags, springs: Array) ->
     moved = 0
     for i in range(flags.branch.size):
         before = flags.branch[i]
-        low, high, under, over = _ends(springs[i], before, flags.ranks[i])
+        low, high, under, over = _ends(springs[i], before, flags.ranks[i], flags.most[i])
         x, way = y[moving + i], rates[moving + i]
         if x >= high and way > 0.0:
             flags.branch[i] = over
+            if over == HELD:
+                flags.ranks[i] = flags.most[i]
         elif x <= low and way < 0.0:
             flags.branch[i] = under
-        elif (before == SNAP and way < 0.0) or (before == BACK and way > 0.0):
+        elif (before in (SNAP, AGAIN) and way < 0.0) or (before == BACK and way > 0.0):
             flags.ranks[i] = _score(springs[i], before, flags.ranks[i], x)[0]
             flags.branch[i] = HELD
+            if before == SNAP:
+                flags.most[i] = flags.ranks[i]
+            # within the ends of what is held: a rate that is 0 to rounding turns nothing to and fro
+            low, high, _, _ = _ends(springs[i], HELD, flags.ranks[i], flags.most[i])
+            near = 4e-16 if before == BACK else -4e-16
+            y[moving + i] = (max(x, low) if before == BACK else min(x, high)) * (1.0 + near)
         moved += flags.branch[i] != before
     return moved
 
@@ -509,7 +543,8 @@ def _suspect(
     k, y1, f1, first = one.k, one.y1, one.rates, 1.0
     moving = y.size - system.relax[:, :, 0].size - flags.branch.size
     for i in range(flags.branch.size):
-        low, high, _, _ = _ends(system.springs[i], flags.branch[i], flags.ranks[i])
+        p, branch = system.springs[i], flags.branch[i]
+        low, high, _, _ = _ends(p, branch, flags.ranks[i], flags.most[i])
         e0, e1, d0, d1 = y[moving + i], y1[moving + i], k[0, moving + i], f1[moving + i]
         if high < math.inf and d0 > 0.0 > d1:
             x = _turn(e0, d0, e1, d1, h)
@@ -519,8 +554,8 @@ def _suspect(
             x = _turn(-e0, -d0, -e1, -d1, h)
             if min(e0, e1) + 2.0 * h * d0 * x < low:
                 first = min(first, x)
-        if flags.branch[i] in (SNAP, BACK):
-            way = 1.0 if flags.branch[i] == SNAP else -1.0
+        if branch in (SNAP, AGAIN, BACK):
+            way = -1.0 if branch == BACK else 1.0
             for stage in range(1, 12):
                 if way * k[stage, moving + i] < 0.0:
                     first = min(first, _C[stage])
@@ -547,7 +582,7 @@ def _record(
     while done < times.size and times[done] <= now:
         place = 0.0
         for i in range(springs.shape[0]):
-            x = _strain(y[moving + i], flags.branch[i], flags.ranks[i], springs[i])
+            x = _strain(y[moving + i], flags, i, springs[i])
             place += springs[i, H] * x
             nodes[i, done] = place
         base[done] = pressure
@@ -576,7 +611,7 @@ def _follow(
         np.empty(groups), np.empty(size), np.zeros(size, np.int64), np.ones(count),
     )  # fmt: skip
     one.units[moving:] = 2
-    flags = Flags(kinds.copy(), np.full(count, -math.inf))
+    flags = Flags(kinds.copy(), np.full(count, -math.inf), np.full(count, -math.inf))
     for i in range(count):
         if kinds[i] < HELD:
             one.units[moving + i] = 1
@@ -713,7 +748,8 @@ def _follow(
         if hit:
             _rates(y, one.rates, one.stress, flags, system, value + rate * length, rate)
             for i in range(count):
-                low, high, _, _ = _ends(springs[i], flags.branch[i], flags.ranks[i])
+                branch, ranks = flags.branch[i], (flags.ranks[i], flags.most[i])
+                low, high, _, _ = _ends(springs[i], branch, ranks[0], ranks[1])
                 for bound in (low, high):
                     x = y[moving + i]
                     floor = 1e-2 if flags.branch[i] < HELD else 1e-290

@@ -3,8 +3,8 @@
 Undamped, massless springs that do not relax bear one stress, and along a monotone stretch of it
 the strain of each is a monotone function of that stress. At every sample the stress is sought at
 which their elongations add up to the prescribed displacement; then each spring takes down what it
-remembers: the flag of a bistable spring, the rank of a microscale one. Nothing is integrated, so
-neither the times of the samples nor the width of a snap matter. Law: model.md, sections 1 and 6.
+remembers: the flag of a bistable spring, the ranks of a microscale one. Nothing is integrated, so
+neither the times of the samples nor the width of a snap matter. Law: model.md, sections 1, 6, 8.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from independent import Array, Truth
-from mpmath import inf, log, mp, mpf, ncdf, sqrt
+from mpmath import exp, inf, log, mp, mpf, ncdf, sqrt
 
 DIGITS = 30
 
@@ -65,32 +65,38 @@ class _Bistable(_Linear):
 
 
 class _Microscale(_Linear):
-    """The rank up to which micro-springs have snapped, as a normal score."""
+    """The ranks up to which micro-springs have snapped, and ever had, as normal scores."""
 
     def __init__(self, spring: Any) -> None:
-        names = ("k0", "kc", "eps_star", "spread_plus", "spread_minus")
-        self.k0, self.kc, self.star, self.plus, self.minus = (
+        names = ("k0", "kc", "eps_star", "spread_plus", "spread_minus", "stiffening", "weakening")
+        self.k0, self.kc, self.star, self.plus, self.minus, self.n, self.weakening = (
             mpf(getattr(spring, name)) for name in names
         )
         self.at_plus, self.at_minus = log(mpf(spring.sigma_plus)), log(mpf(spring.sigma_minus))
-        self.rank = -inf
+        self.soft, self.rank, self.most = self.k0 * exp(-mpf(spring.softening)), -inf, -inf
 
-    def moved(self, s: Any) -> Any:
-        """Return the rank at a stress, from the one that is remembered."""
+    def moved(self, s: Any) -> tuple[Any, Any]:
+        """Return both ranks at a stress, from those that are remembered."""
         if s <= 0:
-            return -inf
+            return -inf, self.most
         plus = (log(s) - self.at_plus) / self.plus
-        minus = (log(s) - self.at_minus) / self.minus
-        return min(max(self.rank, plus), max(plus, minus))
+        least = max(plus, min(plus + self.weakening / self.plus, self.most))
+        most = max(least, (log(s) - self.at_minus) / self.minus)
+        rank = min(max(self.rank, least), most)
+        return rank, max(rank, self.most)
+
+    def _on_a(self, s: Any, k: Any) -> Any:
+        return s / (k + s) if self.n == 1 else 1 - (1 + self.n * s / k) ** (-1 / self.n)
 
     def strain(self, s: Any) -> Any:
-        rank = self.moved(s)
-        snapped, rest = ncdf(rank), ncdf(-rank)
+        rank, most = self.moved(s)
+        snapped, rest, never = ncdf(rank), ncdf(-rank), ncdf(-most)
         on_c = self.star + s / (self.kc + s) if snapped > 0 else mpf(0)
-        return rest * s / (self.k0 + s) + snapped * on_c
+        worn = (rest - never) * self._on_a(s, self.soft) if rest > never else mpf(0)
+        return never * self._on_a(s, self.k0) + worn + snapped * on_c
 
     def keep(self, s: Any) -> None:
-        self.rank = self.moved(s)
+        self.rank, self.most = self.moved(s)
 
 
 def _spring(spring: Any) -> _Linear:
@@ -114,7 +120,8 @@ def _root(springs: list[_Linear], heights: list[Any], top: Any, s: Any) -> Any:
     low = high = s
     low_miss = high_miss = here
     step = max(abs(s), min(p.k0 for p in springs)) / 1000
-    floor = -min(p.k0 for p in springs)  # no spring but a linear one can be pulled further
+    # no spring but a linear one can be pulled further
+    floor = -min(min(p.k0, getattr(p, "soft", p.k0) / getattr(p, "n", 1)) for p in springs)
     while here * (high_miss if here < 0 else low_miss) > 0:
         if here < 0:
             low, low_miss = high, high_miss
