@@ -1,0 +1,335 @@
+"""Microscale springs that remember (model, section 8) against an implementation of their own.
+
+`Formula` is section 8 as it stands: the state is updated in small steps, the strain is written out,
+and the stress at a strain is a root found by bracketing. `discrete` follows the micro-springs
+themselves.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.random import Generator
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import ndtr, ndtri
+
+import foamfit as ff
+
+Array = NDArray[np.float64]
+PLAIN = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 1.3e6, 0.4, 5.5e5, 0.6)
+WORN = replace(PLAIN, stiffening=1.6, softening=0.7, weakening=0.45)
+SPRINGS = {
+    "all three": WORN,
+    "no weakening": replace(WORN, weakening=0.0),
+    "no softening": replace(WORN, softening=0.0),
+    "hysteretic above": replace(WORN, spread_plus=0.8, spread_minus=0.4),
+    "equal spreads": replace(WORN, spread_minus=0.4),
+    "reversible once snapped": replace(WORN, weakening=2.0, spread_minus=0.4),
+    "always reversible": replace(WORN, sigma_minus=3e6, spread_minus=0.4, weakening=0.0),
+    "soft at first": replace(WORN, stiffening=0.3, eps_star=0.6),
+}
+
+
+class Formula:
+    """Section 8; ranks w and W stand for p and P, so that 1 - P keeps its digits."""
+
+    def __init__(self, spring: ff.MicroscaleSpring) -> None:
+        self.spring, self.w, self.most = spring, -math.inf, -math.inf
+
+    def moved(self, s: float) -> tuple[float, float]:
+        p, first, back = self.spring, -math.inf, -math.inf
+        if s > 0.0:
+            first = math.log(s / p.sigma_plus) / p.spread_plus
+            back = math.log(s / p.sigma_minus) / p.spread_minus
+        least = max(first, min(first + p.weakening / p.spread_plus, self.most))
+        w = min(max(self.w, least), max(least, back))
+        return w, max(self.most, w)
+
+    def on_a(self, s: float, k: float) -> float:
+        n = self.spring.stiffening
+        return -math.expm1(-math.log1p(n * s / k) / n) if n * s > -k else -math.inf
+
+    def strain(self, s: float) -> float:
+        p, (w, most) = self.spring, self.moved(s)
+        never, once, snapped = ndtr(-most), ndtr(-w) - ndtr(-most), ndtr(w)
+        strain = never * self.on_a(s, p.k0)
+        if once > 0.0:
+            strain += once * self.on_a(s, p.k0 * math.exp(-p.softening))
+        return strain + snapped * (p.eps_star + s / (p.kc + s)) if snapped > 0.0 else strain
+
+    def stress(self, strain: float) -> float:
+        low, high = 0.0, self.spring.k0
+        if self.strain(0.0) > strain:  # in tension
+            low, high = -1e-9 * high, 0.0
+            while self.strain(low) > strain:
+                low *= 2.0
+        else:
+            while self.strain(high) < strain:
+                high *= 2.0
+            near = high
+            while near > 1e-280 and self.strain(near) > strain:  # the size of a small root
+                near *= 1e-3
+            low = near if self.strain(near) <= strain else 0.0
+        if self.strain(low) == strain:
+            return low
+        return float(
+            brentq(
+                lambda s: max(self.strain(s) - strain, -1e300), low, high,
+                xtol=1e-300, rtol=9e-16, maxiter=1000,
+            )
+        )  # fmt: skip
+
+    def keep(self, s: float, before: float) -> None:
+        for part in np.linspace(before, s, 5)[1:]:
+            self.w, self.most = self.moved(float(part))
+
+
+def between(rng: Generator, low: float, high: float) -> float:
+    return float(low * (high / low) ** rng.random())
+
+
+def drawn(rng: Generator, extreme: bool) -> ff.MicroscaleSpring:
+    """Draw any admissible spring; its least ε_* is the largest of many values."""
+    k0 = between(rng, 1e4, 1e8)
+    kc = k0 * between(rng, 0.02, 100.0)
+    n = between(rng, 0.02, 50.0) if extreme else between(rng, 0.3, 4.0)
+    d, s = rng.uniform(0.0, 6.0 if extreme else 2.0), rng.uniform(0.0, 6.0 if extreme else 1.0)
+    d, s = (d, 0.0) if (kind := rng.random()) < 0.15 else (0.0, s) if kind < 0.3 else (d, s)
+    n = 1.0 if 0.3 < kind < 0.4 else n
+    wide = [between(rng, 1e-3, 5.0) if extreme else between(rng, 0.05, 1.0) for _ in range(2)]
+    if rng.random() < 0.15:
+        wide[1] = wide[0]
+    x = np.logspace(-8.0, 14.0, 4001)
+    k = k0 * math.exp(-d)
+    least = max(0.0, float((-np.expm1(-np.log1p(n * x) / n) - k * x / (kc + k * x)).max()))
+    star = least + (1e-5 if rng.random() < 0.2 else rng.uniform(1e-3, 0.6))
+    plus = k0 * between(rng, 0.02, 2.0)
+    minus = plus * between(rng, 0.005, 1.5)
+    return ff.MicroscaleSpring(
+        k0, kc, star, plus, wide[0], minus, wide[1], stiffening=n, softening=d, weakening=s
+    )
+
+
+def history(rng: Generator, spring: ff.MicroscaleSpring) -> Array:
+    """Stresses that turn anywhere: partial loops, past the old peak, to zero, back, in tension."""
+    top = spring.sigma_plus * between(rng, 0.1, 30.0)
+    pull = -0.4 * min(spring.k0 * math.exp(-spring.softening) / spring.stiffening, spring.kc)
+    levels = [0.0]
+    for turn in range(int(rng.integers(2, 14))):
+        last = levels[-1]
+        kind = rng.random()
+        if turn > 2 and kind < 0.25:
+            levels.append(levels[int(rng.integers(len(levels)))])
+        elif turn % 2 == 0:
+            levels.append(rng.uniform(last, max(last, top)) if kind < 0.8 else 1.2 * top)
+        else:
+            levels.append(
+                0.0 if kind < 0.4 else pull if kind < 0.5 else max(last, 0.0) * rng.random()
+            )
+    parts = int(rng.choice([1, 2, 6]))
+    return np.concatenate([
+        np.linspace(a, b, parts + 1)[1:] for a, b in pairwise(levels)
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize("extreme", [False, True])
+def test_stress_and_strain_are_those_of_the_formula(extreme: bool) -> None:
+    """To 1e-8 of the range; where a digit of the strain moves the stress by more, within that."""
+    for number in range(150):
+        rng = np.random.default_rng([8, extreme, number])
+        spring = drawn(rng, extreme)
+        given = history(rng, spring)
+        along, before, strain, fractions = Formula(spring), 0.0, [], []
+        for s in given:
+            along.keep(s, before)
+            strain.append(along.strain(s))
+            fractions.append((ndtr(along.w), ndtr(along.most)))
+            before = s
+        wanted = np.array(strain)
+        assert np.abs(spring.strain(given) - wanted).max() <= 1e-12 * np.abs(wanted).max(), number
+        found = spring.fractions_along(given)
+        assert np.abs(np.transpose(found) - fractions).max() <= 1e-12, number
+        assert spring.fraction_along(given).tolist() == found[0].tolist()
+        along, before, back, loose = Formula(spring), 0.0, [], []
+        for eps in wanted:
+            digit = 8e-16 * abs(eps)
+            s = along.stress(eps)
+            loose.append(abs(along.stress(eps + digit) - along.stress(eps - digit)))
+            along.keep(s, before)
+            back.append(s)
+            before = s
+        got, allowed = spring.stress(wanted), 1e-9 * np.abs(given).max() + 2.0 * np.array(loose)
+        assert (np.abs(got - back) <= allowed).all(), number
+        assert (np.abs(got - given) <= allowed).all(), number  # each is the inverse of the other
+
+
+def test_without_memory_it_is_section_6_bit_for_bit() -> None:
+    same = replace(PLAIN, stiffening=1.0, softening=0.0, weakening=0.0)
+    assert same.law is PLAIN.law
+    assert same.row.tolist() == PLAIN.row.tolist()
+    rng = np.random.default_rng(6)
+    given = history(rng, PLAIN)
+    along, strain, before = Formula(PLAIN), [], 0.0
+    for s in given:
+        along.keep(s, before)
+        strain.append(along.strain(s))
+        before = s
+    assert PLAIN.strain(given) == pytest.approx(strain, rel=1e-13)
+    # neither does it differ before anything has snapped twice
+    up = np.linspace(0.0, 4e6, 30)
+    once = replace(WORN, stiffening=1.0)
+    assert once.strain(up) == pytest.approx(PLAIN.strain(up), rel=1e-14)
+    assert once.stress(PLAIN.strain(up)) == pytest.approx(up, rel=1e-12)
+
+
+def discrete(spring: ff.MicroscaleSpring, stress: Array, count: int) -> Array:
+    """Follow so many micro-springs, each of which knows whether it has snapped once."""
+    score = ndtri((np.arange(count) + 0.5) / count)
+    first = spring.sigma_plus * np.exp(spring.spread_plus * score)
+    again = first * math.exp(-spring.weakening)
+    back = np.minimum(spring.sigma_minus * np.exp(spring.spread_minus * score), again)
+    snapped, once, strain = np.zeros(count, bool), np.zeros(count, bool), []
+    n, soft = spring.stiffening, spring.k0 * math.exp(-spring.softening)
+    for s in stress:
+        through = s >= np.where(once, again, first)
+        snapped = (snapped | through) & ~(snapped & ~through & (s < back))
+        once |= snapped
+        k = np.where(once, soft, spring.k0)
+        on_a = 1.0 - (1.0 + n * s / k) ** (-1.0 / n)
+        strain.append(np.where(snapped, spring.eps_star + s / (spring.kc + s), on_a).mean())
+    return np.array(strain)
+
+
+@pytest.mark.parametrize("name", SPRINGS)
+def test_discrete_micro_springs_converge_to_it_as_their_number_grows(name: str) -> None:
+    spring = SPRINGS[name]
+    corners = 1e6 * np.array([0.0, 1.4, 0.3, 1.1, 0.2, 1.9, 0.0, 1.2, 0.5, 2.6, 0.4, 2.6, 3.2, 0.0])
+    stress = np.interp(np.linspace(0.0, corners.size - 1.0, 60 * corners.size),
+                       np.arange(corners.size), corners)  # fmt: skip
+    exact = spring.strain(stress)
+    counts = np.array([250, 1000, 4000, 16000])
+    error = np.array([np.abs(discrete(spring, stress, c) - exact).max() for c in counts])
+    assert (error * counts < 1.0).all()  # less than the strain of one micro-spring
+    order = -np.polyfit(np.log(counts), np.log(error), 1)[0]
+    assert order == pytest.approx(1.0, abs=0.15)
+
+
+# ---------------------------------------------------------------------------------- what it refuses
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("stiffening", 0.0), ("stiffening", -1.0), ("stiffening", math.nan),
+        ("stiffening", math.inf), ("softening", -0.1), ("softening", math.nan),
+        ("weakening", -1e-9), ("weakening", math.inf),
+    ],
+)  # fmt: skip
+def test_an_inadmissible_value_is_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ff.InputError, match=name) as refused:
+        replace(WORN, **{name: value})
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("n", [0.02, 0.3, 1.0, 1.6, 50.0])
+@pytest.mark.parametrize("kc", [2e5, 2.5e6, 5.5e6, 8e7])
+def test_the_least_eps_star_is_that_of_the_softened_branch(n: float, kc: float) -> None:
+    for d in (0.0, 0.7, 4.0):
+        k = 5.5e6 * math.exp(-d)
+        s = np.geomspace(1e-6 * k, 1e15 * k, 400_001)
+        least = max(0.0, float((-np.expm1(-np.log1p(n * s / k) / n) - s / (kc + s)).max()))
+        own = replace(PLAIN, kc=kc, eps_star=5.0, stiffening=n, softening=d)
+        replace(own, eps_star=least + 1e-8)
+        if least > 1e-6:
+            with pytest.raises(ff.InputError, match="eps_star"):
+                replace(own, eps_star=least - 1e-6)
+
+
+def test_a_tension_that_the_softened_branch_cannot_carry_is_refused() -> None:
+    pole = -WORN.k0 * math.exp(-WORN.softening) / WORN.stiffening
+    with pytest.raises(ff.SimulationError, match="tension"):
+        WORN.strain(np.array([0.0, 3e6, 0.0, 1.01 * pole]))
+    WORN.strain(np.array([0.0, 3e6, 0.0, 0.99 * pole]))
+    with pytest.raises(ff.SimulationError, match="branch"):
+        WORN.stress(np.array([0.0, 1.0 + WORN.eps_star]))
+
+
+# ----------------------------------------------------------------------------------- loops it makes
+
+
+@pytest.mark.parametrize("name", SPRINGS)
+@pytest.mark.parametrize("by_strain", [False, True])
+def test_inner_loops_return_to_where_they_began(name: str, by_strain: bool) -> None:
+    """Each loop closes, and is wiped out by a larger one; the largest fraction ever is not."""
+    spring = SPRINGS[name]
+    stress = 1e6 * np.array([0, 2.5, 0.6, 1.4, 0.9, 1.2, 0.9, 1.4, 0.6, 1.4, 0.6, 2.5, 3.0])
+    follow = spring.strain
+    if by_strain:
+        given = spring.strain(stress)
+
+        def follow(levels: Array) -> Array:  # the same, by what is inverse to it
+            return spring.stress(levels)
+
+        stress = given
+    out = follow(stress)
+    # levels 3 and 7, 2, 8 and 10, 4 and 6: visited again, whatever lay between
+    for one, other in [(3, 7), (7, 9), (2, 8), (8, 10), (4, 6), (1, 11)]:
+        assert out[other] == pytest.approx(out[one], rel=1e-12), (one, other)
+    # past the old peak first loading goes on as if nothing had been
+    assert out[12] == pytest.approx(follow(stress[[0, 12]])[1], rel=1e-12)
+
+
+def test_zero_stress_does_not_wipe_out_what_has_snapped_once() -> None:
+    """The second loop of a test differs from the first; the third is the second."""
+    up = np.linspace(0.0, 2.5e6, 40)
+    loop = np.concatenate([up, up[::-1]])
+    strain = WORN.strain(np.tile(loop, 3)).reshape(3, -1)
+    p, ever = WORN.fractions_along(np.tile(loop, 3))
+    assert p[[0, 79, 80, 159]].tolist() == [0.0] * 4
+    assert (ever[39:] == ever[39]).all()
+    assert (strain[1, 1:39] > strain[0, 1:39] + 1e-4).all()
+    assert strain[2] == pytest.approx(strain[1], rel=1e-14)
+    assert strain[:, 39] == pytest.approx([strain[0, 39]] * 3, rel=1e-14)  # the peak
+    # unloading is that of the first loop
+    assert strain[1, 40:] == pytest.approx(strain[0, 40:], rel=1e-14)
+
+
+# ------------------------------------------------------------------------------------- derivatives
+
+
+@pytest.mark.parametrize("name", SPRINGS)
+@pytest.mark.parametrize("moved", [False, True])
+@pytest.mark.parametrize("count", [1, 2])
+def test_derivatives_in_closed_form_are_those_of_differences(
+    name: str, moved: bool, count: int
+) -> None:
+    """Along histories of stress and of displacement; the second spring is another one in series."""
+    spring, heights = SPRINGS[name], [1e-3, 0.7e-3][:count]
+    corners = np.array([0.0, 1.4, 0.31, 1.1, 0.23, 1.9, 0.05, 1.2, 0.52, 2.6, 0.41, 2.7, 0.0])
+    time = np.arange(12.0 * 8 + 1)
+    shape = np.interp(time, np.arange(0.0, time.size, 8.0), corners)
+    names = [f"s1_{short}" for short in spring.law.own if getattr(spring, short) != 0.0]
+
+    def run(own: ff.MicroscaleSpring, *asked: str) -> ff.Response:
+        other = replace(WORN, sigma_plus=0.9e6, eps_star=0.35)
+        chain = ff.Chain([own, other][:count], heights, 2e-5)
+        move = ff.DisplacementDrive(0.28 * sum(heights) * shape)
+        drive = move if moved else ff.StressDrive(1e6 * shape)
+        return ff.simulate(chain, drive, time, sensitivities=asked)
+
+    exact = run(spring, *names).sensitivities
+    for full in names:
+        short = full.removeprefix("s1_")
+        value = getattr(spring, short)
+        low, high = (run(replace(spring, **{short: value * (1.0 + k)})) for k in (-1e-5, 1e-5))
+        for what in ("displacement", "base_stress"):
+            wanted = (getattr(high, what) - getattr(low, what)) / (2e-5 * value)
+            got = getattr(exact[full], what)
+            size = np.abs(getattr(low, what)).max() / value
+            close = 1e-6 * np.abs(got).max() + 1e-7 * size
+            assert np.abs(got - wanted).max() <= close, (short, what)
