@@ -333,3 +333,25 @@ def test_derivatives_in_closed_form_are_those_of_differences(
             size = np.abs(getattr(low, what)).max() / value
             close = 1e-6 * np.abs(got).max() + 1e-7 * size
             assert np.abs(got - wanted).max() <= close, (short, what)
+
+
+def test_derivatives_behind_a_narrow_snap_that_all_have_passed() -> None:
+    """What is softer is then all of branch a; the derivative by softening was none."""
+    narrow = replace(WORN, spread_plus=0.02, relaxation=[(0.3, 1.0)])
+    time = np.linspace(0.0, 4.0, 81)
+    drive = ff.DisplacementDrive(0.9e-3 * (1.0 - np.cos(1.5 * np.pi * time)) / 2.0)
+
+    def run(own: ff.MicroscaleSpring, *asked: str) -> ff.Response:
+        chain = ff.Chain([own, replace(PLAIN, eta=1e5)], [1e-3, 0.7e-3], 2e-5)
+        return ff.simulate(chain, drive, time, 1e-9, sensitivities=asked)
+
+    exact = run(narrow, "s1_softening", "s1_weakening", "s1_stiffening").sensitivities
+    assert narrow.fractions_along(run(narrow).base_stress)[1].max() == 1.0
+    for full, got in exact.items():
+        short = full.removeprefix("s1_")
+        value = getattr(narrow, short)
+        low, high = (run(replace(narrow, **{short: value * (1.0 + k)})) for k in (-1e-5, 1e-5))
+        wanted = (high.displacement[0] - low.displacement[0]) / (2e-5 * value)
+        away = np.abs(wanted - got.displacement[0]) <= 1e-3 * np.abs(wanted).max()
+        assert np.abs(wanted).max() > 1e-6
+        assert away.all(), short

@@ -223,6 +223,10 @@ def _distance_at_peak(
         peak = int(motion.displacement[-1].argmax())
         return _distance_to_pole(rows, heights, motion.displacement[:, peak : peak + 1])
     distance = _distance_to_pole(rows, heights, motion.displacement)
+    # Where a microscale spring turns between two samples is among its switches.
+    turned = motion.switches[rows[motion.switches[:, 1].astype(int), kernels.KIND] == MICROSCALE]
+    beyond = turned[:, 4] - rows[turned[:, 1].astype(int), kernels.EPS_STAR]
+    distance = min(distance, 1.0 - float(beyond.max(initial=0.0)))
     bistable = rows[:, kernels.KIND] == BISTABLE
     if scene.speed == 0.0 or not bistable.any() or not _hard(scene, rows, heights):
         return distance

@@ -70,18 +70,30 @@ from foamfit.springs.ranks import (
 
 
 @inner
+def _root(n: float, x: float) -> tuple[float, float]:
+    """Return a = 1 - (1 + nx)^(-1/n), and -ln(1 - a); `log1p` and `expm1` are the slow ones."""
+    y = 1.0 + n * x
+    if y > 1.25:
+        log = math.log(y) / n
+        return 1.0 - math.exp(-log), log
+    log = math.log1p(n * x) / n
+    return -math.expm1(-log), log
+
+
+@inner
 def on_a(n: float, k: float, sigma: float) -> tuple[float, float, float]:
     """Strain a(σ; k) of the stiffening branch and its two derivatives; -inf if it has none."""
     if n == 1.0:
         one = 1.0 / (k + sigma)
         slope = k * one * one
         return (sigma * one, slope, -2.0 * slope * one) if sigma > -k else (-math.inf, 0.0, 0.0)
-    y = 1.0 + n * sigma / k
-    if not y > 0.0:
+    above = k + n * sigma
+    if not above > 0.0:
         return -math.inf, 0.0, 0.0
-    log = math.log1p(n * sigma / k) / n
-    slope = math.exp(-log) / (k * y)
-    return -math.expm1(-log), slope, -(1.0 + n) * slope / (k * y)
+    strain, log = _root(n, sigma / k)
+    per = 1.0 / above
+    slope = (1.0 - strain if strain < 0.9 else math.exp(-log)) * per
+    return strain, slope, -(1.0 + n) * slope * per
 
 
 @inner
@@ -93,11 +105,11 @@ def stress_on_a(n: float, k: float, eps: float) -> float:
 
 
 @inner
-def by_stiffening(n: float, k: float, sigma: float) -> float:
-    """Derivative of a(σ; k) by n."""
-    x = sigma / k
-    log = math.log1p(n * x)
-    return math.exp(-log / n) * (x / (1.0 + n * x) - log / n) / n
+def changes_on_a(n: float, k: float, sigma: float) -> tuple[float, float, float]:
+    """Strain a(σ; k), and its derivatives by σ and by n; σ is above the pole."""
+    strain, log = _root(n, sigma / k)
+    left, per = 1.0 - strain if strain < 0.9 else math.exp(-log), 1.0 / (k + n * sigma)
+    return strain, left * per, left * (sigma * per - log) / n
 
 
 # ---------------------------------------------------------------- the branches of the spring
@@ -120,8 +132,11 @@ def moves(branch: int) -> bool:
 @inner
 def mixture(
     row: Row, branch: int, p: float, rest: float, never: float, sigma: float
-) -> tuple[float, float, float]:
-    """Strain at a stress where p, 1 - p and 1 - P are these, and two derivatives at fixed p, P."""
+) -> tuple[float, float, float, float, float]:
+    """Strain at a stress where p, 1 - p and 1 - P are these, and two derivatives at fixed p, P.
+
+    Then strain and slope of the branch a that snaps.
+    """
     n, k = row[STIFFENING], row[K_SNAPPED]
     two = 1.0 / (row[KC] + sigma)
     on_c = row[KC] * two * two
@@ -135,7 +150,7 @@ def mixture(
         strain += never * (fresh - one)
         soft += never * (stiff - slope)
         bent += never * (stiffer - bend)
-    return strain, soft, bent
+    return strain, soft, bent, one, slope
 
 
 @inner
@@ -144,17 +159,16 @@ def at_stress(row: Row, state: Array, sigma: float) -> float:
     branch = int(state[BRANCH])
     if not moves(branch):
         p, rest = state[SNAPPED], state[REST]
-        strain, slope, bend = mixture(row, branch, p, rest, state[NEVER], sigma)
+        strain, slope, bend, _, _ = mixture(row, branch, p, rest, state[NEVER], sigma)
         state[FLEXIBILITY], state[CURVATURE] = slope, bend
         return strain
     if not sigma > 0.0:
         return -math.inf
     place, scale = line(row, branch)
     rank = (math.log(sigma) - place) / scale
-    p, rest = share(rank), share(-rank)
-    strain, slope, bend = mixture(row, branch, p, rest, state[NEVER], sigma)
-    k = row[K0] if branch == SNAP else row[K_SNAPPED]
-    one, on_one, _ = on_a(row[STIFFENING], k, sigma)
+    p = share(rank)
+    rest = share(-rank) if rank > 0.0 else 1.0 - p
+    strain, slope, bend, one, on_one = mixture(row, branch, p, rest, state[NEVER], sigma)
     two = 1.0 / (row[KC] + sigma)
     gap, rate = row[EPS_STAR] + sigma * two - one, density(rank) / (scale * sigma)
     bend += 2.0 * rate * (row[KC] * two * two - on_one)
@@ -192,21 +206,19 @@ def stress_in(row: Row, state: Array, eps: float) -> float:
         sigma = stress_on_a(row[STIFFENING], row[K0], eps)
         at_stress(row, state, sigma)
         return sigma
-    low, high = _ends_of_stress(row, state, eps)
-    sigma, slope = state[SIGMA], state[FLEXIBILITY]
-    if slope > 0.0:
+    sigma, slope, low, high = state[SIGMA], state[FLEXIBILITY], -math.inf, math.inf
+    bounded = not slope > 0.0
+    if bounded:
+        low, high = _ends_of_stress(row, state, eps)
+        if not low < sigma < high:
+            sigma = _inside(row, low, high)
+    else:
         step = (eps - state[EPS]) / slope
         sigma += step * (1.0 - 0.5 * step * state[CURVATURE] / slope)
-    if not low < sigma < high:
-        sigma = 0.5 * (low + high) if high < math.inf else max(2.0 * low, row[K0])
     narrow = min(row[SPREAD_PLUS], row[SPREAD_MINUS], 1.0) if moves(branch) else 1.0
     for _ in range(300):
         miss = at_stress(row, state, sigma) - eps
         slope, bend = state[FLEXIBILITY], state[CURVATURE]
-        if miss > 0.0:
-            high = sigma
-        else:
-            low = sigma
         step = miss / slope
         part = 1.0 - 0.5 * step * bend / slope
         if 0.5 < part < 2.0:
@@ -215,12 +227,28 @@ def stress_in(row: Row, state: Array, eps: float) -> float:
         if abs(step) <= NEAR * abs(sigma) * narrow and low <= new <= high:
             state[FLEXIBILITY] += bend * (new - sigma)
             return new
+        if not bounded:  # the guess was not good enough
+            low, high = _ends_of_stress(row, state, eps)
+            bounded = True
+            if not low < sigma < high:
+                sigma = _inside(row, low, high)
+                continue
+        if miss > 0.0:
+            high = sigma
+        else:
+            low = sigma
         if not low < new < high:
             new = _halfway(low, high, sigma)
             if not low < new < high:  # neighbouring numbers: nothing lies between them
                 return sigma
         sigma = new
     return sigma
+
+
+@inner
+def _inside(row: Row, low: float, high: float) -> float:
+    """Return a stress between two, of which the second may be infinite."""
+    return 0.5 * (low + high) if high < math.inf else max(2.0 * low, row[K0])
 
 
 @inner
@@ -443,12 +471,11 @@ def under_stress(
     """
     n, never = row[STIFFENING], share(-ever)
     p, rest = (share(rank), share(-rank)) if branch != A else (0.0, 1.0)
-    strain, soft, _ = mixture(row, branch, p, rest, never, sigma)
+    strain, soft, _, one, _ = mixture(row, branch, p, rest, never, sigma)
     if strain == -math.inf or (branch == A and never == 1.0):
         return strain, soft, 0.0, 0.0, 0.0
-    k = row[K0] if branch == SNAP else row[K_SNAPPED]
-    one, by_ever, pace = on_a(n, k, sigma)[0], 0.0, 0.0
-    if branch != SNAP:
+    by_ever, pace = 0.0, 0.0
+    if branch != SNAP and never < 1.0 and row[K_SNAPPED] != row[K0]:
         by_ever = density(ever) * (one - on_a(n, row[K0], sigma)[0])
     if branch == A:
         return strain, soft, 0.0, by_ever, 0.0
@@ -462,6 +489,44 @@ def under_stress(
 
 
 @inner
+def _partials(
+    row: Row, branch: int, rank: float, ever: float, sigma: float, out: Array
+) -> tuple[float, float, float, float]:
+    """Fill what `strain_tangents` does; returns what `under_stress` does, but for the strain."""
+    n, two = row[STIFFENING], 1.0 / (row[KC] + sigma)
+    p, rest, weight = 0.0, 1.0, 0.0
+    if branch != A:
+        p, weight = share(rank), density(rank)
+        rest = share(-rank) if rank > 0.0 else 1.0 - p
+    never, weight_ever = (rest, weight) if rank == ever else (share(-ever), density(ever))
+    fresh = rest if branch == SNAP or never == 1.0 else never  # on branch a, and never snapped
+    worn = max(rest - fresh, 0.0)
+    a, slope, by_n = changes_on_a(n, row[K0], sigma)
+    one, softer, by_n_softer = a, slope, by_n
+    if branch != SNAP and row[K_SNAPPED] != row[K0]:
+        one, softer, by_n_softer = changes_on_a(n, row[K_SNAPPED], sigma)
+    for c in range(CARRIED):
+        out[c] = 0.0
+    out[0] = -sigma * (fresh * slope + worn * softer) / row[K0]
+    out[1], out[2] = -p * sigma * two * two, p
+    out[OF_STIFFENING] = fresh * by_n + worn * by_n_softer
+    out[OF_SOFTENING] = worn * sigma * softer
+    soft = fresh * slope + worn * softer + p * row[KC] * two * two
+    by_rank, by_ever, pace = weight * (row[EPS_STAR] + sigma * two - one), 0.0, 0.0
+    if never < 1.0:
+        by_ever = weight_ever * (one - a)
+    if moves(branch):
+        place, scale = line(row, branch)
+        pace = 1.0 / (scale * sigma)
+        first = 5 if branch == BACK else 3
+        middle = row[LOG_PLUS] if branch in (AGAIN, BOTH) else place
+        out[first], out[first + 1] = -math.exp(-middle) / scale, -rank / scale
+        if branch in (AGAIN, BOTH):
+            out[OF_WEAKENING] = 1.0 / scale
+    return soft, by_rank, by_ever, pace
+
+
+@inner
 def strain_tangents(
     row: Row, branch: int, rank: float, ever: float, sigma: float, out: Array
 ) -> None:
@@ -469,28 +534,7 @@ def strain_tangents(
 
     At those places stand the derivatives of the rank w at a fixed stress.
     """
-    n, p, never = row[STIFFENING], share(rank), share(-ever)
-    rest = share(-rank)
-    if branch == A:
-        p, rest = 0.0, 1.0
-    virgin = branch == SNAP or never == 1.0
-    fresh = rest if virgin else never  # on branch a, and never snapped
-    worn = 0.0 if virgin else max(rest - never, 0.0)
-    soft, softer = on_a(n, row[K0], sigma)[1], on_a(n, row[K_SNAPPED], sigma)[1]
-    two = 1.0 / (row[KC] + sigma)
-    out[:] = 0.0
-    out[0] = -sigma * (fresh * soft + worn * softer) / row[K0]
-    out[1], out[2] = -p * sigma * two * two, p
-    out[OF_STIFFENING] = fresh * by_stiffening(n, row[K0], sigma)
-    out[OF_STIFFENING] += worn * by_stiffening(n, row[K_SNAPPED], sigma)
-    out[OF_SOFTENING] = worn * sigma * softer
-    if moves(branch):
-        scale = line(row, branch)[1]
-        first = 5 if branch == BACK else 3
-        out[first] = -math.exp(-(row[LOG_MINUS] if branch == BACK else row[LOG_PLUS])) / scale
-        out[first + 1] = -rank / scale
-        if branch in (AGAIN, BOTH):
-            out[OF_WEAKENING] = 1.0 / scale
+    _partials(row, branch, rank, ever, sigma, out)
 
 
 @inner
@@ -510,21 +554,22 @@ def tangents(
     They are by k0 … spread_minus, the logarithm of the strain, stiffening, softening, weakening.
     `d_rank` and `d_ever`, the same of w and W, are brought up to date where the spring moves.
     """
-    _, soft, by_rank, by_ever, pace = under_stress(row, branch, rank, ever, sigma)
-    strain_tangents(row, branch, rank, ever, sigma, out)
+    soft, by_rank, by_ever, pace = _partials(row, branch, rank, ever, sigma, out)
     slope = 1.0 / (soft + by_rank * pace)
-    for c in range(CARRIED):
-        by_line = c == OF_WEAKENING or 3 <= c < OF_STRAIN
-        if branch == HELD and rank == ever:
+    out[OF_STRAIN] = -eps
+    if branch == HELD and rank == ever:
+        for c in range(CARRIED):
             d_rank[c] = d_ever[c]
-        elif branch != HELD:
-            d_rank[c] = out[c] if by_line else 0.0
-        known = 0.0 if by_line else out[c]
-        if c == OF_STRAIN:
-            known = -eps
-        out[c] = -slope * (known + by_rank * d_rank[c] + by_ever * d_ever[c])
-        if moves(branch):
-            d_rank[c] += pace * out[c]
-        if branch == SNAP:
+    elif branch != HELD:
+        for c in range(CARRIED):
+            d_rank[c] = 0.0
+        for c in range(3, OF_STRAIN):
+            d_rank[c], out[c] = out[c], 0.0
+        d_rank[OF_WEAKENING], out[OF_WEAKENING] = out[OF_WEAKENING], 0.0
+    for c in range(CARRIED):
+        out[c] = -slope * (out[c] + by_rank * d_rank[c] + by_ever * d_ever[c])
+        d_rank[c] += pace * out[c]
+    if branch == SNAP:
+        for c in range(CARRIED):
             d_ever[c] = d_rank[c]
     return slope

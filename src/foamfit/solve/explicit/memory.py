@@ -50,7 +50,7 @@ from foamfit.springs.kernels import (
     piece,
 )
 from foamfit.springs.law import MICROSCALE
-from foamfit.springs.memory_kernels import line, mixture, on_a
+from foamfit.springs.memory_kernels import line, mixture
 from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 from foamfit.springs.ranks import (
     BRANCH,
@@ -443,8 +443,7 @@ def strain_at(row: Row, state: Array, now: Array, moving: bool, s: float) -> tup
         p, q, steep = share(u), share(-u), density(u) / (now[SCALE] * s)
     one, two = 1.0 / (row[K0] + s), 1.0 / (row[KC] + s)
     if row[REMEMBERS] > 0.0:
-        eps, soft, _ = mixture(row, int(state[BRANCH]), p, q, state[NEVER], s)
-        on_main = on_a(row[STIFFENING], now[K_MAIN], s)[0]
+        eps, soft, _, on_main, _ = mixture(row, int(state[BRANCH]), p, q, state[NEVER], s)
         return eps, soft + (row[EPS_STAR] + s * two - on_main) * steep
     soft = q * row[K0] * one * one + p * row[KC] * two * two
     gap = row[EPS_STAR] + s * (two - one)

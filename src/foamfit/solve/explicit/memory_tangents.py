@@ -73,6 +73,7 @@ from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 from foamfit.springs.ranks import (
     BRANCH,
     EVER,
+    NEVER,
     OF_SOFTENING,
     OF_STIFFENING,
     OF_WEAKENING,
@@ -107,6 +108,7 @@ def _fill_partials_remembering(memory: Memory, i: int, moving: bool, order: int)
     row, now, m, out = memory.rows[i], memory.now[i], memory.series[i], memory.partials
     state, n, star = memory.state[i], row[STIFFENING], row[EPS_STAR]
     branch, k, never = int(state[BRANCH]), now[K_MAIN], now[UNSNAPPED]
+    first_loading = branch == SNAP or state[NEVER] == 1.0  # not so where all have snapped
     s, below, below_c, fresh = m[:, EQ], m[:, BELOW_A], m[:, BELOW_C], m[:, FRESH]
     snapped, score, dense = m[:, SNAPPED], m[:, SCORE], m[:, DENSITY]
     square, square_c, hard = out[SQUARE_A, i], out[SQUARE_C, i], out[SQUARE_FRESH, i]
@@ -146,7 +148,7 @@ def _fill_partials_remembering(memory: Memory, i: int, moving: bool, order: int)
             out[first, i, o], out[first + 1, i, o] = -width * per_place, -by_score * per_scale
             if branch in (AGAIN, BOTH):
                 out[OF_WEAKENING, i, o] = width * per_scale
-        out[OF_SOFTENING, i, o] = on_a / n if never > 0.0 else 0.0
+        out[OF_SOFTENING, i, o] = 0.0 if first_loading else on_a / n
         out[2, i, o] = snapped[o] if moving else (p if o == 0 else 0.0)
         out[BY_EVER, i, o] = 0.0
         if never > 0.0:
