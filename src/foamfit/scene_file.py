@@ -133,12 +133,12 @@ def _spring(given: _Part) -> Spring:
     if kind not in known:
         raise InputError(f"{given.where} kind = {kind!r}; it must be one of {', '.join(known)}.")
     law = laws.law(kind)
+    extra = max(law.options, key=len, default=())  # all parameters that options would free
+    wide = laws.law(laws.with_options(kind, extra))
+    law = wide if set(wide.own) - set(law.own) & set(given.table) else law
     terms = ["relaxation"] if law.hysteretic else []
     given.only("kind", "height", "mass", *law.names, *terms)
-    values = [
-        given.number(name, param, 0.0 if name == "eta" else None)
-        for name, param in law.by_name.items()
-    ]
+    values = [given.number(name, param, param.neutral) for name, param in law.by_name.items()]
     shown = given.table.get("relaxation")
     wrong = f'relaxation = {shown!r} must be a list of terms like [{{ g = 0.5, tau = "0.2 s" }}]'
     relaxation = [

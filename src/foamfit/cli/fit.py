@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 @options.TEST
 @options.SPECIMEN
 @options.CYCLE
+@options.CYCLES
 @fitting.fit_options
 @options.output("fits/<test>/<model>", "fit.json")
 @options.option("--verbose", "Print the checklist, reasons, notes and all models too.")
@@ -41,11 +42,12 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
         foamfit fit TEST.csv --model auto --open
         foamfit fit TEST.csv --model microscale --relaxation 1
         foamfit fit TEST.csv --model microscale --relaxation 1 --cycle all
+        foamfit fit TEST.csv --model microscale --stiffening --mullins --cycles 1-3
         foamfit fit TEST.csv --drive displacement --out results/today --figure-width one
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
     output.check(without_report=False)
-    model = asked["model"] = fitting.model_name(asked["model"], asked["relaxation"])
+    model = asked["model"] = fitting.model_name(asked)
     with (
         options.compiling(output.silent, model, asked["relaxation"]) as compile_rest,
         options.drawing_beside() as drawers,

@@ -55,6 +55,26 @@ CYCLE = option(
     "Cycle of a slow record: a number, several as 1,2,10, or all. Default: the first.",
     metavar="N|all",
 )
+
+
+def _range(
+    context: click.Context, parameter: click.Parameter, text: str | None
+) -> tuple[int, int] | None:
+    """Read the first and the last number of several cycles."""
+    if text is None:
+        return None
+    first, dash, last = (part.strip() for part in text.partition("-"))
+    if not (dash and first.isdecimal() and last.isdecimal() and 0 < int(first) <= int(last)):
+        raise click.BadParameter(f"'{text}' is not FIRST-LAST in that order, like 1-3.")
+    return int(first), int(last)
+
+
+CYCLES = option(
+    "--cycles",
+    "Several cycles of a slow record as one history, with one set of parameters.",
+    metavar="FIRST-LAST",
+    callback=_range,
+)
 DRIVE = option(
     "--drive",
     "Default: impact if striker and time are known, else displacement.",
@@ -67,6 +87,8 @@ RELAXATION = option(
     default=0,
     metavar="N",
 )
+STIFFENING = option("--stiffening", "Let branch a of microscale springs stiffen as the test says.")
+MULLINS = option("--mullins", "Let what has snapped once soften and weaken (microscale springs).")
 PLOT = option("--plot", "Also draw a PNG, PDF or SVG; its data go beside it as CSV.", FILE)
 WIDTH = option(
     "--figure-width",

@@ -201,9 +201,10 @@ def side_of(result: Result) -> Side:
     terms = given.get("relaxation", 0)
     if type(terms) is not int or terms < 0:
         raise _broken(where, f"'relaxation' cannot be {str(terms)[:40]!r}")
+    model = Model.of_result(given)
     return Side(
-        label=f"{given['test']}: {law_in_words(given['model'], terms)}, {given['drive']} drive",
-        kinds=Model.parse(given["model"]).kinds,
+        label=f"{given['test']}: {law_in_words(model.name, terms)}, {given['drive']} drive",
+        kinds=model.kinds,
         relaxation=terms,
         estimates={name: _estimate(p, where, name) for name, p in given["parameters"].items()},
         correlation=_correlation(given.get("correlation"), where),

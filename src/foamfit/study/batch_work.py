@@ -64,8 +64,10 @@ class Recipe:
             check_time_shift(test, drive or choose_drive(test))
         if self.model == "auto" or not (self.fix or self.vary):
             return None
-        terms = self.options.get("relaxation", 0)
-        params = make_params(test, self.model, drive, time_shift=shift, relaxation=terms)
+        more: dict[str, Any] = {
+            name: self.options.get(name) or 0 for name in ("relaxation", *laws.OPTIONS)
+        }
+        params = make_params(test, self.model, drive, time_shift=shift, **more)
         return fix_and_vary(params, self.model, self.fix or {}, self.vary)
 
 
