@@ -18,8 +18,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
-from foamfit.fitting.minima import exchange_springs, scan_places, settle_ends
-from foamfit.fitting.order import in_order
+from foamfit.fitting.minima import exchange_springs, in_order, scan_places, settle_ends
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import (
     REFINED,
