@@ -276,7 +276,7 @@ def test_a_profile_goes_on_beyond_a_minimum_that_is_as_good():
     noise = rng.standard_normal(400)
 
     class Two(Curve):
-        def residual(self, values: np.ndarray) -> np.ndarray:
+        def differences(self, values: np.ndarray) -> np.ndarray:
             out = self.data.copy()
             out[0] += 30.0 * values[1] * (values[1] - 3.0)
             out[1] += 30.0 * values[0]
@@ -299,9 +299,9 @@ def test_a_profile_goes_on_beyond_a_minimum_that_is_as_good():
     assert both.ci95[1] == pytest.approx(3.0 - alone.ci95[0], rel=1e-2)
 
     class Gap(Two):
-        def residual(self, values: np.ndarray) -> np.ndarray:
+        def residual(self, values: np.ndarray, shift: np.ndarray | float = 0.0) -> np.ndarray:
             self.failures += 1e-5 < values[1] < 2.99  # nothing can be simulated there
-            return super().residual(values)
+            return super().residual(values, shift)
 
     bench = TwoBench(Gap(np.arange(400.0), noise))
     around = BestPoint(bench, np.zeros(2), ("a", "b"))  # type: ignore[arg-type]
@@ -319,7 +319,7 @@ def test_what_one_profile_meets_counts_for_the_others():
     noise[:2] = 0.0
 
     class Stairs(Curve):
-        def residual(self, values: np.ndarray) -> np.ndarray:
+        def differences(self, values: np.ndarray) -> np.ndarray:
             out, u = self.data.copy(), values[1] / 3.0
             out[0] += 1.1 * values[1] * (values[1] - 3.0)
             out[1] += 30.0 * (values[0] - (3.0 - 2.0 * u) * u**2)
@@ -347,11 +347,11 @@ class _Interrupting(Tracker):
 
     left = 60
 
-    def residual(self, values: np.ndarray) -> np.ndarray:
+    def residual(self, values: np.ndarray, shift: np.ndarray | float = 0.0) -> np.ndarray:
         self.left -= 1
         if self.left < 0:
             raise KeyboardInterrupt
-        return super().residual(values)
+        return super().residual(values, shift)
 
 
 def test_an_interrupted_profile_keeps_what_was_done(impact, monkeypatch):

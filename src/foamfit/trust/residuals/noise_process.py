@@ -71,6 +71,11 @@ class NoiseProcess:
         product: Array = np.fft.irfft(spectrum, axis=0)[:n]
         return product
 
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """So many samples of normal noise, (n,)."""
+        root = np.sqrt(np.maximum(self._circulant(n).real, 0.0))
+        return np.asarray(np.fft.irfft(root * np.fft.rfft(rng.standard_normal(2 * n)))[:n])
+
     def forms(self, columns: Array, mix: Array | None = None) -> Array:
         """Variance lᵀΣl of the noise times each column l of an (n, m) product, (m,).
 
