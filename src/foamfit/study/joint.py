@@ -68,10 +68,9 @@ class JointResult(JointData):
     ) -> Path:
         """Write joint.json, joint.html, joint.png and a result folder per test; returns the folder.
 
-        joint.csv holds what is plotted in joint.png. An older result there is replaced as a whole,
-        at the end. The folders of the tests are made by `jobs` processes (by default one for each
-        core), without `report` with tables alone. Figures are "one" or "two" columns wide, or as
-        wide as a length ("85 mm").
+        An older result there is replaced as a whole, at the end. The folders of the tests are made
+        by `jobs` processes (by default one for each core), without `report` with tables alone.
+        Figures are "one" or "two" columns wide, or as wide as a length ("85 mm").
         """
         inches(figure_width)  # refuses what is no width
         check_target(folder)
