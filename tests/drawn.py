@@ -73,9 +73,7 @@ def _figures(width: str) -> Iterator[tuple[str, Figure]]:
     for name, make in RESULTS.items():
         yield name, plot_fit(make(), width=width)
     yield "response", plot_response(response(), width=width)
-    yield "insight", plot_insight(insight(), title="a test · before the fit", width=width)
-    shares = {"contact_and_zero": 0.02, "velocity": 0.01, "mass": 0.01, "height": 0.01}
-    shares |= {"area": 0.005, "calibration": 0.02, "law": 0.01}
+    yield "insight", plot_insight(insight(), width=width)
     one = fabricated.result()
     named = replace(one, measurement=replace(one.measurement, name="foam-1/model-1"))
     yield "comparison", plot_comparison(compare([named]), width=width)
