@@ -107,7 +107,6 @@ def test_values_are_found_with_their_intervals(found):
 def test_linked_values_are_one_value_bit_for_bit(found, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     found.save(tmp_path / "out", jobs=1)
-    assert (tmp_path / "out" / "joint.csv").read_text().startswith("panel,series,")
     content = json.loads((tmp_path / "out" / "joint.json").read_text())
     value = content["parameters"]["s1_k0"]["value"]
     for test in content["tests"]:

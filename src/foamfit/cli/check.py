@@ -15,7 +15,9 @@ from foamfit.terminal import say
 def check(test: Path, specimen: Path | None) -> None:
     """Say what the loader understood of TEST.csv: columns, contact, specimen, energy.
 
-    Example: foamfit check TEST.csv --specimen foam.toml
+    \b
+    Example:
+        foamfit check TEST.csv --specimen foam.toml
     """
     from foamfit.data.csv_file import read_test
     from foamfit.data.describe import describe
