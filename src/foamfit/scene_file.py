@@ -16,7 +16,7 @@ from foamfit.data.csv_file import read_history
 from foamfit.data.toml_file import check_keys, load_toml
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError
-from foamfit.files import write_file
+from foamfit.files import read_whole, write_file
 from foamfit.solve.simulation import Response
 from foamfit.springs import laws
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
@@ -176,6 +176,14 @@ def _samples(given: _Part) -> Array:
         told = f"must be a whole number from 2 to {_MOST_SAMPLES}"
         raise InputError(f"{given.where} samples = {samples!r} {told}.")
     return np.linspace(0.0, end, samples)
+
+
+def check_target(path: Path) -> None:
+    """Raise InputError if a file stands there that is no response of an earlier run."""
+    if path.is_file() and not read_whole(path, len(RESPONSE)).startswith(RESPONSE.encode()):
+        raise InputError(
+            f"{path} stands where the response is to go, and is not one; choose another name"
+        )
 
 
 def write_response(response: Response, path: Path) -> None:

@@ -30,7 +30,7 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
     """Identify the parameters of TEST.csv and write a result folder.
 
     With several cycles the folder holds one result folder for each, cycles.csv, cycles.png and
-    cycles.json: what changes from cycle to cycle, by one fit of them together.
+    cycles.json: the parameters by cycle.
 
     Exit code 0: a fit was made; 1: the input or the call is wrong; 2: no acceptable fit was found
     (what was found is written); 70: a defect of foamfit; 130 and 143: ended by Ctrl-C or SIGTERM

@@ -28,7 +28,7 @@ from foamfit.fitting.curves import check_time_shift, choose_drive
 from foamfit.fitting.problem import fix_and_vary, make_params
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
-from foamfit.report.studies.batch import REFUSED, Row, Sketch, row_of
+from foamfit.report.studies.batch import REFUSED, Row, row_of
 from foamfit.report.studies.cycles import write_cycles
 from foamfit.springs import laws
 from foamfit.study.cycles import fit_cycles
@@ -134,10 +134,7 @@ def stored(folder: Path, wanted: str, recipe: Recipe) -> tuple[Row, ...] | None:
         there = content.get("figure_width", inches(TWO)) if content["pages"] else None
         if recipe.pages and there != inches(recipe.width):
             return None
-        rows = [
-            row | {"sketch": row["sketch"] and Sketch(**row["sketch"])} for row in content["rows"]
-        ]
-        return tuple(Row(**row) for row in rows)
+        return tuple(Row(**row) for row in content["rows"])
     except (
         OSError,
         ValueError,
@@ -228,14 +225,12 @@ def _several(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write
     """Each cycle is a row, and its folder is one in the folder of the test."""
     recipe = task.recipe
     assert isinstance(recipe.cycles, tuple)
-    # Not together, which takes longer than all of them: the summary has a row for each.
     found = fit_cycles(
         path,
         toml,
         cycles=recipe.cycles or None,
         model=recipe.model,
         params=recipe.params,
-        together=False,
         **recipe.options,
     )
 
