@@ -269,12 +269,18 @@ def find_turns(values: Array, back: float | None = None) -> NDArray[np.int64]:
     return np.array(turns, dtype=np.int64)
 
 
-def first_cycle(test: Measurement) -> slice:
-    """Samples of the first of several cycles that are one history; all of them of one cycle."""
+def cycles_of(test: Measurement) -> dict[int, slice]:
+    """Samples of each of several cycles that are one history, by their numbers; {} of one cycle.
+
+    They are divided where the motion turns from unloading to loading.
+    """
     if test.last_cycle is None or test.displacement is None:
-        return slice(None)
+        return {}
     turns = find_turns(test.displacement, _REST * float(np.ptp(test.displacement)))
-    return slice(None, int(turns[1]) + 1) if turns.size > 1 else slice(None)
+    ends = [0, *turns[1::2].tolist()]
+    numbers = test.cycles[test.cycles.index(test.cycle) : test.cycles.index(test.last_cycle) + 1]
+    ends = [*ends[: len(numbers)], len(test.displacement)]
+    return {n: slice(*ends[i : i + 2]) for i, n in enumerate(numbers[: len(ends) - 1])}
 
 
 def _reversals(displacement: Array) -> list[tuple[int, int, bool]]:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from foamfit.arrays import Array
-from foamfit.data.cycles import find_turns, first_cycle
+from foamfit.data.cycles import cycles_of, find_turns
 from foamfit.data.measurement import Measurement
 from foamfit.fitting.box import Space
 from foamfit.fitting.curves import smoothed
@@ -61,7 +61,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
     count, relaxing = len(laws), 2 * model.relaxation * sum(law.hysteretic for law in laws)
     more = sum(max(law.wanted_marks - OWN_MARKS, 0) for law in laws if law.hysteretic)
     marks = qmc.LatinHypercube(7 * count + more + relaxing, rng=rng).random(CURVE_STARTS)
-    starts, once = [], first_cycle(loop)
+    starts, once = [], next(iter(cycles_of(loop).values()), slice(None))
     lines = [law.own == ("k0",) for law in laws]
     ways = range(max(law.ways for law in laws))
     for (turn, mark), way in product(enumerate(marks), ways):
