@@ -21,7 +21,7 @@ EPS, SIGMA, BRANCH, Z = range(4)
 def fill(values, row):
     """Copy the parameters; refuse what no spring has."""
     row[:] = values
-    return values.min() > 0.0
+    return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4:].min() > 0.0
 
 
 def begin(row, state):
@@ -80,7 +80,9 @@ LAW = ff.Law(
     title="Bouc-Wen spring beside an elastic foam",
     params=(
         *CURVE,
-        ff.Param("k", ("k", ""), "Pa", "hysteretic stiffness", (1.0, "slope"), (1e-3, 1e3), "slope"),
+        ff.Param(
+            "k", ("k", ""), "Pa", "hysteretic stiffness", (1.0, "slope"), (1e-3, 1e3), "slope"
+        ),
         ff.Param(
             "limit", ("z", "m"), "", "largest hysteretic strain", (0.1, "strain"), (1e-3, 1.0),
             "strain",

@@ -2,10 +2,11 @@
 
     σ = σ_0(ε) + (k/N) Σ e_j,   de_j = dε  as long as |e_j| < y_j,   y_j = slip ((j - ½)/N)^spread
 
-σ_0 is the Ogden curve (`ogden.py`), e_j the elastic strain of slider j and all that it remembers. The
-slip strains are those of Segalman's power law, spread = 1/(1 + χ), in N = 24 equal shares of the
-stiffness k. For N → ∞ loading from rest adds k ε (1 - u spread/(1 + spread)) with
-u = (ε/slip)^(1/spread) as long as ε <= slip, and unloading twice this curve at half the way (Masing).
+σ_0 is the Ogden curve (`ogden.py`), e_j the elastic strain of slider j and all that it remembers.
+The slip strains are those of Segalman's power law, spread = 1/(1 + χ), in N = 24 equal shares of
+the stiffness k. For N → ∞ loading from rest adds k ε (1 - u spread/(1 + spread)) with
+u = (ε/slip)^(1/spread) as long as ε <= slip, and unloading takes off twice this curve at half the
+way (Masing).
 
 Iwan 1966, J. Appl. Mech. 33, 893; Segalman 2005, J. Appl. Mech. 72, 752.
 """
@@ -24,7 +25,7 @@ def fill(values, row):
     row[:7] = values
     for j in range(N):
         row[7 + j] = values[5] * ((j + 0.5) / N) ** values[6]
-    return values.min() > 0.0
+    return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4:].min() > 0.0
 
 
 def begin(row, state):
@@ -68,7 +69,9 @@ LAW = ff.Law(
     title="Maxwell-slip spring",
     params=(
         *CURVE,
-        ff.Param("k", ("k", ""), "Pa", "stiffness of all sliders", (1.0, "slope"), (1e-3, 1e3), "slope"),
+        ff.Param(
+            "k", ("k", ""), "Pa", "stiffness of all sliders", (1.0, "slope"), (1e-3, 1e3), "slope"
+        ),
         ff.Param(
             "slip", ("y", "m"), "", "largest slip strain", (0.2, "strain"), (1e-3, 1e1), "strain"
         ),

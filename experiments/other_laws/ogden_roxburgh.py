@@ -22,7 +22,7 @@ EPS, SIGMA, BRANCH, LARGEST = range(4)
 def fill(values, row):
     """Copy the parameters; refuse what no spring has."""
     row[:] = values
-    return values.min() > 0.0 and values[4] >= 1.0
+    return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4] >= 1.0 and values[5] > 0.0
 
 
 def begin(row, state):
