@@ -19,6 +19,7 @@ from foamfit.springs.chain import Drive
 
 Array = NDArray[np.float64]
 PLUS, MINUS, HELD, BOTH, VIRGIN = "plus", "minus", "held", "both", "virgin"
+FIRST = "first"
 LEAST = -12.0  # rank below which a share of 2e-33 has snapped
 
 
@@ -104,11 +105,11 @@ class Microscale(Linear):
 
     def _cross(self) -> float:
         """Stress at which P₊ = P₋ as they stand."""
-        p = self.spring
-        if p.spread_plus == p.spread_minus:
-            return math.inf if p.sigma_minus < p.sigma_plus else 0.0
-        slope = 1.0 / p.spread_minus - 1.0 / p.spread_plus
-        number = math.log(p.sigma_minus) / p.spread_minus - math.log(p.sigma_plus) / p.spread_plus
+        (plus, spread), (minus, other) = self._of(False), self._of(True)
+        if spread == other:
+            return math.inf if minus < plus else 0.0
+        slope = 1.0 / other - 1.0 / spread
+        number = math.log(minus) / other - math.log(plus) / spread
         at = number / slope
         return math.exp(at) if at < 700.0 else math.inf
 
@@ -162,9 +163,82 @@ class Microscale(Linear):
         self.mode = HELD
 
 
+class Remembering(Microscale):
+    """Section 8 of the model: what has snapped once is softer and snaps through earlier."""
+
+    def __init__(self, spring: Any) -> None:
+        super().__init__(spring)
+        self.most = LEAST  # the rank up to which micro-springs have ever snapped
+
+    def _of(self, minus: bool) -> tuple[float, float]:
+        middle, spread = super()._of(minus)
+        return middle if minus else middle * math.exp(-self.spring.weakening), spread
+
+    def _a(self, s: float, k: float) -> tuple[float, float]:
+        n = self.spring.stiffening
+        y = 1.0 + n * s / k
+        return 1.0 - y ** (-1.0 / n), y ** (-1.0 / n - 1.0) / k
+
+    def strain(self, s: float) -> tuple[float, float]:
+        p = self.spring
+        middle, spread = self._of(self.mode == MINUS)
+        middle = p.sigma_plus if self.mode == FIRST else middle
+        u, steep = self.rank if self.mode == HELD else -math.inf, 0.0
+        if self.mode not in (HELD, VIRGIN) and s > 0.0:
+            u = math.log(s / middle) / spread
+            steep = math.exp(-0.5 * u * u) / math.sqrt(2.0 * math.pi) / (spread * s)
+        snapped, ever = ndtr(u), ndtr(u if self.mode == FIRST else self.most)
+        (fresh, stiff), (worn, soft) = self._a(s, p.k0), self._a(s, p.k0 * math.exp(-p.softening))
+        c, rise = p.eps_star + s / (p.kc + s), p.kc / (p.kc + s) ** 2
+        strain = (1.0 - ever) * fresh + (ever - snapped) * worn + snapped * c
+        slope = (1.0 - ever) * stiff + (ever - snapped) * soft + snapped * rise
+        return strain, slope + steep * (c - (fresh if self.mode == FIRST else worn))
+
+    def _first(self, rank: float) -> float:
+        return float(self.spring.sigma_plus * math.exp(self.spring.spread_plus * rank))
+
+    def _again(self, rank: float) -> float:
+        middle, spread = self._of(False)
+        return middle * math.exp(spread * rank)
+
+    def ends(self) -> tuple[float, float]:
+        if self.mode == FIRST:
+            return -math.inf, math.inf
+        low, high = super().ends()
+        if (self.mode == HELD and self.rank >= self.most) or (
+            self.mode == VIRGIN and self.most == LEAST
+        ):
+            high = self._first(self.rank)
+        if self.mode in (PLUS, BOTH):
+            high = min(high, self._again(self.most))
+        return low, high
+
+    def turns(self) -> int:
+        return -1 if self.mode == FIRST else super().turns()
+
+    def leave(self, s: float, side: int) -> None:
+        if side > 0 and s == self._first(self.rank) and self.rank >= self.most:
+            self.mode = FIRST
+        elif side > 0 and self.mode in (PLUS, BOTH) and s == self._again(self.most):
+            self.mode, self.rank = HELD, self.most
+        else:
+            super().leave(s, side)
+            if self.mode == VIRGIN:
+                self.rank = LEAST
+
+    def turn(self, s: float) -> None:
+        if self.mode == FIRST:
+            self.most = self.rank = math.log(s / self.spring.sigma_plus) / self.spring.spread_plus
+            self.mode = HELD
+        else:
+            super().turn(s)
+
+
 def law_of(spring: Any) -> Linear:
     if getattr(spring, "unilateral", False):
         return Unilateral(spring)
+    if spring.law.own[-1] == "weakening":
+        return Remembering(spring)
     return {
         ff.BistableSpring: Bistable, ff.MicroscaleSpring: Microscale, ff.LinearSpring: Linear
     }[type(spring)](spring)  # fmt: skip

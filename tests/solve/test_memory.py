@@ -26,6 +26,9 @@ WIDE = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 1.3e6, 2.0, 2.5e5, 1.7)
 CROSSED = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 9.0e5, 0.3, 7.0e5, 0.8)  # hysteretic below
 ABOVE = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 9.0e5, 0.8, 7.0e5, 0.4)  # hysteretic above
 REVERSIBLE = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 6.0e5, 0.5, 7.0e5, 0.5)
+WORN = replace(FOAM, eps_star=0.25, stiffening=1.6, softening=0.7, weakening=0.45)
+STIFF = replace(CROSSED, stiffening=0.6, softening=0.4, weakening=0.2)
+LATE = replace(ABOVE, stiffening=2.5, softening=0.2, weakening=0.15)
 BISTABLE = ff.BistableSpring(5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6)
 LINEAR = ff.LinearSpring(60e6)
 GAP = ff.LinearSpring(60e6, unilateral=True)
@@ -104,6 +107,16 @@ SCENES: dict[str, tuple[ff.Chain, Drive]] = {
     "stress, viscous top": (chain([relaxing(FOAM), MICRO], site=1e3), stress(2e6)),
     "stress on a mass": (chain([relaxing(FOAM), MICRO], [0.0, 1e-4]), stress(1.5e6)),
     "stress, bistable relaxing": (chain([relaxing(BISTABLE)]), stress(5e6)),
+    "impact, remembering": (chain([WORN]), IMPACT),
+    "impact, remembering, relaxation, dashpot": (chain([damped(relaxing(STIFF), 60.0)]), IMPACT),
+    "impact, remembering, interior mass": (chain([WORN, relaxing(LATE)], [3e-3, 0.0]), IMPACT),
+    "impact on three, two remembering": (
+        chain([WORN, LINEAR, relaxing(STIFF)], [2e-3, 1e-3, 0.0]), ff.Impact(7e-3, 1.2)),
+    "motion of two, remembering": (chain([relaxing(WORN), relaxing(LATE, TWO)]), MOVED),
+    "motion of two, remembering, one damped": (chain([WORN, damped(STIFF, 200.0)]), MOVED),
+    "stress, remembering, relaxing": (chain([relaxing(STIFF)]), stress(2e6)),
+    "stress on two, remembering, damped": (
+        chain([relaxing(LATE), damped(WORN, 200.0)]), stress(2e6)),
 }  # fmt: skip
 
 
@@ -116,7 +129,7 @@ def names_of(given: ff.Chain) -> list[str]:
     """All parameters of a chain that has these springs."""
     names = []
     for i, spring in enumerate(given.springs, start=1):
-        own = [n for n in spring.__dataclass_fields__ if n not in ("relaxation", "unilateral")]
+        own = list(spring.law.names)
         for k in range(1, len(spring.relaxation) + 1):
             own += [f"g{k}", f"tau{k}"]
         names += [f"s{i}_{n}" for n in [*own, "height"]]
@@ -153,12 +166,14 @@ def with_value(given: ff.Chain, name: str, value: float) -> ff.Chain:
 # The others differ in little; all are within the error that is asked for.
 # Where springs turn to and fro by rounding the judge has no say: SciPy, from event to event, has.
 TURNING = ("impact, gap between masses", "stress, viscous top")
+# The judge does not know what springs remember of their snapping; SciPy, from event to event, does.
+REMEMBERING = tuple(name for name in SCENES if "remembering" in name)
 
 
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "motion of two"])
 def test_a_motion_is_as_exact_as_asked_for(name: str) -> None:
     given, drive = SCENES[name]
-    if name in TURNING:
+    if name in TURNING + REMEMBERING:
         moved, pressed, end, _ = memory_reference.follow(given, drive, TIME)
     else:
         truth = follow(given, drive, TIME)
@@ -180,6 +195,8 @@ EXACT = [
     "motion of two, relaxing", "motion of two, both damped", "motion of two, interior mass",
     "stress on two, one damped", "stress, viscous top", "impact, gap between masses",
     "impact, interior mass, two microscale",
+    "impact, remembering, relaxation, dashpot", "impact, remembering, interior mass",
+    "motion of two, remembering", "stress on two, remembering, damped",
 ]  # fmt: skip
 
 

@@ -37,7 +37,8 @@ from foamfit.springs.kernels import (
 )
 from foamfit.springs.law import MICROSCALE
 from foamfit.springs.laws import followed
-from foamfit.springs.microscale_kernels import (
+from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
+from foamfit.springs.ranks import (
     BRANCH,
     CARRIED,
     CURVATURE,
@@ -49,7 +50,6 @@ from foamfit.springs.microscale_kernels import (
     SIGMA,
     STATE,
 )
-from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 from foamfit.springs.sensitivities import branch_derivative
 
 # The nodes on [0, 1], and the coefficients of 1, r, r², r³ in the Lagrange polynomials on them.
@@ -76,7 +76,7 @@ OF_BUMP, LASTING, TABLE = 13, 14, 15
 
 
 class Kept(NamedTuple):
-    """What terms remember: y (terms,), and its derivatives (terms, CARRIED), by τ (terms or 0,)."""
+    """What terms remember: y (terms,), and its derivatives (terms, carried), by τ (terms or 0,)."""
 
     y: Array
     by: Array
@@ -105,12 +105,13 @@ def _switch(row: Row, state: Array, up: bool) -> None:
 
 
 @inner
-def _tangents(row: Row, state: Array, d_rank: Array, out: Array) -> None:
+def _tangents(row: Row, state: Array, d_ranks: Array, out: Array) -> None:
     """Fill the derivatives of the stress at a strain; see `microscale_kernels.tangents`."""
     branch, eps = int(state[BRANCH]), state[EPS]
     if row[KIND] == MICROSCALE:
         rank = micro.rank_now(row, state)
-        micro.tangents(row, branch, rank, state[SIGMA], eps, d_rank, out)
+        ever = micro.ever_now(state, rank)
+        micro.tangents(row, branch, rank, ever, state[SIGMA], eps, d_ranks, out)
         return
     slope = slope_on(row, branch, eps)
     curved, _, x0, _ = branch_shape(row, branch)
@@ -277,23 +278,23 @@ def _try_nodes(
 
 @inlined
 def _derive(
-    row: Row, state: Array, nodes: Array, d_rank: Array, d_nodes: Array, first: float, last: float
+    row: Row, state: Array, nodes: Array, d_ranks: Array, d_nodes: Array, first: float, last: float
 ) -> None:
     """Fill the derivatives of the stress at the nodes of a step between two strains."""
-    for c in range(CARRIED):
+    for c in range(d_nodes.shape[1]):
         d_nodes[0, c] = d_nodes[3, c]
     here = state[SIGMA], state[EPS]
     for i in range(1, 4):
         state[EPS], state[SIGMA] = first + NODES[i] * (last - first), nodes[i]
-        _tangents(row, state, d_rank, d_nodes[i])
+        _tangents(row, state, d_ranks, d_nodes[i])
     state[SIGMA], state[EPS] = here
 
 
 @inlined
-def _derive_end(row: Row, state: Array, d_rank: Array, d_nodes: Array, wanted: bool) -> None:
+def _derive_end(row: Row, state: Array, d_ranks: Array, d_nodes: Array, wanted: bool) -> None:
     """Fill the derivatives of the stress where the spring is now, if they are wanted."""
     if wanted:
-        _tangents(row, state, d_rank, d_nodes[3])
+        _tangents(row, state, d_ranks, d_nodes[3])
 
 
 @inlined
@@ -308,7 +309,7 @@ def _relax(row: Row, h: float, table: Array, nodes: Array, d_nodes: Array, kept:
         if kept.by_tau.size > 0:
             by_x = -decay * kept.y[k] - total - x * change
             kept.by_tau[k] = decay * kept.by_tau[k] - by_x * x / tau
-            for c in range(CARRIED):
+            for c in range(d_nodes.shape[1]):
                 total_c = 0.0
                 for i in range(4):
                     total_c += table[k, WEIGHT + i] * d_nodes[i, c]
@@ -365,16 +366,17 @@ def relaxed_along(
     -------
     tuple of arrays
         Stress (n,), Pa, infinite from the end of a branch on; branches (n,); derivatives of the
-        stress (8 or 0, n) by k0 … kh_minus or spread_minus, and by the logarithm of the strain; by
-        the g of every term (terms, n), and by its τ (terms or 0, n).
+        stress (8, 11 or 0, n) by k0 … kh_minus or spread_minus, by the logarithm of the strain, and
+        by what a spring remembers; by the g of every term (terms, n), and by its τ (terms or 0, n).
     """
     n, terms, wanted = eps.size, (row.size - N_COLUMNS) // 2, int(derive)
-    sigma, branches, by = np.empty(n), np.empty(n, np.int64), np.empty((wanted * CARRIED, n))
+    count = micro.carried(row)
+    sigma, branches, by = np.empty(n), np.empty(n, np.int64), np.empty((wanted * count, n))
     by_g, by_tau = np.empty((terms, n)), np.empty((wanted * terms, n))
     state, nodes = np.empty(STATE), np.empty(4)
     table, moments = np.zeros((terms, TABLE)), np.empty(5)
-    kept = Kept(np.zeros(terms), np.zeros((terms, CARRIED)), np.zeros(by_tau.shape[0]))
-    d_rank, d_nodes = np.zeros(CARRIED), np.zeros((4, CARRIED))
+    kept = Kept(np.zeros(terms), np.zeros((terms, count)), np.zeros(by_tau.shape[0]))
+    d_ranks, d_nodes = np.zeros((2, CARRIED)), np.zeros((4, count))
     _begin(row, state)
     largest, entered, plain = 0.0, True, 0
     _begin_table(row, t[n - 1] - t[0], table)
@@ -393,7 +395,7 @@ def relaxed_along(
             if start:  # from rest to the first sample in no time
                 _settle(row, state, end)
                 done, entered = until, True
-            _derive_end(row, state, d_rank, d_nodes, derive and entered)
+            _derive_end(row, state, d_ranks, d_nodes, derive and entered)
             entered = False
             pace = until - done
             at, first = done, state[EPS]
@@ -422,7 +424,7 @@ def relaxed_along(
                 if not short:
                     plain = CHECKED if sloped and error <= PLAIN * rtol * largest else 0
                 if derive:
-                    _derive(row, state, nodes, d_rank, d_nodes, origin, goal)
+                    _derive(row, state, nodes, d_ranks, d_nodes, origin, goal)
                 _relax(row, h, table, nodes, d_nodes, kept)
                 done = until if last else done + pace
                 pace *= 2.0
@@ -435,7 +437,7 @@ def relaxed_along(
                 continue
             if state[EPS] != end:  # so near the end of a branch that no time is left
                 _settle(row, state, end)
-                _derive_end(row, state, d_rank, d_nodes, derive)
+                _derive_end(row, state, d_ranks, d_nodes, derive)
             break
         if start:
             kept.y[:] = -state[SIGMA]

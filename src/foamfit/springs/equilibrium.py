@@ -49,8 +49,8 @@ def _series_strain(
     size = 0.0
     for i in range(rows.shape[0]):
         if rows[i, KIND] == MICROSCALE:
-            rank, branch = rank_at(rows[i], ranks[i], branches[i], sigma)
-            eps[i], soft, by_rank, pace = under_stress(rows[i], branch, rank, sigma)
+            rank, ever, branch = rank_at(rows[i], ranks[i, 0], ranks[i, 1], branches[i], sigma)
+            eps[i], soft, by_rank, _, pace = under_stress(rows[i], branch, rank, ever, sigma)
             compliance += heights[i] * (soft + by_rank * pace)
             total += heights[i] * eps[i]
             size += heights[i] * max(abs(eps[i]), LEAST)
@@ -142,7 +142,7 @@ def equilibrate(
     Newton's method finds it, from the eighth trial on inside a bracket that every third trial
     halves. Where the root lies in a jump of the elongation (k_h± = 0, or a snap so narrow that
     neighbouring numbers for the stress lie apart in it), the springs share it from the base up.
-    `branches` and `ranks`, those of microscale springs, are brought up to date.
+    `branches` and `ranks` (springs, 2), those of microscale springs, are brought up to date.
     """
     found = False
     low, high = -math.inf, math.inf
@@ -171,7 +171,8 @@ def equilibrate(
         sigma = _split_jump(rows, branches, ranks, heights, elongation, low, high, eps)
     for i in range(eps.size):
         if rows[i, KIND] == MICROSCALE:
-            ranks[i], branches[i] = rank_at(rows[i], ranks[i], branches[i], sigma)
+            reached = rank_at(rows[i], ranks[i, 0], ranks[i, 1], branches[i], sigma)
+            ranks[i, 0], ranks[i, 1], branches[i] = reached
         else:
             branches[i] = branch_at_strain(rows[i], branches[i], eps[i])
     return sigma
@@ -187,7 +188,7 @@ def equilibrium_along(
     """
     count, n = rows.shape[0], top.size
     branches = np.empty(count, np.int64)
-    now, ranks = np.empty(count), np.full(count, -math.inf)
+    now, ranks = np.empty(count), np.full((count, 2), -math.inf)
     for i in range(count):
         branches[i] = first_branch(rows[i])
     last = 0.0

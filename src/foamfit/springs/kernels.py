@@ -55,13 +55,17 @@ SIGMA_A, SIGMA_C, EPS_STAR, EPS_HAT_A, EPS_HAT_C, SIGMA_HAT_A, SIGMA_HAT_C, N_CO
 # A microscale spring has in place of most of them the logarithms of sigma_plus and sigma_minus, the
 # spreads, and the logarithm of the stress where both laws of snapping meet (see `law.crossing`).
 LOG_PLUS, SPREAD_PLUS, LOG_MINUS, SPREAD_MINUS, LOG_CROSS = EPS_A, EPS_C, KH_PLUS, KH_MINUS, SIGMA_A
+# If it remembers what has snapped (1, else 0): the stiffening n of branch a, k0 of what has snapped
+# once, and the logarithm of its median snap-through stress; LOG_CROSS is then where that one meets
+# snap-back.
+REMEMBERS, STIFFENING, K_SNAPPED, LOG_AGAIN = SIGMA_C, EPS_HAT_A, EPS_HAT_C, SIGMA_HAT_A
 # After the columns follow the relaxation terms: g of term k (from 0) in N_COLUMNS + 2 k, its time τ
 # in the next; g = 0, τ = inf where a spring has fewer than others. Without any, rows end before.
 
 # Branches: of the bistable spring, of a linear one, and of a unilateral one out of contact; of the
 # microscale spring (virgin, it is on A): the snapped fraction p is held, p = P₊, p = P₋ > P₊, and
-# p = P₊ = P₋.
-A, D, C, E, LINE, OPEN, HELD, SNAP, BACK, BOTH = range(10)
+# p = P₊ = P₋; and p = P₊(σ e^s) of what has snapped before.
+A, D, C, E, LINE, OPEN, HELD, SNAP, BACK, BOTH, AGAIN = range(11)
 
 _derived_points = inner(derived_points)
 _admissible = inner(admissible)

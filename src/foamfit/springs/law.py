@@ -11,9 +11,10 @@ import math
 BISTABLE, LINEAR, UNILATERAL, MICROSCALE = 0, 1, 2, 3
 # Branches by their numbers: of the bistable spring, of a linear one, and of a unilateral one out of
 # contact; of the microscale spring, of which the snapped fraction p is held, p = P₊, p = P₋ > P₊,
-# and p = P₊ = P₋.
+# and p = P₊ = P₋; and of what has snapped before, where that snaps through once more.
 BRANCH_NAMES = (
     "a", "d", "c", "e", "line", "open", "held", "snap-through", "snap-back", "reversible",
+    "snap-through again",
 )  # fmt: skip
 # Below this rank (in standard normal scores) a microscale spring counts as virgin: so few, a share
 # of 5e-17, have snapped.
@@ -110,3 +111,43 @@ def crossing(log_plus: float, spread_plus: float, log_minus: float, spread_minus
     if spread_minus == spread_plus:
         return math.inf if log_minus < log_plus else -math.inf
     return log_plus + spread_plus * ((log_plus - log_minus) / (spread_minus - spread_plus))
+
+
+def most_beyond(k: float, kc: float, n: float) -> tuple[float, float]:
+    """Largest excess of branch a over branch c without its ε_*, and the stress where it is.
+
+    The excess is f(σ) = a(σ; k) - σ/(kc+σ) with a = 1 - (1 + nσ/k)^(-1/n) (model, section 8); for
+    n = 1 that of `least_eps_star`. It rises where g(σ) = 2 ln(kc+σ) - ln(k kc) - (1+1/n) ln(1+nσ/k)
+    is positive; g turns once at most, so f has one maximum at most.
+    """
+    if n == 1.0:
+        one, other = math.sqrt(k), math.sqrt(kc)
+        return max(0.0, (other - one) / (other + one)), one * other
+
+    def rises(sigma: float) -> float:
+        gains = 2.0 * math.log(kc + sigma) - math.log(k) - math.log(kc)
+        return gains - (1.0 + 1.0 / n) * math.log1p(n * sigma / k)
+
+    turn = ((1.0 + n) * kc - 2.0 * k) / (n - 1.0)  # of g
+    if n > 1.0:  # g falls up to its turn, and is negative there
+        if kc <= k:
+            return 0.0, 0.0
+        low, high = 0.0, turn
+    else:  # g rises up to its turn, if that is at a stress at all, and falls without end
+        low = max(turn, 0.0)
+        if rises(low) <= 0.0:
+            return 0.0, 0.0
+        high = max(low, k, kc)
+        while rises(high) > 0.0 and high < 1e300:
+            high *= 2.0
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        if not low < middle < high:
+            break
+        if rises(middle) > 0.0:
+            low = middle
+        else:
+            high = middle
+    sigma = 0.5 * (low + high)
+    excess = -math.expm1(-math.log1p(n * sigma / k) / n) - sigma / (kc + sigma)
+    return max(excess, 0.0), sigma

@@ -14,20 +14,25 @@ import math
 
 import numpy as np
 
+from foamfit.springs import memory_kernels as memory
 from foamfit.springs.kernels import (
     BACK,
     BOTH,
     EPS_STAR,
     HELD,
     K0,
+    K_SNAPPED,
     KC,
     KIND,
+    LOG_AGAIN,
     LOG_CROSS,
     LOG_MINUS,
     LOG_PLUS,
+    REMEMBERS,
     SNAP,
     SPREAD_MINUS,
     SPREAD_PLUS,
+    STIFFENING,
     A,
     Array,
     Branches,
@@ -40,58 +45,104 @@ from foamfit.springs.law import (
     MICROSCALE,
     crossing,
     least_eps_star,
+    most_beyond,
 )
-
-# The state of a walk: strain, stress, branch, rank, p, 1 - p, the strains and stresses at which the
-# branch ends, and dε/dσ, d²ε/dσ² where the stress was last sought. Then what stays: strain and
-# stress where snap-through and snap-back meet, where the first micro-spring snaps, and where the
-# last one has snapped back.
-EPS, SIGMA, BRANCH, RANK, SNAPPED, REST, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH = range(10)
-FLEXIBILITY, CURVATURE, MEET, SIGMA_MEET, FIRST, SIGMA_FIRST, LAST, SIGMA_LAST = range(10, 18)
-STATE = 18
-# Derivatives that are carried: by k0 … spread_minus, and by (the logarithm of) the strain itself.
-OF_STRAIN, CARRIED = 7, 8
-# A step of Halley's method so small, in widths over which the law bends, is the last: what it
-# leaves is about its cube.
-NEAR = 3e-6
-# The least stress that is sought: the least normal number.
-LEAST = 2.0**-1022
-_ROOT_HALF, _ROOT_TURN = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
+from foamfit.springs.memory_kernels import turned as turned
+from foamfit.springs.ranks import (
+    BRANCH,
+    CARRIED,
+    CURVATURE,
+    EPS,
+    EVER,
+    FIRST,
+    FLEXIBILITY,
+    HIGH,
+    LAST,
+    LEAST,
+    LOW,
+    MEET,
+    NEAR,
+    OF_STRAIN,
+    PLAIN_CARRIED,
+    RANK,
+    REST,
+    SIGMA,
+    SIGMA_FIRST,
+    SIGMA_HIGH,
+    SIGMA_LAST,
+    SIGMA_LOW,
+    SIGMA_MEET,
+    SNAPPED,
+    STATE,
+    density,
+    share,
+)
 
 _least_eps_star = inner(least_eps_star)
 _crossing = inner(crossing)
+_most_beyond = inner(most_beyond)
 
 
-@compiled
-def fill_microscale(values: Array, row: Row) -> bool:
-    """Write k0 … spread_minus and what follows from them; false if they are not admissible."""
+@inner
+def _fill_alike(values: Array, row: Row) -> bool:
+    """Write k0 … spread_minus of a spring of any ε_*; false if they are not admissible."""
     k0, kc, eps_star = values[0], values[1], values[2]
     spread_plus, spread_minus = values[4], values[6]
     for own in range(7):
         if own != 2 and not 0.0 < values[own] < math.inf:
             return False
-    if not _least_eps_star(k0, kc) <= eps_star < math.inf:
+    if not 0.0 <= eps_star < math.inf:
         return False
     row[KIND], row[K0], row[KC], row[EPS_STAR] = MICROSCALE, k0, kc, eps_star
     row[LOG_PLUS], row[SPREAD_PLUS] = math.log(values[3]), spread_plus
     row[LOG_MINUS], row[SPREAD_MINUS] = math.log(values[5]), spread_minus
     row[LOG_CROSS] = _crossing(row[LOG_PLUS], spread_plus, row[LOG_MINUS], spread_minus)
+    row[REMEMBERS], row[STIFFENING], row[K_SNAPPED], row[LOG_AGAIN] = 0.0, 1.0, k0, row[LOG_PLUS]
     return True
 
 
+@compiled
+def fill_microscale(values: Array, row: Row) -> bool:
+    """Write k0 … spread_minus and what follows from them; false if they are not admissible."""
+    return _fill_alike(values, row) and row[EPS_STAR] >= _least_eps_star(row[K0], row[KC])
+
+
+@inner
+def _remember(row: Row, stiffening: float, softening: float, weakening: float) -> bool:
+    """Write what a spring remembers (model, section 8); false if it is not admissible."""
+    if not (0.0 < stiffening < math.inf):
+        return False
+    if not (0.0 <= softening < math.inf and 0.0 <= weakening < math.inf):
+        return False
+    row[REMEMBERS], row[STIFFENING] = 1.0, stiffening
+    row[K_SNAPPED] = row[K0] * math.exp(-softening)
+    row[LOG_AGAIN] = row[LOG_PLUS] - weakening
+    cross = _crossing(row[LOG_AGAIN], row[SPREAD_PLUS], row[LOG_MINUS], row[SPREAD_MINUS])
+    row[LOG_CROSS] = cross
+    if not row[K_SNAPPED] > 0.0:
+        return False
+    return row[EPS_STAR] >= _most_beyond(row[K_SNAPPED], row[KC], stiffening)[0]
+
+
+@compiled
+def fill_stiffening(values: Array, row: Row) -> bool:
+    """Write k0 … spread_minus and stiffening; false if they are not admissible."""
+    return _fill_alike(values, row) and _remember(row, values[7], 0.0, 0.0)
+
+
+@compiled
+def fill_mullins(values: Array, row: Row) -> bool:
+    """Write k0 … spread_minus, softening and weakening; false if they are not admissible."""
+    return _fill_alike(values, row) and _remember(row, 1.0, values[7], values[8])
+
+
+@compiled
+def fill_memory(values: Array, row: Row) -> bool:
+    """Write k0 … spread_minus, stiffening, softening and weakening; false if not admissible."""
+    return _fill_alike(values, row) and _remember(row, values[7], values[8], values[9])
+
+
 # ---------------------------------------------------------------- the law
-
-
-@inner
-def share(rank: float) -> float:
-    """Φ, the share of all ranks that lies below one."""
-    return 0.5 * math.erfc(-_ROOT_HALF * rank)
-
-
-@inner
-def density(rank: float) -> float:
-    """Φ', the density of ranks."""
-    return _ROOT_TURN * math.exp(-0.5 * rank * rank)
 
 
 @inner
@@ -126,6 +177,9 @@ def _strain_between(row: Row, log: float, spread: float, sigma: float) -> float:
 @inner
 def begin(row: Row, state: Array) -> None:
     """Set the state of a spring that never bore anything."""
+    if row[REMEMBERS] > 0.0:
+        memory.begin(row, state, 0.0)
+        return
     state[:] = 0.0
     state[BRANCH], state[RANK], state[REST] = A, -math.inf, 1.0
     plus, minus = row[LOG_PLUS], row[LOG_MINUS]
@@ -142,6 +196,9 @@ def begin(row: Row, state: Array) -> None:
 @inner
 def begin_above(row: Row, state: Array, least: float) -> None:
     """Set the state of a spring that never bore anything, and snaps nothing below a strain."""
+    if row[REMEMBERS] > 0.0:
+        memory.begin(row, state, least)
+        return
     begin(row, state)
     if min(state[FIRST], state[LAST]) >= least:
         return
@@ -206,14 +263,11 @@ def _hold(row: Row, state: Array, up: bool) -> None:
 
 
 @inner
-def turned(state: Array, up: bool) -> bool:
-    """Whether a spring that snaps, or snaps back, is now moved the other way."""
-    return state[BRANCH] == BACK if up else state[BRANCH] == SNAP
-
-
-@inner
 def switch(row: Row, state: Array, up: bool) -> None:
     """Go over from the end of a branch, or from where the strain turns, to the next branch."""
+    if row[REMEMBERS] > 0.0:
+        memory.switch(row, state, up)
+        return
     branch = int(state[BRANCH])
     if turned(state, up):
         _hold(row, state, up)
@@ -238,6 +292,8 @@ def switch(row: Row, state: Array, up: bool) -> None:
 @inner
 def stress_in(row: Row, state: Array, eps: float) -> float:
     """Stress at a strain on the branch that the spring is on; infinite if it cannot have any."""
+    if row[REMEMBERS] > 0.0:
+        return memory.stress_in(row, state, eps)
     branch = int(state[BRANCH])
     if branch == A:
         return row[K0] * eps / (1.0 - eps) if eps < 1.0 else math.inf
@@ -324,7 +380,12 @@ def settle(row: Row, state: Array, eps: float) -> None:
 
 @inner
 def fill_slopes(row: Row, state: Array) -> None:
-    """Fill dε/dσ and d²ε/dσ² on a branch on which no micro-spring snaps: held, or `a`."""
+    """Fill dε/dσ and d²ε/dσ² on a branch on which no micro-spring snaps: held, or `a`.
+
+    Those of a spring that remembers come with the stress.
+    """
+    if row[REMEMBERS] > 0.0:
+        return
     one, two = 1.0 / (row[K0] + state[SIGMA]), 1.0 / (row[KC] + state[SIGMA])
     on_a, on_c = state[REST] * row[K0] * one * one, state[SNAPPED] * row[KC] * two * two
     state[FLEXIBILITY], state[CURVATURE] = on_a + on_c, -2.0 * (on_a * one + on_c * two)
@@ -342,6 +403,8 @@ def leaves(state: Array, eps: float) -> bool:
 @inner
 def rank_now(row: Row, state: Array) -> float:
     """The rank up to which micro-springs have snapped."""
+    if row[REMEMBERS] > 0.0:
+        return memory.rank_now(row, state)
     branch = int(state[BRANCH])
     if branch in (A, HELD):
         return state[RANK]
@@ -350,28 +413,45 @@ def rank_now(row: Row, state: Array) -> float:
     return (math.log(state[SIGMA]) - row[LOG_PLUS]) / row[SPREAD_PLUS]
 
 
+@inner
+def ever_now(state: Array, rank: float) -> float:
+    """The rank up to which micro-springs have ever snapped, where they have up to `rank` now."""
+    return rank if state[BRANCH] == SNAP else state[EVER]
+
+
 @compiled
 def stress_along(row: Row, eps: Array) -> tuple[Array, Array, Branches]:
-    """Stress, rank and branch of one microscale spring along a strain history, from rest."""
-    sigma, rank = np.empty(eps.size), np.empty(eps.size)
+    """Stress, ranks and branch of one microscale spring along a strain history, from rest.
+
+    The ranks (2, n) are those of what has snapped, and of what has ever snapped.
+    """
+    sigma, rank = np.empty(eps.size), np.empty((2, eps.size))
     branches, state = np.empty(eps.size, np.int64), np.empty(STATE)
     begin(row, state)
     for j in range(eps.size):
         while leaves(state, eps[j]):
             switch(row, state, eps[j] > state[EPS])
         settle(row, state, eps[j])
-        sigma[j], rank[j] = state[SIGMA], rank_now(row, state)
+        sigma[j], rank[0, j] = state[SIGMA], rank_now(row, state)
+        rank[1, j] = ever_now(state, rank[0, j])
         branches[j] = int(state[BRANCH])
         if not sigma[j] < math.inf:  # past the end of branch c: nothing follows
             sigma[j:] = math.inf
-            branches[j:], rank[j:] = branches[j], rank[j]
+            branches[j:], rank[:, j:] = branches[j], rank[:, j : j + 1]
             break
     return sigma, rank, branches
 
 
 @inner
-def rank_at(row: Row, rank: float, branch: int, sigma: float) -> tuple[float, int]:
-    """Rank and branch at a stress of a spring that was last seen at others."""
+def rank_at(
+    row: Row, rank: float, ever: float, branch: int, sigma: float
+) -> tuple[float, float, int]:
+    """Ranks of what has snapped, and has ever, and branch of a spring last seen at other stresses.
+
+    The second rank counts only where the spring remembers.
+    """
+    if row[REMEMBERS] > 0.0:
+        return memory.rank_at(row, rank, ever, branch, sigma)
     plus = minus = -math.inf
     if sigma > 0.0:
         log = math.log(sigma)
@@ -386,45 +466,51 @@ def rank_at(row: Row, rank: float, branch: int, sigma: float) -> tuple[float, in
         branch = HELD  # also at an end of the held stresses that it has not passed
     if rank < LEAST_RANK:
         rank, branch = -math.inf, A
-    return rank, branch
+    return rank, ever, branch
 
 
 @inner
 def under_stress(
-    row: Row, branch: int, rank: float, sigma: float
-) -> tuple[float, float, float, float]:
-    """Strain at a stress, its derivatives by stress and rank, and that of the rank by the stress.
+    row: Row, branch: int, rank: float, ever: float, sigma: float
+) -> tuple[float, float, float, float, float]:
+    """Strain at a stress, its derivatives by stress and both ranks, and of the rank by the stress.
 
     The strain is -inf where the spring cannot carry the tension.
     """
+    if row[REMEMBERS] > 0.0:
+        return memory.under_stress(row, branch, rank, ever, sigma)
     if not sigma > -row[K0]:
-        return -math.inf, 0.0, 0.0, 0.0
+        return -math.inf, 0.0, 0.0, 0.0, 0.0
     one = 1.0 / (row[K0] + sigma)
     if branch == A:
-        return sigma * one, row[K0] * one * one, 0.0, 0.0
+        return sigma * one, row[K0] * one * one, 0.0, 0.0, 0.0
     two, p, rest = 1.0 / (row[KC] + sigma), share(rank), share(-rank)
     on_a, on_c = sigma * one, row[EPS_STAR] + sigma * two
     soft = rest * row[K0] * one * one + p * row[KC] * two * two
     pace = 0.0
     if branch != HELD:
         pace = 1.0 / (row[SPREAD_MINUS if branch == BACK else SPREAD_PLUS] * sigma)
-    return rest * on_a + p * on_c, soft, density(rank) * (on_c - on_a), pace
+    return rest * on_a + p * on_c, soft, density(rank) * (on_c - on_a), 0.0, pace
 
 
 @compiled
 def strain_along(row: Row, sigma: Array) -> tuple[Array, Array, Branches]:
-    """Strain, rank and branch of one microscale spring along a stress history, from rest.
+    """Strain, ranks and branch of one microscale spring along a stress history, from rest.
 
+    The ranks (2, n) are those of what has snapped, and of what has ever snapped.
     The strain is -inf where the spring cannot carry the tension.
     """
-    eps, ranks = np.empty(sigma.size), np.empty(sigma.size)
-    branches, branch, rank = np.empty(sigma.size, np.int64), A, -math.inf
+    eps, ranks = np.empty(sigma.size), np.empty((2, sigma.size))
+    branches, branch, rank, ever = np.empty(sigma.size, np.int64), A, -math.inf, -math.inf
     for j in range(sigma.size):
-        rank, branch = rank_at(row, rank, branch, sigma[j])
+        rank, ever, branch = rank_at(row, rank, ever, branch, sigma[j])
         eps[j] = -math.inf
-        if sigma[j] > -row[K0]:
+        if row[REMEMBERS] > 0.0:
+            p, rest, never = share(rank), share(-rank), share(-ever)
+            eps[j] = memory.mixture(row, branch, p, rest, never, sigma[j])[0]
+        elif sigma[j] > -row[K0]:
             eps[j] = strain_of(row, share(rank), share(-rank), sigma[j])
-        branches[j], ranks[j] = branch, rank
+        branches[j], ranks[0, j], ranks[1, j] = branch, rank, ever
     return eps, ranks, branches
 
 
@@ -433,17 +519,28 @@ def strain_along(row: Row, sigma: Array) -> tuple[Array, Array, Branches]:
 
 @inner
 def tangents(
-    row: Row, branch: int, rank: float, sigma: float, eps: float, d_rank: Array, out: Array
+    row: Row,
+    branch: int,
+    rank: float,
+    ever: float,
+    sigma: float,
+    eps: float,
+    d_ranks: Array,
+    out: Array,
 ) -> float:
     """Fill the derivatives of the stress at a strain; returns the slope dσ/dε.
 
-    They are by k0 … spread_minus, and by the logarithm of the strain. `d_rank`, the same of the
-    rank, is brought up to date where the spring moves.
+    They are by k0 … spread_minus, and by the logarithm of the strain; where the spring remembers,
+    also by stiffening, softening, weakening. `d_ranks` (2, CARRIED), the same of both ranks, is
+    brought up to date where the spring moves.
     """
+    d_rank = d_ranks[0]
+    if row[REMEMBERS] > 0.0:
+        return memory.tangents(row, branch, rank, ever, sigma, eps, d_rank, d_ranks[1], out)
     k0, kc, star = row[K0], row[KC], row[EPS_STAR]
     one, two = 1.0 / (k0 + sigma), 1.0 / (kc + sigma)
     if branch == A:
-        for c in range(CARRIED):
+        for c in range(PLAIN_CARRIED):
             d_rank[c] = out[c] = 0.0
         slope = 1.0 / (k0 * one * one)
         out[0] = slope * sigma * one * one
@@ -454,7 +551,7 @@ def tangents(
     flexible = rest * k0 * one * one + p * kc * two * two
     if branch == HELD:
         slope = 1.0 / flexible
-        for c in range(CARRIED):
+        for c in range(PLAIN_CARRIED):
             out[c] = -slope * weight * d_rank[c]
         out[0] += slope * rest * sigma * one * one
         out[1] += slope * p * sigma * two * two
@@ -466,7 +563,7 @@ def tangents(
     first = 5 if back else 3
     by_log = -math.exp(-(row[LOG_MINUS] if back else row[LOG_PLUS])) / spread
     slope = 1.0 / (flexible + weight / (spread * sigma))
-    for c in range(CARRIED):
+    for c in range(PLAIN_CARRIED):
         out[c] = d_rank[c] = 0.0
     d_rank[first], d_rank[first + 1] = by_log, -rank / spread
     out[0] = slope * rest * sigma * one * one
@@ -474,34 +571,47 @@ def tangents(
     out[2] = -slope * p
     out[first], out[first + 1] = -slope * weight * by_log, slope * weight * rank / spread
     out[OF_STRAIN] = slope * eps
-    for c in range(CARRIED):
+    for c in range(PLAIN_CARRIED):
         d_rank[c] += out[c] / (spread * sigma)
     return slope
+
+
+@inner
+def carried(row: Row) -> int:
+    """How many derivatives are carried along."""
+    return CARRIED if row[REMEMBERS] > 0.0 else PLAIN_CARRIED
 
 
 @compiled
 def stress_tangents_along(
     row: Row, eps: Array, sigma: Array, ranks: Array, branches: Branches
 ) -> tuple[Array, Array]:
-    """Derivatives of the stress (8, n) along a strain history, and the slope dσ/dε (n,).
+    """Derivatives of the stress (8 or 11, n) along a strain history, and the slope dσ/dε (n,).
 
     See `tangents` for what they are by.
     """
-    out, slope = np.empty((CARRIED, eps.size)), np.empty(eps.size)
-    now, d_rank = np.empty(CARRIED), np.zeros(CARRIED)
+    count = carried(row)
+    out, slope = np.empty((count, eps.size)), np.empty(eps.size)
+    now, d_ranks = np.empty(CARRIED), np.zeros((2, CARRIED))
     for j in range(eps.size):
-        slope[j] = tangents(row, branches[j], ranks[j], sigma[j], eps[j], d_rank, now)
-        for c in range(CARRIED):
+        w, ever, branch = ranks[0, j], ranks[1, j], branches[j]
+        slope[j] = tangents(row, branch, w, ever, sigma[j], eps[j], d_ranks, now)
+        for c in range(count):
             out[c, j] = now[c]
     return out, slope
 
 
 @inner
-def strain_tangents(row: Row, branch: int, rank: float, sigma: float, out: Array) -> None:
+def strain_tangents(
+    row: Row, branch: int, rank: float, ever: float, sigma: float, out: Array
+) -> None:
     """Fill the derivatives of the strain by k0, kc, eps_star; of the rank by sigma_plus and so on.
 
     Those of the strain are at a fixed stress and rank, those of the rank at a fixed stress.
     """
+    if row[REMEMBERS] > 0.0:
+        memory.strain_tangents(row, branch, rank, ever, sigma, out)
+        return
     one, two, p = 1.0 / (row[K0] + sigma), 1.0 / (row[KC] + sigma), share(rank)
     out[0], out[1], out[2] = -share(-rank) * sigma * one * one, -p * sigma * two * two, p
     for own in range(3, OF_STRAIN):

@@ -43,13 +43,16 @@ class Model:
     relaxation: int = 0
 
     @classmethod
-    def parse(cls, name: str, relaxation: int = 0) -> Model:
+    def parse(cls, name: str, relaxation: int = 0, options: tuple[str, ...] = ()) -> Model:
         """Read a model's name, for example "linear+bistable".
+
+        `options` are those of the fit that free more parameters: see `laws.OPTIONS`.
 
         Raises
         ------
         InputError
-            If a spring in it is unknown, or there are too many of them or of relaxation terms.
+            If a spring in it is unknown, there are too many of them or of relaxation terms, or no
+            spring has the parameters of an option.
         """
         if type(relaxation) is not int or not 0 <= relaxation <= MOST_TERMS:
             raise InputError(
@@ -69,12 +72,26 @@ class Model:
                     f"model '{name}': '{kind}' is not a spring; "
                     f"join {', '.join(known)} by '+', from the base up"
                 )
-        return cls(kinds, relaxation)
+        for option in options:
+            having = [kind for kind in known if (option,) in laws.law(kind).options]
+            if not set(having) & set(kinds):
+                raise InputError(
+                    f"--{option} needs a spring that has its parameters, and model '{name}' has "
+                    f"none; take one with {' or '.join(having)}"
+                )
+        return cls(tuple(laws.with_options(kind, options) for kind in kinds), relaxation)
 
     @property
     def name(self) -> str:
         """The model's name, springs from the base up."""
-        return "+".join(self.kinds)
+        return "+".join(law.word or law.kind for law in self.laws)
+
+    @cached_property
+    def options(self) -> tuple[str, ...]:
+        """Options that free the parameters of some springs; see `laws.OPTIONS`."""
+        base = ((laws.law(law.word), law.kind) for law in self.laws if law.word)
+        found = {o for one, kind in base for o, of in one.options.items() if of == kind}
+        return max(found, key=len, default=())
 
     @cached_property
     def laws(self) -> tuple[Law, ...]:

@@ -74,8 +74,7 @@ def any_param(short: str) -> Param:
     """Record of a parameter by its short name alone, of the first law that has it."""
     if (common := COMMON.get(family(short))) is not None:
         return common
-    records = (laws.law(kind).by_name for kind in laws.kinds())
-    return next(by_name[short] for by_name in records if short in by_name)
+    return next(law.by_name[short] for law in laws.records() if short in law.by_name)
 
 
 def unit_of(name: str) -> str:
@@ -107,7 +106,7 @@ def direction(
         if short == ETA.name:
             return spring, OWN_ETA
         if short in law.own:
-            return spring, law.own.index(short)
+            return spring, law.derivative(short)
         if short in names_of(law.kind, terms):
             return spring, OWN_RELAXATION + relaxation_names(terms).index(short)
     raise InputError(

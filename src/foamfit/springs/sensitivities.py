@@ -3,6 +3,8 @@
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from foamfit.springs.kernels import (
@@ -12,7 +14,9 @@ from foamfit.springs.kernels import (
     KC,
     KIND,
     OPEN,
+    REMEMBERS,
     SIGMA_C,
+    SNAP,
     A,
     Array,
     Branches,
@@ -22,16 +26,13 @@ from foamfit.springs.kernels import (
     branch_shape,
     compiled,
     inner,
+    maker,
     slope_on,
 )
 from foamfit.springs.law import BISTABLE, MICROSCALE
-from foamfit.springs.microscale_kernels import (
-    OF_STRAIN,
-    strain_along,
-    strain_tangents,
-    under_stress,
-)
+from foamfit.springs.microscale_kernels import strain_along, strain_tangents, under_stress
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
+from foamfit.springs.ranks import CARRIED, OF_STRAIN, OF_WEAKENING
 
 
 @inner
@@ -58,6 +59,95 @@ def branch_derivative(row: Row, branch: int, own: int) -> tuple[float, float, fl
     return d_kc, d_eps_star, 0.0
 
 
+class _Followed(NamedTuple):
+    """Springs at one sample, and what of their derivatives is carried along.
+
+    `slope` (springs,) are dσ/dε, `change` (p, 3) the derivatives of k, x0 and s0 of the branch that
+    the direction's spring is on. Of microscale springs, `ranks` (springs, 2, n) are the ranks of
+    what has snapped, and of what has ever snapped, along the history; `by` (springs, CARRIED) the
+    derivatives of the strain by the parameters, `by_ranks` (springs, 2) by the ranks and `pace`
+    that of the first one by the stress; `d_ranks` (p, springs, 2) the derivatives of the ranks.
+    """
+
+    slope: Array
+    change: Array
+    ranks: Array
+    by: Array
+    by_ranks: Array
+    pace: Array
+    d_ranks: Array
+
+
+@maker
+def _followed(rows: Array, sigma: Array, size: int) -> _Followed:
+    """Springs at rest."""
+    count, n = rows.shape[0], sigma.size
+    ranks = np.zeros((count, 2, n))
+    for i in range(count):
+        if rows[i, KIND] == MICROSCALE:
+            ranks[i] = strain_along(rows[i], sigma)[1]
+    return _Followed(
+        np.empty(count), np.zeros((size, 3)), ranks, np.zeros((count, CARRIED)),
+        np.zeros((count, 2)), np.zeros(count), np.zeros((size, count, 2)),
+    )  # fmt: skip
+
+
+@inner
+def _follow(
+    at: _Followed, rows: Array, i: int, j: int, sigma: float, eps: Array, branches: Branches,
+    directions: Branches,
+) -> None:  # fmt: skip
+    """Fill what belongs to spring i at sample j."""
+    branch = branches[i, j]
+    if rows[i, KIND] == MICROSCALE:
+        w, ever = at.ranks[i, 0, j], at.ranks[i, 1, j]
+        _, soft, by_rank, by_ever, at.pace[i] = under_stress(rows[i], branch, w, ever, sigma)
+        at.by_ranks[i, 0], at.by_ranks[i, 1] = by_rank, by_ever
+        strain_tangents(rows[i], branch, w, ever, sigma, at.by[i])
+        at.slope[i] = 1.0 / (soft + by_rank * at.pace[i])
+        return
+    if j == 0 or branch != branches[i, j - 1]:
+        for p in range(directions.shape[0]):
+            own = directions[p, 1]
+            if directions[p, 0] == i and own < OWN_ETA:
+                new = branch_derivative(rows[i], branch, own)
+                at.change[p, 0], at.change[p, 1], at.change[p, 2] = new
+    at.slope[i] = slope_on(rows[i], branch, eps[i, j])
+
+
+@inner
+def _moves_line(own: int) -> bool:
+    """Whether a parameter moves the ranks of a microscale spring, not its strain at them."""
+    return 3 <= own < OF_STRAIN or own == OF_WEAKENING
+
+
+@inner
+def _mixture_tangent(at: _Followed, p: int, i: int, branch: int, own: int, held: bool) -> float:
+    """Derivative of a microscale spring's strain at a fixed stress by a parameter of its own.
+
+    `own` is -1 where the parameter is another spring's; `held` says that all that ever snapped is
+    held.
+    """
+    d_rank, d_ever = at.d_ranks[p, i, 0], at.d_ranks[p, i, 1]
+    if branch == HELD:  # what is held moves with the stress where it turned
+        d_rank = d_ever if held else d_rank
+    else:
+        d_rank = at.by[i, own] if _moves_line(own) else 0.0
+    at.d_ranks[p, i, 0] = d_rank
+    out = at.by_ranks[i, 0] * d_rank + at.by_ranks[i, 1] * d_ever
+    return out + at.by[i, own] if own >= 0 and not _moves_line(own) else out
+
+
+@inner
+def _rank_tangents(at: _Followed, p: int, branches: Branches, common: float) -> None:
+    """Let the ranks that move do so with the common stress."""
+    for i in range(branches.size):
+        if branches[i] != HELD:
+            at.d_ranks[p, i, 0] += at.pace[i] * common
+        if branches[i] == SNAP:
+            at.d_ranks[p, i, 1] = at.d_ranks[p, i, 0]
+
+
 @compiled
 def equilibrium_tangents(
     rows: Array,
@@ -65,7 +155,7 @@ def equilibrium_tangents(
     sigma: Array,
     eps: Array,
     branches: Branches,
-    moved: bool,
+    moved_top: bool,
     directions: Branches,
 ) -> tuple[Array, Array]:
     """Derivatives along a history of springs in series, undamped and massless.
@@ -78,7 +168,7 @@ def equilibrium_tangents(
         Their common stress, Pa.
     eps, branches : (springs, n) arrays
         Their strains and branches.
-    moved : bool
+    moved_top : bool
         Whether the displacement of the top is prescribed, or else the stress.
     directions : (p, 2) array
         See `parameters`.
@@ -91,63 +181,45 @@ def equilibrium_tangents(
     """
     (count, n), size = eps.shape, directions.shape[0]
     out_w, out_s = np.empty((size, count, n)), np.empty((size, n))
-    change = np.zeros((size, 3))  # of k, x0 and s0 of the branch that the direction's spring is on
-    slope, compliance = np.empty(count), np.zeros(count + 1)  # the latter of all below each node
-    ranks, d_ranks, longer = np.zeros((count, n)), np.zeros((size, count)), np.empty(count)
-    by, by_rank, pace = np.zeros((count, OF_STRAIN)), np.zeros(count), np.zeros(count)
-    for i in range(count):
-        if rows[i, KIND] == MICROSCALE:
-            ranks[i] = strain_along(rows[i], sigma)[1]
+    at, longer = _followed(rows, sigma, size), np.empty(count)
+    compliance, slope = np.zeros(count + 1), at.slope  # of all below each node
     for j in range(n):
         flat = -1
         for i in range(count):
-            branch = branches[i, j]
-            if rows[i, KIND] == MICROSCALE:
-                _, soft, by_rank[i], pace[i] = under_stress(rows[i], branch, ranks[i, j], sigma[j])
-                strain_tangents(rows[i], branch, ranks[i, j], sigma[j], by[i])
-                slope[i] = 1.0 / (soft + by_rank[i] * pace[i])
-            else:
-                for p in range(size if j == 0 or branch != branches[i, j - 1] else 0):
-                    own = directions[p, 1]
-                    if directions[p, 0] == i and own < OWN_ETA:
-                        new = branch_derivative(rows[i], branch, own)
-                        change[p, 0], change[p, 1], change[p, 2] = new
-                slope[i] = slope_on(rows[i], branch, eps[i, j])
+            _follow(at, rows, i, j, sigma[j], eps, branches, directions)
             compliance[i + 1] = compliance[i]
             if slope[i] > 0.0:
                 compliance[i + 1] += heights[i] / slope[i]
             elif flat < 0:
                 flat = i
         for p in range(size):
-            own, at = directions[p, 1], directions[p, 0]
+            own, spring = directions[p, 1], directions[p, 0]
             known = total = 0.0  # δσ at fixed strain, δ of the elongation at fixed stress
             for i in range(count):
                 longer[i] = 0.0
+                mine = own if i == spring and own < OWN_ETA else -1
                 if rows[i, KIND] == MICROSCALE:
-                    if branches[i, j] != HELD:  # what is held moves with the stress where it turned
-                        d_ranks[p, i] = by[i, own] if i == at and 3 <= own < OWN_ETA else 0.0
-                    longer[i] = heights[i] * by_rank[i] * d_ranks[p, i]
-                if i == at and own == OWN_HEIGHT:
-                    longer[i] += eps[i, j]
-                elif i == at and rows[i, KIND] == MICROSCALE:
-                    longer[i] += heights[i] * by[i, own] if own < 3 else 0.0
-                elif i == at and own < OWN_ETA:
+                    held = at.ranks[i, 0, j] == at.ranks[i, 1, j] and rows[i, REMEMBERS] > 0.0
+                    moved = _mixture_tangent(at, p, i, branches[i, j], mine, held)
+                    longer[i] = heights[i] * moved
+                elif mine >= 0:
                     curved, _, x0, _ = branch_shape(rows[i], branches[i, j])
                     x = eps[i, j] - x0
                     factor = x / (1.0 - x) if curved else x
-                    known = factor * change[p, 0] - slope[i] * change[p, 1] + change[p, 2]
+                    known = factor * at.change[p, 0] - slope[i] * at.change[p, 1] + at.change[p, 2]
                     longer[i] = -heights[i] * known / slope[i] if slope[i] > 0.0 else 0.0
+                if i == spring and own == OWN_HEIGHT:
+                    longer[i] += eps[i, j]
                 total += longer[i]
             common = gap = 0.0
-            if moved and flat < 0:
+            if moved_top and flat < 0:
                 common = -total / float(compliance[count])
-            elif moved:  # a flat branch takes up all that the others leave
-                common = known if at == flat else 0.0
+            elif moved_top:  # a flat branch takes up all that the others leave
+                common = known if spring == flat else 0.0
                 gap = -total - common * float(compliance[count])
             out_s[p, j], total = common, 0.0
             for node in range(count):
                 total += longer[node] + (gap if node == flat else 0.0)
                 out_w[p, node, j] = total + common * compliance[node + 1]
-                if branches[node, j] != HELD:
-                    d_ranks[p, node] += pace[node] * common
+            _rank_tangents(at, p, branches[:, j], common)
     return out_w, out_s

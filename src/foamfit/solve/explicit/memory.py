@@ -11,8 +11,10 @@ h = u φ(u) all that is in it has a short recurrence,
     w s u' = s',   φ' = -u' h,   P' = u' φ,   (k0 + s) (1 - a) = k0,
 
 in each of which the last coefficient of s enters linearly: one division finds it from that of the
-strain. Held, P is a constant. The rank of a spring is kept as a normal score w = Φ⁻¹(p). It moves
-with the parameters like all that is in the state.
+strain. Held, P is a constant. A spring that remembers (model, section 8) has (k + ns) (1-a)' =
+-s' (1-a) for the third, with the softer k of what has snapped once, and adds for the share N that
+never has the difference N (a(s; k0) - a(s; k)) of both branches. The rank of a spring is kept as a
+normal score w = Φ⁻¹(p). It moves with the parameters like all that is in the state.
 """
 
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
@@ -25,63 +27,69 @@ import numpy as np
 
 from foamfit.solve.polynomial import first_crossing, value_at
 from foamfit.springs import microscale_kernels as micro
+from foamfit.springs import ranks
 from foamfit.springs.kernels import (
+    AGAIN,
     BACK,
     EPS_STAR,
-    ETA,
     HELD,
     K0,
+    K_SNAPPED,
     KC,
-    KH_MINUS,
-    KH_PLUS,
     KIND,
-    LOG_MINUS,
-    LOG_PLUS,
     N_COLUMNS,
+    REMEMBERS,
     SNAP,
-    SPREAD_MINUS,
-    SPREAD_PLUS,
+    STIFFENING,
     Array,
     Branches,
-    D,
-    E,
     Row,
     inlined,
     inner,
     maker,
     piece,
 )
-from foamfit.springs.law import BISTABLE, MICROSCALE
-from foamfit.springs.microscale_kernels import (
+from foamfit.springs.law import MICROSCALE
+from foamfit.springs.memory_kernels import line, mixture, on_a
+from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
+from foamfit.springs.ranks import (
     BRANCH,
     CARRIED,
     EPS,
+    EVER,
     FLEXIBILITY,
     HIGH,
     LOW,
+    NEVER,
     OF_STRAIN,
     RANK,
     REST,
     SIGMA,
     STATE,
+    density,
+    share,
 )
-from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 
 # Columns of `Memory.series`, which stand side by side at each order since the recurrences read them
-# all: equilibrium stress s; Σ z_k; 1 - a, 1 + eps_star - c; their difference; P; n u_n, u_n, φ, h.
-# Then follow the z of the relaxation terms.
-EQ, RELAXED, BELOW_A, BELOW_C, BETWEEN, SNAPPED, PACE, SCORE, DENSITY, BEND, N_MEMORY = range(11)
-# Rows of `Memory.partials`: the derivatives of the strain at fixed stress by the seven parameters
-# of the law, by p, and by the stress; then what these are made of.
-BY_RANK, BY_STRESS, SQUARE_A, SQUARE_C, WIDTH, STEEP, N_PARTIALS = range(7, 14)
+# all: equilibrium stress s; Σ z_k; 1 - a, 1 + eps_star - c; their difference; P; n u_n, u_n, φ, h;
+# 1 - a of what has never snapped. Then follow the z of the relaxation terms.
+EQ, RELAXED, BELOW_A, BELOW_C, BETWEEN, SNAPPED, PACE, SCORE, DENSITY, BEND = range(10)
+FRESH, N_MEMORY = 10, 11
+# Rows of `Memory.partials`: the derivatives of the strain at fixed stress by the parameters of the
+# law (see `springs.ranks`), by both ranks, and by the stress; then what these are made of.
+BY_RANK, BY_EVER, BY_STRESS, SQUARE_A, SQUARE_C, WIDTH, STEEP = range(CARRIED, CARRIED + 7)
+SQUARE_FRESH, BY_N, BY_N_FRESH, LOG, N_PARTIALS = range(CARRIED + 7, CARRIED + 12)
 # Rows of `Memory.tangents`: the derivatives of s, and those of the z of the terms.
 D_EQ, N_TANGENTS = range(2)
 # Columns of `Memory.now`: place and scale of the normal distribution that is followed, p and 1 - p
 # where the step starts, 1 + Σ g and its inverse; dε/ds there, its inverse, and dε/dΣ; what of a
 # derivative of Σ is not of s. Then what the orders of a step share: 1/(k0 + s) (on a curved branch
-# of another spring that of its k), 1/(kc + s), 1/s; the derivatives of a, c and u by s; c - a.
+# of another spring that of its k), 1/(kc + s), 1/s; the derivatives of a, c and u by s; c - a. Of a
+# spring that remembers n, k of branch a, the share that is on a harder one (0: none), and of that
+# 1/(k0 + ns) and the derivative.
 PLACE, SCALE, FRACTION, LEFT, GAIN, PER_GAIN, GIVE, PER_GIVE, SOFT, BASE = range(10)
-PER_A, PER_C, PER_S, RATE_A, RATE_C, RATE_U, GAP, N_NOW = range(10, 18)
+PER_A, PER_C, PER_S, RATE_A, RATE_C, RATE_U, GAP = range(10, 17)
+STIFF, K_MAIN, UNSNAPPED, PER_FRESH, RATE_FRESH, N_NOW = range(17, 23)
 # A held spring is past where it turned if its strain is, by so much of itself.
 MARGIN = 1e-13
 # A strain that changes in a step by so little of itself stands still.
@@ -104,11 +112,11 @@ class Memory(NamedTuple):
 
     rows (springs, columns) are the springs, state (springs, STATE) that of the microscale ones,
     now (springs, N_NOW) the numbers above, series (springs, order + 2, N_MEMORY + terms) also those
-    of the relaxation. `partials` (N_PARTIALS, springs, order + 2) are filled where
-    derivatives are wanted; of these, in p `directions` (p, 2), `ranks` (p, springs) are those of
-    what is held, and `tangents` (p, springs, N_TANGENTS + terms, order + 2) the series of what
-    changes. `one_sided` (p,) marks derivatives that do not exist.
-    `scratch` is (2, CARRIED).
+    of the relaxation. `partials` (N_PARTIALS, springs, order + 2) are filled where derivatives are
+    wanted; of these, in p `directions` (p, 2), `ranks` (p, springs) are those of what is held,
+    `evers` those of the rank up to which micro-springs have ever snapped, and `tangents` (p,
+    springs, N_TANGENTS + terms, order + 2) the series of what changes. `one_sided` (p,) marks
+    derivatives that do not exist. `scratch` is (3, CARRIED).
     """
 
     rows: Array
@@ -118,6 +126,7 @@ class Memory(NamedTuple):
     partials: Array
     directions: Branches
     ranks: Array
+    evers: Array
     tangents: Array
     one_sided: Array
     scratch: Array
@@ -135,9 +144,10 @@ def make_memory(rows: Array, order: int, directions: Branches, one_sided: Array)
         np.zeros((N_PARTIALS, count, order + 2)),
         directions,
         np.zeros((size, count)),
+        np.zeros((size, count)),
         np.zeros((size, count, N_TANGENTS + terms, order + 2)),
         one_sided,
-        np.empty((2, CARRIED)),
+        np.empty((3, CARRIED)),
     )
     for i in range(count):
         gain = 1.0
@@ -167,10 +177,12 @@ def enter_mixture(memory: Memory, i: int) -> tuple[float, float]:
     """Prepare for the branch that a microscale spring has entered; the strains of its ends."""
     row, state, now = memory.rows[i], memory.state[i], memory.now[i]
     branch, low, high = int(state[BRANCH]), state[LOW], state[HIGH]
-    now[PLACE] = row[LOG_MINUS] if branch == BACK else row[LOG_PLUS]
-    now[SCALE] = row[SPREAD_MINUS] if branch == BACK else row[SPREAD_PLUS]
-    for own in range(3, OF_STRAIN):
-        for n in range(memory.partials.shape[2]):
+    now[PLACE], now[SCALE] = line(row, branch)
+    hard = branch == SNAP or state[NEVER] == 1.0  # none that has snapped is on branch a
+    now[STIFF], now[K_MAIN] = row[STIFFENING], row[K0] if hard else row[K_SNAPPED]
+    now[UNSNAPPED] = 0.0 if hard else state[NEVER]
+    for own in range(3, CARRIED):
+        for n in range(memory.partials.shape[2] if own != OF_STRAIN else 0):
             memory.partials[own, i, n] = 0.0
     if branch == HELD:
         low, high = low * (1.0 - MARGIN), high * (1.0 + MARGIN)
@@ -188,16 +200,22 @@ def leave(memory: Memory, i: int, eps: float, up: bool, turning: bool, d_eps: Ar
     if turning:
         state[FLEXIBILITY] = 0.0
         micro.settle(row, state, eps)
-        rank, d_rank = micro.rank_now(row, state), memory.scratch[0]
-        slope = micro.tangents(
-            row, int(state[BRANCH]), rank, state[SIGMA], eps, d_rank, memory.scratch[1]
-        )
+        branch, rank, sigma = int(state[BRANCH]), micro.rank_now(row, state), state[SIGMA]
+        ever, d_ranks = micro.ever_now(state, rank), memory.scratch[:2]
+        d_ranks[:] = 0.0
+        slope = micro.tangents(row, branch, rank, ever, sigma, eps, d_ranks, memory.scratch[2])
+        by_ever = micro.under_stress(row, branch, rank, ever, sigma)[3]
         for k in range(memory.directions.shape[0]):
             own = memory.directions[k, 1]
             known = memory.directions[k, 0] == i and own < OWN_ETA
-            moved = slope * d_eps[k, i] / (now[SCALE] * state[SIGMA])
-            memory.ranks[k, i] = moved + (d_rank[own] if known else 0.0)
+            moved = slope * (d_eps[k, i] - by_ever * memory.evers[k, i]) / (now[SCALE] * sigma)
+            memory.ranks[k, i] = moved + (d_ranks[0, own] if known else 0.0)
+            if branch == SNAP:
+                memory.evers[k, i] = memory.ranks[k, i]
     micro.switch(row, state, up)
+    if row[REMEMBERS] > 0.0 and state[RANK] == state[EVER]:
+        for k in range(memory.directions.shape[0]):
+            memory.ranks[k, i] = memory.evers[k, i]
     return int(state[BRANCH])
 
 
@@ -220,10 +238,10 @@ def first_turn(
     """
     spring, whole = -1, span
     for i in range(branches.size):
-        if branches[i] == SNAP or branches[i] == BACK:
+        if branches[i] in (SNAP, AGAIN, BACK):
             if stands(eps[i], order, whole):
                 continue
-            ahead = 1.0 if branches[i] == SNAP else -1.0
+            ahead = -1.0 if branches[i] == BACK else 1.0
             for n in range(order):
                 c[n] = ahead * (n + 1) * eps[i, n + 1]
             when, where = (
@@ -265,13 +283,16 @@ def start_mixture(memory: Memory, i: int, moving: bool, eps: float) -> float:
     row, state, now, m = memory.rows[i], memory.state[i], memory.now[i], memory.series[i, 0]
     micro.settle(row, state, eps)
     s = state[SIGMA]
-    per_a, per_c = 1.0 / (row[K0] + s), 1.0 / (row[KC] + s)
-    below_a, below_c = row[K0] * per_a, row[KC] * per_c
+    k, stiff = now[K_MAIN], now[STIFF]
+    per_a, per_c = 1.0 / (k + stiff * s), 1.0 / (row[KC] + s)
+    below_a, below_c = k * per_a, row[KC] * per_c
+    if stiff != 1.0:
+        below_a = below_a ** (1.0 / stiff)
     m[BELOW_A], m[BELOW_C], m[BETWEEN] = below_a, below_c, below_a - below_c
-    p, q, steep = state[micro.SNAPPED], state[REST], 0.0
+    p, q, steep = state[ranks.SNAPPED], state[REST], 0.0
     if moving:
         u = (math.log(s) - now[PLACE]) / now[SCALE]
-        p, q, at = micro.share(u), micro.share(-u), micro.density(u)
+        p, q, at = share(u), share(-u), density(u)
         m[SCORE], m[DENSITY], m[BEND] = u, at, u * at
         now[PER_S] = 1.0 / s
         now[RATE_U] = now[PER_S] / now[SCALE]
@@ -282,9 +303,30 @@ def start_mixture(memory: Memory, i: int, moving: bool, eps: float) -> float:
     now[RATE_A], now[RATE_C] = below_a * per_a, below_c * per_c
     now[GAP] = row[EPS_STAR] + below_a - below_c
     now[GIVE] = q * now[RATE_A] + p * now[RATE_C] + now[GAP] * steep
+    if now[UNSNAPPED] > 0.0:
+        now[PER_FRESH] = 1.0 / (row[K0] + stiff * s)
+        m[FRESH] = (row[K0] * now[PER_FRESH]) ** (1.0 / stiff)
+        now[RATE_FRESH] = m[FRESH] * now[PER_FRESH]
+        now[GIVE] += now[UNSNAPPED] * (now[RATE_FRESH] - now[RATE_A])
     now[PER_GIVE] = 1.0 / now[GIVE]
     now[SOFT] = now[GIVE] * now[PER_GAIN]
     return s
+
+
+@inner
+def _bent(m: Array, column: int, n: int, stiff: float) -> float:
+    """Order n of 1 - a, but for its factor -1/(k + ns) and what the stress of that order adds."""
+    total = 0.0
+    for j in range(1, n):
+        total += (j + stiff * (n - j)) * m[j, EQ] * m[n - j, column]
+    return total / n
+
+
+@inner
+def _unsnapped(now: Array, m: Array, n: int) -> float:
+    """Order n of what the share that never snapped adds to the strain, on its harder branch a."""
+    m[n, FRESH] = -_bent(m, FRESH, n, now[STIFF]) * now[PER_FRESH]
+    return now[UNSNAPPED] * (m[n, BELOW_A] - m[n, FRESH])
 
 
 @inlined
@@ -300,9 +342,12 @@ def strain_of_mixture(now: Array, m: Array, moving: bool, n: int) -> float:
             s_j, k = m[j, EQ], n - j
             by_a += s_j * m[k, BELOW_A]
             by_c += s_j * m[k, BELOW_C]
+        if now[STIFF] != 1.0:
+            by_a = _bent(m, BELOW_A, n, now[STIFF])
         below_a, below_c = -by_a * now[PER_A], -by_c * now[PER_C]
         m[n, BELOW_A], m[n, BELOW_C] = below_a, below_c
-        return -now[LEFT] * below_a - now[FRACTION] * below_c
+        more = _unsnapped(now, m, n) if now[UNSNAPPED] > 0.0 else 0.0
+        return more - now[LEFT] * below_a - now[FRACTION] * below_c
     by_s = by_density = by_bend = products = parts = 0.0
     for j in range(1, n):
         s_j, pace_j, k = m[j, EQ], m[j, PACE], n - j
@@ -313,12 +358,16 @@ def strain_of_mixture(now: Array, m: Array, moving: bool, n: int) -> float:
         by_bend += pace_j * m[k, BEND]
         products += m[j, SCORE] * m[k, DENSITY]
         parts += m[j, SNAPPED] * m[k, BETWEEN]
+    if now[STIFF] != 1.0:
+        by_a = _bent(m, BELOW_A, n, now[STIFF])
     per_n = 1.0 / n
     below_a, below_c, pace = -by_a * now[PER_A], -by_c * now[PER_C], -by_s * now[PER_S]
     snapped = (pace * m[0, DENSITY] + by_density) * per_n
     m[n, BELOW_A], m[n, BELOW_C], m[n, BETWEEN] = below_a, below_c, below_a - below_c
     m[n, PACE], m[n, SCORE], m[n, SNAPPED] = pace, pace * per_n, snapped
     m[n, DENSITY], m[n, BEND] = -(pace * m[0, BEND] + by_bend) * per_n, products
+    if now[UNSNAPPED] > 0.0:
+        parts += _unsnapped(now, m, n)
     return snapped * now[GAP] - now[LEFT] * below_a - now[FRACTION] * below_c + parts
 
 
@@ -328,6 +377,8 @@ def finish_mixture(now: Array, m: Array, moving: bool, n: int, s_n: float) -> No
     on_a, on_c = s_n * now[RATE_A], s_n * now[RATE_C]
     m[n, BELOW_A] -= on_a
     m[n, BELOW_C] -= on_c
+    if now[UNSNAPPED] > 0.0:
+        m[n, FRESH] -= s_n * now[RATE_FRESH]
     if moving:
         more = s_n * now[RATE_U]
         score, density = m[n, SCORE] + more, m[n, DENSITY] - m[0, BEND] * more
@@ -384,13 +435,17 @@ def strain_at(row: Row, state: Array, now: Array, moving: bool, s: float) -> tup
 
     What it takes is the spring's own of a `Memory`.
     """
-    p, q, steep = state[micro.SNAPPED], state[REST], 0.0
+    p, q, steep = state[ranks.SNAPPED], state[REST], 0.0
     if moving:
         if not s > 0.0:
             return math.nan, math.nan
         u = (math.log(s) - now[PLACE]) / now[SCALE]
-        p, q, steep = micro.share(u), micro.share(-u), micro.density(u) / (now[SCALE] * s)
+        p, q, steep = share(u), share(-u), density(u) / (now[SCALE] * s)
     one, two = 1.0 / (row[K0] + s), 1.0 / (row[KC] + s)
+    if row[REMEMBERS] > 0.0:
+        eps, soft, _ = mixture(row, int(state[BRANCH]), p, q, state[NEVER], s)
+        on_main = on_a(row[STIFFENING], now[K_MAIN], s)[0]
+        return eps, soft + (row[EPS_STAR] + s * two - on_main) * steep
     soft = q * row[K0] * one * one + p * row[KC] * two * two
     gap = row[EPS_STAR] + s * (two - one)
     return q * (s * one) + p * (row[EPS_STAR] + s * two), soft + gap * steep
@@ -413,148 +468,3 @@ def advance_memory(state: Array, series: Array, order: int, span: float) -> None
             series[i, 0, k] = z
             total += z
         series[i, 0, RELAXED] = total
-
-
-# ---------------------------------------------------------------- its derivatives
-
-
-@inner
-def fill_partials(
-    memory: Memory, i: int, moving: bool, back: bool, eps: Array, order: int
-) -> float:
-    """Fill the derivatives of a spring's strain at fixed stress; returns the slope dΣ/dε now."""
-    row, now, m, out = memory.rows[i], memory.now[i], memory.series[i], memory.partials
-    s, below_a, below_c = m[:, EQ], m[:, BELOW_A], m[:, BELOW_C]
-    snapped, score, density = m[:, SNAPPED], m[:, SCORE], m[:, DENSITY]
-    square_a, square_c, width = out[SQUARE_A, i], out[SQUARE_C, i], out[WIDTH, i]
-    gap, by_stress, steep = out[BY_RANK, i], out[BY_STRESS, i], out[STEEP, i]
-    by_k0, by_kc, by_star = out[0, i], out[1, i], out[2, i]
-    by_place, by_scale = out[5 if back else 3, i], out[6 if back else 4, i]
-    per_k0, per_kc, per_scale, per_s = 1.0 / row[K0], 1.0 / row[KC], 1.0 / now[SCALE], 1.0 / s[0]
-    per_place = per_scale * math.exp(-now[PLACE])
-    p, q, star = now[FRACTION], now[LEFT], row[EPS_STAR]
-    at_rank = 1.0 if moving else micro.density(memory.state[i, RANK])
-    for n in range(order + 1):
-        aa = cc = 0.0
-        for j in range((n + 1) // 2):
-            aa += below_a[j] * below_a[n - j]
-            cc += below_c[j] * below_c[n - j]
-        aa, cc, middle = 2.0 * aa, 2.0 * cc, n // 2
-        if n % 2 == 0:
-            aa += below_a[middle] * below_a[middle]
-            cc += below_c[middle] * below_c[middle]
-        square_a[n], square_c[n] = aa, cc
-        gap[n] = at_rank * (below_a[n] - below_c[n] + (star if n == 0 else 0.0))
-        qa, qaa, pc, pcc = q * below_a[n], q * aa, p * below_c[n], p * cc
-        by_star[n] = p if n == 0 else 0.0
-        by_stress[n] = 0.0
-        if moving:
-            wide = gap[0] * density[n]
-            for j in range(1, n + 1):
-                qa -= snapped[j] * below_a[n - j]
-                qaa -= snapped[j] * square_a[n - j]
-                pcc += snapped[j] * square_c[n - j]
-                wide += gap[j] * density[n - j]
-            if n > 0:  # all of the strain is in these parts
-                pc = star * snapped[n] - qa - eps[n]
-            width[n] = wide
-            by_score, by_s = wide * score[0], wide
-            for j in range(1, n + 1):
-                by_score += score[j] * width[n - j]
-                by_s -= s[j] * steep[n - j]
-            steep[n] = by_s * per_s
-            by_star[n], by_stress[n] = snapped[n], steep[n] * per_scale
-            by_place[n], by_scale[n] = -wide * per_place, -by_score * per_scale
-        by_k0[n], by_kc[n] = (qaa - qa) * per_k0, (pcc - pc) * per_kc
-        by_stress[n] += qaa * per_k0 + pcc * per_kc
-    return now[GAIN] / by_stress[0]
-
-
-@inlined
-def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, slope: float, n: int) -> float:
-    """Order n of the derivative of (1 + Σ g) s in direction k, but for what δε_n adds.
-
-    `slope` is dΣ/dε.
-    """
-    d_s = memory.tangents[k, i, D_EQ]
-    soft, own = memory.partials[BY_STRESS, i], memory.directions[k, 1]
-    even = odd = 0.0  # two sums at once
-    if memory.directions[k, 0] == i and own < OWN_ETA:
-        even = memory.partials[own, i, n]
-    if not moving:
-        odd = memory.partials[BY_RANK, i, n] * memory.ranks[k, i]
-    for j in range(1, n, 2):
-        even += soft[j] * d_s[n - j]
-        odd += soft[j + 1] * d_s[n - j - 1]
-    if n % 2 == 1:
-        even += soft[n] * d_s[0]
-    return -slope * (even + odd)
-
-
-@inlined
-def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
-    """Order n of the derivative of Σ z_k, and of g s at fixed s, in direction k."""
-    total = 0.0
-    for term in range(memory.series.shape[2] - N_MEMORY):
-        total += memory.tangents[k, i, N_TANGENTS + term, n]
-        own = OWN_RELAXATION + 2 * term
-        if memory.directions[k, 0] == i and memory.directions[k, 1] == own:
-            total += memory.series[i, n, EQ]
-    return total
-
-
-@inlined
-def keep_tangent(memory: Memory, k: int, i: int, n: int, d_sig: float) -> None:
-    """Write order n of the derivative of the equilibrium stress, and the next of what relaxes."""
-    d_s = (d_sig - memory.now[i, BASE]) * memory.now[i, PER_GAIN]
-    memory.tangents[k, i, D_EQ, n] = d_s
-    for term in range(memory.series.shape[2] - N_MEMORY):
-        g, tau = memory.rows[i, N_COLUMNS + 2 * term], memory.rows[i, N_COLUMNS + 2 * term + 1]
-        dz = memory.tangents[k, i, N_TANGENTS + term]
-        flow = dz[n] + g * d_s
-        own = OWN_RELAXATION + 2 * term
-        if memory.directions[k, 0] == i and memory.directions[k, 1] == own:
-            flow += memory.series[i, n, EQ]
-        dz[n + 1] = -flow * (1.0 / (tau * (n + 1)))
-        if memory.directions[k, 0] == i and memory.directions[k, 1] == own + 1:
-            dz[n + 1] -= memory.series[i, n + 1, N_MEMORY + term] * (1.0 / tau)
-
-
-@inner
-def advance_memory_tangents(memory: Memory, k: int, order: int, span: float) -> None:
-    """Carry the derivatives in direction k of what relaxes over a step."""
-    for i in range(memory.now.shape[0]):
-        for term in range(memory.series.shape[2] - N_MEMORY):
-            dz = memory.tangents[k, i, N_TANGENTS + term]
-            dz[0] = value_at(dz, order, span)
-
-
-@inner
-def _is_flat(row: Row, branch: int) -> bool:
-    """Whether a spring is on a flat branch that nothing slows."""
-    slope = row[KH_PLUS] if branch == D else row[KH_MINUS] if branch == E else 1.0
-    return row[KIND] == BISTABLE and slope == 0.0 and row[ETA] == 0.0
-
-
-@inner
-def mark_one_sided(
-    memory: Memory, branches: Branches, eps: Array, series: Array, order: int, span: float
-) -> None:
-    """Mark the directions that would move a spring that snaps and stands still, or a plateau.
-
-    One way of the parameter the spring snaps on, the other way it is held; of several springs on
-    flat branches one goes first: there are two derivatives. `eps` and `series` (p, springs, …) are
-    the series of the strains, and their derivatives.
-    """
-    flat = 0
-    for i in range(branches.size):
-        flat += _is_flat(memory.rows[i], branches[i])
-    for p in range(series.shape[0]):
-        i, own = memory.directions[p, 0], memory.directions[p, 1]
-        if flat > 1 and i >= 0 and own in (0, 2, 3) and _is_flat(memory.rows[i], branches[i]):
-            memory.one_sided[p] = 1.0
-    for i in range(branches.size):
-        if (branches[i] == SNAP or branches[i] == BACK) and stands(eps[i], order, span):
-            for p in range(series.shape[0]):
-                if not stands(series[p, i], order, span) and series[p, i, 1] != 0.0:
-                    memory.one_sided[p] = 1.0

@@ -12,8 +12,8 @@ from foamfit.solve.explicit.series import (
     V,
     W,
     advance,
-    advance_tangents,
 )
+from foamfit.solve.explicit.tangents import advance_tangents
 from foamfit.solve.polynomial import (
     fill_values,
     slope_at,

@@ -27,7 +27,6 @@ from foamfit.solve.explicit.memory import (
     RELAXED,
     SOFT,
     Memory,
-    advance_memory_tangents,
     enter_mixture,
     finish_mixture,
     keep,
@@ -40,8 +39,10 @@ from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.kernels import (
     HELD,
     KIND,
+    REMEMBERS,
     Array,
     Branches,
+    Row,
     branch_shape,
     inlined,
     inner,
@@ -51,8 +52,8 @@ from foamfit.springs.kernels import (
     piece,
 )
 from foamfit.springs.law import MICROSCALE
-from foamfit.springs.microscale_kernels import FIRST
 from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
+from foamfit.springs.ranks import FIRST
 from foamfit.springs.sensitivities import branch_derivative
 
 # Rows of the series of a chain: displacement and velocity of the nodes above the groups, strain and
@@ -101,10 +102,16 @@ class SeriesTangents(NamedTuple):
 
 
 @inner
+def is_mixture(row: Row, branch: int) -> bool:
+    """Whether `Memory` follows a spring: all but branch a of one that remembers nothing."""
+    return branch >= HELD or (row[KIND] == MICROSCALE and row[REMEMBERS] > 0.0)
+
+
+@inner
 def enter(rows: Array, i: int, branch: int, law: Array, memory: Memory | None) -> None:
     """Write the branch that spring i enters."""
-    if memory is not None and branch >= HELD:
-        law[i, CURVED] = float(branch)
+    if memory is not None and is_mixture(rows[i], branch):
+        law[i, CURVED] = float(max(branch, HELD))
         law[i, LOW], law[i, HIGH] = enter_mixture(memory, i)
         return
     curved, law[i, SLOPE], law[i, ORIGIN], law[i, OFFSET] = branch_shape(rows[i], branch)
@@ -136,7 +143,7 @@ def enter_tangents(
             d.law[p, i, SLOPE], d.law[p, i, ORIGIN], d.law[p, i, OFFSET] = dk, dx0, ds0
             if dk != 0.0 or dx0 != 0.0 or ds0 != 0.0:
                 d.live[p] = 1.0
-            if branch >= HELD:  # of a mixture, `Memory` has them
+            if is_mixture(rows[i], branch):  # of a mixture, `Memory` has them
                 d.live[p] = 1.0
 
 
@@ -679,15 +686,3 @@ def advance(s: Array, groups: int, order: int, span: float) -> None:
     for row in range(W, EPS + 1):
         for i in range(s.shape[1] if row == EPS else groups):
             s[row, i, 0] = value_at(s[row, i], order, span)
-
-
-@piece
-def advance_tangents(
-    d: SeriesTangents, groups: int, order: int, span: float, memory: Memory | None
-) -> None:
-    """Carry the derivatives of the state over a step of length `span`."""
-    for p in range(d.drag.size):
-        if d.live[p] > 0.0:
-            advance(d.series[p], groups, order, span)
-            if memory is not None:
-                advance_memory_tangents(memory, p, order, span)

@@ -16,11 +16,14 @@ from foamfit.solve.explicit.memory import (
     EQ,
     GAIN,
     Memory,
+    start_relaxed,
+    start_relaxed_tangent,
+)
+from foamfit.solve.explicit.memory_tangents import (
+    advance_memory_tangents,
     fill_partials,
     keep_tangent,
     relaxed_tangent,
-    start_relaxed,
-    start_relaxed_tangent,
     tangent_of_mixture,
 )
 from foamfit.solve.explicit.series import (
@@ -39,6 +42,7 @@ from foamfit.solve.explicit.series import (
     V,
     W,
     _stress_term,
+    advance,
     product,
     springs_of,
 )
@@ -272,3 +276,15 @@ def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memo
         change += tilt[i, 0] * d.series[p, EPS, i, 0] - memory.now[i, BASE]
         start_relaxed_tangent(memory, p, i, change / memory.now[i, GAIN])
     start_relaxed(memory, i, stress)
+
+
+@piece
+def advance_tangents(
+    d: SeriesTangents, groups: int, order: int, span: float, memory: Memory | None
+) -> None:
+    """Carry the derivatives of the state over a step of length `span`."""
+    for p in range(d.drag.size):
+        if d.live[p] > 0.0:
+            advance(d.series[p], groups, order, span)
+            if memory is not None:
+                advance_memory_tangents(memory, p, order, span)

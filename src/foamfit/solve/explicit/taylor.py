@@ -21,6 +21,8 @@ from foamfit.solve.explicit.memory import (
     load,
     longest,
     make_memory,
+)
+from foamfit.solve.explicit.memory_tangents import (
     mark_one_sided,
 )
 from foamfit.solve.explicit.samples import delay, depart, mend_kink, sample, sample_tangents
@@ -38,7 +40,6 @@ from foamfit.solve.explicit.series import (
     V,
     W,
     advance,
-    advance_tangents,
     enter,
     enter_tangents,
     expand,
@@ -50,7 +51,7 @@ from foamfit.solve.explicit.series import (
     settle_together,
     share_a_stress,
 )
-from foamfit.solve.explicit.tangents import expand_tangents, start_relaxing
+from foamfit.solve.explicit.tangents import advance_tangents, expand_tangents, start_relaxing
 from foamfit.solve.polynomial import (
     LEAST_TRUNCATION,
     first_crossing,

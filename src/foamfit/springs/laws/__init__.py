@@ -24,7 +24,10 @@ from foamfit.springs.laws.record import Param as Param
 from foamfit.springs.spring import LawSpring, Relaxation
 
 ENTRY_POINTS = "foamfit.laws"
-_LAWS = {law.kind: law for law in (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)}
+OPTIONS = ("stiffening", "mullins")  # of a fit, that free more parameters of a law
+_PAPER = (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)
+_OPTIONAL = (microscale.STIFFENING_LAW, microscale.MULLINS_LAW, microscale.MEMORY_LAW)
+_LAWS = {law.kind: law for law in (*_PAPER, *_OPTIONAL)}
 PAPER = tuple(_LAWS)  # laws that the kernels know
 _TEXTS: dict[str, str] = {}  # of the law files that were loaded, by path
 _asked_packages: list[bool] = []
@@ -54,9 +57,21 @@ copyreg.pickle(Law, _by_kind)
 
 
 def kinds() -> tuple[str, ...]:
-    """Names of all laws that are known, the paper's first."""
+    """Names of all laws that are known, the paper's first; see `with_options` for the others."""
     _load_packages()
-    return tuple(_LAWS)
+    return tuple(kind for kind, law in _LAWS.items() if not law.word)
+
+
+def records() -> tuple[Law, ...]:
+    """All laws that are known, those with the parameters of options too."""
+    _load_packages()
+    return tuple(_LAWS.values())
+
+
+def with_options(kind: str, options: tuple[str, ...]) -> str:
+    """Name of a law with the parameters of some options; itself where it has none of these."""
+    known = law(kind).options
+    return known.get(tuple(one for one in OPTIONS if one in options and (one,) in known), kind)
 
 
 def is_registered(kind: str) -> bool:

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
-from foamfit.springs import kernels
+from foamfit.springs import kernels, ranks
 from foamfit.springs import microscale_kernels as micro
 from foamfit.springs.law import MICROSCALE
 from foamfit.springs.laws.record import BRANCH, EPS, SIGMA, Functions, Law
@@ -40,7 +40,7 @@ def _begin(row: Array, state: Array) -> None:
     state[:] = 0.0
     branch = kernels.first_branch(row)
     state[BRANCH] = branch
-    state[micro.LOW], state[micro.HIGH] = kernels.interval(row, branch)
+    state[ranks.LOW], state[ranks.HIGH] = kernels.interval(row, branch)
 
 
 @kernels.compiled
@@ -48,7 +48,7 @@ def _leaves(row: Array, state: Array, eps: float) -> bool:
     """Whether a spring leaves its branch before it reaches a strain."""
     if row[kernels.KIND] == MICROSCALE:
         return micro.leaves(state, eps)
-    return eps > state[micro.HIGH] if eps > state[EPS] else eps < state[micro.LOW]
+    return eps > state[ranks.HIGH] if eps > state[EPS] else eps < state[ranks.LOW]
 
 
 @kernels.compiled
@@ -67,16 +67,19 @@ def _switch(row: Array, state: Array, up: bool) -> None:
         micro.switch(row, state, up)
         return
     branch = int(state[BRANCH])
-    state[EPS] = state[micro.HIGH] if up else state[micro.LOW]
+    state[EPS] = state[ranks.HIGH] if up else state[ranks.LOW]
     branch = kernels.above(branch) if up else kernels.below(branch)
     state[BRANCH] = branch
-    state[micro.LOW], state[micro.HIGH] = kernels.interval(row, branch)
+    state[ranks.LOW], state[ranks.HIGH] = kernels.interval(row, branch)
     state[SIGMA] = kernels.stress_on(row, branch, state[EPS])
 
 
 _FILL = {
     "bistable": kernels.fill_bistable,
     "microscale": micro.fill_microscale,
+    "microscale, stiffening": micro.fill_stiffening,
+    "microscale, mullins": micro.fill_mullins,
+    "microscale, stiffening, mullins": micro.fill_memory,
     "linear": kernels.fill_linear,
     "unilateral": kernels.fill_unilateral,
 }
@@ -101,7 +104,7 @@ def compiled_functions(law: Law) -> Functions:
 def sizes_of(law: Law) -> tuple[int, int]:
     """Length of a row and of a state of a law."""
     if law.kind in _FILL:
-        return kernels.N_COLUMNS, micro.STATE
+        return kernels.N_COLUMNS, ranks.STATE
     return law.columns or len(law.params), law.states
 
 

@@ -11,14 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
-from foamfit.springs.law import BRANCH_NAMES, least_eps_star
-from foamfit.springs.laws.record import (
-    LAST_STRAIN,
-    Between,
-    Compared,
-    Law,
-    Param,
-)
+from foamfit.springs.law import BRANCH_NAMES, least_eps_star, most_beyond
+from foamfit.springs.laws.record import LAST_STRAIN, Between, Compared, Law, Param
 from foamfit.springs.laws.shared import (
     COMPARED_ETA,
     COMPARED_HEIGHT,
@@ -47,7 +41,14 @@ class MicroscaleSpring(Spring):
     snap-through and snap-back stress lies below σ (P₋ no less than P₊, both 0 in tension),
 
         p ← min(max(p, P₊(σ)), P₋(σ))          along the history of σ, from p = 0,
-        ε = (1-p) σ/(k0+σ) + p (eps_star + σ/(kc+σ)).
+        ε = (1-p) σ/(k0+σ) + p (eps_star + σ/(kc+σ))          (model, section 6).
+
+    Where it remembers what has snapped (model, section 8) its state also has P, the largest p ever.
+    What has snapped once is softer on branch a and snaps through at a lower stress, and branch a
+    stiffens as a(σ; k) = 1 - (1 + nσ/k)^(-1/n):
+
+        U(σ) = max(P₊(σ), min(P₊(σ e^s), P)),   p ← min(max(p, U(σ)), max(U(σ), P₋(σ))),
+        ε = (1-P) a(σ; k0) + (P-p) a(σ; k0 e^-d) + p (eps_star + σ/(kc+σ)).
 
     Parameters
     ----------
@@ -67,6 +68,12 @@ class MicroscaleSpring(Spring):
         Standard deviation of the logarithm of the snap-back stress.
     eta : float
         η, dashpot in parallel, Pa·s.
+    stiffening : float
+        n > 0; 1 is the branch a of eq. 2.
+    softening : float
+        d >= 0: what has snapped once has k0 e^-d for k0.
+    weakening : float
+        s >= 0: what has snapped once snaps through at σ₊ e^-s.
     relaxation : sequence of pairs of float
         Relaxation terms (g, τ in s) in parallel; left out = none. `stress` and `strain` follow the
         equilibrium, without them.
@@ -85,26 +92,34 @@ class MicroscaleSpring(Spring):
     sigma_minus: float
     spread_minus: float
     eta: float = 0.0
+    stiffening: float = 1.0
+    softening: float = 0.0
+    weakening: float = 0.0
     relaxation: Relaxation = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         """Refuse what is not admissible, by name."""
-        freeze_numbers(self, LAW)
+        freeze_numbers(self, MEMORY_LAW)
         freeze_terms(self, self.relaxation)
-        least = least_eps_star(self.k0, self.kc)
+        least = _least_star(self.k0, self.kc, self.stiffening, self.softening)
         wanted = f"at least {least:.9g}, so that branch c lies beyond branch a at every stress"
         require(self.eps_star >= least, "eps_star", self.eps_star, wanted)
 
     @property
     def law(self) -> Law:
-        """The record of its law."""
-        return LAW
+        """The record of its law: that with memory where it has any."""
+        neutral = self.stiffening == 1.0 and self.softening == 0.0 == self.weakening
+        return LAW if neutral else MEMORY_LAW
 
     @property
     def snap_strain(self) -> float:
-        """Strain by which a micro-spring of the middle rank jumps where it snaps through."""
-        sigma = self.sigma_plus
-        return self.eps_star + sigma / (self.kc + sigma) - sigma / (self.k0 + sigma)
+        """Strain by which a micro-spring of the middle rank jumps where it first snaps through."""
+        on = {name: float(eps[0]) for name, eps in self.elastic_branches(self._middle).items()}
+        return on["c"] - on["a"]
+
+    @property
+    def _middle(self) -> Array:
+        return np.array([self.sigma_plus])
 
     def snapped_below(self, stress: ArrayLike) -> Array:
         """P₊: the fraction that has snapped on first loading to these stresses."""
@@ -117,18 +132,36 @@ class MicroscaleSpring(Spring):
 
     def fraction_along(self, stress: ArrayLike) -> Array:
         """Fraction that has snapped along a stress history (Pa), shape (n,), from none."""
+        return self.fractions_along(stress)[0]
+
+    def fractions_along(self, stress: ArrayLike) -> tuple[Array, Array]:
+        """Fractions that have snapped, and have ever snapped, along a stress history (Pa)."""
         history = np.atleast_1d(as_samples(stress, "stress"))
-        out, snapped = np.empty(history.size), 0.0
-        ends = zip(self.snapped_below(history), self.left_below(history), strict=True)
-        for j, (least, most) in enumerate(ends):
-            snapped = min(max(snapped, least), most)
-            out[j] = snapped
-        return out
+        snapped, ever = np.empty((2, history.size))
+        p = most = 0.0
+        first, back = self.snapped_below(history), self.left_below(history)
+        again = self.snapped_below(history * math.exp(self.weakening))
+        for j in range(history.size):
+            least = max(first[j], min(again[j], most))
+            p = min(max(p, least), max(least, back[j]))
+            most = max(most, p)
+            snapped[j], ever[j] = p, most
+        return snapped, ever
 
     def elastic_branches(self, stress: Array) -> dict[str, Array]:
-        """Strains of branches a (none has snapped) and c (all have) at these stresses (Pa)."""
-        on_c = self.eps_star + stress / (self.kc + stress)
-        return {"a": stress / (self.k0 + stress), "c": on_c}
+        """Strains of branches a (none has snapped) and c (all have) at these stresses (Pa).
+
+        With softening also that of branch a where all have snapped once.
+        """
+        out = {"a": self._on_a(stress, self.k0)}
+        if self.softening > 0.0:
+            out["a, once snapped"] = self._on_a(stress, self.k0 * math.exp(-self.softening))
+        return out | {"c": self.eps_star + stress / (self.kc + stress)}
+
+    def _on_a(self, stress: Array, k: float) -> Array:
+        """Strain a(σ; k) of branch a."""
+        n = self.stiffening
+        return np.asarray(-np.expm1(-np.log1p(n * stress / k) / n))
 
     @property
     def medians(self) -> tuple[tuple[str, str, float, float], ...]:
@@ -160,6 +193,27 @@ def _ranks_below(stress: ArrayLike, middle: float, spread: float) -> Array:
     return np.asarray(ndtr(scores), dtype=float)
 
 
+def _least_star(k0: float, kc: float, stiffening: float = 1.0, softening: float = 0.0) -> float:
+    """Least ε_*: with it branch c lies at or beyond branch a, softened too, at every stress."""
+    return most_beyond(k0 * math.exp(-softening), kc, stiffening)[0]
+
+
+def _read(loop: Loop, marks: Array, scales: Any, more: tuple[float, ...], least: Any) -> Array:
+    """Read a spring off a loop; `more` are stiffening, softening, weakening as far as it has them.
+
+    `least(k0, kc)` is its least ε_*. See `read_off`.
+    """
+    last = float(np.max(loop.strain))
+    first = max(loop.at(0.05 * last, loading=True), 0.002 * scales.stress) / (0.05 * last)
+    k0, kc = first * 10.0 ** (1.2 * marks[0] - 0.4), scales.stress * 10.0 ** (2.3 * marks[1] - 0.5)
+    lowest = least(k0, kc)
+    star = lowest + 0.5 * marks[2] * (LAST_STRAIN - lowest)
+    plus = max(loop.at((0.2 + 0.8 * marks[3]) * last, loading=True), 0.02 * scales.stress)
+    minus = max(loop.at((0.2 + 0.7 * marks[5]) * last, loading=False), 0.01 * scales.stress)
+    spreads = 10.0 ** (1.2 * marks[[4, 6]] - 1.0)
+    return np.array([k0, kc, star, plus, spreads[0], minus, spreads[1], *more, 0.0])
+
+
 def read_off(loop: Loop, marks: Array, scales: Any, way: int) -> Array:
     """Read a spring off a loop, given where on it its snap stresses are taken to lie.
 
@@ -168,15 +222,7 @@ def read_off(loop: Loop, marks: Array, scales: Any, way: int) -> Array:
     micro-springs snap through and back, and the two spreads. Returned are k0 … spread_minus, and a
     dashpot of zero (SI).
     """
-    last = float(np.max(loop.strain))
-    first = max(loop.at(0.05 * last, loading=True), 0.002 * scales.stress) / (0.05 * last)
-    k0, kc = first * 10.0 ** (1.2 * marks[0] - 0.4), scales.stress * 10.0 ** (2.3 * marks[1] - 0.5)
-    least = least_eps_star(k0, kc)
-    star = least + 0.5 * marks[2] * (LAST_STRAIN - least)
-    plus = max(loop.at((0.2 + 0.8 * marks[3]) * last, loading=True), 0.02 * scales.stress)
-    minus = max(loop.at((0.2 + 0.7 * marks[5]) * last, loading=False), 0.01 * scales.stress)
-    spreads = 10.0 ** (1.2 * marks[[4, 6]] - 1.0)
-    return np.array([k0, kc, star, plus, spreads[0], minus, spreads[1], 0.0])
+    return _read(loop, marks, scales, (), _least_star)
 
 
 def _neighbours(values: Array, top: float) -> Iterator[Array]:
@@ -193,15 +239,25 @@ def _from_stresses(mixed: Array, height: float) -> Array:
     return np.asarray(mixed * [height, height, 1.0 / height, 1.0, 1.0, 1.0, 1.0])
 
 
-def _least_slopes(k0: float, kc: float) -> tuple[tuple[float, float], ...]:
-    """Derivatives of both ends of ε_* by k0 and kc."""
-    least = least_eps_star(k0, kc)
-    rise = 0.25 * (1.0 - least * least) if least > 0.0 else 0.0  # by the logarithm of kc/k0
-    return (-rise / k0, 0.0), (rise / kc, 0.0)
+def _least_slopes(
+    k0: float, kc: float, stiffening: float = 1.0, softening: float = 0.0
+) -> tuple[tuple[float, float], ...]:
+    """Derivatives of both ends of ε_* by k0, kc, stiffening and softening."""
+    k, n = k0 * math.exp(-softening), stiffening
+    excess, sigma = most_beyond(k, kc, n)
+    if excess == 0.0:
+        return ((0.0, 0.0),) * 4
+    x, log = sigma / k, math.log1p(n * sigma / k)
+    on_a = math.exp(-log / n)  # 1 - a
+    by_log_k = -x * on_a / (1.0 + n * x)
+    by_n = on_a * (x / (1.0 + n * x) - log / n) / n
+    return (by_log_k / k0, 0.0), (sigma / (kc + sigma) ** 2, 0.0), (by_n, 0.0), (-by_log_k, 0.0)
 
 
 _BEYOND_A = Between(
-    ("k0", "kc"), lambda k0, kc: (least_eps_star(k0, kc), LAST_STRAIN), _least_slopes
+    ("k0", "kc"),
+    lambda k0, kc: (least_eps_star(k0, kc), LAST_STRAIN),
+    lambda k0, kc: _least_slopes(k0, kc)[:2],
 )
 _STRESSES, _SPREADS = (math.log(0.02), math.log(1.0)), (math.log(0.05), math.log(2.0))
 
@@ -247,6 +303,11 @@ LAW = Law(
     searched=(
         "k0", "kc", "eps_star", "sigma_plus", "sigma_minus", "spread_plus", "spread_minus",
     ),
+    options={
+        ("stiffening",): "microscale, stiffening",
+        ("mullins",): "microscale, mullins",
+        ("stiffening", "mullins"): "microscale, stiffening, mullins",
+    },
     read_off=read_off,
     marks=7,
     onset=lambda values: values[3],
@@ -269,3 +330,85 @@ LAW = Law(
     "grey: the elastic branch a, on which none has snapped, and the densified branch c, on which "
     "all have.",
 )  # fmt: skip
+
+
+# ---------------------------------------------------------------- with memory
+
+_STIFFENING = Param(
+    "stiffening", ("n", ""), "", "stiffening of branch a (1: the paper's)", (1.0, "one"),
+    (0.02, 50.0), inner=(math.log(0.3), math.log(3.0)), neutral=1.0, branch="a", example="2.0",
+)  # fmt: skip
+_SOFTENING = Param(
+    "softening", ("d", ""), "", "softening of what has snapped once: k0 becomes k0·exp(-d)",
+    (0.5, "one"), (0.0, 6.0), "one", "value", inner=(0.0, 2.0), least_size=0.1,
+    admissible="zero or positive", neutral=0.0, branch="snap-back", example="0.8",
+)  # fmt: skip
+_WEAKENING = Param(
+    "weakening", ("s", ""), "", "weakening of what has snapped once: σ₊ becomes σ₊·exp(-s)",
+    (0.3, "one"), (0.0, 6.0), "one", "value", inner=(0.0, 1.0), least_size=0.1,
+    admissible="zero or positive", neutral=0.0, branch="snap-through again", example="0.5",
+)  # fmt: skip
+_OPTIONAL = {"stiffening": (_STIFFENING,), "mullins": (_SOFTENING, _WEAKENING)}
+# Largest coordinates that start values are read off with.
+_MOST = {"softening": 2.0, "weakening": 1.0}
+
+
+def _marked(name: str, mark: float) -> float:
+    """Start value of an optional parameter from a mark in [0, 1]."""
+    return 3.0 ** (2.0 * mark - 1.0) if name == "stiffening" else _MOST[name] * mark
+
+
+def _with(*options: str) -> Law:
+    """The law with the parameters of some options."""
+    extra = tuple(param for option in options for param in _OPTIONAL[option])
+    names = tuple(param.name for param in extra)
+    # What the least ε_* depends on besides k0 and kc, and where it stands among these arguments.
+    also = tuple(name for name in names if name != "weakening")
+    picked = [0, 1, *(2 + ("stiffening", "softening").index(name) for name in also)]
+
+    def least(k0: float, kc: float, *given: float) -> float:
+        return _least_star(k0, kc, **dict(zip(also, given, strict=True)))
+
+    def slopes(k0: float, kc: float, *given: float) -> tuple[tuple[float, float], ...]:
+        all_of = _least_slopes(k0, kc, **dict(zip(also, given, strict=True)))
+        return tuple(all_of[place] for place in picked)
+
+    beyond = Between(("k0", "kc", *also), lambda *given: (least(*given), LAST_STRAIN), slopes)
+
+    def read(loop: Loop, marks: Array, scales: Any, way: int) -> Array:
+        more = tuple(map(_marked, names, marks[7:]))
+        given = [value for name, value in zip(names, more, strict=True) if name in also]
+        return _read(loop, marks, scales, more, lambda k0, kc: least(k0, kc, *given))
+
+    def make(*values: float, relaxation: Relaxation = ()) -> MicroscaleSpring:
+        given: dict[str, Any] = dict(zip((*LAW.own, *names, "eta"), values, strict=True))
+        return MicroscaleSpring(relaxation=relaxation, **given)
+
+    kind = ", ".join((LAW.kind, *options))
+    return replace(
+        LAW,
+        kind=kind,
+        word=LAW.kind,
+        params=tuple(
+            replace(param, coordinate=beyond) if param.name == "eps_star" else param
+            for param in (*LAW.params, *extra)
+        ),
+        functions=functions_of(kind),
+        spring=make,
+        branches={**LAW.branches, "snap-through again": "what has snapped before snaps once more"},
+        searched=("k0", "kc", *names, *LAW.searched[2:]),
+        read_off=read,
+        marks=7 + len(names),
+        exchanged=None,
+        compared=(*LAW.compared[:-1], *map(_compared, extra), LAW.compared[-1]),
+        places={"stiffening": 8, "softening": 9, "weakening": 10},
+        options={},
+    )
+
+
+def _compared(param: Param) -> Compared:
+    return Compared(param.symbol[0], "", (param.name,), lambda value: value)
+
+
+STIFFENING_LAW, MULLINS_LAW = _with("stiffening"), _with("mullins")
+MEMORY_LAW = _with("stiffening", "mullins")

@@ -239,6 +239,12 @@ class Law:
         Whether the paper publishes parameters of it.
     numbered : tuple of str, optional
         Names of the branches by their numbers; by default the order of `branches`.
+    options : mapping
+        Options of a fit that free more parameters: the law with them.
+    word : str
+        The word of a model's name, where it is not `kind`.
+    places : mapping
+        Places of derivatives by parameters, where these are not in the order of `params`.
     """
 
     kind: str
@@ -267,6 +273,9 @@ class Law:
     remembers: bool = True
     published: bool = False
     numbered: tuple[str, ...] = ()
+    options: Mapping[tuple[str, ...], str] = field(default_factory=dict)
+    word: str = ""
+    places: Mapping[str, int] = field(default_factory=dict)
 
     @cached_property
     def own(self) -> tuple[str, ...]:
@@ -337,6 +346,10 @@ class Law:
         """Make some spring of the law, whatever its numbers: of it only the law counts."""
         own = self.assembled(lambda param: 0.2 if param.of else abs(param.start[0]) or 1.0)
         return self.make([*own, 0.0], ())
+
+    def derivative(self, short: str) -> int:
+        """Place of the derivative by one of its own parameters."""
+        return self.places.get(short, self.own.index(short))
 
     def named_branch(self, number: int) -> str:
         """Name of a branch by its number."""

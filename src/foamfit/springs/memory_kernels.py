@@ -1,0 +1,530 @@
+"""The compiled law of a microscale spring that remembers what has snapped (model, section 8).
+
+With p the fraction that has snapped and P the largest it has ever been,
+
+    ε = (1-P) a(σ; k0) + (P-p) a(σ; k0 e^-d) + p (eps_star + σ/(kc+σ)),
+    a(σ; k) = 1 - (1 + nσ/k)^(-1/n).
+
+Ranks w and W stand for p = Φ(w) and P = Φ(W); see `ranks`. On first loading w = W = u₊ with
+u₊ = (ln σ - ln sigma_plus)/spread_plus. What has snapped before snaps through once more at
+w = u₊ + s/spread_plus up to W, is held there until u₊ = W, and then first loading goes on. It snaps
+back at w = u₋.
+"""
+
+# mypy: disallow-untyped-decorators=False, warn-return-any=False
+from __future__ import annotations
+
+import math
+
+from foamfit.springs.kernels import (
+    AGAIN,
+    BACK,
+    BOTH,
+    EPS_STAR,
+    HELD,
+    K0,
+    K_SNAPPED,
+    KC,
+    LOG_AGAIN,
+    LOG_CROSS,
+    LOG_MINUS,
+    LOG_PLUS,
+    SNAP,
+    SPREAD_MINUS,
+    SPREAD_PLUS,
+    STIFFENING,
+    A,
+    Array,
+    Row,
+    inner,
+)
+from foamfit.springs.law import LEAST_RANK
+from foamfit.springs.ranks import (
+    BRANCH,
+    CARRIED,
+    CURVATURE,
+    EPS,
+    EVER,
+    FLEXIBILITY,
+    HIGH,
+    LEAST,
+    LEAST_AT,
+    LOW,
+    NEAR,
+    NEVER,
+    OF_SOFTENING,
+    OF_STIFFENING,
+    OF_STRAIN,
+    OF_WEAKENING,
+    RANK,
+    REST,
+    SIGMA,
+    SIGMA_HIGH,
+    SIGMA_LOW,
+    SNAPPED,
+    density,
+    share,
+)
+
+# ---------------------------------------------------------------- the elastic branches
+
+
+@inner
+def on_a(n: float, k: float, sigma: float) -> tuple[float, float, float]:
+    """Strain a(σ; k) of the stiffening branch and its two derivatives; -inf if it has none."""
+    if n == 1.0:
+        one = 1.0 / (k + sigma)
+        slope = k * one * one
+        return (sigma * one, slope, -2.0 * slope * one) if sigma > -k else (-math.inf, 0.0, 0.0)
+    y = 1.0 + n * sigma / k
+    if not y > 0.0:
+        return -math.inf, 0.0, 0.0
+    log = math.log1p(n * sigma / k) / n
+    slope = math.exp(-log) / (k * y)
+    return -math.expm1(-log), slope, -(1.0 + n) * slope / (k * y)
+
+
+@inner
+def stress_on_a(n: float, k: float, eps: float) -> float:
+    """Stress at a strain of that branch; infinite from its end on."""
+    if not eps < 1.0:
+        return math.inf
+    return k * math.expm1(-n * math.log1p(-eps)) / n
+
+
+@inner
+def by_stiffening(n: float, k: float, sigma: float) -> float:
+    """Derivative of a(σ; k) by n."""
+    x = sigma / k
+    log = math.log1p(n * x)
+    return math.exp(-log / n) * (x / (1.0 + n * x) - log / n) / n
+
+
+# ---------------------------------------------------------------- the branches of the spring
+
+
+@inner
+def line(row: Row, branch: int) -> tuple[float, float]:
+    """Place and scale of the normal distribution of ln σ that the rank follows on a branch."""
+    if branch == BACK:
+        return row[LOG_MINUS], row[SPREAD_MINUS]
+    return row[LOG_PLUS] if branch == SNAP else row[LOG_AGAIN], row[SPREAD_PLUS]
+
+
+@inner
+def moves(branch: int) -> bool:
+    """Whether micro-springs snap on a branch."""
+    return branch != A and branch != HELD
+
+
+@inner
+def mixture(
+    row: Row, branch: int, p: float, rest: float, never: float, sigma: float
+) -> tuple[float, float, float]:
+    """Strain at a stress where p, 1 - p and 1 - P are these, and two derivatives at fixed p, P."""
+    n, k = row[STIFFENING], row[K_SNAPPED]
+    two = 1.0 / (row[KC] + sigma)
+    on_c = row[KC] * two * two
+    if branch == SNAP or never == 1.0:  # none that has snapped is on branch a
+        k, never = row[K0], 0.0
+    one, slope, bend = on_a(n, k, sigma)
+    strain = rest * one + p * (row[EPS_STAR] + sigma * two)
+    soft, bent = rest * slope + p * on_c, rest * bend - 2.0 * p * on_c * two
+    if never > 0.0 and k != row[K0]:
+        fresh, stiff, stiffer = on_a(n, row[K0], sigma)
+        strain += never * (fresh - one)
+        soft += never * (stiff - slope)
+        bent += never * (stiffer - bend)
+    return strain, soft, bent
+
+
+@inner
+def at_stress(row: Row, state: Array, sigma: float) -> float:
+    """Strain at a stress on the branch that the spring is on; fills dε/dσ and d²ε/dσ²."""
+    branch = int(state[BRANCH])
+    if not moves(branch):
+        p, rest = state[SNAPPED], state[REST]
+        strain, slope, bend = mixture(row, branch, p, rest, state[NEVER], sigma)
+        state[FLEXIBILITY], state[CURVATURE] = slope, bend
+        return strain
+    if not sigma > 0.0:
+        return -math.inf
+    place, scale = line(row, branch)
+    rank = (math.log(sigma) - place) / scale
+    p, rest = share(rank), share(-rank)
+    strain, slope, bend = mixture(row, branch, p, rest, state[NEVER], sigma)
+    k = row[K0] if branch == SNAP else row[K_SNAPPED]
+    one, on_one, _ = on_a(row[STIFFENING], k, sigma)
+    two = 1.0 / (row[KC] + sigma)
+    gap, rate = row[EPS_STAR] + sigma * two - one, density(rank) / (scale * sigma)
+    bend += 2.0 * rate * (row[KC] * two * two - on_one)
+    bend -= rate * gap * (rank / scale + 1.0) / sigma
+    state[FLEXIBILITY], state[CURVATURE] = slope + rate * gap, bend
+    return strain
+
+
+@inner
+def _ends_of_stress(row: Row, state: Array, eps: float) -> tuple[float, float]:
+    """Stresses between which the spring has a strain: those of the stiffest and softest branch."""
+    n, star, stiff = row[STIFFENING], row[EPS_STAR], stress_on_a(row[STIFFENING], row[K0], eps)
+    if eps < 0.0 or (not moves(int(state[BRANCH])) and state[SNAPPED] == 0.0):
+        soft = stress_on_a(n, row[K_SNAPPED], eps)
+        low, high = min(stiff, soft), max(stiff, soft)
+    else:
+        low, high = 0.0, stiff
+        if eps > star:
+            low = row[KC] * (eps - star) / (1.0 - (eps - star))
+    wide = 1e-14
+    return low - wide * abs(low), high + wide * abs(high)
+
+
+@inner
+def stress_in(row: Row, state: Array, eps: float) -> float:
+    """Stress at a strain on the branch that the spring is on; infinite past its end.
+
+    Halley's method from the parabola through the point before, inside a bracket.
+    """
+    branch = int(state[BRANCH])
+    reach = 1.0 + (row[EPS_STAR] if moves(branch) or state[SNAPPED] > 0.0 else 0.0)
+    if not eps < reach:
+        return math.inf
+    if branch == A and (state[NEVER] == 1.0 or eps == 0.0):
+        sigma = stress_on_a(row[STIFFENING], row[K0], eps)
+        at_stress(row, state, sigma)
+        return sigma
+    low, high = _ends_of_stress(row, state, eps)
+    sigma, slope = state[SIGMA], state[FLEXIBILITY]
+    if slope > 0.0:
+        step = (eps - state[EPS]) / slope
+        sigma += step * (1.0 - 0.5 * step * state[CURVATURE] / slope)
+    if not low < sigma < high:
+        sigma = 0.5 * (low + high) if high < math.inf else max(2.0 * low, row[K0])
+    narrow = min(row[SPREAD_PLUS], row[SPREAD_MINUS], 1.0) if moves(branch) else 1.0
+    for _ in range(300):
+        miss = at_stress(row, state, sigma) - eps
+        slope, bend = state[FLEXIBILITY], state[CURVATURE]
+        if miss > 0.0:
+            high = sigma
+        else:
+            low = sigma
+        step = miss / slope
+        part = 1.0 - 0.5 * step * bend / slope
+        if 0.5 < part < 2.0:
+            step /= part
+        new = sigma - step
+        if abs(step) <= NEAR * abs(sigma) * narrow and low <= new <= high:
+            state[FLEXIBILITY] += bend * (new - sigma)
+            return new
+        if not low < new < high:
+            new = _halfway(low, high, sigma)
+            if not low < new < high:  # neighbouring numbers: nothing lies between them
+                return sigma
+        sigma = new
+    return sigma
+
+
+@inner
+def _halfway(low: float, high: float, sigma: float) -> float:
+    """Return a stress between two, halfway in its logarithm where that can be."""
+    if high == math.inf:
+        return 2.0 * max(sigma, LEAST)
+    if low > 0.0:
+        return math.sqrt(low) * math.sqrt(high)
+    if low == 0.0:
+        return 1e-3 * high if high > 1e6 * LEAST else 0.5 * high
+    return 0.5 * (low + high)
+
+
+# ---------------------------------------------------------------- from branch to branch
+
+
+@inner
+def begin(row: Row, state: Array, least: float) -> None:
+    """Set the state of a spring that never bore anything, and snaps nothing below a strain."""
+    state[:] = 0.0
+    state[RANK], state[EVER], state[REST], state[NEVER] = -math.inf, -math.inf, 1.0, 1.0
+    state[LEAST_AT] = least
+    _enter(row, state, A, True)
+
+
+@inner
+def _ends(row: Row, state: Array, end: int, sigma: float) -> None:
+    """Let the branch end at a stress: upwards (HIGH) or downwards (LOW)."""
+    kept = state[FLEXIBILITY], state[CURVATURE]
+    eps = at_stress(row, state, sigma)
+    state[FLEXIBILITY], state[CURVATURE] = kept
+    if (end == HIGH and eps < state[EPS]) or (end == LOW and eps > state[EPS]):
+        eps, sigma = state[EPS], state[SIGMA]
+    state[end], state[end + SIGMA_LOW - LOW] = eps, sigma
+
+
+@inner
+def _no_less(row: Row, state: Array, end: int) -> None:
+    """Move the end of a branch up to the least strain at which a micro-spring may snap."""
+    least = state[LEAST_AT]
+    if state[end] < least:
+        kept = state[FLEXIBILITY], state[CURVATURE]
+        state[end + SIGMA_LOW - LOW], state[end] = stress_in(row, state, least), least
+        state[FLEXIBILITY], state[CURVATURE] = kept
+
+
+@inner
+def _has_loop(row: Row, sigma: float, up: bool) -> bool:
+    """Whether snap-back lies below snap-through just above, or just below, a stress."""
+    below = row[SPREAD_MINUS] >= row[SPREAD_PLUS]
+    log = math.log(sigma)
+    if below:
+        return log < row[LOG_CROSS] if up else log <= row[LOG_CROSS]
+    return log >= row[LOG_CROSS] if up else log > row[LOG_CROSS]
+
+
+@inner
+def _last_stress(row: Row) -> float:
+    """Stress at which the last micro-spring has snapped back."""
+    through = row[LOG_AGAIN] + row[SPREAD_PLUS] * LEAST_RANK
+    return math.exp(min(through, row[LOG_MINUS] + row[SPREAD_MINUS] * LEAST_RANK))
+
+
+@inner
+def _enter(row: Row, state: Array, branch: int, up: bool) -> None:
+    """Enter a branch at the strain and stress where the spring is, upwards or downwards."""
+    state[BRANCH], state[FLEXIBILITY] = branch, 0.0
+    state[LOW], state[SIGMA_LOW] = -math.inf, -math.inf
+    state[HIGH], state[SIGMA_HIGH] = math.inf, math.inf
+    below, cross = row[SPREAD_MINUS] >= row[SPREAD_PLUS], math.exp(row[LOG_CROSS])
+    if branch == A:
+        state[RANK], state[SNAPPED], state[REST] = -math.inf, 0.0, 1.0
+        first = row[LOG_PLUS] if state[NEVER] == 1.0 else row[LOG_AGAIN]
+        _ends(row, state, HIGH, math.exp(first + row[SPREAD_PLUS] * LEAST_RANK))
+        if state[HIGH] < state[LEAST_AT]:
+            state[BRANCH] = SNAP if state[NEVER] == 1.0 else AGAIN
+            _no_less(row, state, HIGH)
+            state[BRANCH] = A
+    elif branch in (AGAIN, BOTH):
+        high = math.exp(row[LOG_AGAIN] + row[SPREAD_PLUS] * state[EVER])
+        if (branch == AGAIN) == below:  # where both lines meet, the other one begins
+            high = min(high, cross)
+        _ends(row, state, HIGH, high)
+        if branch == BOTH:
+            last = _last_stress(row)
+            _ends(row, state, LOW, max(last, cross) if below else last)
+            _no_less(row, state, LOW)
+    elif branch == BACK:
+        last = _last_stress(row)
+        _ends(row, state, LOW, last if below else max(last, cross))
+        _no_less(row, state, LOW)
+
+
+@inner
+def _hold(row: Row, state: Array, rank: float) -> None:
+    """Hold a rank that has been reached."""
+    p, rest = share(rank), share(-rank)
+    state[BRANCH], state[RANK], state[SNAPPED], state[REST] = HELD, rank, p, rest
+    state[FLEXIBILITY] = 0.0
+    first = row[LOG_PLUS] if rank >= state[EVER] else row[LOG_AGAIN]
+    back = row[LOG_MINUS] + row[SPREAD_MINUS] * rank
+    again = row[LOG_AGAIN] + row[SPREAD_PLUS] * rank
+    _ends(row, state, HIGH, max(math.exp(first + row[SPREAD_PLUS] * rank), state[SIGMA]))
+    _ends(row, state, LOW, min(math.exp(min(back, again)), state[SIGMA]))
+
+
+@inner
+def turned(state: Array, up: bool) -> bool:
+    """Whether a spring that snaps, or snaps back, is now moved the other way."""
+    branch = state[BRANCH]
+    return branch == BACK if up else branch in (SNAP, AGAIN)
+
+
+@inner
+def _snap_again(row: Row, state: Array) -> None:
+    """Snap through once more what has snapped before; or go on with first loading."""
+    if state[RANK] >= state[EVER]:
+        _enter(row, state, SNAP, True)
+    else:
+        _enter(row, state, AGAIN if _has_loop(row, state[SIGMA], True) else BOTH, True)
+
+
+@inner
+def _reach(row: Row, state: Array) -> None:
+    """Go over from what snaps once more to what is held at all that ever snapped."""
+    state[RANK] = state[EVER]
+    if row[LOG_AGAIN] == row[LOG_PLUS]:
+        _enter(row, state, SNAP, True)
+    else:
+        _hold(row, state, state[EVER])
+
+
+@inner
+def switch(row: Row, state: Array, up: bool) -> None:
+    """Go over from the end of a branch, or from where the strain turns, to the next branch."""
+    branch = int(state[BRANCH])
+    if turned(state, up):
+        rank = rank_now(row, state)
+        if branch == SNAP:
+            state[EVER], state[NEVER] = rank, share(-rank)
+        _hold(row, state, rank)
+        if not up and row[LOG_AGAIN] == row[LOG_PLUS] and not _has_loop(row, state[SIGMA], False):
+            _enter(row, state, BOTH, False)
+        return
+    end = HIGH if up else LOW
+    state[EPS], state[SIGMA] = state[end], state[end + SIGMA_LOW - LOW]
+    sigma = state[SIGMA]
+    if branch == A:
+        if state[NEVER] == 1.0:
+            _enter(row, state, SNAP, True)
+        else:
+            _snap_again(row, state)
+    elif branch == HELD and up:
+        _snap_again(row, state)
+    elif branch == HELD:
+        _enter(row, state, BACK if _has_loop(row, sigma, False) else BOTH, False)
+    elif up:
+        log = row[LOG_AGAIN] + row[SPREAD_PLUS] * state[EVER]
+        if math.log(sigma) >= log - 1e-14 * max(abs(log), 1.0):
+            _reach(row, state)
+        else:
+            _enter(row, state, BOTH if branch == AGAIN else AGAIN, True)
+    elif sigma <= _last_stress(row) or state[EPS] <= state[LEAST_AT]:
+        _enter(row, state, A, False)
+    else:
+        _enter(row, state, BOTH if branch == BACK else BACK, False)
+
+
+@inner
+def rank_now(row: Row, state: Array) -> float:
+    """The rank up to which micro-springs have snapped."""
+    branch = int(state[BRANCH])
+    if not moves(branch):
+        return state[RANK]
+    place, scale = line(row, branch)
+    return (math.log(state[SIGMA]) - place) / scale
+
+
+# ---------------------------------------------------------------- along a stress
+
+
+@inner
+def rank_at(
+    row: Row, rank: float, ever: float, branch: int, sigma: float
+) -> tuple[float, float, int]:
+    """Ranks w and W and branch at a stress of a spring that was last seen at others."""
+    first = again = back = -math.inf
+    if sigma > 0.0:
+        log = math.log(sigma)
+        first = (log - row[LOG_PLUS]) / row[SPREAD_PLUS]
+        again = (log - row[LOG_AGAIN]) / row[SPREAD_PLUS]
+        back = (log - row[LOG_MINUS]) / row[SPREAD_MINUS]
+    least = max(first, min(again, ever))
+    most = max(least, back)
+    if first > max(ever, LEAST_RANK):  # first loading, of a virgin spring too
+        return first, first, SNAP
+    if rank < least:
+        rank = least
+        branch = HELD if least == ever else (AGAIN if back > least else BOTH)
+    elif rank > most:
+        rank, branch = most, BACK if back > least else BOTH
+    elif least < rank < most or rank == ever:
+        branch = HELD
+    elif (rank == least and branch == BACK) or (rank == most and branch in (SNAP, AGAIN)):
+        branch = HELD  # also at an end of the held stresses that it has not passed
+    if rank < LEAST_RANK:
+        rank, branch = -math.inf, A
+    return rank, ever, branch
+
+
+@inner
+def under_stress(
+    row: Row, branch: int, rank: float, ever: float, sigma: float
+) -> tuple[float, float, float, float, float]:
+    """Strain at a stress and its derivatives by stress, w and W; and that of w by the stress.
+
+    On first loading w and W are one: its derivative is that by w. The strain is -inf where the
+    spring cannot carry the tension.
+    """
+    n, never = row[STIFFENING], share(-ever)
+    p, rest = (share(rank), share(-rank)) if branch != A else (0.0, 1.0)
+    strain, soft, _ = mixture(row, branch, p, rest, never, sigma)
+    if strain == -math.inf or (branch == A and never == 1.0):
+        return strain, soft, 0.0, 0.0, 0.0
+    k = row[K0] if branch == SNAP else row[K_SNAPPED]
+    one, by_ever, pace = on_a(n, k, sigma)[0], 0.0, 0.0
+    if branch != SNAP:
+        by_ever = density(ever) * (one - on_a(n, row[K0], sigma)[0])
+    if branch == A:
+        return strain, soft, 0.0, by_ever, 0.0
+    by_rank = density(rank) * (row[EPS_STAR] + sigma / (row[KC] + sigma) - one)
+    if branch != HELD:
+        pace = 1.0 / (line(row, branch)[1] * sigma)
+    return strain, soft, by_rank, by_ever, pace
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+@inner
+def strain_tangents(
+    row: Row, branch: int, rank: float, ever: float, sigma: float, out: Array
+) -> None:
+    """Fill the derivatives of the strain, at fixed stress and ranks, by all but the snap stresses.
+
+    At those places stand the derivatives of the rank w at a fixed stress.
+    """
+    n, p, never = row[STIFFENING], share(rank), share(-ever)
+    rest = share(-rank)
+    if branch == A:
+        p, rest = 0.0, 1.0
+    virgin = branch == SNAP or never == 1.0
+    fresh = rest if virgin else never  # on branch a, and never snapped
+    worn = 0.0 if virgin else max(rest - never, 0.0)
+    soft, softer = on_a(n, row[K0], sigma)[1], on_a(n, row[K_SNAPPED], sigma)[1]
+    two = 1.0 / (row[KC] + sigma)
+    out[:] = 0.0
+    out[0] = -sigma * (fresh * soft + worn * softer) / row[K0]
+    out[1], out[2] = -p * sigma * two * two, p
+    out[OF_STIFFENING] = fresh * by_stiffening(n, row[K0], sigma)
+    out[OF_STIFFENING] += worn * by_stiffening(n, row[K_SNAPPED], sigma)
+    out[OF_SOFTENING] = worn * sigma * softer
+    if moves(branch):
+        scale = line(row, branch)[1]
+        first = 5 if branch == BACK else 3
+        out[first] = -math.exp(-(row[LOG_MINUS] if branch == BACK else row[LOG_PLUS])) / scale
+        out[first + 1] = -rank / scale
+        if branch in (AGAIN, BOTH):
+            out[OF_WEAKENING] = 1.0 / scale
+
+
+@inner
+def tangents(
+    row: Row,
+    branch: int,
+    rank: float,
+    ever: float,
+    sigma: float,
+    eps: float,
+    d_rank: Array,
+    d_ever: Array,
+    out: Array,
+) -> float:
+    """Fill the derivatives of the stress at a strain; returns the slope dσ/dε.
+
+    They are by k0 … spread_minus, the logarithm of the strain, stiffening, softening, weakening.
+    `d_rank` and `d_ever`, the same of w and W, are brought up to date where the spring moves.
+    """
+    _, soft, by_rank, by_ever, pace = under_stress(row, branch, rank, ever, sigma)
+    strain_tangents(row, branch, rank, ever, sigma, out)
+    slope = 1.0 / (soft + by_rank * pace)
+    for c in range(CARRIED):
+        by_line = c == OF_WEAKENING or 3 <= c < OF_STRAIN
+        if branch == HELD and rank == ever:
+            d_rank[c] = d_ever[c]
+        elif branch != HELD:
+            d_rank[c] = out[c] if by_line else 0.0
+        known = 0.0 if by_line else out[c]
+        if c == OF_STRAIN:
+            known = -eps
+        out[c] = -slope * (known + by_rank * d_rank[c] + by_ever * d_ever[c])
+        if moves(branch):
+            d_rank[c] += pace * out[c]
+        if branch == SNAP:
+            d_ever[c] = d_rank[c]
+    return slope
