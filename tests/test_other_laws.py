@@ -12,6 +12,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.special import erf, gamma
 
 import foamfit as ff
+from foamfit.springs import laws
 
 FOLDER = Path(__file__).parent.parent / "experiments" / "other_laws"
 CURVE = {"mu": 2.3e5, "alpha": 9.0, "nu": 2e4, "beta": 2.5}
@@ -207,3 +208,13 @@ def test_a_law_that_depends_on_time_needs_one(tmp_path):
     path.with_suffix(".toml").write_text('[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n')
     with pytest.raises(ff.InputError, match="'fractional' needs a time column"):
         ff.fit(ff.read_test(path), model="fractional")
+
+
+def test_a_law_file_may_import_what_stands_beside_it(tmp_path):
+    example = FOLDER.parent.parent / "notebooks" / "bouc_wen.py"
+    (tmp_path / "stands_beside.py").write_text(example.read_text())
+    path = tmp_path / "imports.py"
+    path.write_text("from stands_beside import LAW\n")
+    before = list(sys.path)
+    assert [one.kind for one in laws.load_file(path)] == ["bouc-wen"]
+    assert sys.path == before
