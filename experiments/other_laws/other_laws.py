@@ -277,12 +277,13 @@ def fit_tests(given: argparse.Namespace) -> None:
         "shoe-foam", "shoe-foam-twins", "mycelium-rates", "lattice-cycles", "cartilage-impact"
     )
     cases = [case for case in TESTS if given.only in case[1]]
+    rows = list[dict[str, Any]]()
     with ProcessPoolExecutor(given.jobs) as pool:
-        tasks = [pool.submit(fit_all, case, data, given.starts) for case in cases]
-        rows = [row for task in tasks for row in task.result()]
-    table = pd.DataFrame(rows).drop(columns="curves")
-    draw(rows, given.out / "other_laws.png")
-    studies.write_csv(table, given.out / "other_laws.csv")
+        for task in [pool.submit(fit_all, case, data, given.starts) for case in cases]:
+            rows += task.result()  # an interrupted study keeps what it has
+            table = pd.DataFrame(rows).drop(columns="curves")
+            studies.write_csv(table, given.out / "other_laws.csv")
+            draw(rows, given.out / "other_laws.png")
 
 
 if __name__ == "__main__":
