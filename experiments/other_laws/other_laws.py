@@ -182,6 +182,7 @@ def law_table(table: pd.DataFrame) -> str:
     """Write the table of the README: a row for each law, misfit and predicted misfit by group."""
     rows = []
     groups = list(dict.fromkeys(group for group, *_ in TESTS))
+    fitted = {group: set(table[table["group"] == group]["test"]) or {""} for group in groups}
     best = {
         (group, one): table[table["group"] == group].groupby("law")[one].mean().min()
         for group in groups
@@ -194,6 +195,9 @@ def law_table(table: pd.DataFrame) -> str:
         cells = []
         for group in groups:
             part = own[own["group"] == group]
+            if len(part) < len(fitted[group]):  # a study that was interrupted
+                cells.append("–")
+                continue
             both = {one: part[one].mean() for one in MEASURES}
             bold = {one: "**" * bool(v == best[group, one]) for one, v in both.items()}
             cells.append(" / ".join(f"{bold[n]}{100.0 * v:.2f}{bold[n]}" for n, v in both.items()))
@@ -225,12 +229,20 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Draw measured and fitted loops: a row for each kind of test, a column for each law."""
     found = {(row["test"], row["law"]): row for row in rows}
     names = [LAWS[i].name for i in DRAWN]
-    tests = [name for name in SHOWN if (name, names[0]) in found]
+    tests = [name for name in SHOWN if any(test == name for test, _ in found)]
     with studies.sheet(path, 1.55 * len(names), 1.5 * len(tests) + 0.5) as figure:
         axes = figure.subplots(len(tests), len(names), sharey="row", sharex="row", squeeze=False)
         for (name, line), column in ((one, k) for one in zip(tests, axes, strict=True)
                                      for k in range(len(names))):  # fmt: skip
-            row, ax = found[name, names[column]], line[column]
+            row, ax = found.get((name, names[column])), line[column]
+            if name == tests[0]:
+                title = names[column].replace(": ", ":\n").replace(", ", ",\n")
+                title = title.replace(" on ", "\non ").replace(" beside ", "\nbeside ")
+                ax.set_title(title, fontsize=6.5)
+            if name == tests[-1]:
+                ax.set_xlabel("strain (–)")
+            if row is None:  # a study that was interrupted
+                continue
             strain, measured, fitted = row["curves"]
             factor, unit = (1e6, "MPa") if measured.max() > 1e6 else (1e3, "kPa")
             ax.plot(strain, measured / factor, color="0.6", lw=1.6)
@@ -241,12 +253,6 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             )  # fmt: skip
             if column == 0:
                 ax.set_ylabel(f"{name.removesuffix('_impact')}\nstress ({unit})", fontsize=7)
-            if line is axes[0]:
-                title = names[column].replace(": ", ":\n").replace(", ", ",\n")
-                ax.set_title(title.replace(" on ", "\non ").replace(" beside ", "\nbeside "),
-                             fontsize=6.5)  # fmt: skip
-            if line is axes[-1]:
-                ax.set_xlabel("strain (–)")
         figure.suptitle(
             "Measured (grey; shoe foam arXiv:2602.12694, mycelium LivingMatterLab/CANN, lattice "
             "mev43/FYP-Cyclic-Compression, cartilage JoVE 64450), fitted (red), misfit",
