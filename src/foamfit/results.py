@@ -14,8 +14,9 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate
 from foamfit.springs.chain import Chain
+from foamfit.springs.model import Model
 from foamfit.springs.spring import Spring
-from foamfit.text import counted
+from foamfit.text import counted, listed
 
 if TYPE_CHECKING:
     import lmfit
@@ -222,6 +223,9 @@ class Check:
     fatal: bool = False  # Whether a "no" means that no acceptable fit was found
 
 
+OPTIONS_IN_WORDS = {"stiffening": "stiffening", "mullins": "softening and weakening"}
+
+
 def rung_name(model: str, damping: str, relaxation: int = 0) -> str:
     """Model, relaxation and damping in words."""
     if not relaxation:
@@ -328,8 +332,13 @@ def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dic
 
 
 def law_in_words(model: str, relaxation: int) -> str:
-    """Model and relaxation in words."""
-    return f"{model} with {counted(relaxation, 'relaxation term')}" if relaxation else model
+    """Model, what its springs remember, and relaxation in words."""
+    if model == "auto":
+        return model
+    read = Model.parse(model)
+    more = [OPTIONS_IN_WORDS[name] for name, asked in read.options.items() if asked]
+    more += [counted(relaxation, "relaxation term")] if relaxation else []
+    return f"{read.words} with {listed(more)}" if more else read.words
 
 
 @dataclass(frozen=True, eq=False)
@@ -398,6 +407,7 @@ class Fit:
         """Return the content of ``fit.json``: SI, plain types, null for what is not there."""
         test = self.measurement
         asked = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
+        model = Model.parse(self.model)
         optional = {
             "correlation": self.correlation and vars(self.correlation),
             "budget": self.budget and self.budget.contributions,
@@ -411,12 +421,15 @@ class Fit:
             "data": asdict(test.rows)
             | {
                 "cycle": test.cycle,
+                "last_cycle": test.last_cycle,
                 "cycles": len(test.cycles),
                 "start_strain": test.start_strain,
                 "rate": loading_rate(test),
                 "notes": test.notes,
             },
             **{name: getattr(self, name) for name in (*asked, "loss", "warnings", "notes")},
+            **model.options,
+            "model": model.words,
             "checklist": [
                 {name: getattr(check, name) for name in ("question", "answer", "sentence")}
                 for check in self.checklist

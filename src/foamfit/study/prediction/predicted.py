@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.results import law_in_words, plain
+from foamfit.springs.model import Model
 
 SCHEMA = 1
 # What makes the band, in the order in which it is told; "motion" where a noisy one drives.
@@ -143,7 +144,8 @@ class PredictedTest:
                 "cycle": m.cycle,
                 "result": self.source,
                 "joint": self.joint,
-                "model": self.model,
+                "model": Model.parse(self.model).words,
+                **Model.parse(self.model).options,
                 "relaxation": self.relaxation,
                 "drive": self.drive,
                 "seed": self.seed,
