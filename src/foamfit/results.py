@@ -317,7 +317,11 @@ def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dic
     for i, spring in enumerate(springs, start=1):
         if not spring.law.remembers:
             continue
-        own = None if any(one.eta or one.relaxation for one in springs) else stress
+        own = (
+            None
+            if any(one.eta or one.relaxation or one.law.is_viscous for one in springs)
+            else stress
+        )
         if len(springs) == 1:
             own = None if strain is None else np.asarray(spring.stress(strain))
         if own is not None and np.all(np.isfinite(own)):

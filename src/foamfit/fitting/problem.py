@@ -69,6 +69,10 @@ def make_params(
         raise InputError(
             f"{measurement.name}: relaxation needs a time column; give one, or leave relaxation out"
         )
+    if measurement.time is None and (delayed := [law for law in model.laws if law.is_viscous]):
+        raise InputError(
+            f"{measurement.name}: the stress of '{delayed[0].kind}' needs a time column"
+        )
     params = lmfit.Parameters()
     count = len(model.kinds)
     for name in model.names:
