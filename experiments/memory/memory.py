@@ -25,15 +25,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
 import foamfit as ff
-import real_foams
-import studies
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
 from foamfit.report.figures import DPI
 from foamfit.results import Fit
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+import real_foams  # noqa: E402
+import studies  # noqa: E402
 
 TABLE, PARAMETERS, CURVES = HERE / "memory.csv", HERE / "parameters.csv", HERE / "curves.csv"
 SHOWN = "new-heel-comp-1"  # in the picture
@@ -72,9 +73,11 @@ class Table:
         self.values = pd.read_csv(PARAMETERS).to_dict("records") if there else []
 
     def has(self, test: str, what: str) -> bool:
+        """Whether a part of a test is there."""
         return any(row["test"] == test and row["what"] == what for row in self.rows)
 
     def add(self, test: str, what: str, rows: list[dict[str, Any]], result: Fit) -> None:
+        """Add a part of a test and the parameters of its fit, and write both tables."""
         self.rows += [{"test": test, "what": what, **row} for row in rows]
         self.values += [
             {
@@ -187,9 +190,8 @@ def draw(path: Path) -> None:
             for number, one in own.groupby("cycle"):
                 ax.plot(one["strain"], one["predicted (Pa)"] / 1e3, lw=1.1, label=f"cycle {number}")
                 if mask is None:
-                    ax.fill_between(
-                        one["strain"], one["low (Pa)"] / 1e3, one["high (Pa)"] / 1e3, alpha=0.2, lw=0
-                    )  # fmt: skip
+                    ends = one["low (Pa)"] / 1e3, one["high (Pa)"] / 1e3
+                    ax.fill_between(one["strain"], *ends, alpha=0.2, lw=0)
             ax.set(title=title, xlabel="strain (–)")
             ax.legend(loc="upper left")
         axes[0].set_ylabel("stress (kPa)")
