@@ -14,7 +14,6 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate
 from foamfit.springs.chain import Chain
-from foamfit.springs.model import Model
 from foamfit.springs.spring import Spring
 from foamfit.text import counted, listed
 
@@ -333,6 +332,8 @@ def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dic
 
 def law_in_words(model: str, relaxation: int) -> str:
     """Model, what its springs remember, and relaxation in words."""
+    from foamfit.springs.model import Model  # drawing needs no compiler
+
     if model == "auto":
         return model
     read = Model.parse(model)
@@ -405,6 +406,8 @@ class Fit:
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``fit.json``: SI, plain types, null for what is not there."""
+        from foamfit.springs.model import Model  # drawing needs no compiler
+
         test = self.measurement
         asked = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
         model = Model.parse(self.model)

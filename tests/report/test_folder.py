@@ -26,7 +26,8 @@ KEYS = {
     "schema", "foamfit", "test", "data_sha256", "model", "drive", "interior_mass", "seed",
     "status", "warnings",
     "notes", "checklist", "data",
-    "parameters", "relaxation", "derived", "visited", "misfit", "weights", "statistics", "energy",
+    "parameters", "relaxation", "stiffening", "mullins", "derived", "visited", "misfit", "weights",
+    "statistics", "energy",
     "runtime_s", "stopped", "loss", "noise", "outliers",
 }  # fmt: skip
 

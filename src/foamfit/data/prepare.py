@@ -94,8 +94,7 @@ def condition(
     record = spoilt.bridge_standstills(done(spoilt.fill_staircase(record)), still)
     cycles = [] if impact else find_cycles(record)
     chosen = choose_cycles(cycles, window.cycle, window.last)
-    begun = chosen if chosen is not None and not chosen.place else cycles[0] if cycles else None
-    first = cut_to_cycle(record, cycles, begun)[0] if begun else record
+    first = cut_to_cycle(record, cycles, cycles[0])[0] if cycles else record
     curves = first.curves("acceleration")
     levels = {c: estimated_noise(v) for c, v in curves.items()} | held
     if impact:
@@ -105,7 +104,9 @@ def condition(
         notes += zeros.flight_notes(first, start, span, levels, known, spread)
     else:
         start = start_of_slow_test(first, levels)
-        span = zeros.Span.of_slow_test(first, start)
+        begun = chosen is not None and not chosen.place  # with the first contact
+        kept = cut_to_cycle(record, cycles, chosen)[0] if chosen and begun else first
+        span = zeros.Span.of_slow_test(kept, start)
     record, found = zeros.take_zeros(record, first, start, span, levels, impact=impact)
     notes += found.notes
     later = chosen if chosen is not None and chosen.place else None  # with a contact of its own

@@ -28,15 +28,19 @@ from foamfit.page.worker import News, parsed
 from foamfit.report.folder import load_result
 from foamfit.results import law_in_words
 from foamfit.springs import laws
+from foamfit.springs.model import Model
 
 # Where a checkout of the repository may be: the working directory, or around an editable install.
 CHECKOUTS = (Path(), Path(__file__).parents[3])
 # Options that are shown, and those that are folded away; --fix and --vary have ticks.
 SHOWN = ("model", "drive", "relaxation", "cycle")
 FOLDED = (
-    *("starts", "max_time", "seed", "loss", "interior_mass", "time_shift"),
+    *laws.OPTIONS,
+    *("cycles", "starts", "max_time", "seed", "loss", "interior_mass", "time_shift"),
     *("profile", "bootstrap", "mcmc"),
 )
+# Options on which the curves of a model depend.
+OF_CURVES = ("drive", "relaxation", "interior_mass", "time_shift", *laws.OPTIONS)
 POLL = 200  # ms
 # Over all windows, one test is read and the curves of one are prepared at a time.
 READING, PREPARING = (
@@ -143,7 +147,7 @@ class Window:
         self.fields = (*self.quantities.values(), self.rest, self.cycle)
         for field in self.fields:
             field.param.watch(self._edited, "value")
-        for name in ("model", "drive", "relaxation", "interior_mass", "time_shift"):
+        for name in ("model", *OF_CURVES):
             self.options[name].widget.param.watch(self._model_chosen, "value")
         save = partial(pn.widgets.FileDownload, embed=False, auto=True, **STYLE)
         saves = {
@@ -440,13 +444,14 @@ class Window:
         self.report.object = piece("report", self._report())
         fit = load_result(self.desk.fits[cycle])
         values = {name: one["value"] for name, one in fit["parameters"].items()}
-        place = {name: fit[name] for name in ("model", "relaxation", "drive")}
-        self._turn_fitted(News(cycle=cycle, values=values, **place))
+        place = {name: fit[name] for name in ("relaxation", "drive")}
+        model = Model.of_result(fit).name
+        self._turn_fitted(News(cycle=cycle, values=values, model=model, **place))
 
 
 def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options on which the curves of a model depend."""
-    return {one: asked[one] for one in ("drive", "relaxation", "interior_mass", "time_shift")}
+    return {one: asked[one] for one in OF_CURVES}
 
 
 def models() -> list[str]:
