@@ -38,7 +38,7 @@ INSTEAD = {("foam-2", "stress"): "linear+bistable"}
 DRIVES = ("impact", "stress")
 RUNS = [(case, drive) for case in CASES for drive in DRIVES]
 LEFT_OUT = (  # large, and made again by this script
-    "curves.csv", "fit.csv", "residuals.csv", "sensitivities.csv", "fit.pdf", "report.html",
+    "curves.csv", "fit.pdf", "report.html",
 )  # fmt: skip
 LIMIT = 3.0  # standard errors
 
@@ -128,7 +128,7 @@ def main() -> None:
     summary = f"{finding(comparison)}\n\n{in_parts(folders)}"
     page = PAGE.format(finding=summary, text=text)
     (HERE / "comparison.md").write_text(page, encoding="utf-8")
-    plot_comparison(comparison, HERE / "comparison.png", table=False)  # which is in the page
+    plot_comparison(comparison, HERE / "comparison.png")
     print(text, summary, sep="\n\n")
 
 

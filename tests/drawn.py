@@ -15,7 +15,7 @@ import foamfit as ff
 from conftest import synthetic_impact
 from foamfit.data.measurement import Outliers
 from foamfit.report.comparison import compare, plot_comparison
-from foamfit.report.identifiability_plots import plot_budget, plot_insight
+from foamfit.report.identifiability_plots import plot_insight
 from foamfit.report.plots import plot_fit, plot_response
 from foamfit.trust.identifiability import Insight
 
@@ -73,10 +73,7 @@ def _figures(width: str) -> Iterator[tuple[str, Figure]]:
     for name, make in RESULTS.items():
         yield name, plot_fit(make(), width=width)
     yield "response", plot_response(response(), width=width)
-    yield "insight", plot_insight(insight(), title="a test · before the fit", width=width)
-    shares = {"contact_and_zero": 0.02, "velocity": 0.01, "mass": 0.01, "height": 0.01}
-    shares |= {"area": 0.005, "calibration": 0.02, "law": 0.01}
-    yield "budget", plot_budget(fabricated.budget(**shares), width=width)
+    yield "insight", plot_insight(insight(), width=width)
     one = fabricated.result()
     named = replace(one, measurement=replace(one.measurement, name="foam-1/model-1"))
     yield "comparison", plot_comparison(compare([named]), width=width)

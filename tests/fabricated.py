@@ -233,10 +233,5 @@ def microscale_result(**changed: Any) -> FitResult:
 def no_figures() -> dict[str, Images | None]:
     """What stands for the figures of a report, of which drawing takes longest."""
     few = b"\x89PNG" + bytes(20)
-    there = {"fit": Images(few, 250, b"%PDF", b"x"), "shown": Images(few, 250)}
-    return there | {
-        "residuals": Images(few, 250, None, b"x"),
-        "sensitivities": None,
-        "profiles": None,
-        "budget": None,
-    }
+    there = {"fit": Images(few, 250, b"%PDF"), "shown": Images(few, 250)}
+    return there | {"residuals": Images(few, 250), "information": None, "profiles": None}

@@ -23,11 +23,12 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pandas as pd
+from selection import Selection, select_own
 
 import foamfit as ff
 from foamfit.one_model import Options
 from foamfit.report.figures import BLUE, DPI, VERMILION
-from foamfit.study.shared import Group, Selection, select_own
+from foamfit.study.shared import Group
 from foamfit.text import significant
 
 HERE = Path(__file__).parent
@@ -62,7 +63,7 @@ def fit_twins(data: Path, toml: Path) -> tuple[pd.DataFrame, list[Group]]:
     for name, height, diameter in studies.twins(data / "shoe-foam-twins"):
         studies.write_specimen(toml, height, diameter)
         path = data / "shoe-foam-twins" / f"{name}_raw.txt"
-        found = ff.fit_cycles(path, toml, together=False, intervals="local", **MODEL)
+        found = ff.fit_cycles(path, toml, intervals="local", **MODEL)
         rows.append(found.table.reset_index().assign(specimen=name))
         fits = [found.results[n] for n in TOGETHER]
         options = Options(relaxation=1)
@@ -187,7 +188,7 @@ def fit_lattices(data: Path, toml: Path) -> tuple[pd.DataFrame, dict[str, ff.Cyc
     found = {
         name: ff.fit_cycles(
             data / "lattice-cycles" / f"{name}_raw.csv", toml, cycles=LATTICE_CYCLES,
-            together=False, intervals="local", **MODEL,
+            intervals="local", **MODEL,
         )
         for name in LATTICES
     }  # fmt: skip

@@ -13,6 +13,7 @@ from foamfit.one_model import SEARCHED, Keywords, Options, Progress, identify, j
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_result
 from foamfit.results import Fit
+from foamfit.springs.model import with_options
 from foamfit.trust.intervals import Announce
 
 
@@ -72,6 +73,10 @@ def fit(
     relaxation : int
         Relaxation terms of every bistable and microscale spring: s1_g1, s1_tau1, …; model="auto"
         tries one term by itself and refuses this.
+    stiffening : bool
+        Whether branch a of every microscale spring stiffens as the test says: s1_stiffening.
+    mullins : bool
+        Whether what has snapped once softens and weakens: s1_softening, s1_weakening.
     loss : str
         "linear" (least squares), or one that reduces the weight of large residuals: "soft_l1",
         "huber" or "cauchy".
@@ -125,6 +130,7 @@ def fit(
             f"relaxation = {chosen.relaxation} belongs to one model; name it instead of 'auto', "
             "which tries relaxation by itself"
         )
+    with_options(model, stiffening=chosen.stiffening, mullins=chosen.mullins)
     from foamfit.auto import compare_models
 
     return FitResult(**vars(compare_models(measurement, chosen, progress, tell)))

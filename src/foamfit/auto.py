@@ -40,7 +40,7 @@ from foamfit.trust.residuals.residual_tests import BENT, find_structure, neighbo
 # From the simplest up, in groups: one spring; a linear spring below it or its relaxation; two
 # springs; three; two that relax. More springs have more parameters (23 and more) than a loop has
 # features. Springs that remember take too long in three, others gain nothing in the last group.
-_OWN = [kind for kind in laws.PAPER if laws.law(kind).hysteretic]
+_OWN = [law.kind for law in map(laws.law, laws.PAPER) if law.hysteretic and not law.word]
 _SLOW = [kind for kind in _OWN if laws.law(kind).remembers]
 _QUICK = [kind for kind in _OWN if kind not in _SLOW]
 LADDER = tuple(

@@ -18,8 +18,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
-from foamfit.fitting.minima import exchange_springs, scan_places, settle_ends
-from foamfit.fitting.order import in_order
+from foamfit.fitting.minima import exchange_springs, in_order, scan_places, settle_ends
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import (
     REFINED,
@@ -33,6 +32,7 @@ from foamfit.fitting.search import (
     what_stopped,
 )
 from foamfit.results import Fit, Intervals
+from foamfit.springs.model import with_options
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
@@ -76,6 +76,8 @@ class Keywords(TypedDict, total=False):
     interior_mass: bool
     time_shift: bool
     relaxation: int
+    stiffening: bool
+    mullins: bool
     loss: str
     intervals: str
     draws: int | None
@@ -97,6 +99,8 @@ class Options:
     interior_mass: bool = False
     time_shift: bool = False
     relaxation: int = 0
+    stiffening: bool = False
+    mullins: bool = False
     loss: str = "linear"
     intervals: str = "auto"
     draws: int | None = None
@@ -141,6 +145,7 @@ class Options:
         self, measurement: Measurement, model: str, params: lmfit.Parameters | None = None
     ) -> Problem:
         """Set up the fit of one model."""
+        model = with_options(model, stiffening=self.stiffening, mullins=self.mullins)
         more = {name: getattr(self, name) for name in ("time_shift", "loss", "relaxation")}
         given = (self.drive, params, self.weights, self.interior_mass)
         return make_problem(measurement, model, *given, **more)

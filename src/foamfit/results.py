@@ -15,7 +15,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate
 from foamfit.springs.chain import Chain
 from foamfit.springs.spring import Spring
-from foamfit.text import counted
+from foamfit.text import counted, listed
 
 if TYPE_CHECKING:
     import lmfit
@@ -222,6 +222,9 @@ class Check:
     fatal: bool = False  # Whether a "no" means that no acceptable fit was found
 
 
+OPTIONS_IN_WORDS = {"stiffening": "stiffening", "mullins": "softening and weakening"}
+
+
 def rung_name(model: str, damping: str, relaxation: int = 0) -> str:
     """Model, relaxation and damping in words."""
     if not relaxation:
@@ -313,7 +316,11 @@ def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dic
     for i, spring in enumerate(springs, start=1):
         if not spring.law.remembers:
             continue
-        own = None if any(one.eta or one.relaxation for one in springs) else stress
+        own = (
+            None
+            if any(one.eta or one.relaxation or one.law.is_viscous for one in springs)
+            else stress
+        )
         if len(springs) == 1:
             own = None if strain is None else np.asarray(spring.stress(strain))
         if own is not None and np.all(np.isfinite(own)):
@@ -324,8 +331,15 @@ def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dic
 
 
 def law_in_words(model: str, relaxation: int) -> str:
-    """Model and relaxation in words."""
-    return f"{model} with {counted(relaxation, 'relaxation term')}" if relaxation else model
+    """Model, what its springs remember, and relaxation in words."""
+    from foamfit.springs.model import Model  # drawing needs no compiler
+
+    if model == "auto":
+        return model
+    read = Model.parse(model)
+    more = [OPTIONS_IN_WORDS[name] for name, asked in read.options.items() if asked]
+    more += [counted(relaxation, "relaxation term")] if relaxation else []
+    return f"{read.words} with {listed(more)}" if more else read.words
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,8 +406,11 @@ class Fit:
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``fit.json``: SI, plain types, null for what is not there."""
+        from foamfit.springs.model import Model  # drawing needs no compiler
+
         test = self.measurement
         asked = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
+        model = Model.parse(self.model)
         optional = {
             "correlation": self.correlation and vars(self.correlation),
             "budget": self.budget and self.budget.contributions,
@@ -407,12 +424,15 @@ class Fit:
             "data": asdict(test.rows)
             | {
                 "cycle": test.cycle,
+                "last_cycle": test.last_cycle,
                 "cycles": len(test.cycles),
                 "start_strain": test.start_strain,
                 "rate": loading_rate(test),
                 "notes": test.notes,
             },
             **{name: getattr(self, name) for name in (*asked, "loss", "warnings", "notes")},
+            **model.options,
+            "model": model.words,
             "checklist": [
                 {name: getattr(check, name) for name in ("question", "answer", "sentence")}
                 for check in self.checklist

@@ -16,7 +16,7 @@ from foamfit.data.csv_file import read_history
 from foamfit.data.toml_file import check_keys, load_toml
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError
-from foamfit.files import write_file
+from foamfit.files import read_whole, write_file
 from foamfit.solve.simulation import Response
 from foamfit.springs import laws
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
@@ -133,12 +133,12 @@ def _spring(given: _Part) -> Spring:
     if kind not in known:
         raise InputError(f"{given.where} kind = {kind!r}; it must be one of {', '.join(known)}.")
     law = laws.law(kind)
+    extra = max(law.options, key=len, default=())  # all parameters that options would free
+    wide = laws.law(laws.with_options(kind, extra))
+    law = wide if set(wide.own) - set(law.own) & set(given.table) else law
     terms = ["relaxation"] if law.hysteretic else []
     given.only("kind", "height", "mass", *law.names, *terms)
-    values = [
-        given.number(name, param, 0.0 if name == "eta" else None)
-        for name, param in law.by_name.items()
-    ]
+    values = [given.number(name, param, param.neutral) for name, param in law.by_name.items()]
     shown = given.table.get("relaxation")
     wrong = f'relaxation = {shown!r} must be a list of terms like [{{ g = 0.5, tau = "0.2 s" }}]'
     relaxation = [
@@ -176,6 +176,14 @@ def _samples(given: _Part) -> Array:
         told = f"must be a whole number from 2 to {_MOST_SAMPLES}"
         raise InputError(f"{given.where} samples = {samples!r} {told}.")
     return np.linspace(0.0, end, samples)
+
+
+def check_target(path: Path) -> None:
+    """Raise InputError if a file stands there that is no response of an earlier run."""
+    if path.is_file() and not read_whole(path, len(RESPONSE)).startswith(RESPONSE.encode()):
+        raise InputError(
+            f"{path} stands where the response is to go, and is not one; choose another name"
+        )
 
 
 def write_response(response: Response, path: Path) -> None:

@@ -202,15 +202,13 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     page.get_by_role("button", name="Stop").click()
     report = page.frame_locator("iframe")
     api.expect(report.get_by_text("stopped by Ctrl-C").first).to_be_visible(timeout=LATER)
-    # One to its end with a parameter that is held, beside a published set.
+    # One to its end with a parameter that is held.
     page.get_by_label("s1_eta as a number").fill("3")
     page.get_by_label("s1_eta fixed in the fit").check()
     page.get_by_label("Starts:").fill("2")
     page.get_by_role("button", name="Fit", exact=True).click()
     api.expect(page.get_by_text("A fit is running.")).to_be_visible()
     api.expect(report.get_by_text("s1_kc").first).to_be_visible(timeout=LATER)
-    page.get_by_label("Compare with").select_option("foam-1/model-2")
-    api.expect(page.get_by_text("beside published foam-1/model-2").first).to_be_visible()
     # Saved is what the command writes.
     with page.expect_download() as saved:
         page.get_by_text("Save the result folder").click()
@@ -260,22 +258,16 @@ def test_firefox_drops_fits_turns_and_saves(playwright, served, tmp_path):
 
 
 def test_another_file_keeps_nothing_of_the_one_before(window):
-    """Its specimen is that of its own TOML, or is filled in; what was typed is offered."""
+    """Its specimen is that of its own TOML, or is filled in."""
     page = window
     height, rest = page.get_by_label("Specimen height"), page.get_by_label("Further TOML")
     load(page)
     api.expect(height).to_have_value("1.19 mm")
-    offer = page.get_by_role("button", name="Fill in as for the file before")
-    api.expect(offer).to_be_hidden()
     choose(page, ("other.csv", TEST.read_text()))
     api.expect(height).to_have_value("")
     api.expect(rest).to_have_value("")
     api.expect(page.get_by_text("height", exact=False).first).to_be_visible()
     api.expect(page.get_by_role("button", name="Fit", exact=True)).to_be_disabled()
-    offer.click()
-    api.expect(height).to_have_value("1.19 mm")
-    api.expect(offer).to_be_hidden()
-    page.get_by_label("s1_k0", exact=True).wait_for()
 
 
 def test_two_windows_do_not_mix(window, served):

@@ -7,15 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import fabricated
 import foamfit as ff
 from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
-from foamfit.cli import main
 from foamfit.data.describe import describe
 from foamfit.data.energy import audit
-from foamfit.report.identifiability_plots import plot_budget
 from foamfit.report.page import render_report
 from foamfit.report.readable import readable
 from foamfit.report.result_figures import draw_all
@@ -86,7 +83,6 @@ def test_the_report_has_the_budget_as_table_and_picture() -> None:
     }
     result = replace(one, budget=budget, parameters=estimates)
     figures = dict(draw_all(result))
-    assert figures["budget"] is not None
     text = render_report(result, figures)
     page = text[text.index("Uncertainty budget") :]
     head, row = (part.split("</tr>")[0] for part in page.split("<tr>")[1:3])
@@ -102,19 +98,9 @@ def test_noise_alone_needs_no_budget() -> None:
     """All of it stands in the table of parameters."""
     result = fabricated.result(budget=fabricated.budget(law=0.03))
     figures = dict(draw_all(result))
-    assert figures["budget"] is None
     text = render_report(result, figures)
     assert "Uncertainty budget" not in text
     assert "systematic</th>" not in text
-
-
-def test_bars_are_shares_of_the_variance() -> None:
-    figure = plot_budget(fabricated.budget(area=0.02, contact_and_zero=0.01))
-    shares, totals = figure.axes
-    widths = [[bar.get_width() for bar in bars] for bars in shares.containers]
-    assert np.allclose(np.sum(widths, axis=0), 100.0)
-    assert np.allclose(np.array(widths)[:, 0], [100 / 6, 100 / 6, 400 / 6])
-    assert [bar.get_width() for bar in totals.containers[0]] == pytest.approx([6**0.5] * 2)
 
 
 def test_check_says_which_deviation_would_matter() -> None:
@@ -176,20 +162,3 @@ def test_a_velocity_that_the_flight_contradicts_is_a_warning(tmp_path: Path) -> 
     assert summary_text(wrong, verbose=True).count("given as 1.9 m/s") == 1
     page = render_report(wrong, fabricated.no_figures())
     assert page.index("given as 1.9 m/s") < page.index("<h2>Parameters")
-
-
-def test_the_outlook_ranks_what_is_taken_for_exact(tmp_path: Path) -> None:
-    def told(path: Path) -> str:
-        done = CliRunner().invoke(main, ["check", str(path), "--model", "bistable"])
-        assert done.exit_code == 0, done.output
-        return " ".join(done.stdout.partition("\nexact ")[2].partition("\n\n")[0].split())
-
-    text = told(impact_file(tmp_path, "2 m/s"))
-    for quantity in ("velocity", "striker mass", "area", "height"):
-        assert f"1 % of the {quantity} moves s1_" in text
-    times = [float(part.split(" times")[0]) for part in text.split("(")[1:]]
-    assert times == sorted(times, reverse=True)
-    area = next(part for part in text.split(", ") if "of the area" in part)
-    assert "by 1 % of its scale" in area  # of whatever stress it is
-    stated = told(impact_file(tmp_path, "2 ± 0.01 m/s"))
-    assert "of the velocity" not in stated

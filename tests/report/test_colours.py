@@ -19,10 +19,8 @@ from matplotlib.colors import to_rgb
 
 import foamfit.report
 from drawn import figures
-from foamfit.report.identifiability_plots import LOOKS
 from foamfit.report.plots import DASHES, MARKS
 from foamfit.report.studies import cycles, joint, prediction
-from foamfit.results import SOURCES
 
 EYES = {
     "normal": np.eye(3),
@@ -115,12 +113,6 @@ def test_parts_of_a_band_have_dashes_of_their_own() -> None:
     assert len({str(dash) for dash in DASHES}) == len(set(MARKS)) == 4
 
 
-def test_sources_of_a_budget_are_told_apart_by_colour_or_hatching() -> None:
-    assert set(LOOKS) == set(SOURCES)
-    for one, other in combinations(LOOKS.values(), 2):
-        assert one[1] != other[1] or not is_told(one[0], other[0]), (one, other)
-
-
 @pytest.mark.parametrize(
     ("one", "other"),
     [
@@ -170,10 +162,3 @@ def test_states_on_the_pages_are_told_apart_and_can_be_read(
     for back, letters in (found[state] for state in states):
         for eye in EYES:
             assert abs(lab(back, eye)[0] - lab(letters, eye)[0]) > 50.0
-
-
-def test_what_is_unsure_in_a_summary_is_told_from_what_is_sure() -> None:
-    style = (TEMPLATES / "summary.html").read_text(encoding="utf-8")
-    strokes = dict(re.findall(r"\.(\w+) \{ stroke: (#\w+);", style))
-    assert not is_told(strokes["dots"], strokes["unsure"])
-    assert not is_told(strokes["m"], strokes["f"])

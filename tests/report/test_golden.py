@@ -105,9 +105,6 @@ def auto() -> Fit:
 CASES: dict[str, Callable[[], str]] = {
     "published": lambda: printed("published"),
     "check": lambda: printed("check", TEST),
-    "check_model": lambda: printed(
-        "check", TEST, "--model", "bistable", "--published", "foam-1/model-1"
-    ),
     "fit_one_spring": lambda: summary_text(one_spring()),
     "fit_one_spring_verbose": lambda: summary_text(one_spring(), verbose=True),
     "fit_two_springs": lambda: summary_text(with_rows(fabricated.chain_result())),

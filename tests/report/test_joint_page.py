@@ -1,6 +1,5 @@
 """The picture and the page of a joint fit."""
 
-import os
 import re
 from dataclasses import replace
 
@@ -13,7 +12,7 @@ from conftest import AREA, HEIGHT
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
-from foamfit.report.figures import STYLE, image, laid_out, plotted, table
+from foamfit.report.figures import STYLE, image, laid_out
 from foamfit.report.studies.joint import joint_page, joint_text, plot_joint
 from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import Alternative, fit_jointly
@@ -177,27 +176,6 @@ def test_the_words_have_the_same_numbers(found):
     assert "warning: x.csv is left out" in told
     assert re.search(r"s1_sigma_plus +log rate +1\d\d\.\d kPa", told)
     assert "*  log rate" in told
-
-
-def test_what_the_picture_shows_is_in_its_table(found) -> None:
-    head, *rows = plotted(plot_joint(found))
-    assert head[:2] == ("panel", "series")
-    for t, (test, measurement) in enumerate(zip(found.tests, found.measurements, strict=True)):
-        drawn = [row for row in rows if row[:2] == (test, "measured")]
-        step = max(measurement.stress.size // 400, 1)
-        strain = measurement.displacement[::step] / measurement.specimen.height
-        np.testing.assert_allclose([float(row[4]) for row in drawn], strain, rtol=1e-5, atol=1e-12)
-        assert {row[2] for row in drawn} == {"strain"}
-        assert all(row[3].startswith("stress (") for row in drawn)
-        assert any(row[:2] == (test, "fitted") for row in rows), t
-    assert {"95 % interval", "determined"} <= {row[1] for row in rows}
-
-
-def test_a_name_that_is_no_unicode_stands_in_the_table(found) -> None:
-    odd = replace(found, tests=(os.fsdecode(b"foam \xe9"), *found.tests[1:]))
-    parameters = {n: replace(p, tests=None) for n, p in found.parameters.items()}
-    figure = plot_joint(replace(odd, parameters=parameters))
-    assert b"foam \\udce9,measured" in table(figure)
 
 
 def test_in_one_column_nothing_is_wider(found) -> None:

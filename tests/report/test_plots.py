@@ -9,14 +9,13 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 import fabricated
 import foamfit as ff
 from foamfit.api import FitResult
 from foamfit.errors import InputError
-from foamfit.fitting.branches import Section
-from foamfit.report.figures import STYLE, image, laid_out
-from foamfit.report.identifiability_plots import without_shakes
+from foamfit.report.figures import MOST_POINTS, STYLE, drawing, image, laid_out
 from foamfit.report.plots import origin_word, plot_fit, plot_residuals, plot_response
 from foamfit.report.readable import readable_unit
 from foamfit.results import Switch
@@ -310,20 +309,6 @@ def test_a_microscale_loop_that_does_not_reach_branch_c_is_drawn() -> None:
     assert "c" not in texts(loop)
 
 
-def test_shakes_of_a_measured_motion_are_no_branch_of_their_own() -> None:
-    cuts = tuple(
-        Section(name, start, stop)
-        for name, start, stop in (
-            ("snap-through", 0, 400), ("held", 400, 402), ("snap-through", 402, 600),
-            ("held", 600, 640), ("snap-back", 640, 1000),
-        )
-    )  # fmt: skip
-    kept = without_shakes(cuts, 1000)
-    assert [(cut.branches, cut.start, cut.stop) for cut in kept] == [
-        ("snap-through", 0, 600), ("held", 600, 640), ("snap-back", 640, 1000)
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize("k0", [4e5, 3e6, 1e7])
 def test_names_of_branches_stay_in_their_panel(k0: float) -> None:
     spring = replace(fabricated.MICRO, k0=k0, sigma_plus=1.5e5, spread_plus=0.2)
@@ -336,3 +321,23 @@ def test_names_of_branches_stay_in_their_panel(k0: float) -> None:
     loop = figure.axes[-1]
     (name,) = (text for text in loop.texts if text.get_text() == "snap-through")
     assert name.get_window_extent().x0 >= loop.get_window_extent().x0
+
+
+def test_a_long_line_is_drawn_through_what_can_be_seen() -> None:
+    n = 100_000
+    x = np.linspace(0.0, 1.0, n)
+    y = np.sin(40.0 * x)
+    y[[33_333, 77_777]] = 3.0, -2.0
+    pictures = []
+    for limit in (MOST_POINTS, n):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("foamfit.report.figures.MOST_POINTS", limit)
+            with drawing(3.0, 2.0) as figure:
+                ax = figure.subplots()
+                (line,) = ax.plot(x, y, lw=0.9, label="y")
+        pictures.append(image(figure, "png", 100))
+        kept = line.get_xydata()
+        assert len(kept) == (n if limit == n else pytest.approx(2000, abs=1000))
+        assert {3.0, -2.0} <= set(kept[:, 1])
+    thin, whole = (imread(io.BytesIO(png))[..., :3] for png in pictures)
+    assert np.mean(np.abs(thin - whole) > 0.1) < 0.002

@@ -648,7 +648,6 @@ def rows_of(count):
         status = ("ok", "warnings", "failed")[i % 3]
         yield Row(
             f"test-{i:04d}", f"data/test-{i:04d}.csv", status, None, base.misfit, 1.0, given,
-            base.sketch,
         )  # fmt: skip
     yield Row("<b>", "<b>.csv", "refused", "no <height> & no width")
 
@@ -660,13 +659,11 @@ def test_the_page_of_a_thousand_tests_is_small_and_needs_nothing_else(tmp_path):
     assert len(page) < 2_500_000
     assert not re.search(r"(src|href)=\"(https?:)?//", page)
     assert page.count("<tr>") == 1002
-    assert page.count('<path class="m" d="M') == 1000
-    assert page.count('<div class="strip">') == 7  # what is held is no column
     assert "no &lt;height&gt; &amp; no width" in page
     assert page.count("<i>") >= 6000  # intervals
 
 
-def test_the_page_has_no_misfit_that_no_test_has_and_no_axis_below_zero_without_need(tmp_path):
+def test_the_page_has_no_misfit_that_no_test_has(tmp_path):
     cells = [[float(k), None, 0.5 * k, 1.5 * k, "determined", "Pa"] for k in (1, 2, 40)]
     rows = [
         Row(f"t{i}", f"t{i}.csv", "ok", None, {"stress_strain": 0.01, "stress_time": None}, 1.0,
@@ -678,9 +675,6 @@ def test_the_page_has_no_misfit_that_no_test_has_and_no_axis_below_zero_without_
     assert "misfit loop" in page
     assert "misfit u(t)" not in page
     assert "misfit σ(t)" not in page
-    ends = re.search(r'<div class="ends"><span>(.*?)</span>.*<span>(.*?)</span></div>', page)
-    assert ends is not None
-    assert float(ends[2]) == 0.0
 
 
 def test_of_very_many_tests_the_page_shows_some_and_all_that_failed(tmp_path):
@@ -690,17 +684,6 @@ def test_of_very_many_tests_the_page_shows_some_and_all_that_failed(tmp_path):
     page = (tmp_path / "summary.html").read_text(encoding="utf-8")
     assert f"This page shows {MOST_ON_PAGE + 1} of them" in page
     assert "last" in page
-
-
-def test_a_sketch_follows_the_curves():
-    result = fabricated.result()
-    sketch = row_of("t", "t.csv", result).sketch
-    numbers = [int(n) for n in re.findall(r"-?\d+", sketch.measured)]
-    points = np.cumsum(np.reshape(numbers, (-1, 2)), axis=0)
-    top = np.argmin(points[:, 1])
-    assert points[:, 0].min() >= 0
-    assert points[:, 0].max() == points[top, 0] == 116
-    assert sketch.ends.startswith("35 % strain, ")
 
 
 def test_models_with_other_parameters_leave_cells_empty():
@@ -718,4 +701,3 @@ def test_the_page_of_a_batch_shows_the_range_that_a_state_goes_by(tmp_path: Path
     write_page(rows, tmp_path, "two tests")
     page = (tmp_path / "summary.html").read_text()
     assert "198 to 202; range 40 to 710" in page
-    assert page.split('class="ranges"')[1].split('d="')[1].startswith("M225")

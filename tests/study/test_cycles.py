@@ -1,7 +1,8 @@
-"""The cycles of a record: each on its own, then together, and their folder."""
+"""The cycles of a record, each on its own, and their folder."""
 
 import csv
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +11,9 @@ import pytest
 from click.testing import CliRunner
 
 import foamfit as ff
-from conftest import DATA, needs_data, thinned, without_pictures
+from conftest import DATA, EXPERIMENTS, needs_data, thinned, without_pictures
 from cycled import FRESH, ONSETS, SETS, write_record
 from foamfit.cli import main
-from foamfit.report.figures import plotted
 from foamfit.report.studies import cycles as cycles_report
 
 
@@ -49,85 +49,6 @@ def test_a_cycle_that_is_not_there_is_a_row_with_its_sentence(found):
     assert np.isnan(row["s1_k0"])
 
 
-def test_what_changes_by_cycle_is_found(found):
-    selection = found.selection
-    assert found.together == (1, 2, 3)
-    first, second = selection.steps[:2]
-    assert (first.own, second.own) == ((), ("s1_eps_a",))
-    assert selection.explained(second) > 0.9  # the rest is where contact is found in each cycle
-    assert "s1_eps_a" in selection.best.own
-    assert selection.bic_alone > selection.best.bic
-    best = selection.best.fits[0]
-    # Cycles 2 and 3 have a contact of their own, whose displacement is not exact.
-    assert best.own == ("s1_eps_a", "displacement_zero")
-    assert ["displacement_zero" in one.free() for one in best.problems] == [False, True, True]
-    assert best.n_vary == len(best.shared) + 5
-    assert best.value("s1_eps_a") == pytest.approx(ONSETS, abs=2e-3)
-    assert len(set(best.value("s1_dsigma"))) == 1  # one value for all, not one share of σ_a
-    told = " ".join(found.sentences)
-    assert "may be shared: misfit" in told
-    assert "From cycle 1 to 3: s1_eps_a falls by" in told
-
-
-def told_of(found, spans, together):
-    """Sentences on eps_a, with these 95 % intervals of the cycles and values of all together."""
-    from foamfit.study import cycles
-
-    results = {}
-    for number, (low, high) in zip(found.together, spans, strict=True):
-        result = found.results[number]
-        one = replace(
-            result.parameters["s1_eps_a"], value=0.5 * (low + high), ci95=(low, high), range=None
-        )
-        results[number] = replace(result, parameters={**result.parameters, "s1_eps_a": one})
-    selection = found.selection
-    best = selection.best
-    index = best.fits[0].problems[0].index["s1_eps_a"]
-    values = [np.where(np.arange(one.size) == index, value, one)
-              for one, value in zip(best.fits[0].values, together, strict=True)]  # fmt: skip
-    step = replace(best, fits=(replace(best.fits[0], values=tuple(values)),))
-    steps = tuple(step if one is best else one for one in selection.steps)
-    moved = replace(found, results=results)
-    return " ".join(cycles._sentences(moved, replace(selection, steps=steps)))
-
-
-@pytest.mark.parametrize(
-    ("spans", "together", "wanted"),
-    [
-        ([(0.10, 0.11), (0.12, 0.13), (0.14, 0.15)], [0.1, 0.12, 0.15], "s1_eps_a rises by 50 % ("),
-        # the fit of all cycles goes the other way than their own fits
-        ([(0.10, 0.11), (0.12, 0.13), (0.14, 0.15)], [0.15, 0.12, 0.1], "cycles hop: s1_eps_a of"),
-        # there and back
-        ([(0.10, 0.11), (0.30, 0.31), (0.14, 0.15)], [0.1, 0.12, 0.15], "cycles hop: s1_eps_a of"),
-        ([(0.10, 0.15), (0.12, 0.13), (0.14, 0.19)], [0.1, 0.12, 0.15], "no trend is said: the"),
-        ([(-np.inf, np.inf), (0.1, 0.2), (0.3, 0.4)], [0.1, 0.1, 0.2], "no trend is said: the"),
-    ],
-)
-def test_a_trend_is_said_where_values_ranges_and_joint_fit_agree(found, spans, together, wanted):
-    told = told_of(found, spans, together)
-    assert wanted in told
-    assert ("rises" in told or "falls" in told) == ("rises" in wanted)
-
-
-def test_cycles_together_are_spread_over_a_long_record():
-    from foamfit.study.cycles import MOST_TOGETHER, spread
-
-    numbers = [*range(1, 51), *range(60, 1001, 10)]
-    chosen = spread(numbers)
-    assert len(chosen) == MOST_TOGETHER
-    assert (chosen[0], chosen[-1]) == (1, 1000)
-    assert set(chosen) <= set(numbers)
-    assert spread([2, 5]) == (2, 5)
-
-
-def test_one_cycle_has_nothing_to_be_together_with(record):
-    alone = ff.fit_cycles(record, cycles=(2,), starts=2, intervals="local")
-    assert alone.selection is None
-    assert alone.sentences == (
-        "The cycles are not fitted together, because fewer than two cycles have a fit.",
-    )
-
-
 def test_a_cycle_that_the_record_lacks_is_a_wrong_call(record, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     told = CliRunner().invoke(main, ["fit", str(record), "--cycle", "1,99"])
@@ -135,12 +56,9 @@ def test_a_cycle_that_the_record_lacks_is_a_wrong_call(record, tmp_path, monkeyp
     assert "has no cycle 99; its cycles are 1 to 3" in told.stderr
 
 
-@pytest.mark.parametrize("at", ["reading", "fit", "together"])
+@pytest.mark.parametrize("at", ["reading", "fit"])
 def test_ctrl_c_keeps_what_was_found(record, monkeypatch, at):
     from foamfit.study import cycles
-
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
 
     tried, real = [], cycles.fit
 
@@ -153,14 +71,10 @@ def test_ctrl_c_keeps_what_was_found(record, monkeypatch, at):
         return real(*words, **options)
 
     monkeypatch.setattr(cycles, "fit", fit)
-    if at == "together":
-        monkeypatch.setattr(cycles, "select_own", interrupted)
     kept = ff.fit_cycles(record, starts=1, intervals="local")
-    assert list(kept.results) == {"reading": [1], "fit": [1, 2], "together": [1, 2, 3]}[at]
+    assert list(kept.results) == {"reading": [1], "fit": [1, 2]}[at]
     assert all("Ctrl-C" in why for why in kept.refused.values())
     assert len(kept.results) + len(kept.refused) == 3
-    assert kept.selection is None
-    assert "together" in kept.sentences[0]
 
 
 # -------------------------------------------------------------------------------- the folder
@@ -169,7 +83,6 @@ def test_ctrl_c_keeps_what_was_found(record, monkeypatch, at):
 def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
-    monkeypatch.setattr(cycles_report, "table", lambda _: b"")
     monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
     folder = tmp_path / "out"
     found.results[1].save(folder)  # of a fit of one cycle
@@ -177,7 +90,6 @@ def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path,
     names = {path.name for path in folder.iterdir()}
     assert names == {
         "cycle-1", "cycle-2", "cycle-3", "cycles.csv", "cycles.json", "cycles.png",
-        "cycles-plotted.csv",
     }  # fmt: skip
     assert json.loads((folder / "cycle-2" / "fit.json").read_text())["data"]["cycle"] == 2
     with (folder / "cycles.csv").open(newline="") as file:
@@ -188,8 +100,6 @@ def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path,
     assert rows[0]["s1_k0_state"] == "determined"
     assert float(rows[1]["dissipated_energy"]) > 0.0
     content = json.loads((folder / "cycles.json").read_text())
-    assert "s1_eps_a" in content["together"]["own"]
-    assert [step["chosen"] for step in content["together"]["steps"]].count(True) == 1
     assert content["refused"]["7"] == found.refused[7]
     found.save(folder)
     found.results[1].save(folder)
@@ -200,29 +110,12 @@ def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path,
 def test_what_foamfit_did_not_write_is_not_replaced(found, tmp_path, monkeypatch, place):
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
-    monkeypatch.setattr(cycles_report, "table", lambda _: b"")
     monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
     found.save(tmp_path / "out")
     (tmp_path / "out" / place).write_text("mine")
     with pytest.raises(ff.InputError, match="did not write"):
         found.save(tmp_path / "out")
     assert (tmp_path / "out" / place).read_text() == "mine"
-
-
-def test_what_the_picture_shows_is_in_its_table(found):
-    _, *rows = plotted(cycles_report.plot_cycles(found))
-    loop = [row for row in rows if row[1] == "cycle 2"]
-    measured = found.results[2].curves.measured_stress
-    np.testing.assert_allclose([float(row[5]) for row in loop], measured / 1e3, rtol=1e-5)
-    assert {row[2:4] for row in loop} == {("strain from the first contact", "stress (kPa)")}
-    (value,) = [
-        float(row[5]) for row in rows
-        if row[0].startswith("k0 (") and row[1] == "determined" and row[4] == "2"
-    ]  # fmt: skip
-    k0 = found.results[2].parameters["s1_k0"]
-    assert value == pytest.approx(k0.value / 1e6, rel=1e-5)
-    names = {row[1] for row in rows}
-    assert {"95 % interval", "fitted together", "cycle 1, fitted", "cycle 3, fitted"} <= names
 
 
 def test_in_one_column_two_panels_stand_side_by_side(found):
@@ -277,13 +170,11 @@ def test_one_cycle_is_fitted_as_any_test(record, tmp_path, monkeypatch):
 def test_all_cycles_are_fitted_in_turn(record, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
-    monkeypatch.setattr(cycles_report, "table", lambda _: b"")
     monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
     words = ("fit", record, "--cycle", "all", "--starts", 2, "--out", tmp_path / "out")
     result = run(*words, "--fix", "s1_kc=20e6")
     assert result.exit_code == 0
     assert "3 of 3 cycles fitted" in result.stdout
-    assert "fitted together, what each cycle has of its own:" in result.stdout
     assert (tmp_path / "out" / "cycle-3" / "fit.json").is_file()
     assert json.loads((tmp_path / "out" / "cycles.json").read_text())["fitted"] == [1, 2, 3]
 
@@ -291,7 +182,6 @@ def test_all_cycles_are_fitted_in_turn(record, tmp_path, monkeypatch):
 def test_json_holds_every_cycle(record, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
-    monkeypatch.setattr(cycles_report, "table", lambda _: b"")
     monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
     words = ("--starts", 1, "--json", "--out", tmp_path / "out")
     result = run("fit", record, "--cycle", "1,2", *words)
@@ -311,7 +201,11 @@ def test_json_holds_every_cycle(record, tmp_path, monkeypatch):
 def test_three_cycles_of_a_shoe_foam_share_all_but_snap_through_and_relaxation(tmp_path):
     """Measurements: arXiv:2602.12694."""
     from foamfit.one_model import Options
-    from foamfit.study.shared import Group, step_of
+
+    sys.path.insert(0, str(EXPERIMENTS / "damage"))
+    from selection import step_of
+
+    from foamfit.study.shared import Group
 
     toml = tmp_path / "specimen.toml"
     toml.write_text(
@@ -321,7 +215,7 @@ def test_three_cycles_of_a_shoe_foam_share_all_but_snap_through_and_relaxation(t
     record = DATA / "shoe-foam-twins" / "new-heel-comp-1_raw.txt"
     path = thinned(record, tmp_path, 2)
     options = {"model": "microscale", "relaxation": 1, "intervals": "local"}
-    found = ff.fit_cycles(path, toml, cycles=(1, 2, 4), together=False, **options)
+    found = ff.fit_cycles(path, toml, cycles=(1, 2, 4), **options)
     assert found.recorded == (1, 2, 3, 4, 5, 6)
     strains = found.table["start_strain"]
     assert strains[1] == 0.0

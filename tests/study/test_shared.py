@@ -1,13 +1,17 @@
 """Which parameters several tests share."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from conftest import HEIGHT, synthetic_loop
+from conftest import EXPERIMENTS, HEIGHT, synthetic_loop
 from foamfit.fitting.problem import make_problem
-from foamfit.study.shared import Group, effective_samples, select_own
+from foamfit.study.shared import Group, effective_samples
+
+sys.path.insert(0, str(EXPERIMENTS / "damage"))
+from selection import select_own
 
 SPRING, LOOP = synthetic_loop(noise=0.0)
 

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.optimize import least_squares
 
 import foamfit as ff
 from conftest import AREA, EXPERIMENTS, HEIGHT, synthetic_impact, synthetic_loop
-from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.fitting.branches import FLIGHT, Section
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord
-from foamfit.report import outlook as planning
 from foamfit.report.comparison import published_side
 from foamfit.report.identifiability_plots import (
     plot_insight,
@@ -29,13 +24,12 @@ from foamfit.report.identifiability_plots import (
 from foamfit.report.page import render_report
 from foamfit.report.summary import summary_text
 from foamfit.results import Intervals
-from foamfit.springs.chain import Chain, Impact
+from foamfit.springs.chain import Impact
 from foamfit.trust import checklist
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import Check, status_of
 from foamfit.trust.conclude import conclude
-from foamfit.trust.identifiability import Insight
-from reference import reference_impact
+from foamfit.trust.identifiability import Insight, look
 
 IMPACT = Impact(mass=7e-3, velocity=1.75)
 SLOW = EXPERIMENTS / "foam-1" / "model-1-1.75mps-reconstruction.csv"
@@ -82,38 +76,7 @@ def insight_of(scaled: np.ndarray, values: np.ndarray | None = None) -> Insight:
     )  # fmt: skip
 
 
-# ---------------------------------------------------------------- the closing velocity
-
-
-@pytest.mark.parametrize("name", ["foam-1/model-1", "foam-1/model-2"])
-def test_the_closing_velocity_brings_the_energy_of_the_way_to_c1(name: str) -> None:
-    """An undamped striker comes to C1 if m v²/2 = A H ∫σ dε, branch a then d; model.md: 1.911."""
-    s = ff.published[name].bistable
-    rise = s.eps_hat_c - s.eps_a
-    work = s.k0 * (-s.eps_a - math.log1p(-s.eps_a)) + s.sigma_a * rise + 0.5 * s.kh_plus * rise**2
-    direct = math.sqrt(2.0 * AREA * HEIGHT * work / IMPACT.mass)
-    found = planning.closing_velocity(Chain([s], [HEIGHT], AREA), IMPACT, 1)
-    assert found == pytest.approx(direct, rel=3e-5)
-    assert found == pytest.approx(1.911, abs=6e-4)
-
-
-def test_the_closing_velocity_of_a_chain_by_independent_integration() -> None:
-    item = ff.published["foam-1/model-3"]
-    chain = Chain(item.chain.springs, item.chain.heights, item.chain.area, [0.0, 0.0])
-    found = planning.closing_velocity(chain, IMPACT, 2)
-    assert found == pytest.approx(1.923, abs=6e-4)
-    time = np.linspace(0.0, 1.2e-3, 7)
-    for factor, closed in ((0.999, False), (1.001, True)):
-        run = reference_impact(chain, Impact(IMPACT.mass, factor * found), time, rtol=1e-9)
-        assert any(branch == "c" for _, _, branch in run.switches) == closed
-
-
-def test_dampers_raise_the_closing_velocity_and_a_wall_has_none() -> None:
-    spring = ff.published["foam-1/model-1"].bistable
-    damped = Chain([spring], [HEIGHT], AREA, site_damping=200.0)
-    assert planning.closing_velocity(damped, IMPACT, 1) > 1.95
-    stiff = Chain([replace(spring, k0=1e14, kc=1e15, kh_plus=1e14)], [HEIGHT], AREA)
-    assert planning.closing_velocity(stiff, IMPACT, 1) is None
+# ---------------------------------------------------------------- errors to expect
 
 
 # ---------------------------------------------------------------- expected errors
@@ -125,8 +88,8 @@ def test_the_errors_to_expect_are_the_scatter_of_refits() -> None:
     problem = problem_of(test)
     values = values_of(problem, spring)
     noise = {"stress_time": test.noise.stress, "displacement_time": test.noise.displacement}
-    outlook = planning.expect(problem, values, noise)
-    names = outlook.insight.names
+    insight = look(BestPoint(problem, values), noise)
+    names = insight.names
     places = [problem.index[name] for name in names]
     sizes = problem.sizes(names, values)
     clean = problem.objective.residual(values)  # simulated minus the noisy curves
@@ -143,29 +106,9 @@ def test_the_errors_to_expect_are_the_scatter_of_refits() -> None:
 
         fit = least_squares(residual, values[places] / sizes, jac=lambda _: slopes * sizes)
         found.append(fit.x * sizes)
-    expected = [outlook.estimates[name].stderr for name in names]
-    ratios = np.std(found, axis=0, ddof=1) / expected
+    ratios = np.std(found, axis=0, ddof=1) / insight.stderr
     assert np.all((ratios > 0.72) & (ratios < 1.32)), dict(zip(names, ratios, strict=True))
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.12)
-
-
-def test_half_the_noise_of_the_only_channel_halves_all_errors() -> None:
-    rng = np.random.default_rng(1)
-    insight = insight_of(rng.standard_normal((80, 3)))
-    assert planning.worth(insight)["stress_time"] == pytest.approx(dict.fromkeys("pqr", 0.5))
-
-
-def test_the_worth_of_a_channel_is_that_of_a_test_with_less_noise() -> None:
-    spring, test = synthetic_impact()
-    problem = problem_of(test)
-    values = values_of(problem, spring)
-    noise = {"stress_time": 4e4, "displacement_time": 4e-6}
-    now = planning.expect(problem, values, noise)
-    quiet = planning.expect(problem, values, noise | {"displacement_time": 2e-6})
-    for name, ratio in planning.worth(now.insight)["displacement_time"].items():
-        assert 0.5 <= ratio <= 1.0
-        direct = quiet.estimates[name].stderr / now.estimates[name].stderr
-        assert ratio == pytest.approx(direct, rel=1e-6)
 
 
 # ---------------------------------------------------------------- directions in words
@@ -351,7 +294,11 @@ def test_trials_that_fail_and_masses_that_ring_are_asked_after() -> None:
     heavy = replace(test, specimen=Specimen(HEIGHT, AREA, 5.56e-6, item.chain.heights))
     params = make_params(heavy, "linear+bistable")
     problem = make_problem(heavy, "linear+bistable", None, params, None, interior_mass=True)
-    values = planning.known_values(problem, published_side("foam-1/model-3"))
+    known = {name: p.value for name, p in published_side("foam-1/model-3").estimates.items()}
+    values = problem.vector()
+    for name in problem.model.names:
+        values[problem.model.index[name]] = 0.0 if name.endswith("eta") else known[name]
+    values = problem.space().complete(values)
     result = conclude(BestPoint(problem, values), SearchRecord(0, 8, 0.0, AGREED))
     assert answers(result)["vibration"] is False
     assert "determined" not in {p.state for p in result.parameters.values()}
@@ -459,120 +406,22 @@ def test_a_damper_that_may_be_none_is_not_called_determined() -> None:
     assert result.parameters["s1_eta"].state == "determined"
 
 
-# ---------------------------------------------------------------- check --model
-
-
-def said(*args: object) -> str:
-    result = CliRunner().invoke(main, [str(arg) for arg in args])
-    assert result.exit_code == 0, result.output
-    return " ".join(result.stdout.split())
-
-
-def test_check_answers_for_a_test_that_is_there(tmp_path: Path) -> None:
-    picture = tmp_path / "what.png"
-    text = said(
-        "check", SLOW, "--model", "bistable", "--published", "foam-1/model-1", "--plot", picture
-    )
-    assert "At 1.75 m/s spring 1 turns back on branch d; the loop closes from 1.911 m/s on." in text
-    assert "The channel worth measuring better is stress-time." in text
-    assert "s1_kc: not determined, branch c of spring 1 is not reached." in text
-    assert "s1_kc MPa 82.50 not determined 82.50 ± " in text
-    # where they are in the file; a plan has the same record in mind
-    assert re.search(r"contact time t₀ µs 62\.58 ± 0\.\d+ determined 62\.6 ± ", text)
-    assert re.search(r"zero of the motion w₀ µm −3\.2 ± \d\.\d weak −3\.2 ± ", text)
-    assert picture.read_bytes().startswith(b"\x89PNG")
-
-
-def test_check_calls_a_guess_a_guess() -> None:
-    text = said("check", SLOW, "--model", "bistable")
-    assert "the best of 4 quick descents" in text
-    assert (
-        "is a guess: this test does not determine s1_kc, s1_dsigma, s1_eps_c, s1_kh_minus" in text
-    )
-
-
-def test_check_answers_for_a_test_that_is_only_planned(tmp_path: Path) -> None:
-    plan = tmp_path / "plan.toml"
-    plan.write_text(
-        'name = "next week"\n[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n'
-        '[striker]\nmass = "7 g"\nvelocity = "2.1 m/s"\n[noise]\nstress = "20 kPa"\n'
-    )
-    text = said("check", plan, "--model", "bistable", "--published", "foam-1/model-1")
-    assert "spring 1 closes its loop; the loop closes from 1.911 m/s on." in text
-    assert "stress-time 20 kPa (stated)" in text
-
-
-def test_a_slow_test_is_told_by_its_strain() -> None:
-    text = said("check", SLOW, "--model", "bistable", "--drive", "displacement",
-                "--published", "foam-1/model-1")  # fmt: skip
-    assert "the loop closes from an overall strain of 0.346 (3.839 MPa) on." in text
-
-
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (["--plot", "x.png"], "--plot needs --model"),
-        (["--drive", "impact"], "--drive needs --model"),
-        (["--model", "bistable", "--published", "foam-9"], "no published set 'foam-9'"),
-        (["--model", "bistable", "--published", "foam-2"], "foam-2 is a linear+bistable"),
-        (["--model", "bistable", "--params", "nowhere"], "nowhere is not a result folder"),
-        (["--model", "bistable", "--plot", "x.doc"], "x.doc"),
-        (["--model", "rubber"], "rubber"),
-    ],
-)
-def test_check_refuses_in_one_line(
-    args: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(main, ["check", str(SLOW), *args])
-    assert result.exit_code == 1
-    assert words in result.stderr
-    assert len(result.stderr.splitlines()) == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_plan_says_what_it_needs(tmp_path: Path) -> None:
-    plan = tmp_path / "plan.toml"
-    plan.write_text('[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n')
-    for args, words in (
-        ([], "--published or --params"),
-        (["--published", "foam-1/model-1"], "[striker] mass is missing"),
-    ):
-        result = CliRunner().invoke(main, ["check", str(plan), "--model", "bistable", *args])
-        assert result.exit_code == 1
-        assert words in result.stderr
-
-
 # ---------------------------------------------------------------- pictures and report
 
 
-def test_the_pictures_show_every_parameter_and_curve() -> None:
+def test_the_picture_shows_every_parameter() -> None:
     result = concluded()
-    names, curves = result.insight.names, result.insight.curves
-    above, below = plot_insight(result.insight, result.correlation.matrix).subfigs
-    for panel, curve in zip(above.axes, curves, strict=True):
-        lines = [line for line in panel.lines if len(line.get_xdata()) > 2]
-        # Where the numbers of a row stand in the panel.
-        places = [line.get_transform() - panel.transData for line in lines]
-        pairs = zip(places, lines, strict=True)
-        traces = [at.transform(line.get_xydata())[:, 1] for at, line in pairs]
-        assert len(traces) == len(names)
-        for i, (name, trace) in enumerate(zip(names, traces, strict=True)):
-            shown, true = i - np.asarray(trace), result.insight.along(name, curve)
-            largest = np.abs([shown, true]).max(axis=1)  # nothing where a curve knows no zero
-            off = np.abs(shown * largest[1] - true * largest[0]).max()
-            assert off <= 0.01 * np.prod(largest)
-            assert (largest[0] > 0.01) == (largest[1] > 0.0)
-    left, right = below.axes
+    names = result.insight.names
+    left, right = plot_insight(result.insight, result.correlation.matrix).axes
     assert [label.get_text() for label in left.get_yticklabels()] == list(names)
     diagonal = [text for text in right.texts if text.get_text() == "1"]
     assert len(diagonal) >= len(names)
 
 
-def test_report_and_plan_show_them_too() -> None:
+def test_the_report_shows_them_too() -> None:
     result = concluded()
     page = render_report(result)
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 3
     for words in (
         "Checklist",
         "What the test determines",
@@ -581,11 +430,6 @@ def test_report_and_plan_show_them_too() -> None:
         assert words in page
     assert result.insight.sentence() in page
     assert result.insight.sentence() in " ".join(summary_text(result, verbose=True).split())
-    spring, test = synthetic_impact()
-    problem = problem_of(test)
-    plan = planning.make_outlook(problem, values_of(problem, spring), "the truth")
-    figure = plot_insight(plan.planned.insight, title="before the fit")
-    assert [len(half.axes) for half in figure.subfigs] == [2, 2]
 
 
 # ---------------------------------------------------------------- what the words leave out

@@ -40,12 +40,12 @@ def compare(
     from foamfit.report.comparison import comparison_text, plot_comparison, write_csv
 
     read = [path / "fit.json" if path.is_dir() else path for path in results]
-    own = options.check_files(table, plot, read)
+    options.check_files(table, plot, read)
     comparison = side_by_side(results, name)
     say(comparison_text(comparison))
     if plot is not None:
-        plot_comparison(comparison, plot, width=figure_width, table=own)
-        say(f"\ndrawn in {plot}, its data in {plot.with_suffix('.csv')}")
+        plot_comparison(comparison, plot, width=figure_width)
+        say(f"\ndrawn in {plot}")
     if table is not None:
         write_csv(comparison, table)
         say(f"\nwritten to {table}")

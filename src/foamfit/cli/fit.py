@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 @options.TEST
 @options.SPECIMEN
 @options.CYCLE
+@options.CYCLES
 @fitting.fit_options
 @options.output("fits/<test>/<model>", "fit.json")
 @options.option("--verbose", "Print the checklist, reasons, notes and all models too.")
@@ -29,7 +30,7 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
     """Identify the parameters of TEST.csv and write a result folder.
 
     With several cycles the folder holds one result folder for each, cycles.csv, cycles.png and
-    cycles.json: what changes from cycle to cycle, by one fit of them together.
+    cycles.json: the parameters by cycle.
 
     Exit code 0: a fit was made; 1: the input or the call is wrong; 2: no acceptable fit was found
     (what was found is written); 70: a defect of foamfit; 130 and 143: ended by Ctrl-C or SIGTERM
@@ -41,11 +42,12 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
         foamfit fit TEST.csv --model auto --open
         foamfit fit TEST.csv --model microscale --relaxation 1
         foamfit fit TEST.csv --model microscale --relaxation 1 --cycle all
+        foamfit fit TEST.csv --model microscale --stiffening --mullins --cycles 1-3
         foamfit fit TEST.csv --drive displacement --out results/today --figure-width one
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
     output.check(without_report=False)
-    model = asked["model"] = fitting.model_name(asked["model"], asked["relaxation"])
+    model = asked["model"] = fitting.model_name(asked)
     with (
         options.compiling(output.silent, model, asked["relaxation"]) as compile_rest,
         options.drawing_beside() as drawers,

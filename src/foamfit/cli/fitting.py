@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from foamfit.cli.options import COUNT, DRIVE, RELAXATION, WHOLE, option, together
+from foamfit.cli.options import (
+    COUNT,
+    DRIVE,
+    MULLINS,
+    RELAXATION,
+    STIFFENING,
+    WHOLE,
+    option,
+    together,
+)
 from foamfit.cli.progress import Progress
 from foamfit.errors import InputError
 
@@ -22,7 +31,7 @@ if TYPE_CHECKING:
     from foamfit.study.cycles import CycleFits
 
 # Options that `foamfit.fit` does not take as keywords, and those that become its `intervals`.
-OF_ONE_MODEL, WAYS = ("cycle", "model", "fix", "vary"), ("profile", "bootstrap", "mcmc")
+OF_ONE_MODEL, WAYS = ("cycle", "cycles", "model", "fix", "vary"), ("profile", "bootstrap", "mcmc")
 
 
 def _fixes(
@@ -59,6 +68,8 @@ fit_options = together(
     option("--interior-mass", "Put the specimen's mass between the springs."),
     option("--time-shift", "Fit the delay of the motion against the force."),
     RELAXATION,
+    STIFFENING,
+    MULLINS,
     option(
         "--loss",
         "All but linear weigh large residuals less.",
@@ -73,11 +84,14 @@ fit_options = together(
 )
 
 
-def model_name(model: str, relaxation: int = 0) -> str:
+def model_name(asked: Mapping[str, Any]) -> str:
     """Return a model's name without spaces; InputError if there is no such model."""
-    from foamfit.springs.model import Model
+    from foamfit.springs.laws import OPTIONS
+    from foamfit.springs.model import Model, with_options
 
-    return "auto" if model.strip() == "auto" else Model.parse(model, relaxation).name
+    model = asked["model"].strip()
+    with_options(model, **{name: asked[name] for name in OPTIONS})
+    return "auto" if model == "auto" else Model.parse(model, asked["relaxation"]).words
 
 
 def cycles_of(text: str | None) -> tuple[int | None, tuple[int, ...] | None]:
@@ -116,9 +130,12 @@ def fit_as_asked(
     from foamfit.data.csv_file import read_test
 
     search = keywords_of(options)
-    model = model_name(options["model"])
+    model = model_name(options)
     alone, several = cycles_of(options["cycle"])
-    measurement = read_test(test, specimen, alone)
+    together = options.get("cycles")
+    if together is not None and options["cycle"] is not None:
+        raise InputError("give either --cycle or --cycles, not both")
+    measurement = read_test(test, specimen, alone, cycles=together)
     for number in set(several or ()).difference(measurement.cycles):
         last = f"its cycles are {min(measurement.cycles)} to {max(measurement.cycles)}"
         raise InputError(f"--cycle {options['cycle']}: {test} has no cycle {number}; {last}")
@@ -143,9 +160,10 @@ def _params(
     """Return the parameters of a model as --fix and --vary want them; None for auto."""
     from foamfit.fitting.curves import check_time_shift, choose_drive
     from foamfit.fitting.problem import fix_and_vary, make_params
+    from foamfit.springs.laws import OPTIONS
 
     drive, fix, vary = (options[name] for name in ("drive", "fix", "vary"))
-    more = {name: options[name] for name in ("time_shift", "relaxation")}
+    more = {name: options[name] for name in ("time_shift", "relaxation", *OPTIONS)}
     if options["time_shift"]:
         check_time_shift(measurement, drive or choose_drive(measurement))
     if model != "auto":

@@ -60,7 +60,7 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
         if not output.no_report:
             begin(jobs, len(read.tests), FEW_FOLDERS)
         with progress_line(output.silent, "joint fit") as line:
-            found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress, keep=folder)
+            found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
         output.finish(
             found.save,
             folder / "joint.html",

@@ -55,6 +55,26 @@ CYCLE = option(
     "Cycle of a slow record: a number, several as 1,2,10, or all. Default: the first.",
     metavar="N|all",
 )
+
+
+def _range(
+    context: click.Context, parameter: click.Parameter, text: str | None
+) -> tuple[int, int] | None:
+    """Read the first and the last number of several cycles."""
+    if text is None:
+        return None
+    first, dash, last = (part.strip() for part in text.partition("-"))
+    if not (dash and first.isdecimal() and last.isdecimal() and 0 < int(first) <= int(last)):
+        raise click.BadParameter(f"'{text}' is not FIRST-LAST in that order, like 1-3.")
+    return int(first), int(last)
+
+
+CYCLES = option(
+    "--cycles",
+    "Several cycles of a slow record as one history, with one set of parameters.",
+    metavar="FIRST-LAST",
+    callback=_range,
+)
 DRIVE = option(
     "--drive",
     "Default: impact if striker and time are known, else displacement.",
@@ -67,7 +87,9 @@ RELAXATION = option(
     default=0,
     metavar="N",
 )
-PLOT = option("--plot", "Also draw a PNG, PDF or SVG; its data go beside it as CSV.", FILE)
+STIFFENING = option("--stiffening", "Let branch a of microscale springs stiffen as the test says.")
+MULLINS = option("--mullins", "Let what has snapped once soften and weaken (microscale springs).")
+PLOT = option("--plot", "Also draw a PNG, PDF or SVG.", FILE)
 WIDTH = option(
     "--figure-width",
     'Width of figures: one column (3.25 in), two (7 in), or a length as "85 mm".',
@@ -194,11 +216,8 @@ def output(folder: str, printed: str) -> Callable[[Command], Command]:
     return add
 
 
-def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> bool:
-    """Refuse files that cannot be written, or that are read too, before anything is computed.
-
-    Returns whether the plotted data need a table of their own: `table` may be it already.
-    """
+def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> None:
+    """Refuse files that cannot be written, or that are read too, before anything is computed."""
     given = [path for path in (table, plot) if path is not None]
     for path in given:
         check_file(path)
@@ -206,16 +225,10 @@ def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -
             raise InputError(f"{path} is read by this command and would be lost; name another file")
     if len({path.resolve() for path in given}) < len(given):
         raise InputError(f"{given[0]} is named twice; the table and the figure must be two files")
-    if plot is None:
-        return False
-    from foamfit.report.figures import check_table, figure_format
+    if plot is not None:
+        from foamfit.report.figures import figure_format
 
-    figure_format(plot)
-    data = plot.with_suffix(".csv")
-    if table is not None and data.resolve() == table.resolve():
-        return False
-    check_table(data)
-    return True
+        figure_format(plot)
 
 
 # ---------------------------------------------------------------- what runs beside a command

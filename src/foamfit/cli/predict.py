@@ -19,6 +19,7 @@ from foamfit.cli.options import Output
 @options.option(
     "--cycle", "Cycle of a slow record. Default: the first.", options.COUNT, metavar="N"
 )
+@options.CYCLES
 @options.option(
     "--drive",
     "Default: that of the result.",
@@ -43,6 +44,7 @@ def predict(
     test: Path,
     specimen: Path | None,
     cycle: int | None,
+    cycles: tuple[int, int] | None,
     output: Output,
     **asked: Any,
 ) -> None:
@@ -57,6 +59,7 @@ def predict(
     Examples:
         foamfit predict fits/TEST/microscale OTHER.csv
         foamfit predict joint/new-heel OTHER.csv --cycle 2 --out predictions/second
+        foamfit predict fits/TEST/microscale TEST.csv --cycles 1-5
     """
     output.check(without_report=False)
     from foamfit.data.csv_file import read_test
@@ -70,7 +73,7 @@ def predict(
     folder = output.folder(default, (test, specimen or toml, result))
     read_source(result)  # a wrong path is reported before anything is compiled
     with options.compiling(output.silent) as compile_rest:
-        measurement = read_test(test, specimen, cycle)
+        measurement = read_test(test, specimen, cycle, cycles=cycles)
         from foamfit.study import predict as study
 
         compile_rest()

@@ -49,14 +49,12 @@ def simulate(
     microscale spring has k0, kc, eps_star, sigma_plus, spread_plus, sigma_minus and spread_minus;
     it and the bistable one may relax: relaxation = [{ g = 0.5, tau = "0.2 s" }].
     """
-    from foamfit.report.figures import check_table
-    from foamfit.scene_file import RESPONSE, files_of_scene, read_scene, write_response
+    from foamfit.scene_file import check_target, files_of_scene, read_scene, write_response
     from foamfit.solve.simulation import simulate as run
 
     target = Path(scene.with_suffix(".csv").name) if out is None else out
-    table = options.check_files(target, plot, files_of_scene(scene))
-    if target.is_file():
-        check_table(target, RESPONSE, "the response is to go, and is not one; choose another name")
+    options.check_files(target, plot, files_of_scene(scene))
+    check_target(target)
     with options.compiling(quiet=False) as compile_rest:
         chain, drive, time = read_scene(scene)
         compile_rest()
@@ -66,5 +64,5 @@ def simulate(
     if plot is not None:
         from foamfit.report.plots import plot_response
 
-        plot_response(response, plot, width=figure_width, table=table)
-        say(f"drawn in {plot}, its data in {plot.with_suffix('.csv')}")
+        plot_response(response, plot, width=figure_width)
+        say(f"drawn in {plot}")

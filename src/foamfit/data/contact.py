@@ -53,10 +53,9 @@ class Kink(NamedTuple):
 
 
 def _kink(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
-    """Time from which a signal rises as a straight line above the level before.
+    """Time from which a signal rises as a straight line; None if it rises from the first sample on.
 
-    Least squares on a grid of times, then on a finer one. None if a rise from the first sample does
-    about as well.
+    Least squares on a grid of times, then on a finer one.
     """
     block = 1 + len(time) // 500  # their means show it as well
     rows = len(time) // block
@@ -87,10 +86,7 @@ def _kink(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
 
 
 def _reached(values: Array, share: float) -> tuple[int, int]:
-    """First of three samples in a row above a share of the rise, and how many samples it took.
-
-    They are counted from the last one below a third of the share.
-    """
+    """First of three samples in a row above a share of the rise; samples from a third of it on."""
     up = values[: int(np.argmax(values)) + 1]
     base = float(np.percentile(up, 5))
     level = (up - base) / ((up[-1] - base) or 1.0)
@@ -143,15 +139,12 @@ def _at_kink(channel: str, time: Array, at: Kink, by: str, what: str = "rest") -
 
 
 def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool]:
-    """First value of a motion, by a line through its early rise, and whether its zero is elsewhere.
-
-    Fewer than five samples before the peak show no zero.
-    """
+    """First value of a motion, by a line through its rise, and whether its zero is elsewhere."""
     top = int(np.argmax(w))
     early = slice(0, max(5, top // 12))
     first = level_on_line(time[early], w[early], time[0], noise)[0]
     least = max(ELSEWHERE * first.error, 0.02 * (float(w[top]) - first.value))
-    return first.value, top >= 5 and abs(first.value) > least
+    return first.value, top >= 5 and abs(first.value) > least  # fewer show no zero
 
 
 def start_of_impact(record: Record, levels: Levels) -> Start:
@@ -199,18 +192,14 @@ def _first_sample(record: Record, levels: Levels) -> Start:
     level, slope = level_on_line(time[early], stress[early], time[0], levels["stress"])
     back = level.value / slope.value if slope.value > 0 else 0.0
     most = max(8 * (time[1] - time[0]), 0.15 * (time[np.argmax(stress)] - time[0]))
-    near = start.time == time[0] != 0 and back < most
-    if not near or level.value <= _ERRORS * level.error:
-        return start
-    how = "before the first sample, where the rise leads back to zero"
-    return Start(how, start.time - back, 0)
+    if start.time == time[0] != 0 and back < most and level.value > _ERRORS * level.error:
+        how = "before the first sample, where the rise leads back to zero"
+        return Start(how, start.time - back, 0)
+    return start
 
 
 def start_of_slow_test(record: Record, levels: Levels) -> Start:
-    """Find where a slow test starts: where its motion leaves a rest, or its stress does later.
-
-    Where neither is shown it is where the motion passes its own zero, or the first sample.
-    """
+    """Start where the motion leaves a rest, or the stress does later, or the motion passes zero."""
     time, w, stress = record.instants, record.displacement, record.stress
     first, elsewhere, peak = 0.0, False, float(stress.max())
     if w is not None:

@@ -49,8 +49,24 @@ from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
 
+def _first_and_last(cycle: int | None, cycles: tuple[int, int]) -> tuple[int, int]:
+    """Check the numbers of several cycles."""
+    if cycle is not None:
+        raise InputError("give either cycle or cycles, not both")
+    numbers = tuple(cycles) if isinstance(cycles, tuple | list) else ()
+    if len(numbers) != 2 or any(type(one) is not int or one < 1 for one in numbers):
+        raise InputError(
+            f"cycles = {cycles!r} must be the numbers of the first and the last, like (1, 3)"
+        )
+    return numbers[0], numbers[1]
+
+
 def read_test(
-    path: str | Path, specimen: str | Path | None = None, cycle: int | None = None
+    path: str | Path,
+    specimen: str | Path | None = None,
+    cycle: int | None = None,
+    *,
+    cycles: tuple[int, int] | None = None,
 ) -> Measurement:
     """Read a test file and its TOML, check both and condition the data.
 
@@ -64,6 +80,8 @@ def read_test(
         Number of the cycle of a slow test; without it that of ``[window]`` in the TOML, or else the
         first. A later cycle starts at its own contact: the strain that the foam has not recovered
         by then is taken off, and is the measurement's `start_strain`.
+    cycles : (int, int), optional
+        Numbers of the first and the last of several cycles, taken as one history.
 
     Returns
     -------
@@ -84,6 +102,9 @@ def read_test(
     settings = read_settings(toml, path, channels=CHANNELS)
     text = read_text(path, "the CSV file of a test", settings.sheet)
     window = settings.window if cycle is None else replace(settings.window, cycle=cycle)
+    if cycles is not None:
+        first, last = _first_and_last(cycle, cycles)
+        window = replace(window, cycle=first, last=last)
     table = find_table(text, {column.column for column in settings.columns.values()})
     columns = named.assign_columns(table, settings.columns, toml)
     record, notes = _record(table, columns, settings)

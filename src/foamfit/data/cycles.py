@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.data.measurement import Record
+from foamfit.data.measurement import Measurement, Record
 from foamfit.data.noise import noise_level, smooth
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
@@ -29,6 +29,7 @@ class Cycle:
     """One loading and unloading among the samples of a slow test: `first` up to `end`.
 
     `number` is that of the record's own column of cycles, or counts from 1; `place` counts from 0.
+    Several as one history are one with a `last` number, whose last peak is at `turn`.
     """
 
     number: int
@@ -36,6 +37,19 @@ class Cycle:
     first: int
     top: int
     end: int
+    last: int | None = None
+    turn: int = -1
+
+    @property
+    def last_top(self) -> int:
+        """Sample of the last peak."""
+        return self.top if self.last is None else self.turn
+
+    @property
+    def name(self) -> str:
+        """What it is called: "cycle 2", "cycles 1 to 3"."""
+        one = f"cycle {self.number}"
+        return one if self.last is None else f"cycles {self.number} to {self.last}"
 
 
 def find_cycles(record: Record) -> list[Cycle]:
@@ -70,8 +84,30 @@ def find_cycles(record: Record) -> list[Cycle]:
     return found
 
 
-def choose_cycle(cycles: list[Cycle], number: int | None) -> Cycle | None:
-    """Return the cycle with this number, the first one without; InputError if it is not there."""
+def choose_cycles(cycles: list[Cycle], number: int | None, last: int | None) -> Cycle | None:
+    """Return a cycle, or several as one history; InputError if they are not there.
+
+    Without a number it is the first one.
+    """
+    first = _choose(cycles, number)
+    if last is None or last == number:
+        return first
+    if first is None or len(cycles) == 1:
+        raise InputError(
+            f"cycles {number} to {last} cannot be taken: the record has no cycles to choose from; "
+            "leave them out."
+        )
+    end = _choose(cycles, last)
+    assert end is not None  # there are cycles
+    if end.place <= first.place:
+        raise InputError(
+            f"cycles {number} to {last} cannot be taken: cycle {last} comes before cycle {number} "
+            f"in the file; give them in order, like {last}-{number}."
+        )
+    return replace(first, end=end.end, last=end.number, turn=end.top)
+
+
+def _choose(cycles: list[Cycle], number: int | None) -> Cycle | None:
     if number is None or not cycles:
         return cycles[0] if cycles else None
     there = [cycle.number for cycle in cycles]
@@ -95,21 +131,24 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> tuple[Rec
     notes = []
     if n > 1 or end - start < len(record):
         order = "" if number == cycle.place + 1 else f" (number {cycle.place + 1} in the file)"
+        used = "is used" if cycle.last is None else "are used as one history"
         notes.append(
-            f"Cycle {number}{order} of {n} is used: {end - start} of {len(record)} samples, "
-            f"{start} before it and {len(record) - end} after it are cut."
+            f"{cycle.name.capitalize()}{order} of {n} {used}: {end - start} of {len(record)} "
+            f"samples, {start} before and {len(record) - end} after are cut."
         )
     largest = max(cycles, key=lambda one: float(w[one.top])).number
     share = (w[top] - w.min()) / size
-    if share < _SMALLER:
+    if share < _SMALLER and cycle.last is None:
         notes.append(
             f"Check: cycle {number} reaches {percent(share)} of the largest displacement; "
             f"cycle {largest} of {n} reaches all of it (--cycle {largest}, or [window] cycle = "
             f"{largest})."
         )
-    if end == len(record) and w[top] - w[top:].min() <= _UNLOADED * size:
+    last = cycle.last_top
+    if end == len(record) and w[last] - w[last:].min() <= _UNLOADED * size:
         notes.append("The record has no unloading, so nothing in it determines unloading.")
-    return record.between(start, end, f"before cycle {number}", f"after cycle {number}"), notes
+    after = f"after cycle {number if cycle.last is None else cycle.last}"
+    return record.between(start, end, f"before cycle {number}", after), notes
 
 
 @dataclass(frozen=True)
@@ -137,6 +176,7 @@ def cut_to_reload(
     since is taken off, and said as a strain.
     """
     w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
+    turn, end_of = cycle.last_top, number if cycle.last is None else cycle.last
     assert w is not None  # it has cycles
     before = slice(cycles[cycle.place - 1].top, top)
     lowest = w[before] <= w[before].min() + _LOWEST * np.ptp(w)
@@ -154,8 +194,8 @@ def cut_to_reload(
         return float(values[last] + share * (values[last + 1] - values[last]))
 
     level, offset = free + _LOADED * rise, min(free, 0.0)
-    back = np.flatnonzero(mean[top : cycle.end] <= level)
-    first, end = last + (share > 0.0), top + int(back[0]) + 1 if back.size else cycle.end
+    back = np.flatnonzero(mean[turn : cycle.end] <= level)
+    first, end = last + (share > 0.0), turn + int(back[0]) + 1 if back.size else cycle.end
     time = passed(record.instants)
     moment = "" if record.time is None else f" {engineering(time, 's')} in the file,"
     notes = [
@@ -182,7 +222,7 @@ def cut_to_reload(
         displacement=w - contact,
         interior={node: values - passed(values) for node, values in record.interior.items()},
     )
-    cut = moved.without(slice(cycle.end, None), f"after cycle {number}")
+    cut = moved.without(slice(cycle.end, None), f"after cycle {end_of}")
     cut = cut.without(slice(end, None), "after contact ends")
     cut = cut.without(slice(cycle.first, first), "before contact starts")
     cut = cut.without(slice(0, cycle.first), f"before cycle {number}")
@@ -227,6 +267,20 @@ def find_turns(values: Array, back: float | None = None) -> NDArray[np.int64]:
     if up or not turns:  # the record ends on its way up
         turns.append(best)
     return np.array(turns, dtype=np.int64)
+
+
+def cycles_of(test: Measurement) -> dict[int, slice]:
+    """Samples of each of several cycles that are one history, by their numbers; {} of one cycle.
+
+    They are divided where the motion turns from unloading to loading.
+    """
+    if test.last_cycle is None or test.displacement is None:
+        return {}
+    turns = find_turns(test.displacement, _REST * float(np.ptp(test.displacement)))
+    ends = [0, *turns[1::2].tolist()]
+    numbers = test.cycles[test.cycles.index(test.cycle) : test.cycles.index(test.last_cycle) + 1]
+    ends = [*ends[: len(numbers)], len(test.displacement)]
+    return {n: slice(*ends[i : i + 2]) for i, n in enumerate(numbers[: len(ends) - 1])}
 
 
 def _reversals(displacement: Array) -> list[tuple[int, int, bool]]:

@@ -159,6 +159,7 @@ class Window:
     start: float = -np.inf
     end: float = np.inf
     cycle: int | None = None  # the first one
+    last: int | None = None  # of several that are one history; by default none but `cycle`
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,6 +283,8 @@ class Measurement:
         Rows of the file.
     cycle, cycles
         Number of the cycle that is used, and of all in the record.
+    last_cycle : int or None
+        Number of the last one of several that are used as one history.
     start_strain : float
         Strain at which the contact of a later cycle starts, from the first contact; taken off.
     sampled : dict of str to (n,) bool array
@@ -322,6 +325,7 @@ class Measurement:
     count: RowCount | None = None
     cycle: int = 1
     cycles: tuple[int, ...] = (1,)
+    last_cycle: int | None = None
     start_strain: float = 0.0
     sampled: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     zeros: dict[str, float] = field(default_factory=dict)

@@ -23,7 +23,7 @@ from foamfit.data.contact import (
 )
 from foamfit.data.cycles import (
     Cycle,
-    choose_cycle,
+    choose_cycles,
     cut_to_cycle,
     cut_to_reload,
     find_cycles,
@@ -93,7 +93,7 @@ def condition(
     still = [] if impact else spoilt.find_standstills(record)
     record = spoilt.bridge_standstills(done(spoilt.fill_staircase(record)), still)
     cycles = [] if impact else find_cycles(record)
-    chosen = choose_cycle(cycles, window.cycle)
+    chosen = choose_cycles(cycles, window.cycle, window.last)
     first = cut_to_cycle(record, cycles, cycles[0])[0] if cycles else record
     curves = first.curves("acceleration")
     levels = {c: estimated_noise(v) for c, v in curves.items()} | held
@@ -104,7 +104,9 @@ def condition(
         notes += zeros.flight_notes(first, start, span, levels, known, spread)
     else:
         start = start_of_slow_test(first, levels)
-        span = zeros.Span.of_slow_test(first, start)
+        begun = chosen is not None and not chosen.place  # with the first contact
+        kept = cut_to_cycle(record, cycles, chosen)[0] if chosen and begun else first
+        span = zeros.Span.of_slow_test(kept, start)
     record, found = zeros.take_zeros(record, first, start, span, levels, impact=impact)
     notes += found.notes
     later = chosen if chosen is not None and chosen.place else None  # with a contact of its own
@@ -118,7 +120,7 @@ def condition(
     record, motion = integrate_motion(record, specimen, known)
     if impact:
         record = done(start_within_height(record, specimen, known, motion, found.origins))
-    notes += checks(record, specimen, known, motion)
+    notes += checks(record, specimen, known, motion, several=bool(chosen and chosen.last))
     whole, record = record, done(thin(record))
     block = -(-len(whole) // len(record))
     resting = max(0, start.first - 2) if start.free else 0
@@ -140,6 +142,7 @@ def condition(
         count=count_rows(whole, outliers, block),
         cycle=chosen.number if chosen else 1,
         cycles=tuple(cycle.number for cycle in cycles) or (1,),
+        last_cycle=chosen.last if chosen else None,
         start_strain=found.origins.pop("start_strain", 0.0),
         sampled=record.sampled,
         zeros=found.errors,
@@ -335,12 +338,14 @@ def start_within_height(
     return record, [told + "farther than the height."]
 
 
-def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) -> list[str]:
-    """Refuse strains beyond one; say what is not plausible."""
+def checks(
+    record: Record, specimen: Specimen, striker: Striker, motion: str, *, several: bool = False
+) -> list[str]:
+    """Refuse strains beyond one; say what is not plausible, of `several` cycles less."""
     displacement, height = record.displacement, specimen.height
     assert displacement is not None  # measured or integrated by now
     notes = [] if motion == MEASURED else [f"The file has no displacement: the motion is {motion}."]
-    notes += inner_reversals(displacement)
+    notes += [] if several else inner_reversals(displacement)
     if len(record) < MIN_ROWS:
         raise InputError(f"only {len(record)} samples are in contact; at least {MIN_ROWS} needed.")
     strain = float(displacement.max()) / height

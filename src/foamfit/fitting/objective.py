@@ -49,6 +49,7 @@ OF_DRIVE = ("those of the drive",)  # nuisance parameters, where none are named
 # the other by what is an error of the model in both.
 MODEL_ERROR = 0.005
 MAX_STEPS = 20_000  # a trial that needs more is too stiff to be worth waiting for
+RTOL_OF_ANY_LAW = 1e-5  # of a registered law, whose halved steps cost more
 # Standard deviation of normal residuals over the median of their sizes.
 NORMAL = 1.4826
 # Most instants that are simulated for each sample that averages rows of the file.
@@ -109,6 +110,7 @@ class Objective:
             )
         if self.nuisance == OF_DRIVE:
             self.nuisance = nuisances.names_of(self.drive, time_shift=self.time_shift)
+        self.rtol = max(self.rtol, RTOL_OF_ANY_LAW * self.model.is_registered)
         self.measurement = with_noise(self.measurement)
         self.interior = interior_curves(self.measurement, len(self.model.kinds))
         self.accelerated = self.drive == "impact" and self.measurement.acceleration is not None

@@ -19,7 +19,7 @@ from foamfit.fitting.box import Scales, Space, others
 from foamfit.fitting.curves import check_interior, choose_drive, default_weights
 from foamfit.fitting.objective import Objective
 from foamfit.springs.laws.record import ADMISSIBLE, Between, Param
-from foamfit.springs.model import Model
+from foamfit.springs.model import Model, with_options
 from foamfit.springs.parameters import NUISANCE, any_param, split_name
 
 
@@ -30,6 +30,8 @@ def make_params(
     *,
     time_shift: bool = False,
     relaxation: int = 0,
+    stiffening: bool = False,
+    mullins: bool = False,
 ) -> lmfit.Parameters:
     """Parameters of a model for a test, with bounds from its scales; change them, then `fit`.
 
@@ -50,18 +52,26 @@ def make_params(
         has its own clock and its delay has a ±.
     relaxation : int
         Relaxation terms of every hysteretic spring of a model that is given by its name.
+    stiffening, mullins : bool
+        Whether stiffening, and softening and weakening, of its microscale springs are parameters.
 
     Returns
     -------
     lmfit.Parameters
         Values in SI, named s1_k0 … site_eta.
     """
-    model = Model.parse(model, relaxation) if isinstance(model, str) else model
+    if isinstance(model, str):
+        model = with_options(model, stiffening=stiffening, mullins=mullins)
+        model = Model.parse(model, relaxation)
     drive = choose_drive(measurement) if drive is None else drive
     scales = Scales.of(measurement)
     if model.relaxation and measurement.time is None:
         raise InputError(
             f"{measurement.name}: relaxation needs a time column; give one, or leave relaxation out"
+        )
+    if measurement.time is None and (delayed := [law for law in model.laws if law.is_viscous]):
+        raise InputError(
+            f"{measurement.name}: the stress of '{delayed[0].kind}' needs a time column"
         )
     params = lmfit.Parameters()
     count = len(model.kinds)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from foamfit.arrays import Array
+from foamfit.data.cycles import cycles_of, find_turns
 from foamfit.data.measurement import Measurement
 from foamfit.fitting.box import Space
 from foamfit.fitting.curves import smoothed
@@ -36,8 +37,10 @@ def smooth_loop(measurement: Measurement, followed: Array | None = None) -> Meas
         window = max(motion.size // 60, 1) * 2 + 1
         motion = smoothed(motion, window) if window > 3 else motion
     first = 0 if time is None else int(np.searchsorted(time, 0.0))  # no loop before contact
-    count = min(motion.size - first, LOOP_SAMPLES)
-    keep = np.unique(np.linspace(first, motion.size - 1, count).astype(int))
+    cycles = 1 if measurement.last_cycle is None else 2  # as many samples for all of several
+    count = min(motion.size - first, cycles * LOOP_SAMPLES)
+    keep = np.linspace(first, motion.size - 1, count).astype(int)
+    keep = np.unique(np.append(keep, find_turns(motion))) if cycles > 1 else np.unique(keep)
     thinned = None if time is None else time[keep]
     return replace(
         measurement, displacement=motion[keep], stress=stress[keep], time=thinned,
@@ -58,7 +61,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
     count, relaxing = len(laws), 2 * model.relaxation * sum(law.hysteretic for law in laws)
     more = sum(max(law.wanted_marks - OWN_MARKS, 0) for law in laws if law.hysteretic)
     marks = qmc.LatinHypercube(7 * count + more + relaxing, rng=rng).random(CURVE_STARTS)
-    starts = []
+    starts, once = [], next(iter(cycles_of(loop).values()), slice(None))
     lines = [law.own == ("k0",) for law in laws]
     ways = range(max(law.ways for law in laws))
     for (turn, mark), way in product(enumerate(marks), ways):
@@ -71,15 +74,15 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
                     values[at] = heights[i] * (0.3 + 1.4 * mark[7 * i + 5])
             values = space.complete(values)
             heights = np.maximum(values[given], 1e-3 * space.scales.height)
-        motion = loop.displacement.copy()
+        motion, stress = loop.displacement[once], loop.stress[once]
         for i in range(count):
             if lines[i]:
                 share = 10.0 ** (-3.0 + 2.7 * mark[7 * i + 6])
                 k0 = heights[i] * space.scales.stress / (share * motion.max())
                 values[index[f"s{i + 1}_k0"]] = k0
-                motion = motion - heights[i] * loop.stress / k0
+                motion = motion - heights[i] * stress / k0
         soft = sum(h for h, line in zip(heights, lines, strict=True) if not line)
-        left, rest = Loop(motion / (soft or 1.0), loop.stress), iter(mark[7 * count :])
+        left, rest = Loop(motion / (soft or 1.0), stress), iter(mark[7 * count :])
         for i, law in enumerate(laws):
             if lines[i]:
                 continue

@@ -28,16 +28,19 @@ from foamfit.page.worker import News, parsed
 from foamfit.report.folder import load_result
 from foamfit.results import law_in_words
 from foamfit.springs import laws
-from foamfit.springs.published import published
+from foamfit.springs.model import Model
 
 # Where a checkout of the repository may be: the working directory, or around an editable install.
 CHECKOUTS = (Path(), Path(__file__).parents[3])
 # Options that are shown, and those that are folded away; --fix and --vary have ticks.
 SHOWN = ("model", "drive", "relaxation", "cycle")
 FOLDED = (
-    *("starts", "max_time", "seed", "loss", "interior_mass", "time_shift"),
+    *laws.OPTIONS,
+    *("cycles", "starts", "max_time", "seed", "loss", "interior_mass", "time_shift"),
     *("profile", "bootstrap", "mcmc"),
 )
+# Options on which the curves of a model depend.
+OF_CURVES = ("drive", "relaxation", "interior_mass", "time_shift", *laws.OPTIONS)
 POLL = 200  # ms
 # Over all windows, one test is read and the curves of one are prepared at a time.
 READING, PREPARING = (
@@ -72,12 +75,11 @@ class Window:
         self._shown: object = None
         self._filling = False
         self._asked = {READING: 0, PREPARING: 0}
-        self._before: tuple[dict[str, str], str] = {}, ""
         self._outputs()
         self._inputs(address)
         self.template = pn.Template((TEMPLATES / "page.html").read_text(encoding="utf-8"))
-        test_parts = [self.upload, self.chosen, self.as_before, *self.quantities.values()]
-        result_parts = [self.saves, self.ending, self.report_of, self.beside, self.comparison]
+        test_parts = [self.upload, self.chosen, *self.quantities.values()]
+        result_parts = [self.saves, self.ending, self.report_of]
         parts = {
             "test": [*test_parts, self.rest, self.check, self.problem],
             "model": [self.options[name].widget for name in SHOWN],
@@ -132,9 +134,6 @@ class Window:
             max_length=20_000,
             **STYLE,
         )
-        self.as_before = button(
-            "Fill in as for the file before", self._fill_as_before, visible=False
-        )
         self.check = button("Check the test", self._check)
         lists = {"model": models(), "relaxation": [*range(RELAXATIONS)]}
         self.options = {name: Field(name, lists.get(name), **STYLE) for name in (*SHOWN, *FOLDED)}
@@ -144,15 +143,11 @@ class Window:
         self.stop = button("Stop, and keep the best", self._stop, "danger", visible=False)
         self.back = button("Back to the fit", self._back, visible=False)
         self.report_of = select(name="Report and curves of cycle", options=[0], visible=False)
-        self.beside = select(
-            name="Compare with a published set", options=["", *published], visible=False
-        )
         self.report_of.param.watch(self._back, "value")
-        self.beside.param.watch(self._compare, "value")
         self.fields = (*self.quantities.values(), self.rest, self.cycle)
         for field in self.fields:
             field.param.watch(self._edited, "value")
-        for name in ("model", "drive", "relaxation", "interior_mass", "time_shift"):
+        for name in ("model", *OF_CURVES):
             self.options[name].widget.param.watch(self._model_chosen, "value")
         save = partial(pn.widgets.FileDownload, embed=False, auto=True, **STYLE)
         saves = {
@@ -173,9 +168,9 @@ class Window:
     def _outputs(self) -> None:
         """Make the places for text, which is put there already escaped."""
         style = {"stylesheets": [TEXT], "sizing_mode": "stretch_width", "margin": (4, 0)}
-        places = [pn.pane.HTML("", **style) for _ in range(8)]
+        places = [pn.pane.HTML("", **style) for _ in range(7)]
         self.problem, self.progress, self.compiling, self.understood = places[:4]
-        self.ending, self.misfit, self.comparison, self.report = places[4:]
+        self.ending, self.misfit, self.report = places[4:]
         self.understood.object = soft("There is no test yet.")
         self.ending.object = soft("There is no fit yet.")
 
@@ -235,7 +230,7 @@ class Window:
     def _read(self) -> None:
         """Fill in a dropped TOML, or clear the fields for another file without one, and check.
 
-        What was filled in belongs to the specimen of the file before; it is offered again.
+        What was filled in belongs to the specimen of the file before.
         """
         try:
             found = self.desk.dropped_toml()
@@ -246,14 +241,11 @@ class Window:
         if self.desk.worker is None:  # what is shown of a fit is of another test
             self._hide_result("There is no fit yet.")
             self.curves.held, self.cycle.value = {}, ""
-        offered = found is None and self.desk.replaced
-        if offered:
-            self._before = self._given()
-            found = {}, ""
-        self.as_before.visible = offered and any((*self._before[0].values(), self._before[1]))
+        if found is not None or self.desk.replaced:
+            quantities, self.rest.value = found or ({}, "")
+            for name, field in self.quantities.items():
+                field.value = quantities.get(name, "")
         self.desk.replaced = False
-        if found is not None:
-            self._fill(*found)
         self._filling = False
         self._check()
 
@@ -261,18 +253,6 @@ class Window:
         """The quantities and the further TOML as they are filled in."""
         given = {name: field.value or "" for name, field in self.quantities.items()}
         return given, self.rest.value or ""
-
-    def _fill(self, quantities: Mapping[str, str], rest: str) -> None:
-        for name, field in self.quantities.items():
-            field.value = quantities.get(name, "")
-        self.rest.value = rest
-
-    def _fill_as_before(self, event: Any) -> None:
-        """Take what was filled in for the file before, which was offered."""
-        self._filling, self.as_before.visible = True, False
-        self._fill(*self._before)
-        self._filling = False
-        self._check()
 
     def _edited(self, event: Any) -> None:
         if not self._filling and self.desk.csv is not None:
@@ -294,9 +274,8 @@ class Window:
         if checked.error == BUSY:
             return
         if checked.error:
-            told = soft("The test cannot be read yet: see what is wrong with it.")
-            shown = piece("excerpt", checked.excerpt) if checked.excerpt else ""
-            self.understood.object = told + shown
+            told = "The test cannot be read yet: see what is wrong with it."
+            self.understood.object = soft(told)
         else:
             self.understood.object = piece("verbatim", checked.text)
         self._allow()
@@ -381,9 +360,9 @@ class Window:
         self._poll.start()
 
     def _hide_result(self, why: str) -> None:
-        self.saves.visible = self.beside.visible = self.back.visible = False
+        self.saves.visible = self.back.visible = False
         self.report_of.visible = False
-        self.report.object = self.comparison.object = ""
+        self.report.object = ""
         self.ending.object = soft(why)
 
     def _stop(self, event: Any = None) -> None:
@@ -451,8 +430,7 @@ class Window:
             self.ending.object += piece("cycles", png)
         fits = [*self.desk.fits]
         self.saves.visible = True
-        self.beside.visible = self.back.visible = bool(fits)
-        self.report_of.visible, self.beside.value = len(fits) > 1, ""
+        self.back.visible, self.report_of.visible = bool(fits), len(fits) > 1
         if not fits:
             return
         self.report_of.param.update(options=fits, value=fits[0])
@@ -466,23 +444,14 @@ class Window:
         self.report.object = piece("report", self._report())
         fit = load_result(self.desk.fits[cycle])
         values = {name: one["value"] for name, one in fit["parameters"].items()}
-        place = {name: fit[name] for name in ("model", "relaxation", "drive")}
-        self._turn_fitted(News(cycle=cycle, values=values, **place))
-
-    def _compare(self, event: Any) -> None:
-        if not event.new:
-            self.comparison.object = ""
-            return
-        try:
-            text = self.desk.compared(event.new, self.report_of.value)
-            self.comparison.object = piece("verbatim", text)
-        except InputError as error:
-            self.comparison.object = wrong(error)
+        place = {name: fit[name] for name in ("relaxation", "drive")}
+        model = Model.of_result(fit).name
+        self._turn_fitted(News(cycle=cycle, values=values, model=model, **place))
 
 
 def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options on which the curves of a model depend."""
-    return {one: asked[one] for one in ("drive", "relaxation", "interior_mass", "time_shift")}
+    return {one: asked[one] for one in OF_CURVES}
 
 
 def models() -> list[str]:

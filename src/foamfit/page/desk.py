@@ -13,7 +13,7 @@ import tomllib
 import unicodedata
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tomli_w
@@ -23,11 +23,9 @@ from foamfit.data.csv_file import read_test
 from foamfit.data.describe import describe
 from foamfit.data.energy import audit
 from foamfit.data.measurement import Measurement
-from foamfit.data.tables.csv_table import find_table, read_text
 from foamfit.data.toml_file import toml_beside
 from foamfit.errors import InputError
 from foamfit.page.worker import Job, Worker, end_all, parsed
-from foamfit.report.comparison import compare, comparison_text
 from foamfit.springs import laws
 from foamfit.text import listed
 
@@ -48,8 +46,6 @@ QUANTITIES = {
     "[striker] mass": ("Striker mass (optional)", "7 g"),
     "[striker] velocity": ("Striker velocity (optional)", "1.75 m/s"),
 }
-# Rows of a file around an error: their numbers, and their cells, each with whether it is wrong.
-Excerpt = list[tuple[int, list[tuple[str, bool]]]]
 
 
 @dataclass(frozen=True)
@@ -59,7 +55,6 @@ class Checked:
     text: str = ""
     error: str = ""
     quantity: str = ""
-    excerpt: Excerpt = field(default_factory=list)
 
 
 class Desk:
@@ -159,8 +154,7 @@ class Desk:
             quantity = next((name for name in QUANTITIES if f"{name} " in told), "")
             if "[specimen] needs a diameter" in told:
                 quantity = "[specimen] diameter"
-            excerpt = excerpt_of(self.csv, told)
-            return Checked(error=told, quantity=quantity, excerpt=excerpt)
+            return Checked(error=told, quantity=quantity)
         self.measurement = measurement
         return Checked(text)
 
@@ -247,12 +241,6 @@ class Desk:
             archive.write(self.result.with_suffix(".toml"), "test.toml")
         return content.getvalue()
 
-    def compared(self, published: str, cycle: int = 0) -> str:
-        """Return a fit beside a published set, as `foamfit compare` prints it."""
-        if cycle not in self.fits:
-            raise InputError("There is no fit yet; run one to compare it.")
-        return self._plain(comparison_text(compare([self.fits[cycle]], published)))
-
 
 def too_large(name: str) -> str:
     """Say that a file is too large."""
@@ -305,43 +293,3 @@ def join_toml(quantities: Mapping[str, str], rest: str) -> str:
                 raise InputError(f"The further TOML: {name} is filled in above, too; give it once.")
             section[key] = value
     return tomli_w.dumps(document)
-
-
-# ------------------------------------------------------------------------- what is wrong, and where
-
-
-def excerpt_of(path: Path, sentence: str) -> Excerpt:
-    """Return the headers and the rows around the cell that a sentence of `read_test` names.
-
-    A sentence without a row is about a column, if any: the first rows are shown then.
-    """
-    try:
-        text = read_text(path, "")
-    except InputError:
-        return []
-    lines = text.raw.decode(text.encoding, errors="replace").splitlines()
-    try:
-        table = find_table(text, set())
-        separator, header = table.separator, max(table.header_row - 1, 0)
-    except InputError:
-        separator, header = max("\t;,", key="\n".join(lines[:20]).count), 0
-    found = re.search(r"\brow (\d+)", sentence)
-    row = int(found[1]) - 1 if found else None
-    first = header if row is None else max(row - AROUND, header)
-    some = range(first, min(first + 2 * AROUND + 1, len(lines)))
-    cells = {
-        n: [cell.strip().strip('"') for cell in lines[n].split(separator)]
-        for n in dict.fromkeys([header, *some])
-    }
-    headers = enumerate(cells[header])
-    column = next((k for k, name in headers if name and f"'{name}'" in sentence), None)
-    left = 0 if column is None else max(0, column - ACROSS + 1)
-
-    def wrong(n: int, k: int) -> bool:
-        """Whether a cell is the wrong one, or in the row or column that is wrong as a whole."""
-        return {row, column} != {None} and row in (n, None) and column in (k, None)
-
-    return [
-        (n + 1, [(line[k][:CELL], wrong(n, k)) for k in range(left, min(left + ACROSS, len(line)))])
-        for n, line in cells.items()
-    ]

@@ -201,9 +201,10 @@ def side_of(result: Result) -> Side:
     terms = given.get("relaxation", 0)
     if type(terms) is not int or terms < 0:
         raise _broken(where, f"'relaxation' cannot be {str(terms)[:40]!r}")
+    model = Model.of_result(given)
     return Side(
-        label=f"{given['test']}: {law_in_words(given['model'], terms)}, {given['drive']} drive",
-        kinds=Model.parse(given["model"]).kinds,
+        label=f"{given['test']}: {law_in_words(model.name, terms)}, {given['drive']} drive",
+        kinds=model.kinds,
         relaxation=terms,
         estimates={name: _estimate(p, where, name) for name, p in given["parameters"].items()},
         correlation=_correlation(given.get("correlation"), where),
@@ -499,13 +500,12 @@ def write_csv(comparison: Comparison, path: str | Path) -> None:
 
 
 def plot_comparison(
-    comparison: Comparison, path: str | Path | None = None, *, width: str = TWO, table: bool = True
+    comparison: Comparison, path: str | Path | None = None, *, width: str = TWO
 ) -> Figure:
     """Draw how far each parameter is from its reference, in standard errors, and in percent.
 
     One panel for each reference; shaded are one and three standard errors. What is not compared is
-    left out, what is not determined is named. For `path` and `width` see `plots.plot_fit`; without
-    `table` no CSV of what is plotted is written.
+    left out, what is not determined is named. For `path` and `width` see `plots.plot_fit`.
     """
     groups: dict[str, list[Pair]] = {}
     for pair in comparison.pairs:
@@ -526,7 +526,7 @@ def plot_comparison(
         for ax in figure.axes[-columns:]:  # the lowest ones
             ax.set_xlabel("deviation (standard errors)")
         _name_results(figure, list(groups.values()))
-    return figures.save(figure, path, table=table)
+    return figures.save(figure, path)
 
 
 def _is_shown(row: Row) -> bool:

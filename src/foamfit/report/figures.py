@@ -1,10 +1,4 @@
-"""What all figures share: colours, style, one layout for all images, saving, a table of the data.
-
-The table of what is plotted is read off the figure itself, so any other program can draw it again.
-A line, band or mark is a series by its label (one that begins with "_" is left out of legends, and
-is a series all the same); what has no label is decoration. A panel has the name of its label, if it
-has one, or of its title.
-"""
+"""What all figures share: colours, style, one layout for all images, saving."""
 
 from __future__ import annotations
 
@@ -15,17 +9,15 @@ from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.errors import InputError
-from foamfit.files import csv_bytes, write_file
+from foamfit.files import write_file
 from foamfit.text import wrapped
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -62,10 +54,6 @@ NARROWEST, WIDEST = 2.5, 20.0
 # Lines with more points are drawn through the first, last and extreme samples of this many
 # stretches, which looks the same in print.
 MOST_POINTS, STRETCHES = 3000, 500
-HEAD = ("panel", "series", "x axis", "y axis", "x", "y")
-_STANDS = "the data of the figure would be written, and is no such table; name the figure otherwise"
-# Names of the rows and columns of a matrix that is drawn as shaded cells.
-_CELLS = WeakKeyDictionary["Artist", tuple[Sequence[str], Sequence[str]]]()
 
 
 def inches(width: str) -> float:
@@ -248,116 +236,8 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
     raise InputError(f"a figure is saved as .png, .pdf or .svg, not {Path(path).name!r}")
 
 
-def save(figure: Figure, path: str | Path | None, *, table: bool = False) -> Figure:
-    """Save a figure, if there is a path, in the format of its suffix; returns the figure.
-
-    With `table` what is plotted in it is written beside it as CSV; see `plotted`.
-    """
+def save(figure: Figure, path: str | Path | None) -> Figure:
+    """Save a figure, if there is a path, in the format of its suffix; returns the figure."""
     if path is not None:
-        data = Path(path).with_suffix(".csv")
-        if table:
-            check_table(data)
         write_file(path, image(figure, figure_format(path)))
-        if table:
-            write_file(data, csv_bytes(plotted(figure)))
     return figure
-
-
-# ---------------------------------------------------------------- the table of what is plotted
-
-
-def name_cells(picture: Artist, rows: Sequence[str], columns: Sequence[str]) -> None:
-    """Name the rows and columns of a matrix, which its axes need not show."""
-    _CELLS[picture] = tuple(rows), tuple(columns)
-
-
-def plotted(figure: Figure) -> Iterator[tuple[object, ...]]:
-    """Give the rows of the table, the header first, in the units of the axes.
-
-    x is empty for what lies across a panel, y for what stands upright in it. A band is its outline,
-    an interval its two ends, a cell of a matrix has the names of its row (the series) and column.
-    """
-    yield HEAD
-    for ax in figure.axes:
-        axes = _sides(ax)
-        titles = str(ax.get_label()), ax.get_title(loc="left"), ax.get_title()
-        panel = next(filter(None, titles), f"{axes[1]} over {axes[0]}")
-        for series, x, y in _series(ax):
-            yield from ((panel, series, *axes, *place) for place in zip(x, y, strict=True))
-
-
-def table(figure: Figure) -> bytes:
-    """Return the table as the bytes of a CSV file."""
-    return csv_bytes(plotted(figure))
-
-
-def check_table(path: Path, head: str = ",".join(HEAD), words: str = _STANDS) -> None:
-    """Raise InputError if the path holds a file that does not begin with this header."""
-    try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            known = file.readline().startswith(head)
-    except FileNotFoundError:
-        return
-    except OSError:
-        known = False
-    if not known:
-        raise InputError(f"{path} stands where {words}")
-
-
-def _sides(ax: Axes) -> tuple[str, str]:
-    """Labels of the axes of a panel, taken from a panel that shares them if it has none."""
-    found = []
-    for side, shared in (("x", ax.get_shared_x_axes()), ("y", ax.get_shared_y_axes())):
-        labels = [getattr(one, f"get_{side}label")() for one in (ax, *shared.get_siblings(ax))]
-        found.append(next(filter(None, labels), ""))
-    return found[0], found[1] or " ".join(ax.get_title().split())
-
-
-def _series(ax: Axes) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Give the series of a panel, each with its places."""
-    from matplotlib.collections import LineCollection, PolyCollection
-    from matplotlib.text import Annotation
-
-    for line in ax.lines:
-        if name := _name(line):
-            yield name, *_columns(ax, line, np.asarray(line.get_xydata(), dtype=float))
-    for patch in ax.patches:
-        if name := _name(patch):
-            corners = patch.get_patch_transform().transform(patch.get_path().vertices)
-            yield name, *_columns(ax, patch, corners[:-1])
-    for drawn in ax.collections:
-        if (name := _name(drawn)) and isinstance(drawn, LineCollection | PolyCollection):
-            for path in drawn.get_paths():
-                yield name, *_columns(ax, drawn, np.asarray(path.vertices, dtype=float))
-    for text in ax.texts:
-        if isinstance(text, Annotation) and (name := _name(text)):
-            x, y = text.xy
-            yield f"{name} {text.get_text()}", [_cell(x)], [_cell(y)]
-    for picture in ax.images:
-        rows, columns = _CELLS[picture]
-        for row, values in zip(rows, np.asarray(picture.get_array()).tolist(), strict=True):
-            there = [(x, v) for x, v in zip(columns, values, strict=True) if np.isfinite(v)]
-            yield row, [x for x, _ in there], [_cell(v) for _, v in there]
-
-
-def _name(artist: Artist) -> str:
-    """Name of a series; "" for decoration, which matplotlib labels like "_child3"."""
-    label = str(artist.get_label() or "")
-    return "" if label.startswith("_child") else label.removeprefix("_")
-
-
-def _columns(ax: Axes, artist: Artist, places: Array) -> tuple[list[str], list[str]]:
-    """The coordinates as text; empty along an axis that the series spans."""
-    here = artist.get_transform().contains_branch_seperately(ax.transData)
-    if not all(here):  # both ends of a line across are the same
-        places = np.unique(places[:, [int(here[1])]], axis=0)[:, [0, 0]]
-    columns = [
-        [_cell(value) for value in column] if own else [""] * len(places)
-        for own, column in zip(here, places.T.tolist(), strict=True)
-    ]
-    return columns[0], columns[1]
-
-
-def _cell(value: float) -> str:
-    """A number with more digits than a figure can show; empty if it is not finite."""
-    return f"{value:.6g}" if np.isfinite(value) else ""

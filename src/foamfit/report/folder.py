@@ -21,14 +21,13 @@ from foamfit.report.page import render_report
 from foamfit.report.result_figures import Mapped, draw_all
 from foamfit.results import SCHEMA, Curves, Fit, Intervals, ParameterEstimate, plain
 
-# All that `save_result` may write, what `studies` write beside the folders of cycles and tests, and
-# what is plotted in cycles.png (cycles.csv is the table of all numbers by cycle).
+# All that `save_result` may write, and what `studies` write beside the folders of cycles and tests.
+# Older versions wrote tables of what was plotted: their folders are replaced as well.
 RESULT_FILES = {
     *("fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png"),
     *("fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "budget.csv", "report.html"),
 }
-CYCLES_PLOTTED = "cycles-plotted.csv"
-CYCLES_FILES = {"cycles.json", "cycles.csv", "cycles.png", CYCLES_PLOTTED}
+CYCLES_FILES = {"cycles.json", "cycles.csv", "cycles.png", "cycles-plotted.csv"}
 JOINT_FILES = {"joint.json", "joint.html", "joint.png", "joint.csv"}
 BATCH_FILES = {"summary.csv", "summary.html", "batch.json"}
 PREDICTION_FILES = {"prediction.json", "prediction.csv", "prediction.png", "prediction.pdf"}

@@ -54,7 +54,7 @@ def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -
     A panel of which the fit has no curve is left out. `width` is "one" or "two" columns, or a
     length such as "85 mm"; panels for which it has no room side by side stand one above the other,
     and a figure of fewer panels is no wider than these need. Saved at `path`, if one is given, in
-    the format of its suffix, with what is plotted in a CSV beside it.
+    the format of its suffix.
     """
     panels = _panels(result)
     with _panelled(panels, width) as (figure, axes, size):
@@ -68,7 +68,7 @@ def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -
             if panel.is_loop:
                 _name_branches(labels, panel, result)
         _head(figure, result)
-    return figures.save(figure, path, table=True)
+    return figures.save(figure, path)
 
 
 def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
@@ -91,15 +91,15 @@ def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
             column[-1].set_xlabel(f"time ({unit})" if unit else "sample")
         if not strips:
             figures.say_nothing_there(column[0])
-    return figures.save(figure, path, table=True)
+    return figures.save(figure, path)
 
 
 def plot_response(
-    response: Response, path: str | Path | None = None, *, width: str = TWO, table: bool = True
+    response: Response, path: str | Path | None = None, *, width: str = TWO
 ) -> Figure:
     """Draw what a forward run gave: base stress and displacements over time, stress over strain.
 
-    For `path` and `width` see `plot_fit`; without `table` no CSV of what is plotted is written.
+    For `path` and `width` see `plot_fit`.
     """
     time, stress, nodes = response.time, response.base_stress, response.displacement
     end = response.contact_end
@@ -128,7 +128,7 @@ def plot_response(
             axes[0].annotate("end of contact", (at, 1.0), (-3, -3), **style)
         if len(nodes) > 1:
             axes[1].legend(loc="best", handlelength=1.4)
-    return figures.save(figure, path, table=table)
+    return figures.save(figure, path)
 
 
 def origin_word(result: Fit) -> str | None:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from foamfit.report.figures import DPI, TWO, image, inches, laid_out, table
-from foamfit.report.identifiability_plots import plot_budget, plot_insight, plot_profiles
+from foamfit.report.figures import DPI, TWO, image, inches, laid_out
+from foamfit.report.identifiability_plots import plot_insight, plot_profiles
 from foamfit.report.plots import plot_fit, plot_residuals
 from foamfit.results import Fit
 
@@ -19,26 +19,21 @@ Mapped = Callable[..., Iterable[Any]]  # as the built-in `map`
 COARSE = 160  # dots per inch of a figure that is only on the page, to save time
 # In the order in which they are begun: what takes longest first. "shown" is the fit on the page,
 # two columns wide as all others there.
-_NAMES = ("fit", "shown", "sensitivities", "residuals", "profiles", "budget")
-# What is plotted in profiles and budget is in profiles.csv and budget.csv.
-_TABLES = ("fit", "sensitivities", "residuals")
+_NAMES = ("fit", "shown", "information", "residuals", "profiles")
 
 
 @dataclass(frozen=True)
 class Images:
-    """A figure as the bytes of files: `pdf` where it is for print, `table` what is plotted."""
+    """A figure as the bytes of files: `pdf` where it is for print."""
 
     png: bytes
     dpi: int  # of the PNG
     pdf: bytes | None = None
-    table: bytes | None = None
 
     def files(self) -> Iterator[tuple[str, bytes]]:
         """Suffix and content of the files that are kept beside the report."""
         if self.pdf is not None:
             yield from (("png", self.png), ("pdf", self.pdf))
-        if self.table is not None:
-            yield "csv", self.table
 
 
 def draw_all(
@@ -69,22 +64,20 @@ def _draw(result: Fit, width: str, name: str) -> Images | None:
     figure = _figure(result, width, name)
     if figure is None:
         return None
-    dpi = COARSE if name == "sensitivities" else DPI
+    dpi = COARSE if name == "information" else DPI
     with laid_out(figure, dpi):
         pdf = image(figure, "pdf") if name == "fit" else None
         png = image(figure, "png", dpi)
-    return Images(png, dpi, pdf, table(figure) if name in _TABLES else None)
+    return Images(png, dpi, pdf)
 
 
 def _figure(result: Fit, width: str, name: str) -> Figure | None:
     """Draw one of the figures, if the result has it."""
     if name == "residuals":
         return plot_residuals(result)
-    if name == "sensitivities":
+    if name == "information":
         matrix = None if result.correlation is None else result.correlation.matrix
         return None if result.insight is None else plot_insight(result.insight, matrix)
     if name == "profiles":
         return plot_profiles(result) if result.intervals and result.intervals.profiles else None
-    if name == "budget":
-        return plot_budget(result.budget) if result.budget and result.budget.telling else None
     return plot_fit(result, width=width if name == "fit" else TWO)

@@ -147,7 +147,7 @@ def driven(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
 def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
     """Loop through an impact, for springs of these laws."""
     begin, _, elongate, note = in_series(laws)
-    count = len(laws)
+    count, delayed = len(laws), followed.loops_of(laws).delayed
 
     @compiled
     def strike(
@@ -160,6 +160,9 @@ def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
         for i in range(count):
             soft += springs.heights[i] / springs.eta[i]
         sigma = speed / soft  # what the dashpots bear at contact; 0 where a spring has none
+        if count == 1:
+            pace = speed / springs.heights[0], 0.0
+            sigma += delayed(0, springs.rows[0], springs.states[0], pace)
         for j in range(t.size):
             if t[j] <= 0.0:
                 nodes[:, j], stress[j], branches[:, j] = 0.0, sigma if t[j] == 0.0 else 0.0, 0
@@ -281,6 +284,7 @@ class AnyLawPlan(NamedTuple):
         count, springs = self.time.size, self.springs(rows, heights)
         alone = self.top == MOTION and len(rows) == 1
         timed = bool(springs.terms.size) or (springs.eta.any() and not alone)
+        timed |= any(law.is_viscous for law in self.laws)
         if self.speed == 0.0 and not timed:
             return self.follow(rows, heights, drag, 1)
         parts = max(FIRST_STEPS // count, 1)

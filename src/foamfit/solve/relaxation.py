@@ -83,7 +83,7 @@ class Kept(NamedTuple):
     by_tau: Array
 
 
-_, _begin, _leaves, _switch_law, _settle_law = followed.functions_of("microscale")
+_, _begin, _leaves, _switch_law, _settle_law = followed.functions_of("microscale")[:5]
 
 
 @inner

@@ -7,8 +7,10 @@ relaxation terms, then the heights of a chain, then `site_eta`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,16 +45,13 @@ class Model:
     relaxation: int = 0
 
     @classmethod
-    def parse(cls, name: str, relaxation: int = 0, options: tuple[str, ...] = ()) -> Model:
+    def parse(cls, name: str, relaxation: int = 0) -> Model:
         """Read a model's name, for example "linear+bistable".
-
-        `options` are those of the fit that free more parameters: see `laws.OPTIONS`.
 
         Raises
         ------
         InputError
-            If a spring in it is unknown, there are too many of them or of relaxation terms, or no
-            spring has the parameters of an option.
+            If a spring in it is unknown, or there are too many of them or of relaxation terms.
         """
         if type(relaxation) is not int or not 0 <= relaxation <= MOST_TERMS:
             raise InputError(
@@ -65,33 +64,41 @@ class Model:
             raise InputError(
                 f"a model of {len(kinds)} springs; it must have {MOST_SPRINGS} at most"
             )
-        known = laws.kinds()
+        known = [law.kind for law in laws.records()]
         for kind in kinds:
             if kind not in known:
                 raise InputError(
                     f"model '{name}': '{kind}' is not a spring; "
-                    f"join {', '.join(known)} by '+', from the base up"
+                    f"join {', '.join(laws.kinds())} by '+', from the base up"
                 )
-        for option in options:
-            having = [kind for kind in known if (option,) in laws.law(kind).options]
-            if not set(having) & set(kinds):
-                raise InputError(
-                    f"--{option} needs a spring that has its parameters, and model '{name}' has "
-                    f"none; take one with {' or '.join(having)}"
-                )
-        return cls(tuple(laws.with_options(kind, options) for kind in kinds), relaxation)
+        return cls(kinds, relaxation)
+
+    @classmethod
+    def of_result(cls, content: Mapping[str, Any]) -> Model:
+        """Model of a result (fit.json, joint.json).
+
+        Raises
+        ------
+        InputError
+            If it says no known model.
+        """
+        options = {name: content.get(name) is True for name in laws.OPTIONS}
+        return cls.parse(with_options(content["model"], **options), content.get("relaxation", 0))
 
     @property
     def name(self) -> str:
-        """The model's name, springs from the base up."""
+        """The model's name, springs from the base up, with the options of each."""
+        return "+".join(self.kinds)
+
+    @property
+    def words(self) -> str:
+        """The same as `--model` takes it, without the options."""
         return "+".join(law.word or law.kind for law in self.laws)
 
-    @cached_property
-    def options(self) -> tuple[str, ...]:
-        """Options that free the parameters of some springs; see `laws.OPTIONS`."""
-        base = ((laws.law(law.word), law.kind) for law in self.laws if law.word)
-        found = {o for one, kind in base for o, of in one.options.items() if of == kind}
-        return max(found, key=len, default=())
+    @property
+    def options(self) -> dict[str, bool]:
+        """Which options free more parameters of some spring; see `laws.OPTIONS`."""
+        return {name: any(name in kind.split(", ") for kind in self.kinds) for name in laws.OPTIONS}
 
     @cached_property
     def laws(self) -> tuple[Law, ...]:
@@ -187,3 +194,36 @@ class Model:
             area,
             site_damping=float(values[-1]),
         )
+
+
+def with_options(model: str, **options: bool) -> str:
+    """Name of a model in which options free more parameters of the springs that have them.
+
+    Parameters
+    ----------
+    model
+        The name without options, or "auto".
+    options
+        Those of `laws.OPTIONS`, true where asked for.
+
+    Raises
+    ------
+    InputError
+        If no spring of the model has the parameters of an option.
+    """
+    asked = tuple(name for name in laws.OPTIONS if options.get(name))
+    if not asked:
+        return model
+    if model == "auto":
+        raise InputError(f"{asked[0]} belongs to one model; name it instead of 'auto'")
+    read = Model.parse(model)
+    asked = tuple(name for name in laws.OPTIONS if name in asked or read.options[name])
+    kinds = read.words.split("+")
+    for name in asked:
+        if not any((name,) in laws.law(kind).options for kind in kinds):
+            having = [law.kind for law in laws.records() if (name,) in law.options]
+            raise InputError(
+                f"{name} needs a {' or '.join(having)} spring, and the model '{read.words}' has "
+                f"none; take model {having[0]}, or leave {name} out"
+            )
+    return "+".join(laws.with_options(kind, asked) for kind in kinds)

@@ -30,7 +30,8 @@ from foamfit.report.studies import batch as tables
 from foamfit.report.studies.batch import Row
 from foamfit.results import law_in_words
 from foamfit.solve import cache, precompile
-from foamfit.springs.model import Model
+from foamfit.springs import laws
+from foamfit.springs.model import Model, with_options
 from foamfit.study.batch_work import (
     Outcome,
     Recipe,
@@ -101,7 +102,9 @@ class Batch:
         """Write summary.csv and summary.html."""
         rows = self.summary
         tables.write_summary(rows, self.out)
-        law = law_in_words(self.recipe.model, self.recipe.options.get("relaxation", 0))
+        options = self.recipe.options
+        model = with_options(self.recipe.model, **{o: bool(options.get(o)) for o in laws.OPTIONS})
+        law = law_in_words(model, options.get("relaxation", 0))
         tables.write_page(rows, self.out, f"{self.out.resolve().name}: {law}")
 
 
@@ -235,7 +238,8 @@ def _checked(recipe: Recipe, options: Options) -> str:
                 "'auto', which tries relaxation by itself"
             )
         return "auto"
-    model = Model.parse(recipe.model, options.relaxation)
+    asked = {name: getattr(options, name) for name in laws.OPTIONS}
+    model = Model.parse(with_options(recipe.model, **asked), options.relaxation)
     drive = options.drive or "impact"  # which has them all; each test checks its own
     names = (*model.names, *nuisance.names_of(drive, time_shift=True))
     for name in (*(recipe.fix or ()), *recipe.vary):

@@ -28,7 +28,7 @@ from foamfit.fitting.curves import check_time_shift, choose_drive
 from foamfit.fitting.problem import fix_and_vary, make_params
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
-from foamfit.report.studies.batch import REFUSED, Row, Sketch, row_of
+from foamfit.report.studies.batch import REFUSED, Row, row_of
 from foamfit.report.studies.cycles import write_cycles
 from foamfit.springs import laws
 from foamfit.study.cycles import fit_cycles
@@ -64,8 +64,10 @@ class Recipe:
             check_time_shift(test, drive or choose_drive(test))
         if self.model == "auto" or not (self.fix or self.vary):
             return None
-        terms = self.options.get("relaxation", 0)
-        params = make_params(test, self.model, drive, time_shift=shift, relaxation=terms)
+        more: dict[str, Any] = {
+            name: self.options.get(name) or 0 for name in ("relaxation", *laws.OPTIONS)
+        }
+        params = make_params(test, self.model, drive, time_shift=shift, **more)
         return fix_and_vary(params, self.model, self.fix or {}, self.vary)
 
 
@@ -132,10 +134,7 @@ def stored(folder: Path, wanted: str, recipe: Recipe) -> tuple[Row, ...] | None:
         there = content.get("figure_width", inches(TWO)) if content["pages"] else None
         if recipe.pages and there != inches(recipe.width):
             return None
-        rows = [
-            row | {"sketch": row["sketch"] and Sketch(**row["sketch"])} for row in content["rows"]
-        ]
-        return tuple(Row(**row) for row in rows)
+        return tuple(Row(**row) for row in content["rows"])
     except (
         OSError,
         ValueError,
@@ -226,14 +225,12 @@ def _several(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write
     """Each cycle is a row, and its folder is one in the folder of the test."""
     recipe = task.recipe
     assert isinstance(recipe.cycles, tuple)
-    # Not together, which takes longer than all of them: the summary has a row for each.
     found = fit_cycles(
         path,
         toml,
         cycles=recipe.cycles or None,
         model=recipe.model,
         params=recipe.params,
-        together=False,
         **recipe.options,
     )
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NoReturn
@@ -19,7 +17,6 @@ from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate, rate_error
 from foamfit.errors import InputError, SimulationError
-from foamfit.files import write_file
 from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import Tracker, descend
@@ -27,7 +24,6 @@ from foamfit.one_model import Options, Progress, identify, weigh_motion
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import check_target, try_target
 from foamfit.report.studies.joint import save_joint
-from foamfit.results import plain
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
 from foamfit.study.joint_estimates import common_covariance, parameters_of
@@ -68,10 +64,9 @@ class JointResult(JointData):
     ) -> Path:
         """Write joint.json, joint.html, joint.png and a result folder per test; returns the folder.
 
-        joint.csv holds what is plotted in joint.png. An older result there is replaced as a whole,
-        at the end. The folders of the tests are made by `jobs` processes (by default one for each
-        core), without `report` with tables alone. Figures are "one" or "two" columns wide, or as
-        wide as a length ("85 mm").
+        An older result there is replaced as a whole, at the end. The folders of the tests are made
+        by `jobs` processes (by default one for each core), without `report` with tables alone.
+        Figures are "one" or "two" columns wide, or as wide as a length ("85 mm").
         """
         inches(figure_width)  # refuses what is no width
         check_target(folder)
@@ -99,7 +94,6 @@ def joint(
     seed: int | None = None,
     report: bool = True,
     progress: Progress | None = None,
-    keep: str | Path | None = None,
 ) -> JointResult:
     """Fit the tests of a study together.
 
@@ -117,9 +111,6 @@ def joint(
         Of the search; by default that of the study, or 0.
     progress : callable, optional
         Told the fraction done and what is going on.
-    keep : str or Path, optional
-        Folder beside which the values that were found are written, as ``<folder>.found.json``, if
-        a later step fails; by default `out`.
 
     Returns
     -------
@@ -147,54 +138,26 @@ def joint(
     _links(study, tests)  # refuses what cannot be, before anything is fitted
     with workers(jobs, len(tests), FEW) as each:
         tests, alone = _own_fits(study, options, tests, refused, each, tell)
-        best = list(alone.vectors)
-        with _kept(study, tests, best, out if keep is None else keep):
-            links, starts = _links(study, tests), alone.starts(ONE_FOR_ALL)
-            kinds, free = _choices(tests), {n for one in alone.problems for n in one.free()}
-            tell(0.5, "together")
-            auto = [name for name, kind in study.kinds.items() if kind == AUTO and name in free]
-            if auto:
-                links = joint_fit.choose_kinds(
-                    alone.problems, links, auto, starts, alone.n_eff, kinds
-                )
-            fit = fit_jointly(alone.problems, links, starts, each=each, best=best)
-            tell(0.9, "evidence")
-            asked = [
-                name
-                for name in (*fit.found.shared, *fit.found.own)
-                if fit.found.links.kind(name) in RATES or name in auto
-            ]
-            tried = joint_fit.evidence(fit.found, asked, alone.n_eff, kinds, [alone.vectors])
-            result = _conclude(study, tests, fit, alone, tried, refused)
-            result = replace(result, runtime_s=time.perf_counter() - began)
+        links, starts = _links(study, tests), alone.starts(ONE_FOR_ALL)
+        kinds, free = _choices(tests), {n for one in alone.problems for n in one.free()}
+        tell(0.5, "together")
+        auto = [name for name, kind in study.kinds.items() if kind == AUTO and name in free]
+        if auto:
+            links = joint_fit.choose_kinds(alone.problems, links, auto, starts, alone.n_eff, kinds)
+        fit = fit_jointly(alone.problems, links, starts, each=each)
+        tell(0.9, "evidence")
+        asked = [
+            name
+            for name in (*fit.found.shared, *fit.found.own)
+            if fit.found.links.kind(name) in RATES or name in auto
+        ]
+        tried = joint_fit.evidence(fit.found, asked, alone.n_eff, kinds, [alone.vectors])
+        result = _conclude(study, tests, fit, alone, tried, refused)
+        result = replace(result, runtime_s=time.perf_counter() - began)
     tell(1.0, "done")
     if out is not None:
         result.save(out, jobs=jobs, report=report)
     return result
-
-
-@contextmanager
-def _kept(
-    study: Study, tests: Sequence[_Test], best: Sequence[Array], folder: str | Path | None
-) -> Iterator[None]:
-    """Write the best values of each test beside a folder if anything fails, and say where."""
-    try:
-        yield
-    except Exception as error:
-        if folder is None:
-            raise
-        file = Path(f"{folder}.found.json")
-        told = f"{error}" if isinstance(error, InputError | SimulationError) else f"{error!r}"
-        values = {
-            test.name: dict(zip(test.problem.names, own + test.problem.origins, strict=True))
-            for test, own in zip(tests, best, strict=True)
-        }
-        content = {"name": study.name, "model": study.model, "error": told, "tests": values}
-        text = json.dumps(plain(content), indent=2, ensure_ascii=False)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_file(file, (text + "\n").encode(errors="backslashreplace"))
-        kind = type(error) if isinstance(error, InputError | SimulationError) else RuntimeError
-        raise kind(f"{told}; the values of each test that were found are in {file}") from error
 
 
 # ------------------------------------------------------------------------------- reading

@@ -71,16 +71,13 @@ def fit_jointly(
     starts: Sequence[Vectors],
     *,
     each: Map = map,
-    best: list[Array] | None = None,
 ) -> JointFit:
     """Fit tests whose parameters are linked as `links` say, and judge the fit.
 
     Arguments are those of `fitting.together.fit_linked`; `each` maps a function over what is to be
-    done for each test, as `map` does. `best` is given the values of each test as they are found.
+    done for each test, as `map` does.
     """
-    best = [] if best is None else best
     found = fit_linked(problems, links, starts)
-    best[:] = found.values
     errors = errors_of(found, each)
     point, undrawn, spreads = JointPoint(found, errors), dict[str, Array](), dict[str, Spread]()
     scatter = [name for name in found.own if links.kind(name) == "scatter"]
@@ -93,7 +90,6 @@ def fit_jointly(
         if _still(before, spreads):
             break
         found = fit_linked(problems, replace(links, pulls=pulls), [found.values])
-        best[:] = found.values
         point = JointPoint(found, errors, inflations)
     return JointFit(point, spreads, ranges_of(point, each), correlation_of(point, undrawn))
 

@@ -17,6 +17,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import SCHEMA, Fit, ParameterEstimate, plain
+from foamfit.springs.model import Model
 from foamfit.study.joint_fit import Alternative, JointFit
 from foamfit.study.shared import bic
 from foamfit.study.study_file import Study
@@ -213,12 +214,13 @@ class JointData:
         rate of the value at `rate0` and, with ":b", the slope. "specimens" has the correlation of
         what changes from specimen to specimen.
         """
-        found = self.fit.found
+        found, model = self.fit.found, Model.parse(self.study.model)
         content = {
             "schema": SCHEMA,
             "foamfit": version("foamfit"),
             "name": self.study.name,
-            "model": self.study.model,
+            "model": model.words,
+            **model.options,
             "relaxation": self.study.relaxation,
             "drive": self.drive,
             "seed": self.study.seed,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -10,7 +11,6 @@ import numpy as np
 
 from foamfit.fitting.links import RATES
 from foamfit.report import render
-from foamfit.study.cycle_fits import span_of
 from foamfit.study.joint_result import JointData
 from foamfit.text import listed, percent
 from foamfit.trust.checklist import POOR, UNACCEPTABLE
@@ -79,3 +79,11 @@ def _evidence(result: JointData) -> list[tuple[str, str, str, float]]:
         mine, best = next(o for o in tried if o.chosen), min(tried, key=lambda one: one.bic)
         out.append((name, best.kind, mine.kind, mine.bic - best.bic))
     return out
+
+
+def span_of(found: Sequence[dict[str, float | None]]) -> tuple[float, float] | None:
+    """Smallest and largest misfit of some fits, of the loop or else of the stress; None if none."""
+    names = ("stress_strain", "stress_time", "displacement_time")
+    each = (next((one[n] for n in names if one.get(n) is not None), None) for one in found)
+    known = [one for one in each if one is not None]
+    return (min(known), max(known)) if known else None

@@ -12,6 +12,7 @@ from foamfit.data.toml_file import check_keys, load_toml
 from foamfit.errors import InputError
 from foamfit.fitting.curves import DRIVES
 from foamfit.fitting.links import KINDS
+from foamfit.springs.laws import OPTIONS
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.test_files import find_tests
@@ -25,7 +26,7 @@ _EXAMPLES = {
     "specimen": 'specimen = "foam.toml"',
 }
 _LEAST = {"seed": 0, "cycle": 1, "starts": 1}  # of whole numbers
-_KEYS = (*_EXAMPLES, *_LEAST, "relaxation", "drive", "specimens", "parameters")
+_KEYS = (*_EXAMPLES, *_LEAST, "relaxation", *OPTIONS, "drive", "specimens", "parameters")
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,10 @@ def _read(path: Path, content: Mapping[str, Any]) -> Study:
             raise InputError(f"{key} = {value!r} must be a whole number from {least} up")
     if content.get("drive") not in (None, *DRIVES):
         raise InputError(f"drive = {content['drive']!r} must be one of {', '.join(DRIVES)}")
-    model = Model.parse(content["model"], content.get("relaxation", 0))
+    for key in OPTIONS:
+        if content.get(key) not in (None, True, False):
+            raise InputError(f"{key} = {content[key]!r} must be true or false")
+    model = Model.of_result(content)
     tests = _tests(path, content["tests"])
     kinds, held = _parameters(content.get("parameters", {}), model)
     return Study(

@@ -13,13 +13,12 @@ from urllib.parse import quote
 
 import numpy as np
 
-from foamfit.arrays import Array
 from foamfit.files import csv_bytes, write_file
 from foamfit.report.readable import readable_unit, symbol
 from foamfit.report.render import page, words
 from foamfit.results import Fit, plain
 from foamfit.springs.parameters import springs_first
-from foamfit.text import counted, listed, number, percent
+from foamfit.text import counted, listed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,9 +27,6 @@ CURVES = ("stress_time", "displacement_time", "stress_strain")
 PARTS = ("", "_stderr", "_lo", "_hi", "_state")
 # What a row says of a test without a result.
 REFUSED, OPEN = "refused", "not fitted"
-# Points of a sketched curve, its size in pixels, and how many tests the page shows.
-POINTS, WIDTH, HEIGHT = 40, 116, 76
-STRIP_WIDTH, STRIP_HEIGHT = 900, 110  # of the strip of a parameter
 _STATUS = {
     "ok": "fitted",
     "warnings": "fitted with warnings",
@@ -41,15 +37,6 @@ _STATUS = {
 _MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
 MOST_ON_PAGE = 5000
 _MOST_REFUSALS = 20  # that the terminal names
-
-
-@dataclass(frozen=True)
-class Sketch:
-    """Curves of a test in a few points: paths of SVG, and the ends of their axes in words."""
-
-    measured: str
-    fitted: str
-    ends: str
 
 
 @dataclass(frozen=True)
@@ -67,7 +54,6 @@ class Row:
     misfit: Mapping[str, float | None] = field(default_factory=dict)
     runtime_s: float | None = None
     parameters: Mapping[str, Sequence[Any]] = field(default_factory=dict)
-    sketch: Sketch | None = None
 
     @property
     def has_fit(self) -> bool:
@@ -92,7 +78,7 @@ def row_of(test: str, file: str, result: Fit) -> Row:
         ends = (*(p.ci95 or (None, None)), p.state, p.unit, *(p.range or ()))
         cells[name] = plain([p.value, p.stderr, *ends])
     misfit, runtime = plain(result.misfit), plain(result.runtime_s)
-    return Row(test, file, result.status, error, misfit, runtime, cells, _sketch(result))
+    return Row(test, file, result.status, error, misfit, runtime, cells)
 
 
 # ------------------------------------------------------------------------------- the table
@@ -172,50 +158,6 @@ def _parameter_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
 # ------------------------------------------------------------------------------- the page
 
 
-def _sketch(result: Fit) -> Sketch | None:
-    """Draw the measured and the fitted loop, or the stress against time without a motion."""
-    c = result.curves
-    stress, fitted = c.measured_stress, c.stress_along
-    if stress is None:
-        return None
-    along, axis = c.measured_displacement, "strain"
-    if along is None or fitted is None:
-        along, fitted, axis = c.time, c.stress, "time"
-    if along is None or not np.all(np.isfinite(along)):
-        return None
-    both = stress if fitted is None else np.concatenate([stress, fitted[np.isfinite(fitted)]])
-    x0, x1, y0, y1 = float(along.min()), float(along.max()), float(both.min()), float(both.max())
-    if not (x1 > x0 and y1 > y0):
-        return None
-
-    def path(values: Array | None) -> str:
-        if values is None:
-            return ""
-        good = np.isfinite(values)
-        x, y = WIDTH * (along[good] - x0) / (x1 - x0), HEIGHT * (y1 - values[good]) / (y1 - y0)
-        return _path(x, y)
-
-    factor, unit = readable_unit(y1, "Pa")
-    if axis == "strain":
-        reach = f"{percent(x1 / result.measurement.specimen.height)} strain"
-    else:
-        part, name = readable_unit(x1, "s")
-        reach = f"{x1 / part:.3g} {name}"
-    return Sketch(path(stress), path(fitted), f"{reach}, {y1 / factor:.3g} {unit}")
-
-
-def _path(x: Array, y: Array) -> str:
-    """Draw a curve through a few points at equal distances along it, in whole pixels."""
-    if x.size < 2:
-        return ""
-    length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    at = np.linspace(0.0, length[-1], POINTS)
-    points = np.rint([np.interp(at, length, x), np.interp(at, length, y)]).astype(int).T
-    steps = np.diff(points, axis=0)
-    moved = [f"{dx} {dy}" for dx, dy in steps.tolist() if dx or dy]
-    return f"M{points[0, 0]} {points[0, 1]}l{' '.join(moved)}" if moved else ""
-
-
 def write_page(rows: Sequence[Row], folder: Path, title: str) -> None:
     """Write summary.html whole: one file that needs nothing else."""
     shown = rows
@@ -236,47 +178,20 @@ def write_page(rows: Sequence[Row], folder: Path, title: str) -> None:
         columns=columns,
         cells=[[_cell(row, column) for column in columns] for row in shown],
         misfits={curve: told for curve, told in _MISFITS.items() if curve in measured},
-        width=WIDTH,
-        height=HEIGHT,
-        strip=(STRIP_WIDTH, STRIP_HEIGHT),
     )
     write_file(folder / "summary.html", text.encode("utf-8", "replace"))
 
 
 def _columns(rows: Sequence[Row]) -> Iterator[dict[str, Any]]:
-    """The parameters that any test varied, each in the unit in which it reads well.
-
-    `paths` are SVG over all tests side by side, by the class that draws them; `ends` is the axis.
-    """
+    """The parameters that any test varied, each in the unit in which it reads well."""
     for name in names_of(rows):
-        every = ((i, row.parameters.get(name)) for i, row in enumerate(rows))
-        there = [(i, cell) for i, cell in every if cell is not None and cell[0] is not None]
-        if not there or all(cell[4] == "fixed" for _, cell in there):
+        every = (row.parameters.get(name) for row in rows)
+        there = [cell for cell in every if cell is not None and cell[0] is not None]
+        if not there or all(cell[4] == "fixed" for cell in there):
             continue
-        values = np.array([cell[0] for _, cell in there])
-        factor, unit = readable_unit(float(np.median(np.abs(values))), there[0][1][5])
-        # Wide intervals and far values run out of the strip rather than flatten the others.
-        first, last = np.quantile(values, [0.05, 0.95])
-        room = max(0.6 * (last - first), 0.05 * abs(float(np.median(values))), 1e-12)
-        low, high = float(first - room), float(last + room)
-        if values.min() >= 0.0:
-            low = max(low, 0.0)
-
-        def pixel(value: float, low: float = low, high: float = high) -> float:
-            y = STRIP_HEIGHT * (high - min(max(value, low), high)) / (high - low)
-            return round(y, 1)
-
-        paths: dict[str, str] = dict.fromkeys(("ranges", "bars", "dots", "dots unsure"), "")
-        for i, cell in there:
-            x = round((i + 0.5) * STRIP_WIDTH / len(rows), 1)
-            for ends, line in ((cell[6:8], "ranges"), (cell[2:4], "bars")):
-                if ends and ends[0] is not None:
-                    paths[line] += f"M{x:g} {pixel(ends[0]):g}V{pixel(ends[1]):g}"
-            unsure = " unsure" if cell[4] in ("weak", "not determined") else ""
-            paths[f"dots{unsure}"] += f"M{x:g} {pixel(cell[0]):g}h0"
-        ends = number(high / factor), number(low / factor)
-        column = {"name": name, "symbol": symbol(name), "unit": unit, "factor": factor}
-        yield column | {"paths": paths, "ends": ends}
+        size = float(np.median(np.abs([cell[0] for cell in there])))
+        factor, unit = readable_unit(size, there[0][5])
+        yield {"name": name, "symbol": symbol(name), "unit": unit, "factor": factor}
 
 
 def _cell(row: Row, column: Mapping[str, Any]) -> tuple[str, str, str, str]:

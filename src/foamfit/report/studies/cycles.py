@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, TWO, VERMILION, image, table
-from foamfit.report.folder import CYCLES_PLOTTED, save_whole, write_json, write_result, write_table
+from foamfit.report.figures import BLUE, TWO, image
+from foamfit.report.folder import save_whole, write_json, write_result, write_table
 from foamfit.report.readable import own_name, readable_unit
 from foamfit.report.render import words
 from foamfit.text import percent
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from foamfit.report.result_figures import Mapped
-    from foamfit.study.cycle_fits import FittedCycles
+    from foamfit.study.cycles import CycleFits
 
 COLUMNS, PANEL = 4, (1.85, 1.5)  # of the picture; inches
 LEAST = 1.55  # in, of a panel
@@ -30,7 +30,7 @@ FAR = 20  # a last cycle that is so many times the first is drawn on a logarithm
 
 
 def save_cycles(
-    found: FittedCycles,
+    found: CycleFits,
     folder: str | Path,
     *,
     report: bool = True,
@@ -47,7 +47,7 @@ def save_cycles(
 
 
 def write_cycles(
-    found: FittedCycles, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
+    found: CycleFits, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
 ) -> None:
     """Write all files of the cycles into a folder that is there; reports and pictures if wanted."""
     for number, result in found.results.items():
@@ -59,10 +59,9 @@ def write_cycles(
     if pages:
         figure = plot_cycles(found, width=width)
         (folder / "cycles.png").write_bytes(image(figure, "png", DPI))
-        (folder / CYCLES_PLOTTED).write_bytes(table(figure))
 
 
-def cycles_text(found: FittedCycles) -> str:
+def cycles_text(found: CycleFits) -> str:
     """Return what the command prints of the cycles of a record."""
     names = found.varied if len(found.varied) <= MOST_NAMES else []
     rows = [["cycle", "start strain", "misfit", *(own_name(name, found.model) for name in names)]]
@@ -70,29 +69,14 @@ def cycles_text(found: FittedCycles) -> str:
         off = one.misfit.get("stress_strain") or one.misfit.get("stress_time")
         shown = [percent(one.measurement.start_strain), "–" if off is None else percent(off)]
         rows.append([str(number), *shown, *(f"{one.parameters[n].value:.3g}" for n in names)])
-    return words("cycles", found=found, table=rows, steps=_steps(found))
+    return words("cycles", found=found, table=rows)
 
 
-def _steps(found: FittedCycles) -> list[list[str]]:
-    """Table of what was tried together, the header first."""
-    if (content := found.to_json_dict()["together"]) is None:
-        return []
-    rows = [["", "of each cycle", "parameters", "BIC", *(f"misfit {n}" for n in found.together)]]
-    last = content["alone"] | {"own": ["all (each alone)"], "chosen": False}
-    for step in (*content["steps"], last):
-        own = ", ".join(own_name(name, found.model) for name in step["own"]) or "nothing"
-        off = [percent(m) if m is not None else "–" for m in step["misfit"].values()]
-        mark = "*" if step["chosen"] else ""
-        rows.append([mark, own, str(step["n_vary"]), f"{step['bic']:.1f}", *off])
-    return rows
-
-
-def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
+def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
     """Draw the loops laid over each other, and start strain, energy, misfit, parameters by cycle.
 
     Bars are 95 % intervals; a hollow mark is a parameter that its cycle does not determine well.
-    Lines are the fit of several cycles together: level where the parameter is shared. `width` is
-    "one" or "two" columns, or a length such as "85 mm".
+    `width` is "one" or "two" columns, or a length such as "85 mm".
     """
     results = dict(sorted(found.results.items()))
     varied = found.varied
@@ -100,7 +84,6 @@ def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
     columns = max(figures.abreast(wide, COLUMNS, LEAST), 2)
     rows = 2 + max(0, -(-(panels - 2 * (columns - 2)) // columns))
     told = "points: each cycle alone with 95 % interval, hollow if weak or not determined"
-    told += "; lines: fitted together" if found.selection is not None else ""
     lines = figures.title_lines(wide, f"{found.test} · {found.model}", told)
     with figures.drawing(wide, rows * PANEL[1] + 0.13 * len(lines) + 0.1, lines) as figure:
         grid = figure.add_gridspec(rows, columns)
@@ -138,7 +121,7 @@ def _scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else factor * value
 
 
-def _loops(ax: Axes, found: FittedCycles) -> None:
+def _loops(ax: Axes, found: CycleFits) -> None:
     """Measured loops over each other, from light to dark; the first and the last one fitted."""
     import matplotlib
 
@@ -166,18 +149,11 @@ def _loops(ax: Axes, found: FittedCycles) -> None:
         ax.legend(loc="upper left", fontsize=6.5, handlelength=1.2, labelspacing=0.25)
 
 
-def _parameter(ax: Axes, found: FittedCycles, name: str) -> None:
+def _parameter(ax: Axes, found: CycleFits, name: str) -> None:
     """One parameter with its 95 % intervals against the cycle."""
     results = sorted(found.results.items())
     points = [(n, r.parameters[name]) for n, r in results if name in r.parameters]
     factor, unit = readable_unit(max(abs(p.value) for _, p in points), points[0][1].unit)
     ax.set_title(own_name(name, found.model) + (f" ({unit})" if unit else ""))
     values, ends = figures.draw_estimates(ax, points, factor)
-    if found.selection is not None:
-        best = found.selection.best.fits[0]
-        if name in (*best.shared, *found.selection.best.own):
-            together = (np.array(best.value(name)) / factor).tolist()
-            style: Any = {"color": VERMILION, "linewidth": 0.9, "zorder": 0}
-            ax.plot(found.together, together, label="_fitted together", **style)
-            values += together
     figures.limit(ax, values, ends)

@@ -13,7 +13,7 @@ import numpy as np
 
 from foamfit.fitting.links import RATES, law_values
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, TWO, VERMILION, image, table
+from foamfit.report.figures import BLUE, TWO, VERMILION, image
 from foamfit.report.folder import save_whole, write_json, write_result
 from foamfit.report.readable import Readable, in_unit, own_name, readable, readable_unit, symbol
 from foamfit.report.render import page, words
@@ -77,7 +77,6 @@ def save_joint(
         figure = plot_joint(found, width=width)
         png = image(figure, "png", DPI)
         (fresh / "joint.png").write_bytes(png)
-        (fresh / "joint.csv").write_bytes(table(figure))
         if width != TWO:  # the page is as wide as two columns
             png = image(plot_joint(found), "png", DPI)
         text = joint_page(found, png, linked=reports)

@@ -165,6 +165,8 @@ def _run(path: str, text: str) -> tuple[Law, ...]:
     module = importlib.util.module_from_spec(spec)
     module.__file__ = path
     sys.modules[name] = module
+    folder = str(Path(path).resolve().parent)  # it may import what stands beside it
+    sys.path.insert(0, folder)
     try:
         exec(compile(text, path, "exec"), module.__dict__)
         given = [one for one in vars(module).values() if isinstance(one, Law)]
@@ -177,6 +179,8 @@ def _run(path: str, text: str) -> tuple[Law, ...]:
             raise InputError(f"{path}: {error}") from None
         what = f"{type(error).__name__}: {error}".splitlines()[0]
         raise InputError(f"{path}: the file cannot be run ({what})") from None
+    finally:
+        sys.path.remove(folder)
     if not found:
         raise InputError(f"{path}: the file defines no law; make a foamfit.Law at its top level")
     return found

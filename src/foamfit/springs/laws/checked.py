@@ -62,7 +62,8 @@ def _missing(law: Law) -> str | None:
     given = law.loaded_functions()
     if not isinstance(given, Functions):
         return "functions must be foamfit.Functions(fill, begin, leaves, switch, settle)"
-    absent = [name for name, one in given._asdict().items() if not callable(one)]
+    needed = given if given.viscous is not None else given._replace(viscous=bool)
+    absent = [name for name, one in needed._asdict().items() if not callable(one)]
     return f"the function {absent[0]} is missing" if absent else None
 
 
@@ -75,7 +76,7 @@ def _overrun(law: Law, values: Array) -> str | None:
     given = law.loaded_functions()
     written: list[Any] = [getattr(one, "py_func", one) for one in given]
     plain = Functions(*written)
-    if any(one.__module__.startswith("foamfit.") for one in written):
+    if any(one and one.__module__.startswith("foamfit.") for one in written):
         return None  # the paper's laws call what Python cannot
     columns, states = followed.sizes_of(law)
     row, state = np.zeros(columns), np.zeros(states)
@@ -88,6 +89,8 @@ def _overrun(law: Law, values: Array) -> str | None:
                     if plain.leaves(row, state, strain):
                         plain.switch(row, state, strain > state[EPS])
                 plain.settle(row, state, strain)
+                if plain.viscous is not None:
+                    plain.viscous(row, state, 1.0, 0.1)
     except IndexError:
         return (
             f"a function goes beyond the {columns} numbers of row or the {states} of state; give "

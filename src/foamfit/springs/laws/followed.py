@@ -97,7 +97,8 @@ def functions_of(kind: str) -> Functions:
 def compiled_functions(law: Law) -> Functions:
     """Functions of a law, compiled."""
     given: tuple[Any, ...] = law.loaded_functions()
-    return Functions(*(one if hasattr(one, "py_func") else compiled(one) for one in given))
+    ready = (None, *(one for one in given if hasattr(one, "py_func")))
+    return Functions(*(one if one in ready else compiled(one) for one in given))
 
 
 def sizes_of(law: Law) -> tuple[int, int]:
@@ -146,16 +147,19 @@ class Loops(NamedTuple):
         time by the relaxation terms (n, 3). Returns the whole stress, Pa; NaN where there is none.
     to_stress(i, row, state, terms, eta, stress, h) -> strain
         The inverse; NaN where no strain gives that stress.
+    delayed(i, row, state, (rate, h)) -> stress
+        What of the stress of spring i depends on time, Pa.
     """
 
     start: Compiled
     step: Compiled
     to_stress: Compiled
+    delayed: Compiled
 
 
 def _walker(law: Law) -> Compiled:
     """Take one spring to a strain: over all branches on the way; returns its stress."""
-    _, _, leaves, switch, settle = compiled_functions(law)
+    _, _, leaves, switch, settle, _ = compiled_functions(law)
     columns, states = sizes_of(law)
 
     @compiled
@@ -184,21 +188,40 @@ def _starter(law: Law) -> Compiled:
     return start
 
 
+def _delayer(law: Law) -> Compiled:
+    """Give the stress of a spring that depends on time; `pace` are rate (1/s) and time (s)."""
+    viscous = compiled_functions(law).viscous
+    columns, states = sizes_of(law)
+
+    @compiled
+    def none(rows: Array, whole: Array, pace: tuple[float, float]) -> float:
+        return 0.0
+
+    @compiled
+    def delayed(rows: Array, whole: Array, pace: tuple[float, float]) -> float:
+        return viscous(rows[:columns], whole[:states], pace[0], pace[1])  # type: ignore[misc]
+
+    return none if viscous is None else delayed
+
+
 def _chosen(functions: Sequence[Compiled]) -> Compiled:
-    """One function of those of several springs: called with i, it is the i-th of them."""
+    """One function of those of several springs: called with i, it is the i-th of them.
+
+    Its last argument is what these take: a strain, or rate and time.
+    """
     first = functions[0]
 
     @compiled
-    def alone(i: int, row: Array, state: Array, eps: float) -> float:
-        return first(row, state, eps)
+    def alone(i: int, row: Array, state: Array, given: Any) -> float:
+        return first(row, state, given)
 
     if len(functions) == 1:
         return alone
     rest = _chosen(functions[1:])
 
     @compiled
-    def choose(i: int, row: Array, state: Array, eps: float) -> float:
-        return first(row, state, eps) if i == 0 else rest(i - 1, row, state, eps)
+    def choose(i: int, row: Array, state: Array, given: Any) -> float:
+        return first(row, state, given) if i == 0 else rest(i - 1, row, state, given)
 
     return choose
 
@@ -249,6 +272,7 @@ def loops_of(laws: tuple[Law, ...]) -> Loops:
     """Loops of springs of these laws, base first."""
     walk = _chosen([_walker(law) for law in laws])
     start = _chosen([_starter(law) for law in laws])
+    delayed = _chosen([_delayer(law) for law in laws])
 
     @compiled
     def step(
@@ -265,7 +289,10 @@ def loops_of(laws: tuple[Law, ...]) -> Loops:
             early = -math.expm1(-x) - late
             term[MEMORY] = decay * term[MEMORY] - early * before - late * sigma
             out += term[STRENGTH] * (sigma + term[MEMORY])
-        return out + eta * (eps - from_eps) / h if h > 0.0 and eta > 0.0 else out
+        if h > 0.0:
+            rate = (eps - from_eps) / h
+            out += delayed(i, row, state, (rate, h)) + eta * rate
+        return out
 
     @compiled
     def beside(given: Any, eps: float) -> float:
@@ -285,7 +312,7 @@ def loops_of(laws: tuple[Law, ...]) -> Loops:
             step(i, row, state, terms, eta, eps, h)
         return eps
 
-    return Loops(start, step, to_stress)
+    return Loops(start, step, to_stress, delayed)
 
 
 _NO_TERMS = np.empty((0, 3))

@@ -147,6 +147,10 @@ class Functions(NamedTuple):
         Goes to the end of the branch, upwards or downwards in strain, and on to the next.
     settle(row, state, strain)
         Brings the state to a strain on its branch.
+    viscous(row, state, rate, h) -> float, optional
+        Stress (Pa) that depends on time, added to that of the state, which was reached at a strain
+        rate (1/s) within the time h (s; 0 at the instant of contact). It may keep numbers in the
+        own part of the state. Without time it is not called.
     """
 
     fill: Callable[..., bool]
@@ -154,6 +158,7 @@ class Functions(NamedTuple):
     leaves: Callable[..., bool]
     switch: Callable[..., None]
     settle: Callable[..., None]
+    viscous: Callable[..., float] | None = None
 
 
 class PointOf(NamedTuple):
@@ -320,6 +325,11 @@ class Law:
     def loaded_functions(self) -> Functions:
         """Functions of the law, loaded where they are not given at once."""
         return self.functions if isinstance(self.functions, Functions) else self.functions()
+
+    @cached_property
+    def is_viscous(self) -> bool:
+        """Whether its stress depends on time."""
+        return self.loaded_functions().viscous is not None
 
     def assembled(self, chosen: Callable[[Param], float]) -> Array:
         """Own parameters from a choice for each: its place between its ends, or else its value."""

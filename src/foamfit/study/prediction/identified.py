@@ -207,7 +207,7 @@ def _source(given: _Item) -> Source:
         )
     joint, drive = "tests" in content, content.get("drive")
     try:
-        model = Model.parse(content["model"], content.get("relaxation", 0))
+        model = Model.of_result(content)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     if drive not in (*DRIVES, None) or (drive is None and not joint):

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
+from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
 from foamfit.results import law_in_words, plain
+from foamfit.springs.model import Model
 
 SCHEMA = 1
 # What makes the band, in the order in which it is told; "motion" where a noisy one drives.
@@ -131,6 +133,24 @@ class PredictedTest:
         """Share of the samples of each curve that lie inside its 95 % band."""
         return {name: curve.inside for name, curve in self.curves.items()}
 
+    @property
+    def by_cycle(self) -> dict[int, dict[str, float]]:
+        """Misfit, over its own range, and share inside the band of each of several cycles.
+
+        They are those of the stress under a driven motion, or of the first curve.
+        """
+        curve = self.curves.get("stress_time", next(iter(self.curves.values())))
+        out = {}
+        for number, part in cycles_of(self.measurement).items():
+            kept = curve.kept[part]
+            measured, predicted, lo, hi = (
+                one[part][kept] for one in (curve.measured, curve.predicted, curve.lo, curve.hi)
+            )
+            miss = float(np.sqrt(np.mean((predicted - measured) ** 2)) / np.ptp(measured))
+            within = float(np.mean((lo <= measured) & (measured <= hi)))
+            out[number] = {"misfit": miss, "inside": within}
+        return out
+
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``prediction.json``: SI, plain types, null = not there."""
         m = self.measurement
@@ -141,9 +161,11 @@ class PredictedTest:
                 "test": m.name,
                 "data_sha256": m.data_sha256,
                 "cycle": m.cycle,
+                "last_cycle": m.last_cycle,
                 "result": self.source,
                 "joint": self.joint,
-                "model": self.model,
+                "model": Model.parse(self.model).words,
+                **Model.parse(self.model).options,
                 "relaxation": self.relaxation,
                 "drive": self.drive,
                 "seed": self.seed,
@@ -154,6 +176,7 @@ class PredictedTest:
                 "extrapolated": self.extrapolated,
                 "misfit": self.misfit,
                 "inside": self.inside,
+                "by_cycle": self.by_cycle,
                 "curves": {
                     name: {
                         "range": curve.range,

@@ -1,0 +1,221 @@
+"""Do springs that remember describe all cycles of a foam with one set of parameters?
+
+Method. Running-shoe foam (arXiv:2602.12694, LivingMatterLab/CANN): 14 first cycles are fitted with
+one relaxation term, stiffening, softening and weakening; cycles 1 to 3 of the 11 specimens whose
+files have them are fitted as one history with two relaxation terms; from that fit cycles 4 and 5
+are predicted. The measurements are not part of this repository; FOAMFIT_DATA holds shoe-foam/ and
+shoe-foam-twins/.
+
+Answer. See README.md, which this writes with memory.csv (a row for each cycle of each specimen),
+parameters.csv (every parameter of every fit) and memory.png. A call goes on where the last one
+ended; --fresh begins anew.
+
+    FOAMFIT_DATA=path/to/data python experiments/memory/memory.py
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import foamfit as ff
+from foamfit.data.cycles import cycles_of
+from foamfit.data.measurement import Measurement
+from foamfit.report.figures import DPI
+from foamfit.results import Fit
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+import real_foams  # noqa: E402
+import studies  # noqa: E402
+
+TABLE, PARAMETERS, CURVES = HERE / "memory.csv", HERE / "parameters.csv", HERE / "curves.csv"
+SHOWN = "new-heel-comp-1"  # in the picture
+FIRST, HISTORY, PREDICTED = "first cycle", "cycles 1 to 3", "predicted"
+BARS = {FIRST: (0.56, 0.75), HISTORY: (0.90, 1.10), PREDICTED: (1.0, 1.25)}  # mean, worst, %
+MEMORY: dict[str, Any] = {"model": "microscale", "stiffening": True, "mullins": True}
+
+
+def histories(data: Path, folder: Path) -> Iterator[tuple[str, Path, Path]]:
+    """Name, file and TOML of each specimen with several cycles in a file."""
+    own = [("turbo-comp-1", *real_foams.SHOE_FOAM["turbo-comp-1"], data / "shoe-foam")]
+    twins = [(*one, data / "shoe-foam-twins") for one in studies.twins(data / "shoe-foam-twins")]
+    for name, height, diameter, place in (*own, *twins):
+        toml = studies.write_specimen(folder / f"{name}-cycles.toml", height, diameter)
+        yield name, place / f"{name}_raw.txt", toml
+
+
+def misfits(test: Measurement, result: Fit) -> dict[int, float]:
+    """Misfit of each cycle, over its own range."""
+    fitted, measured = result.curves.stress, test.stress
+    assert fitted is not None
+    assert measured is not None
+    spans = cycles_of(test) or {test.cycle: slice(None)}
+    return {
+        number: float(np.sqrt(np.mean((fitted - measured)[part] ** 2)) / np.ptp(measured[part]))
+        for number, part in spans.items()
+    }
+
+
+class Table:
+    """Rows that are written as they come, so that an interrupted study goes on."""
+
+    def __init__(self, fresh: bool) -> None:
+        there = TABLE.exists() and not fresh
+        self.rows = pd.read_csv(TABLE).to_dict("records") if there else []
+        self.values = pd.read_csv(PARAMETERS).to_dict("records") if there else []
+
+    def has(self, test: str, what: str) -> bool:
+        """Whether a part of a test is there."""
+        return any(row["test"] == test and row["what"] == what for row in self.rows)
+
+    def add(self, test: str, what: str, rows: list[dict[str, Any]], result: Fit) -> None:
+        """Add a part of a test and the parameters of its fit, and write both tables."""
+        self.rows += [{"test": test, "what": what, **row} for row in rows]
+        self.values += [
+            {
+                "test": test, "what": what, "parameter": name, "value": p.value,
+                "stderr": p.stderr, "unit": p.unit, "state": p.state,
+            }
+            for name, p in real_foams.varied(result).items()
+        ]  # fmt: skip
+        studies.write_csv(self.rows, TABLE)
+        studies.write_csv(self.values, PARAMETERS)
+        told = ", ".join(f"{100.0 * row['misfit']:.2f} %" for row in rows)
+        print(f"{test:18}{what:16}{told}", flush=True)
+
+
+def fitted(test: Measurement, **more: Any) -> tuple[Fit, float]:
+    began = time.process_time()  # the machine may be shared
+    return ff.fit(test, **MEMORY, **more), time.process_time() - began
+
+
+def study(data: Path, table: Table) -> None:
+    """Fit and predict what is missing in the table."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for test in real_foams.first_cycles(data, folder):
+            if not table.has(test.name, FIRST):
+                result, seconds = fitted(test, relaxation=1)
+                miss = misfits(test, result)[test.cycle]
+                row = {"cycle": 1, "misfit": miss, "inside": np.nan, "seconds": seconds}
+                table.add(test.name, FIRST, [row], result)
+        for specimen, file, toml in histories(data, folder):
+            if table.has(specimen, HISTORY):
+                continue
+            test = ff.read_test(file, toml, cycles=(1, 3))
+            result, seconds = fitted(test, relaxation=2)
+            later = ff.predict(result, ff.read_test(file, toml, cycles=(1, 5)))
+            whole = {"cycle": "1-3", "misfit": result.misfit["stress_strain"], "seconds": seconds}
+            each = [{"cycle": n, "misfit": m} for n, m in misfits(test, result).items()]
+            table.add(specimen, HISTORY, [whole, *each], result)
+            told = [{"cycle": n, **one} for n, one in later.by_cycle.items() if n > 3]
+            table.add(specimen, PREDICTED, told, result)
+            if specimen == SHOWN:
+                keep_curves(later)
+
+
+def keep_curves(later: ff.Prediction) -> None:
+    """Write measured and predicted curves of the specimen in the picture, thinned."""
+    curve = next(iter(later.curves.values()))
+    test, some = later.measurement, slice(None, None, 2)
+    assert test.displacement is not None
+    frame = pd.DataFrame({
+        "strain": test.displacement / test.specimen.height,
+        "predicted (Pa)": curve.predicted, "low (Pa)": curve.lo, "high (Pa)": curve.hi,
+        "cycle": np.concatenate([
+            np.full(len(test.displacement[part]), n) for n, part in cycles_of(test).items()
+        ]),
+    })  # fmt: skip
+    studies.write_csv(frame[some], CURVES, 5)
+
+
+def summary(table: pd.DataFrame) -> str:
+    """Mean and worst misfit of each part, beside the bars."""
+    rows = []
+    for what, (mean, worst) in BARS.items():
+        own = table[table["what"] == what]
+        own = own[own["cycle"].astype(str).isin(["1-3"])] if what == HISTORY else own
+        miss = 100.0 * own["misfit"].astype(float)
+        inside = 100.0 * own["inside"].astype(float)
+        shown = f"{inside.min():.0f}–{inside.max():.0f} %" if what == PREDICTED else "–"
+        rows.append([
+            what, own["test"].nunique(), f"{miss.mean():.2f} % (≤ {mean:.2f})",
+            f"{miss.max():.2f} % (≤ {worst:.2f})", shown,
+        ])  # fmt: skip
+    head = "what | specimens | mean misfit (goal) | worst misfit (goal) | samples inside the band"
+    return studies.markdown(head, rows)
+
+
+def per_specimen(table: pd.DataFrame) -> str:
+    wide = table[table["what"] != FIRST].assign(cycle=table["cycle"].astype(str))
+    wide = wide.pivot_table(index="test", columns="cycle", values="misfit", sort=False)
+    head = ["specimen", *(f"cycle {c}" if len(c) == 1 else "cycles 1 to 3" for c in wide.columns)]
+    cells = ([test, *(f"{100.0 * x:.2f}" for x in row)] for test, row in wide.iterrows())
+    return studies.markdown(head, cells)
+
+
+def values_table(values: pd.DataFrame) -> str:
+    """Mean and scatter between the specimens of each parameter, from cycles 1 to 3."""
+    own = values[values["what"] == HISTORY]
+    own = own.assign(foam=own["test"].str.rpartition("-comp")[0])
+    rows = []
+    for name, group in own.groupby("parameter", sort=False):
+        cells = []
+        for _, foam in group.groupby("foam", sort=False):
+            scatter = f" ± {foam['value'].std(ddof=1):.2g}" if len(foam) > 1 else ""
+            cells.append(f"{foam['value'].mean():.3g}{scatter}")
+        states = group["state"].value_counts()
+        told = " / ".join(str(states.get(s, 0)) for s in ("determined", "weak", "not determined"))
+        rows.append([name, *cells, told])
+    head = ["parameter", *own["foam"].unique(), "determined / weak / not"]
+    return studies.markdown(head, rows)
+
+
+def draw(path: Path) -> None:
+    """Draw the predicted cycles of one specimen."""
+    curves = pd.read_csv(CURVES)
+    with studies.sheet(path, 7.0, 3.2, DPI) as figure:
+        axes = figure.subplots(1, 2, sharey=True)
+        parts = {"fitted: cycles 1 to 3": curves["cycle"] <= 3, "predicted: 4 and 5": None}
+        for ax, (title, mask) in zip(axes, parts.items(), strict=True):
+            own = curves[mask if mask is not None else curves["cycle"] > 3]
+            for number, one in own.groupby("cycle"):
+                ax.plot(one["strain"], one["predicted (Pa)"] / 1e3, lw=1.1, label=f"cycle {number}")
+                if mask is None:
+                    ends = one["low (Pa)"] / 1e3, one["high (Pa)"] / 1e3
+                    ax.fill_between(one["strain"], *ends, alpha=0.2, lw=0)
+            ax.set(title=title, xlabel="strain (–)")
+            ax.legend(loc="upper left")
+        axes[0].set_ylabel("stress (kPa)")
+        figure.suptitle(
+            f"Running-shoe foam, {SHOWN}: one set of parameters ({real_foams.SOURCE})",
+            x=0.012, ha="left", fontsize=8.5, weight="bold",
+        )  # fmt: skip
+
+
+def main(fresh: bool) -> None:
+    data = studies.measurements("shoe-foam", "shoe-foam-twins")
+    study(data, Table(fresh))
+    table, values = pd.read_csv(TABLE), pd.read_csv(PARAMETERS)
+    page = (HERE / "page.template.md").read_text(encoding="utf-8")
+    text = page.format(
+        source=real_foams.SOURCE, summary=summary(table), specimens=per_specimen(table),
+        values=values_table(values),
+    )  # fmt: skip
+    (HERE / "README.md").write_text(text, encoding="utf-8")
+    if CURVES.exists():
+        draw(HERE / "memory.png")
+
+
+if __name__ == "__main__":
+    parser = studies.arguments(__doc__)
+    parser.add_argument("--fresh", action="store_true", help="forget what is there")
+    main(parser.parse_args().fresh)

@@ -1,0 +1,85 @@
+"""Maxwell-slip (Iwan): an elastic foam beside N sliders, each behind a spring of its own.
+
+    σ = σ_0(ε) + (k/N) Σ e_j,   de_j = dε  as long as |e_j| < y_j,   y_j = slip ((j - ½)/N)^spread
+
+σ_0 is the Ogden curve (`ogden.py`), e_j the elastic strain of slider j and all that it remembers.
+The slip strains are those of Segalman's power law, spread = 1/(1 + χ), in N = 24 equal shares of
+the stiffness k. For N → ∞ loading from rest adds k ε (1 - u spread/(1 + spread)) with
+u = (ε/slip)^(1/spread) as long as ε <= slip, and unloading takes off twice this curve at half the
+way (Masing).
+
+Iwan 1966, J. Appl. Mech. 33, 893; Segalman 2005, J. Appl. Mech. 72, 752.
+"""
+
+import numpy as np
+from ogden import CURVE, curve, read_curve
+
+import foamfit as ff
+
+EPS, SIGMA, BRANCH, FIRST = range(4)
+N = 24
+
+
+def fill(values, row):
+    """Copy the parameters, then the slip strains."""
+    row[:7] = values
+    for j in range(N):
+        row[7 + j] = values[5] * ((j + 0.5) / N) ** values[6]
+    return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4:].min() > 0.0
+
+
+def begin(row, state):
+    """Rest: no slider is strained."""
+    state[:] = 0.0
+
+
+def leaves(row, state, strain):
+    """Whether the strain turns."""
+    return strain != state[EPS] and (strain > state[EPS]) != (state[BRANCH] == 0.0)
+
+
+def switch(row, state, up):
+    """Loading is branch 0, unloading branch 1."""
+    state[BRANCH] = 0.0 if up else 1.0
+
+
+def settle(row, state, strain):
+    """Move each slider, and let slip those at their limit."""
+    step, total = strain - state[EPS], 0.0
+    for j in range(N):
+        limit = row[7 + j]
+        state[FIRST + j] = min(max(state[FIRST + j] + step, -limit), limit)
+        total += state[FIRST + j]
+    state[EPS] = strain
+    state[SIGMA] = curve(strain, row[0], row[1], row[2], row[3])[0] + row[4] / N * total
+
+
+def read_off(loop, marks, scales, way):
+    """The elastic curve is midway; half the width of the loop is the stress of all sliders."""
+    half = 0.5 * scales.strain
+    width = loop.at(half, loading=True) - loop.at(half, loading=False)
+    slip, spread = scales.strain * 10.0 ** (1.2 * marks[2] - 1.2), 0.5 * 8.0 ** marks[3]
+    k = max(0.5 * width, 0.01 * scales.stress) / slip * (1.0 + spread)
+    elastic = read_curve(loop, marks, scales, 0.5)
+    return np.array([*elastic, k, slip, spread, 0.0])
+
+
+LAW = ff.Law(
+    kind="maxwell-slip",
+    title="Maxwell-slip spring",
+    params=(
+        *CURVE,
+        ff.Param(
+            "k", ("k", ""), "Pa", "stiffness of all sliders", (1.0, "slope"), (1e-3, 1e3), "slope"
+        ),
+        ff.Param(
+            "slip", ("y", "m"), "", "largest slip strain", (0.2, "strain"), (1e-3, 1e1), "strain"
+        ),
+        ff.Param("spread", ("s", ""), "", "spread of the slip strains", (1.0, "one"), (0.1, 10.0)),
+    ),
+    functions=ff.Functions(fill, begin, leaves, switch, settle),
+    columns=7 + N,
+    states=3 + N,
+    branches={"loading": "the strain grows", "unloading": "the strain falls"},
+    read_off=read_off,
+)  # fmt: skip

@@ -1,0 +1,296 @@
+"""How do the laws of this project compare with those of the literature?
+
+Method. Running-shoe foams (arXiv:2602.12694), a mycelium, printed lattices and an impact on
+cartilage are fitted by our laws and by those of this folder, each with nine parameters at most, by
+the same search, objective and intervals (`foamfit.fit`, displacement drive: the measured motion is
+prescribed, the stress compared). Then a test that was not fitted (another specimen of the same
+foam, of a lattice a later cycle, of the cartilage a faster impact) is predicted with the values
+found: as it is, and with the predicted stress multiplied by the factor that suits best, for
+specimens differ in stiffness. Records are thinned to at most 320 rows, for all laws alike. The
+measurements are not part of this repository.
+
+Answer. See README.md, which this script writes; beside it other_laws.csv (a row per fit) and
+other_laws.png (loops side by side).
+
+    FOAMFIT_DATA=path/to/data python experiments/other_laws/other_laws.py    # with --jobs 2 faster
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+import foamfit as ff
+from foamfit.data.measurement import Measurement
+from foamfit.springs import laws
+from foamfit.springs.parameters import NUISANCE
+
+HERE = Path(__file__).parent
+sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent.parent / "notebooks")]
+import studies  # noqa: E402
+from real_foams import SHOE_FOAM, STRIKER  # noqa: E402
+
+ROWS = 320  # of a thinned record
+MEASURES = ("misfit", "predicted", "scaled")  # over the range of the measured stress
+
+
+class Compared(NamedTuple):
+    """One law of the table: model, relaxation terms, and the file that defines it."""
+
+    name: str
+    model: str
+    relaxation: int = 0
+    file: str = ""
+    more: dict[str, Any] = {}  # further options of the fit  # noqa: RUF012
+
+
+LAWS = (
+    Compared("microscale", "microscale"),
+    Compared("microscale, relaxation", "microscale", 1),
+    # Compared("microscale, stiffening, softening, weakening, relaxation", "microscale", 1,
+    #          more={"stiffening": True, "mullins": True}),
+    Compared("bistable", "bistable"),
+    Compared("bistable, relaxation", "bistable", 1),
+    Compared("bistable, power-law damper", "bistable-power-damper", 0, "power_law_damper"),
+    Compared("quasi-linear viscoelastic: Ogden, two Prony terms", "ogden", 2, "ogden"),
+    Compared("Ogden-Roxburgh, relaxation", "ogden-roxburgh", 1, "ogden_roxburgh"),
+    Compared("Bouc-Wen, linear, relaxation", "bouc-wen", 1, "bouc_wen"),
+    Compared("Bouc-Wen beside Ogden, relaxation", "bouc-wen-foam", 1, "bouc_wen_foam"),
+    Compared("Maxwell-slip beside Ogden, relaxation", "maxwell-slip", 1, "maxwell_slip"),
+    Compared("fractional element on Ogden, relaxation", "fractional", 1, "fractional"),
+)
+DRAWN = (1, 4, 5, 6, 8, 9, 10)  # laws of the picture
+# Group, test and the test held out; of a lattice their cycles.
+FOAM, MYCELIUM, LATTICE, IMPACT = "shoe foams", "mycelium", "lattices", "impact"
+TESTS = (
+    (FOAM, "turbo-comp-1", "turbo-comp-2"),
+    (FOAM, "leap-comp-2", "leap-comp-3"),
+    (FOAM, "new-heel-comp-1", "new-heel-comp-2"),
+    (FOAM, "worn-heel-comp-1", "worn-heel-comp-2"),
+    (MYCELIUM, "outplane-4s-1", "outplane-4s-2"),
+    (LATTICE, "tpu87-20 cycle 10", "tpu87-20 cycle 100"),
+    (LATTICE, "tpu87-50 cycle 10", "tpu87-50 cycle 100"),
+    (IMPACT, "test_1_impact", "test_3_impact"),
+)
+SHOWN = ("turbo-comp-1", "outplane-4s-1", "tpu87-20 cycle 10", "test_1_impact")
+VELOCITY = {"test_1_impact": 0.785, "test_3_impact": 0.905}  # m/s
+LATTICE_COLUMNS = """\
+time = { column = "Total Time (s)" }
+displacement = { column = "Position(Linear:Position) (mm)", counts_down = true }
+force = { column = "Force(Linear:Load) (kN)", scale = -1 }
+cycle = { column = "Total Cycles" }"""
+
+
+# ------------------------------------------------------------------------------- the tests
+
+
+def read(group: str, name: str, data: Path, folder: Path) -> Measurement:
+    """Read a test as a user would, and thin it."""
+    toml, cycle = folder / "specimen.toml", None
+    if name in SHOE_FOAM:
+        path = data / "shoe-foam" / f"{name}_cycle1.csv"
+        studies.write_specimen(toml, *SHOE_FOAM[name], "")
+    elif group == FOAM:
+        sizes = {one: size for one, *size in studies.twins(data / "shoe-foam-twins")}
+        path = data / "shoe-foam-twins" / f"{name}_raw.txt"
+        studies.write_specimen(toml, *sizes[name])
+    elif group == MYCELIUM:
+        path = data / "mycelium-rates" / f"{name}_raw.txt"
+        gap = path.read_text(encoding="utf-8").splitlines()[1].split("\t")[5].strip()
+        studies.write_specimen(toml, f"{gap} um", "8 mm")
+    elif group == LATTICE:
+        stem, _, number = name.split()
+        path, cycle = data / "lattice-cycles" / f"{stem}_raw.csv", int(number)
+        studies.write_specimen(toml, "12 mm", "20 mm", LATTICE_COLUMNS)
+    else:
+        path = data / "cartilage-impact" / f"{name}.csv"
+        studies.write_specimen(toml, "0.563 mm", "8.5 mm", "")
+        toml.write_text(toml.read_text() + STRIKER.format(velocity=VELOCITY[name]))
+    return thinned(ff.read_test(path, toml, cycle=cycle), folder / f"{name}.csv")
+
+
+def thinned(test: Measurement, path: Path) -> Measurement:
+    """Keep every n-th row of a test, at most `ROWS`, as a test without a striker."""
+    assert test.time is not None
+    assert test.displacement is not None
+    some = slice(None, None, -(-test.time.size // ROWS))
+    own = test.specimen
+    toml = f'name = "{test.name}"\n[specimen]\nheight = "{own.height} m"\narea = "{own.area} m^2"\n'
+    studies.write_test(
+        path, toml, time=test.time[some], stress=test.stress[some],
+        displacement=test.displacement[some],
+    )  # fmt: skip
+    return ff.read_test(path)
+
+
+# ------------------------------------------------------------------------------- the fits
+
+
+def fit_all(case: tuple[str, str, str], data: Path, starts: int) -> list[dict[str, Any]]:
+    """Fit one test by every law and predict the test held out: a row for each, with its curves."""
+    rows = []
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, (group, name, other) = Path(temporary), case
+        test, held_out = (read(group, one, data, folder) for one in (name, other))
+        for law in LAWS:
+            if law.file and not laws.is_registered(law.model):
+                ff.register(importlib.import_module(law.file).LAW)
+            options: dict[str, Any] = law.more | {"relaxation": law.relaxation}
+            ff.fit(test, model=law.model, starts=1, max_time=0.2, intervals="local", **options)
+            began = time.process_time()  # what is compiled is compiled
+            result = ff.fit(test, model=law.model, drive="displacement", starts=starts, **options)
+            seconds = time.process_time() - began
+            told = [p.state for n, p in result.parameters.items() if p.vary and n not in NUISANCE]
+            strain, curves = result.strain, result.curves
+            rows.append({
+                "group": group, "test": name, "held_out": other, "law": law.name,
+                "parameters": len(told), "misfit": result.misfit["stress_strain"],
+                **predicted(result, held_out),
+                **{state: told.count(state) for state in ("determined", "weak", "not determined")},
+                "seconds": seconds, "rows": test.stress.size,
+                "curves": (strain, curves.measured_stress, curves.stress),
+            })  # fmt: skip
+            off, cross = (100.0 * rows[-1][one] for one in ("misfit", "scaled"))
+            print(f"{name:20}{law.name:50}{off:6.2f} %{cross:8.2f} %{seconds:7.1f} s", flush=True)
+    return rows
+
+
+def predicted(result: Any, test: Measurement) -> dict[str, float]:
+    """Misfit of a test that was not fitted: as predicted, and up to one factor of the stress."""
+    one = ff.predict(result, test).curves["stress_strain"]
+    factor = one.predicted @ one.measured / (one.predicted @ one.predicted)
+    off = {"predicted": one.predicted, "scaled": factor * one.predicted}
+    return {
+        name: float(np.sqrt(np.mean((curve - one.measured) ** 2)) / np.ptp(one.measured))
+        for name, curve in off.items()
+    }
+
+
+# ------------------------------------------------------------------------------- page and picture
+
+
+def law_table(table: pd.DataFrame) -> str:
+    """Write the table of the README: a row for each law, misfit and predicted misfit by group."""
+    rows = []
+    groups = list(dict.fromkeys(group for group, *_ in TESTS))
+    fitted = {group: set(table[table["group"] == group]["test"]) or {""} for group in groups}
+    best = {
+        (group, one): table[table["group"] == group].groupby("law")[one].mean().min()
+        for group in groups
+        for one in MEASURES
+    }
+    for law in LAWS:
+        own = table[table["law"] == law.name]
+        if own.empty:
+            continue
+        cells = []
+        for group in groups:
+            part = own[own["group"] == group]
+            if len(part) < len(fitted[group]):  # a study that was interrupted
+                cells.append("–")
+                continue
+            both = {one: part[one].mean() for one in MEASURES}
+            bold = {one: "**" * bool(v == best[group, one]) for one, v in both.items()}
+            cells.append(" / ".join(f"{bold[n]}{100.0 * v:.2f}{bold[n]}" for n, v in both.items()))
+        rows.append([
+            law.name, own["parameters"].iloc[0], *cells,
+            f"{own['determined'].mean():.1f}", f"{own['seconds'].median():.1f} s",
+        ])  # fmt: skip
+    return studies.markdown(["law", "parameters", *groups, "determined", "run time"], rows)
+
+
+def winners(table: pd.DataFrame) -> str:
+    """Name, for each test, the laws with the least misfit and the least misfit of prediction."""
+    rows = []
+    for _, name, other in TESTS:
+        own, cells = table[table["test"] == name], list[str]()
+        if own.empty:
+            continue
+        for one in ("misfit", "scaled"):
+            first, second = own.nsmallest(2, one).itertuples()
+            cells += [f"{first.law}, {100.0 * getattr(first, one):.2f} %",
+                      f"{second.law}, {100.0 * getattr(second, one):.2f} %"]  # fmt: skip
+        rows.append([name, cells[0], cells[1], other, cells[2], cells[3]])
+    return studies.markdown(
+        "fitted | best | second | predicted, up to a factor | best | second", rows
+    )
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draw measured and fitted loops: a row for each kind of test, a column for each law."""
+    found = {(row["test"], row["law"]): row for row in rows}
+    names = [LAWS[i].name for i in DRAWN]
+    tests = [name for name in SHOWN if any(test == name for test, _ in found)]
+    with studies.sheet(path, 1.55 * len(names), 1.5 * len(tests) + 0.5) as figure:
+        axes = figure.subplots(len(tests), len(names), sharey="row", sharex="row", squeeze=False)
+        for (name, line), column in ((one, k) for one in zip(tests, axes, strict=True)
+                                     for k in range(len(names))):  # fmt: skip
+            row, ax = found.get((name, names[column])), line[column]
+            if name == tests[0]:
+                title = names[column].replace(": ", ":\n").replace(", ", ",\n")
+                title = title.replace(" on ", "\non ").replace(" beside ", "\nbeside ")
+                ax.set_title(title, fontsize=6.5)
+            if name == tests[-1]:
+                ax.set_xlabel("strain (–)")
+            if row is None:  # a study that was interrupted
+                continue
+            strain, measured, fitted = row["curves"]
+            factor, unit = (1e6, "MPa") if measured.max() > 1e6 else (1e3, "kPa")
+            ax.plot(strain, measured / factor, color="0.6", lw=1.6)
+            ax.plot(strain, fitted / factor, color=studies.VERMILION, lw=0.9)
+            ax.text(
+                0.05, 0.95, f"{100.0 * row['misfit']:.2f} %", transform=ax.transAxes, va="top",
+                fontsize=7,
+            )  # fmt: skip
+            if column == 0:
+                ax.set_ylabel(f"{name.removesuffix('_impact')}\nstress ({unit})", fontsize=7)
+        figure.suptitle(
+            "Measured (grey; shoe foam arXiv:2602.12694, mycelium LivingMatterLab/CANN, lattice "
+            "mev43/FYP-Cyclic-Compression, cartilage JoVE 64450), fitted (red), misfit",
+            x=0.01, ha="left", fontsize=7.5,
+        )  # fmt: skip
+
+
+def main() -> None:
+    """Fit, and write page, table and picture."""
+    numbers = {"starts": (6, "descents of each fit"), "jobs": (1, "processes")}
+    parser = studies.arguments(__doc__, out=HERE, **numbers)
+    parser.add_argument("--only", default="", help="tests whose name contains this")
+    parser.add_argument("--page", action="store_true", help="only write the page, from the CSV")
+    given = parser.parse_args()
+    if not given.page:
+        fit_tests(given)
+    table = pd.read_csv(given.out / "other_laws.csv")
+    studies.write_page(
+        HERE, out=given.out, table=law_table(table), winners=winners(table), rows=ROWS,
+        starts=given.starts, minutes=f"{table['seconds'].sum() / 60.0:.0f}",
+        circumstances=studies.circumstances(),
+    )  # fmt: skip
+
+
+def fit_tests(given: argparse.Namespace) -> None:
+    """Fit all tests; write the table and the picture."""
+    data = studies.measurements(
+        "shoe-foam", "shoe-foam-twins", "mycelium-rates", "lattice-cycles", "cartilage-impact"
+    )
+    cases = [case for case in TESTS if given.only in case[1]]
+    rows = list[dict[str, Any]]()
+    with ProcessPoolExecutor(given.jobs) as pool:
+        for task in [pool.submit(fit_all, case, data, given.starts) for case in cases]:
+            rows += task.result()  # an interrupted study keeps what it has
+            table = pd.DataFrame(rows).drop(columns="curves")
+            studies.write_csv(table, given.out / "other_laws.csv")
+            draw(rows, given.out / "other_laws.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,220 @@
+"""The laws of experiments/other_laws against closed forms, SciPy and direct evaluation."""
+
+import importlib
+import sys
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import quad, solve_ivp
+from scipy.special import erf, gamma
+
+import foamfit as ff
+from foamfit.springs import laws
+
+FOLDER = Path(__file__).parent.parent / "experiments" / "other_laws"
+CURVE = {"mu": 2.3e5, "alpha": 9.0, "nu": 2e4, "beta": 2.5}
+UP_DOWN = np.concatenate([np.linspace(0.0, 0.6, 61), np.linspace(0.59, 0.0, 60)])
+
+
+@cache
+def law(name):
+    """Register the law of a file."""
+    if str(FOLDER) not in sys.path:
+        sys.path.insert(0, str(FOLDER))
+    return ff.register(importlib.import_module(name).LAW)
+
+
+def stress(strain, mu, alpha, nu, beta):
+    """Nominal stress of the hyperfoam by its published sum."""
+    stretch = 1.0 - strain
+    terms = ((mu, alpha), (nu, -beta))
+    return sum(2.0 * m / a * (1.0 / stretch - stretch ** (a - 1.0)) for m, a in terms)
+
+
+def pressed(spring, time, strain):
+    """Base stress of one spring under a prescribed motion."""
+    chain = ff.Chain([spring], [0.01], area=1e-4)
+    drive = ff.DisplacementDrive(0.01 * strain)
+    return ff.simulate(chain, drive, time, rtol=1e-6).base_stress
+
+
+def test_ogden_curve_is_the_published_sum():
+    spring = law("ogden").make([*CURVE.values(), 0.0], [])
+    np.testing.assert_allclose(spring.stress(UP_DOWN), stress(UP_DOWN, **CURVE), rtol=1e-12)
+
+
+@pytest.mark.parametrize("beta", [0.0, 1e-6, -1.0, -2.5])
+def test_ogden_curve_passes_through_every_exponent(beta):
+    given = CURVE | {"beta": beta}
+    spring = law("ogden").make([*given.values(), 0.0], [])
+    near = given | {"beta": beta or 1e-7}
+    np.testing.assert_allclose(spring.stress(UP_DOWN), stress(UP_DOWN, **near), rtol=1e-6)
+
+
+def test_prony_series_is_its_hereditary_integral():
+    g, tau = 0.8, 0.3
+    spring = law("ogden").make([*CURVE.values(), 0.0], [(g, tau)])
+    time = np.linspace(0.0, 1.0, 401)
+    found = pressed(spring, time, 0.6 * time)[-1]
+
+    def late(s):
+        step = 1e-6
+        slope = (stress(0.6 * s + step, **CURVE) - stress(0.6 * s - step, **CURVE)) / (2.0 * step)
+        return g * np.exp(-(1.0 - s) / tau) * slope * 0.6
+
+    assert found == pytest.approx(stress(0.6, **CURVE) + quad(late, 0.0, 1.0)[0], rel=1e-5)
+
+
+def test_ogden_roxburgh_softens_by_the_energy_below_the_largest():
+    r, m = 1.6, 6e4
+    spring = law("ogden_roxburgh").make([*CURVE.values(), r, m, 0.0], [])
+    path = np.concatenate([UP_DOWN, np.linspace(0.0, 0.7, 71)])
+    elastic = stress(path, **CURVE)
+    energy = np.array([quad(lambda e: stress(e, **CURVE), 0.0, e)[0] for e in path])
+    largest = np.maximum.accumulate(energy)
+    wanted = elastic * (1.0 - erf((largest - energy) / m) / r)
+    np.testing.assert_allclose(spring.stress(path), wanted, rtol=1e-8, atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [0.7, 1.0, 3.0])
+def test_bouc_wen_follows_its_differential_equation(n):
+    k, limit = 4e5, 0.08
+    spring = law("bouc_wen_foam").make([*CURVE.values(), k, limit, n, 0.0], [])
+    z, wanted, last = 0.0, [], 0.0
+    for turn in (0.5, 0.2, 0.6, 0.0):
+        way = np.sign(turn - last)
+
+        def slope(e, z, way=way):
+            return 1.0 - (np.abs(z) / limit) ** n * (z * way > 0.0)
+
+        parts = [last, turn]
+        if z * way < 0.0 and abs(turn - last) > abs(z):  # the slope has a kink at z = 0
+            parts = [last, last - z, turn]
+        for one, other in pairwise(parts):
+            found = solve_ivp(slope, (one, other), [z], "DOP853", rtol=1e-10, atol=1e-12)
+            z = found.y[0, -1]
+        wanted.append(stress(turn, **CURVE) + k * z)
+        last = turn
+    np.testing.assert_allclose(spring.stress([0.0, 0.5, 0.2, 0.6, 0.0])[1:], wanted, rtol=1e-4)
+
+
+def test_maxwell_slip_is_its_sliders_and_near_their_limit():
+    k, slip, spread = 4e5, 0.2, 1.5
+    spring = law("maxwell_slip").make([*CURVE.values(), k, slip, spread, 0.0], [])
+    limits = slip * ((np.arange(24) + 0.5) / 24) ** spread
+    held, wanted = np.zeros(24), []
+    for step in np.diff(UP_DOWN, prepend=0.0):
+        held = np.clip(held + step, -limits, limits)
+        wanted.append(k * held.mean())
+    added = spring.stress(UP_DOWN) - stress(UP_DOWN, **CURVE)
+    np.testing.assert_allclose(added, wanted, atol=1e-6)
+
+    def masing(e):
+        share = np.minimum(e / slip, 1.0) ** (1.0 / spread)
+        return k * np.where(e < slip, e, slip) * (1.0 - share * spread / (1.0 + spread))
+
+    limit = np.concatenate(
+        [masing(UP_DOWN[:61]), masing(0.6) - 2.0 * masing(0.5 * (0.6 - UP_DOWN[61:]))]
+    )
+    np.testing.assert_allclose(added, limit, atol=5e-3 * k * slip)
+
+
+@pytest.mark.parametrize("order", [0.1, 0.3, 0.7])
+def test_fractional_element_under_a_ramp_of_stress(order):
+    strength = 0.4
+    spring = law("fractional").make([*CURVE.values(), strength, order, 0.0], [])
+    grid = np.linspace(0.0, 0.5, 2001)
+    time = np.linspace(0.0, 2.0, 801)
+    top = stress(0.5, **CURVE)
+    strain = np.interp(time / 2.0 * top, stress(grid, **CURVE), grid)
+    wanted = top * time / 2.0 + strength * top / 2.0 * time ** (1.0 - order) / gamma(2.0 - order)
+    np.testing.assert_allclose(pressed(spring, time, strain), wanted, atol=3e-3 * top)
+
+
+def test_fractional_element_along_a_cycle_is_the_direct_sum():
+    strength, order = 0.4, 0.25
+    spring = law("fractional").make([*CURVE.values(), strength, order, 0.0], [])
+    time = np.linspace(0.0, 2.0, 801)
+    strain = 0.25 * (1.0 - np.cos(np.pi * time))
+    elastic = stress(strain, **CURVE)
+    ahead = time[:, None] - time[None, :]
+    kernel = np.where(ahead > 0.0, ahead, 0.0) ** (1.0 - order) / gamma(2.0 - order)
+    wanted = elastic + strength * (kernel[:, :-1] - kernel[:, 1:]) @ (
+        np.diff(elastic) / np.diff(time)
+    )
+    np.testing.assert_allclose(pressed(spring, time, strain), wanted, atol=3e-3 * elastic.max())
+
+
+BISTABLE = {
+    "k0": 5.5e6, "kc": 82.5e6, "dsigma": -0.179e6, "eps_a": 0.14, "eps_c": 0.31,
+    "kh_plus": 14.3e6, "kh_minus": 2.34e6,
+}  # fmt: skip
+
+
+def test_power_law_damper_adds_a_power_of_the_rate():
+    c, n = 2e5, 0.3
+    spring = law("power_law_damper").make([*BISTABLE.values(), c, n, 0.0], [])
+    time = np.linspace(0.0, 1.0, 501)
+    strain = 0.36 * (1.0 - np.abs(1.0 - 2.0 * time))
+    rate = np.where(time <= 0.5, 0.72, -0.72) * (time > 0.0)
+    wanted = ff.BistableSpring(**BISTABLE).stress(strain) + c * np.abs(rate) ** n * np.sign(rate)
+    np.testing.assert_allclose(pressed(spring, time, strain), wanted, rtol=1e-9, atol=1e-3)
+
+
+def test_power_law_damper_of_power_one_is_the_dashpot_in_an_impact():
+    eta, impact, time = 500.0, ff.Impact(mass=7e-3, velocity=2.0), np.linspace(0.0, 1e-3, 101)
+    spring = law("power_law_damper").make([*BISTABLE.values(), eta, 1.0, 0.0], [])
+    paper = ff.BistableSpring(**BISTABLE, eta=eta)
+    found, wanted = (
+        ff.simulate(ff.Chain([one], [1.19e-3], area=1.9635e-5), impact, time, rtol=1e-4)
+        for one in (spring, paper)
+    )
+    top = wanted.base_stress.max()
+    np.testing.assert_allclose(found.base_stress[1:60], wanted.base_stress[1:60], atol=2e-3 * top)
+    assert found.base_stress[0] == pytest.approx(eta * 2.0 / 1.19e-3)
+
+
+def test_power_law_damper_in_an_impact_against_scipy():
+    mass, speed, height, area, c, n, k = 0.01, 1.5, 1e-3, 2e-5, 1e4, 0.5, 5.5e6
+    given = BISTABLE | {"eps_a": 0.6, "eps_c": 0.8, "dsigma": -1e5, "k0": k}  # stays on branch a
+    spring = law("power_law_damper").make([*given.values(), c, n, 0.0], [])
+    time = np.linspace(0.0, 2e-4, 41)
+
+    def total(w, v):
+        eps = w / height
+        return k * eps / (1.0 - eps) + c * abs(v / height) ** n * np.sign(v)
+
+    judged = solve_ivp(
+        lambda t, y: [y[1], -total(*y) * area / mass], (0.0, time[-1]), [0.0, speed], "DOP853",
+        t_eval=time, rtol=1e-10, atol=1e-14,
+    )  # fmt: skip
+    run = ff.simulate(
+        ff.Chain([spring], [height], area=area), ff.Impact(mass=mass, velocity=speed), time,
+        rtol=1e-4,
+    )  # fmt: skip
+    np.testing.assert_allclose(run.displacement[-1], judged.y[0], atol=2e-4 * judged.y[0].max())
+    np.testing.assert_allclose(run.base_stress, [total(*y) for y in judged.y.T], rtol=2e-3)
+
+
+def test_a_law_that_depends_on_time_needs_one(tmp_path):
+    law("fractional")
+    path = tmp_path / "t.csv"
+    strain = np.linspace(0.0, 0.5, 40)
+    rows = np.column_stack([strain, stress(strain, **CURVE)])
+    np.savetxt(path, rows, delimiter=",", header="strain,stress (Pa)", comments="")
+    path.with_suffix(".toml").write_text('[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n')
+    with pytest.raises(ff.InputError, match="'fractional' needs a time column"):
+        ff.fit(ff.read_test(path), model="fractional")
+
+
+def test_a_law_file_may_import_what_stands_beside_it(tmp_path):
+    example = FOLDER.parent.parent / "notebooks" / "bouc_wen.py"
+    (tmp_path / "stands_beside.py").write_text(example.read_text())
+    path = tmp_path / "imports.py"
+    path.write_text("from stands_beside import LAW\n")
+    before = list(sys.path)
+    assert [one.kind for one in laws.load_file(path)] == ["bouc-wen"]
+    assert sys.path == before
