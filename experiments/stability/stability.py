@@ -265,12 +265,12 @@ def fresh_table(lines: pd.DataFrame) -> str:
     return studies.markdown(head, named_once(rows))
 
 
-def memory_table(lines: pd.DataFrame) -> str:
+def memory_table(lines: pd.DataFrame, families: tuple[str, ...]) -> str:
     """Count the fresh scenes of springs with memory per family and rtol."""
     head = "family | rtol | scenes | judged | answers | refused | refused, beyond the judge | over "
     head += "1 rtol | over 3 rtol | largest error / rtol | by energy: impacts, largest / rtol | "
     head += "derivatives judged | refused | wrong, largest | longest s"
-    rows, lines = [], lines[lines.family.isin(fresh.MEMORY)]
+    rows, lines = [], lines[lines.family.isin(families)]
     for _, r in fresh.summary(lines).iterrows():
         own = lines[(lines.family == r.family) & (lines.rtol == r.rtol)]
         beyond = int(((own.outcome == "refused") & (own.judge != "judged")).sum())
@@ -284,9 +284,9 @@ def memory_table(lines: pd.DataFrame) -> str:
     return studies.markdown(head, named_once(rows))
 
 
-def memory_wrong(lines: pd.DataFrame) -> str:
+def memory_wrong(lines: pd.DataFrame, families: tuple[str, ...]) -> str:
     """Name the fresh scenes of springs with memory that are wrong, or refused though judged."""
-    known = lines[lines.family.isin(fresh.MEMORY) & (lines.judge == "judged")]
+    known = lines[lines.family.isin(families) & (lines.judge == "judged")]
     groups = {
         f"over {fresh.BAD:g} rtol at one rtol at least": known[known.outcome == "failure"],
         "with a wrong derivative": known[known.outcome == "wrong derivative"],
@@ -323,8 +323,12 @@ def page(lines: pd.DataFrame, rows: pd.DataFrame, drawn: pd.DataFrame) -> None:
         other=int(answers["other method"].notna().sum()),
         independent=int(answers.independent.notna().sum()),
         largest_independent=_number(answers.independent.max()),
-        fresh=fresh_table(drawn[~drawn.family.isin(fresh.MEMORY)]), memory=memory_table(drawn),
-        memory_wrong=memory_wrong(drawn), fresh_scenes=f"{drawn.scene.nunique():,}",
+        fresh=fresh_table(drawn[~drawn.family.isin(fresh.MEMORY + fresh.REMEMBERING)]),
+        memory=memory_table(drawn, fresh.MEMORY), worn=memory_table(drawn, fresh.REMEMBERING),
+        memory_wrong=memory_wrong(drawn, fresh.MEMORY),
+        worn_wrong=memory_wrong(drawn, fresh.REMEMBERING),
+        worn_scenes=f"{drawn[drawn.family.isin(fresh.REMEMBERING)].scene.nunique():,}",
+        fresh_scenes=f"{drawn.scene.nunique():,}",
         fresh_judged=f"{drawn[drawn.judge == 'judged'].scene.nunique():,}", fresh_seed=fresh.SEED,
         design=int((lines.axis == "design").sum()), largest=_number(answers.error.max()),
         longest=format(lines.seconds.max(), ".0f"),
@@ -345,7 +349,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     if not (HERE / "fresh.csv").exists():
         sys.exit("fresh.csv is missing: make it first with python experiments/stability/fresh.py")
-    drawn = pd.read_csv(HERE / "fresh.csv")
+    drawn = pd.concat([pd.read_csv(HERE / name) for name in ("fresh.csv", "worn.csv")])
     lines = pd.read_csv(HERE / "scenes.csv") if options.page else study(options.scenes)
     lines["reason"] = lines.reason.fillna("")
     rows = table(lines)

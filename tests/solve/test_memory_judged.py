@@ -39,6 +39,10 @@ FRESH = {
     "mixed": (0, 3, 4, 11),
     "motion": (5, 6, 8, 9, 14),
     "motion+relaxation": (8, 10, 11, 31, 35),
+    "worn": (82, 172, 194, 263, 499),
+    "worn+relaxation": (41, 101, 336, 412),
+    "worn chain": (14, 161, 218, 303),
+    "worn motion": (55, 110, 131, 160, 301),
 }
 
 
@@ -166,7 +170,7 @@ def test_what_relaxes_dies_out(law: tuple[float, ...]) -> None:
 @pytest.mark.parametrize("family", FRESH)
 def test_fresh_scenes_with_memory(family: str) -> None:
     """A known motion was refused for its origin in time, for narrow and for wide snaps."""
-    if family == "motion":
+    if family.endswith("motion"):
         pytest.importorskip("mpmath")
     judged = 0
     for number in FRESH[family]:
@@ -177,6 +181,7 @@ def test_fresh_scenes_with_memory(family: str) -> None:
             assert line["outcome"] == "answer", line
             assert line["error"] <= 1.0, line
             assert not line["energy"] > 3.0, line
+            assert not line["slope"] > fresh.slope_bar(line["rtol"]), line
     assert judged >= 6
 
 
@@ -217,3 +222,9 @@ def test_a_refusal_names_what_is_too_fast_only_where_something_is() -> None:
     """Here springs are thrown against the ends of their branches."""
     with pytest.raises(ff.SimulationError, match=r"end of (its|a) branch"):
         ff.simulate(*fresh.scene_from(fresh.spec_of("mixed", 89)), 1e-4)
+
+
+def test_a_spring_that_turns_at_the_end_of_its_branch_between_samples_is_refused() -> None:
+    """No sample lies near; a digit of its strain there is a third of a percent of its stress."""
+    with pytest.raises(ff.SimulationError, match="end of its branch"):
+        ff.simulate(*fresh.scene_from(fresh.spec_of("worn", 104)), 1e-6)

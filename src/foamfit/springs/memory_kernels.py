@@ -36,6 +36,7 @@ from foamfit.springs.kernels import (
     A,
     Array,
     Row,
+    inlined,
     inner,
 )
 from foamfit.springs.law import LEAST_RANK
@@ -69,7 +70,7 @@ from foamfit.springs.ranks import (
 # ---------------------------------------------------------------- the elastic branches
 
 
-@inner
+@inlined
 def _root(n: float, x: float) -> tuple[float, float]:
     """Return a = 1 - (1 + nx)^(-1/n), and -ln(1 - a); `log1p` and `expm1` are the slow ones."""
     y = 1.0 + n * x
@@ -80,7 +81,7 @@ def _root(n: float, x: float) -> tuple[float, float]:
     return -math.expm1(-log), log
 
 
-@inner
+@inlined
 def on_a(n: float, k: float, sigma: float) -> tuple[float, float, float]:
     """Strain a(σ; k) of the stiffening branch and its two derivatives; -inf if it has none."""
     if n == 1.0:
@@ -104,7 +105,7 @@ def stress_on_a(n: float, k: float, eps: float) -> float:
     return k * math.expm1(-n * math.log1p(-eps)) / n
 
 
-@inner
+@inlined
 def changes_on_a(n: float, k: float, sigma: float) -> tuple[float, float, float]:
     """Strain a(σ; k), and its derivatives by σ and by n; σ is above the pole."""
     strain, log = _root(n, sigma / k)
@@ -129,7 +130,7 @@ def moves(branch: int) -> bool:
     return branch != A and branch != HELD
 
 
-@inner
+@inlined
 def mixture(
     row: Row, branch: int, p: float, rest: float, never: float, sigma: float
 ) -> tuple[float, float, float, float, float]:
@@ -153,7 +154,7 @@ def mixture(
     return strain, soft, bent, one, slope
 
 
-@inner
+@inlined
 def at_stress(row: Row, state: Array, sigma: float) -> float:
     """Strain at a stress on the branch that the spring is on; fills dε/dσ and d²ε/dσ²."""
     branch = int(state[BRANCH])
@@ -488,7 +489,7 @@ def under_stress(
 # ---------------------------------------------------------------- derivatives
 
 
-@inner
+@inlined
 def _partials(
     row: Row, branch: int, rank: float, ever: float, sigma: float, out: Array
 ) -> tuple[float, float, float, float]:
@@ -537,7 +538,7 @@ def strain_tangents(
     _partials(row, branch, rank, ever, sigma, out)
 
 
-@inner
+@inlined
 def tangents(
     row: Row,
     branch: int,
