@@ -120,3 +120,21 @@ def test_a_scene_file_may_name_what_a_spring_remembers(tmp_path: Path) -> None:
 
     spring = read_scene(scene)[0].springs[0]
     assert spring.values[-4:] == (1.0, 0.7, 0.0, 0.0)
+
+
+def test_a_batch_and_a_toml_take_several_cycles(record: Path, tmp_path: Path) -> None:
+    out = tmp_path / "runs"
+    rows = ff.batch(
+        [record], out=out, model="microscale", mullins=True, cycles=(1, 2), starts=2, jobs=1,
+        report=False, max_time=20.0,
+    )  # fmt: skip
+    assert rows["status"].tolist() != ["refused"], rows["error"].tolist()
+    content = json.loads((out / "foam" / "fit.json").read_text())
+    assert (content["data"]["last_cycle"], content["mullins"]) == (2, True)
+    toml = record.with_name("own.toml")
+    toml.write_text(record.with_suffix(".toml").read_text() + "[window]\ncycles = [2, 4]\n")
+    assert ff.read_test(record, toml).last_cycle == 4
+    assert ff.read_test(record, toml, cycle=1).last_cycle is None
+    toml.write_text(record.with_suffix(".toml").read_text() + "[window]\ncycles = 3\n")
+    with pytest.raises(ff.InputError, match=r"\[window\] cycles = 3 must be the numbers"):
+        ff.read_test(record, toml)
