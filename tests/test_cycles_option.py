@@ -138,3 +138,13 @@ def test_a_batch_and_a_toml_take_several_cycles(record: Path, tmp_path: Path) ->
     toml.write_text(record.with_suffix(".toml").read_text() + "[window]\ncycles = 3\n")
     with pytest.raises(ff.InputError, match=r"\[window\] cycles = 3 must be the numbers"):
         ff.read_test(record, toml)
+
+
+def test_a_branch_of_the_first_sample_was_reached(record: Path) -> None:
+    """A spring that snaps at the first sample already has reached that branch."""
+    test = ff.read_test(record, cycles=(1, 3))
+    found = ff.fit(
+        test, model="microscale", mullins=True, starts=2, intervals="local", max_time=30.0
+    )
+    assert "snap-through" in found.visited["s1"]
+    assert "never reached" not in found.parameters["s1_sigma_plus"].why
