@@ -120,3 +120,31 @@ def test_a_scene_file_may_name_what_a_spring_remembers(tmp_path: Path) -> None:
 
     spring = read_scene(scene)[0].springs[0]
     assert spring.values[-4:] == (1.0, 0.7, 0.0, 0.0)
+
+
+def test_a_batch_and_a_toml_take_several_cycles(record: Path, tmp_path: Path) -> None:
+    out = tmp_path / "runs"
+    rows = ff.batch(
+        [record], out=out, model="microscale", mullins=True, cycles=(1, 2), starts=2, jobs=1,
+        report=False, max_time=20.0,
+    )  # fmt: skip
+    assert rows["status"].tolist() != ["refused"], rows["error"].tolist()
+    content = json.loads((out / "foam" / "fit.json").read_text())
+    assert (content["data"]["last_cycle"], content["mullins"]) == (2, True)
+    toml = record.with_name("own.toml")
+    toml.write_text(record.with_suffix(".toml").read_text() + "[window]\ncycles = [2, 4]\n")
+    assert ff.read_test(record, toml).last_cycle == 4
+    assert ff.read_test(record, toml, cycle=1).last_cycle is None
+    toml.write_text(record.with_suffix(".toml").read_text() + "[window]\ncycles = 3\n")
+    with pytest.raises(ff.InputError, match=r"\[window\] cycles = 3 must be the numbers"):
+        ff.read_test(record, toml)
+
+
+def test_a_branch_of_the_first_sample_was_reached(record: Path) -> None:
+    """A spring that snaps at the first sample already has reached that branch."""
+    test = ff.read_test(record, cycles=(1, 3))
+    found = ff.fit(
+        test, model="microscale", mullins=True, starts=2, intervals="local", max_time=30.0
+    )
+    assert "snap-through" in found.visited["s1"]
+    assert "never reached" not in found.parameters["s1_sigma_plus"].why

@@ -27,7 +27,7 @@ from foamfit.one_model import Found, Options, Progress
 from foamfit.report import render
 from foamfit.results import Fit, Ladder, Rung, rung_name
 from foamfit.springs import laws
-from foamfit.springs.model import Model
+from foamfit.springs.model import Model, with_options
 from foamfit.springs.parameters import NUISANCE, family, split_name
 from foamfit.text import percent
 from foamfit.trust import evidence
@@ -52,6 +52,16 @@ LADDER = tuple(
         [(f"linear+{kind}+{kind}", 0) for kind in _QUICK],
         [(f"{kind}+{kind}", 1) for kind in _SLOW],
     )
+)
+# The same for several cycles as one history, of which a spring that forgets describes each alone.
+HISTORY = (
+    *((Model.parse(kind, 1),) for kind in _SLOW),
+    *(
+        (Model.parse(with_options(kind, stiffening=True, mullins=True), terms),)
+        for kind in _SLOW
+        for terms in (1, 2)
+        if laws.law(kind).options
+    ),
 )
 # The comparison ends after so many groups in a row without a gain.
 WITHOUT_GAIN = 2
@@ -169,7 +179,7 @@ class _Comparison:
         test = self.measurement
         heights, inside = test.specimen.heights, max(test.interior, default=0)
         groups = []
-        for group in LADDER:
+        for group in LADDER if test.last_cycle is None else HISTORY:
             allowed = []
             for model in group:
                 count = len(model.kinds)

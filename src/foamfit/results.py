@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate
 from foamfit.springs.chain import Chain
@@ -147,6 +148,11 @@ class Snapping:
         return float(self.fraction[self.turn])
 
     @property
+    def ever(self) -> Array:
+        """Fraction that has ever snapped, one per sample."""
+        return np.maximum.accumulate(self.fraction)
+
+    @property
     def halves(self) -> tuple[int | None, int | None]:
         """First samples at which half have snapped, and half have snapped back; None if never."""
         turn, snapped = self.turn, self.fraction >= 0.5
@@ -222,15 +228,29 @@ class Check:
     fatal: bool = False  # Whether a "no" means that no acceptable fit was found
 
 
-OPTIONS_IN_WORDS = {"stiffening": "stiffening", "mullins": "softening and weakening"}
+OPTIONS_IN_WORDS = {"stiffening": ("stiffening",), "mullins": ("softening", "weakening")}
 
 
 def rung_name(model: str, damping: str, relaxation: int = 0) -> str:
     """Model, relaxation and damping in words."""
-    if not relaxation:
-        return model if damping == "none" else f"{model} {damping} damping"
-    rest = {"with": " and damping", "without": ", without damping"}.get(damping, "")
-    return f"{model} with relaxation{rest}"
+    words, more = _in_words(model)
+    if relaxation:
+        more.append("relaxation" if relaxation == 1 else counted(relaxation, "relaxation term"))
+    if not more:
+        return words if damping == "none" else f"{words} {damping} damping"
+    more += ["damping"] * (damping == "with")
+    return f"{words} with {listed(more)}{', without damping' if damping == 'without' else ''}"
+
+
+def _in_words(model: str) -> tuple[str, list[str]]:
+    """Return a model as `--model` takes it, and what its springs have beside."""
+    from foamfit.springs.model import Model  # drawing needs no compiler
+
+    if model == "auto":
+        return model, []
+    read = Model.parse(model)
+    asked = (name for name, there in read.options.items() if there)
+    return read.words, [word for name in asked for word in OPTIONS_IN_WORDS[name]]
 
 
 @dataclass(frozen=True)
@@ -332,14 +352,9 @@ def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dic
 
 def law_in_words(model: str, relaxation: int) -> str:
     """Model, what its springs remember, and relaxation in words."""
-    from foamfit.springs.model import Model  # drawing needs no compiler
-
-    if model == "auto":
-        return model
-    read = Model.parse(model)
-    more = [OPTIONS_IN_WORDS[name] for name, asked in read.options.items() if asked]
+    words, more = _in_words(model)
     more += [counted(relaxation, "relaxation term")] if relaxation else []
-    return f"{read.words} with {listed(more)}" if more else read.words
+    return f"{words} with {listed(more)}" if more else words
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,6 +397,34 @@ class Fit:
         return {f"s{i}": one for i, one in enumerate(self.chain.springs, start=1)}
 
     @property
+    def words(self) -> str:
+        """The model as `--model` takes it."""
+        return _in_words(self.model)[0]
+
+    @property
+    def by_cycle(self) -> dict[int, dict[str, Any]]:
+        """Each of several cycles that are one history; {} of one cycle, or of another drive.
+
+        Misfit over the cycle's own range, dissipated energy measured and fitted (J/m³), and the
+        fraction of each spring's micro-springs that has ever snapped by its end.
+        """
+        c, strain, out = self.curves, self.strain, dict[int, dict[str, Any]]()
+        fitted, measured = c.stress, c.measured_stress
+        if self.drive != "displacement" or strain is None or fitted is None or measured is None:
+            return out
+        for number, part in cycles_of(self.measurement).items():
+            off = float(np.sqrt(np.mean((fitted - measured)[part] ** 2)))
+            out[number] = {
+                "misfit": off / float(np.ptp(measured[part])),
+                "dissipated_measured": float(np.trapezoid(measured[part], strain[part])),
+                "dissipated_fitted": float(np.trapezoid(fitted[part], strain[part])),
+                "ever_snapped": {
+                    name: float(one.ever[part][-1]) for name, one in self.snapping.items()
+                },
+            }
+        return out
+
+    @property
     def at_noise(self) -> bool | None:
         """Whether the residuals are at the estimated noise; None where that is not known."""
         return next((check.answer for check in self.checklist if check.key == "noise"), None)
@@ -415,6 +458,7 @@ class Fit:
             "correlation": self.correlation and vars(self.correlation),
             "budget": self.budget and self.budget.contributions,
             "ladder": self.ladder and asdict(self.ladder),
+            "by_cycle": self.by_cycle,
         }
         content = {
             "schema": SCHEMA,

@@ -29,6 +29,7 @@ PATIENCE = 10  # s in which a scheduler must answer
 @click.argument("tests", metavar="TEST.csv|FOLDER|GLOB …", nargs=-1, required=True)
 @options.SPECIMEN
 @options.CYCLE
+@options.CYCLES
 @options.option(
     "--jobs",
     "Processes on this machine, one thread each. Default: one for each core.",
@@ -79,7 +80,18 @@ def batch(
 
     cycles = alone if several is None else several
     pages, fix = not output.no_report, asked["fix"] or None
-    recipe = Recipe(asked["model"], {}, cycles, fix, asked["vary"], pages, output.figure_width)
+    if asked["cycles"] is not None and asked["cycle"] is not None:
+        raise InputError("give either --cycle or --cycles, not both")
+    recipe = Recipe(
+        asked["model"],
+        {},
+        cycles,
+        fix,
+        asked["vary"],
+        pages,
+        output.figure_width,
+        history=asked["cycles"],
+    )
     if scheduler is None:
         with options.compiling(output.silent, recipe.model, search["relaxation"]) as compile_rest:
             compile_rest()

@@ -27,6 +27,7 @@ from foamfit.data.measurement import (
     Measurement,
     Record,
     Striker,
+    Window,
     interior_channel,
     interior_node,
 )
@@ -43,22 +44,30 @@ from foamfit.data.tables.csv_table import (
 )
 from foamfit.data.tables.draft import without_toml
 from foamfit.data.tables.headers import CHANNELS, example
-from foamfit.data.toml_file import Column, Settings, read_bytes, read_settings, toml_beside
+from foamfit.data.toml_file import (
+    Column,
+    Settings,
+    is_range,
+    read_bytes,
+    read_settings,
+    toml_beside,
+)
 from foamfit.data.units import LARGEST
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
 
-def _first_and_last(cycle: int | None, cycles: tuple[int, int]) -> tuple[int, int]:
-    """Check the numbers of several cycles."""
+def _chosen(window: Window, cycle: int | None, cycles: tuple[int, int] | None) -> Window:
+    """The window with the cycles that a call names."""
+    if cycles is None:
+        return window if cycle is None else replace(window, cycle=cycle, last=None)
     if cycle is not None:
         raise InputError("give either cycle or cycles, not both")
-    numbers = tuple(cycles) if isinstance(cycles, tuple | list) else ()
-    if len(numbers) != 2 or any(type(one) is not int or one < 1 for one in numbers):
+    if not is_range(cycles):
         raise InputError(
-            f"cycles = {cycles!r} must be the numbers of the first and the last, like (1, 3)"
+            f"cycles = {cycles!r} must be the numbers of the first and the last one, like (1, 3)"
         )
-    return numbers[0], numbers[1]
+    return replace(window, cycle=cycles[0], last=cycles[1])
 
 
 def read_test(
@@ -101,10 +110,7 @@ def read_test(
         raise without_toml(toml, read_text(path, "the CSV file of a test"))
     settings = read_settings(toml, path, channels=CHANNELS)
     text = read_text(path, "the CSV file of a test", settings.sheet)
-    window = settings.window if cycle is None else replace(settings.window, cycle=cycle)
-    if cycles is not None:
-        first, last = _first_and_last(cycle, cycles)
-        window = replace(window, cycle=first, last=last)
+    window = _chosen(settings.window, cycle, cycles)
     table = find_table(text, {column.column for column in settings.columns.values()})
     columns = named.assign_columns(table, settings.columns, toml)
     record, notes = _record(table, columns, settings)

@@ -64,6 +64,7 @@ _SECTIONS = {
         "start": _Quantity("s", "0.5 ms"),
         "end": _Quantity("s", "2 ms"),
         "cycle": _Quantity("", "1"),
+        "cycles": _Quantity("", "[1, 3]"),
     },
     "data": {"duplicates": _Quantity("", "average"), "sheet": _Quantity("", "Sheet1")},
 }
@@ -186,12 +187,26 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         specimen=_specimen(path, values["specimen"], spreads),
         striker=Striker(**values["striker"]) if values["striker"] else None,
         noise=Noise(**values["noise"]),
-        window=Window(**values["window"]),
+        window=_window(path, values["window"]),
         columns=_columns(path, document.get("columns", {}), channels),
         uncertainties=spreads,
         motion=_motion(path, document["motion"], spreads) if "motion" in document else None,
         **values["data"],
     )
+
+
+def is_range(cycles: Any) -> bool:
+    """Whether a value has the numbers of a first and a last cycle."""
+    if not isinstance(cycles, tuple | list) or len(cycles) != 2:
+        return False
+    return all(type(one) is int and one > 0 for one in cycles)
+
+
+def _window(path: Path, values: dict[str, Any]) -> Window:
+    first, last = values.pop("cycles", (values.get("cycle"), None))
+    if last is not None and "cycle" in values:
+        raise InputError(f"{path}: [window] has both cycle and cycles; give one of them.")
+    return Window(**{**values, "cycle": first, "last": last})
 
 
 def _value(path: Path, section: str, key: str, value: Any, spreads: dict[str, float]) -> Any:
@@ -200,6 +215,8 @@ def _value(path: Path, section: str, key: str, value: Any, spreads: dict[str, fl
     where, wrong = f"{path}: [{section}] {key}", ""
     if key == "cycle" and (type(value) is not int or value < 1):
         wrong = f"= {value!r} must be a whole number from 1 up"
+    elif key == "cycles" and not is_range(value):
+        wrong = f"= {value!r} must be the numbers of the first and the last one, like [1, 3]"
     elif key == "duplicates" and value not in ("average", "refuse"):
         wrong = f"= {value!r} must be one of average, refuse"
     elif key == "heights" and (not isinstance(value, list) or not value):
@@ -208,7 +225,7 @@ def _value(path: Path, section: str, key: str, value: Any, spreads: dict[str, fl
         wrong = f'= {value!r} must be a name, like "Sheet1"'
     if wrong:
         raise InputError(f"{where} {wrong}.")
-    if key in ("cycle", "duplicates", "sheet"):
+    if key in ("cycle", "cycles", "duplicates", "sheet"):
         return value
     numbers = []
     for i, v in enumerate(value if key == "heights" else [value], 1):

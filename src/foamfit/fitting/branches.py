@@ -18,13 +18,17 @@ FLIGHT = "free flight"
 
 
 def visited(problem: Problem, simulated: Simulated) -> dict[str, tuple[str, ...]]:
-    """Branches that each spring went through, in the order of the first visit."""
+    """Branches that each spring went through, in the order of the first visit.
+
+    It starts at rest, even where it is on another branch at the first sample.
+    """
     laws = problem.model.laws
     seen = {i: [next(iter(law.branches))] for i, law in enumerate(laws)}
-    for _, spring, _, entered, _ in simulated.motion.switches:
-        name = laws[int(spring)].named_branch(int(entered))
-        if name not in seen[int(spring)]:
-            seen[int(spring)].append(name)
+    for _, spring, *numbers, _ in simulated.motion.switches:
+        for number in numbers:
+            name = laws[int(spring)].named_branch(int(number))
+            if name not in seen[int(spring)]:
+                seen[int(spring)].append(name)
     return {f"s{i + 1}": tuple(names) for i, names in seen.items()}
 
 

@@ -11,7 +11,14 @@ from foamfit.report.plots import origin_word
 from foamfit.report.readable import in_unit, quantity, readable
 from foamfit.report.render import page
 from foamfit.report.result_figures import Images, draw_all
-from foamfit.report.summary import ANSWERS, LADDER, conclusions, ladder_cells, misfits
+from foamfit.report.summary import (
+    ANSWERS,
+    LADDER,
+    conclusions,
+    cycle_rows,
+    ladder_cells,
+    misfits,
+)
 from foamfit.results import Fit
 from foamfit.trust.covariance import RULE
 
@@ -31,6 +38,7 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
         origin=origin_word(result),
         conclusions=conclusions(result),
         misfits=misfits(result),
+        cycles=cycle_rows(result),
         statistics=plain["statistics"],
         springs=springs,
         hysteretic={name: spring for name, spring in springs.items() if spring.law.hysteretic},

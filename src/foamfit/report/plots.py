@@ -420,7 +420,7 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
         line = np.column_stack((strain, stress / labels.fy))[strain < right]
         if len(line):  # branch c may lie beyond all that the test reached
             ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5, label=f"_branch {name}")
-            along, wanted = LIGHT[name]
+            along, wanted = LIGHT[name[0]]
             at = line[int(along * (len(line) - 1))]
             labels.write(name, at, wanted, color=GREY, fontsize=7)
     if spring.relaxation and "s1" in result.snapping and result.strain is not None:

@@ -39,6 +39,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     varied = [row for row in rows if row.state != "fixed"]
     return words(
         "summary",
+        cycles=cycle_rows(result),
         result=result,
         m=result.measurement,
         ladder=result.ladder,
@@ -127,6 +128,27 @@ def _moved(result: Fit) -> tuple[str, float] | None:
     }
     most = max(shares, key=shares.__getitem__)
     return (most, shares[most]) if shares[most] > 0.0 else None
+
+
+def cycle_rows(result: Fit) -> list[list[str]]:
+    """Table of several cycles that are one history, its head first; [] of one cycle."""
+    if not (found := result.by_cycle):
+        return []
+    springs = next(iter(found.values()))["ever_snapped"]
+    several = len(springs) > 1
+    ever = ["ever snapped" + (f", {name}" if several else "") for name in springs]
+    head = ["cycle", "misfit", "dissipated (kJ/m³)", "measured", *ever]
+    rows = [
+        [
+            str(number),
+            percent(one["misfit"]),
+            f"{one['dissipated_fitted'] / 1e3:.4g}",
+            f"{one['dissipated_measured'] / 1e3:.4g}",
+            *(percent(share) for share in one["ever_snapped"].values()),
+        ]
+        for number, one in found.items()
+    ]
+    return [head, *rows]
 
 
 def _rows(result: Fit) -> list[str]:

@@ -118,6 +118,7 @@ def batch(
     fresh: bool = False,
     specimen: str | Path | None = None,
     cycle: Cycles = None,
+    cycles: tuple[int, int] | None = None,
     report: bool = True,
     figure_width: str = TWO,
     progress: Progress | None = None,
@@ -151,6 +152,8 @@ def batch(
     cycle : int, sequence of int or "all", optional
         The cycle of each record; several are fitted as `foamfit.fit_cycles` does, and each is a
         row of the summary.
+    cycles : (int, int), optional
+        First and last of several cycles that are fitted as one history.
     report : bool
         Whether each fit has a report and figures.
     figure_width : str
@@ -173,12 +176,15 @@ def batch(
         If the call is wrong, or a result cannot be written, as to a full disk.
     """
     fix, vary = options.pop("fix", None), tuple(options.pop("vary", ()))
-    cycles = () if cycle == "all" else cycle
-    if cycles is not None and not isinstance(cycles, int):
-        cycles = tuple(int(number) for number in cycles)
+    each = () if cycle == "all" else cycle
+    if each is not None and not isinstance(each, int):
+        each = tuple(int(number) for number in each)
+    if each is not None and cycles is not None:
+        raise InputError("give either cycle or cycles, not both")
+    asked = vars(Options.of("batch", options))
     found = run(
         tests,
-        Recipe(model, vars(Options.of("batch", options)), cycles, fix, vary, report, figure_width),
+        Recipe(model, asked, each, fix, vary, report, figure_width, history=cycles),
         out=out,
         executor=executor,
         jobs=jobs,

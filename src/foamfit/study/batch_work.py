@@ -55,6 +55,7 @@ class Recipe:
     pages: bool = True
     width: str = TWO  # of the figures
     laws: Mapping[str, str] = field(default_factory=laws.texts)  # texts of the user's law files
+    history: tuple[int, int] | None = None  # first and last of several cycles fitted as one
 
     def params(self, test: Measurement) -> lmfit.Parameters | None:
         """The parameters of a test, as `fix` and `vary` want them; None for what fit chooses."""
@@ -214,7 +215,7 @@ def _fitted(task: Task) -> tuple[tuple[Row, ...], Write]:
 def _one(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write]:
     recipe = task.recipe
     assert not isinstance(recipe.cycles, tuple)
-    test = read_test(path, toml, recipe.cycles)
+    test = read_test(path, toml, recipe.cycles, cycles=recipe.history)
     result = fit(test, model=recipe.model, params=recipe.params(test), **recipe.options)
     row = row_of(task.name, str(task.path), result)
     pictures: dict[str, Any] = {"pages": recipe.pages, "width": recipe.width}

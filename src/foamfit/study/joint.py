@@ -170,7 +170,7 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
     for i, ((name, path), specimen) in enumerate(pairs):
         tell(0.1 * i / len(pairs), "reading")
         try:
-            test = read_test(path, specimen, study.cycle)
+            test = read_test(path, specimen, study.cycle, cycles=study.cycles)
             options.problem(test, study.model)
             found.append((name, path, test))
         except (InputError, SimulationError) as error:

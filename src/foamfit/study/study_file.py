@@ -8,7 +8,7 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from foamfit.data.toml_file import check_keys, load_toml
+from foamfit.data.toml_file import check_keys, is_range, load_toml
 from foamfit.errors import InputError
 from foamfit.fitting.curves import DRIVES
 from foamfit.fitting.links import KINDS
@@ -26,7 +26,7 @@ _EXAMPLES = {
     "specimen": 'specimen = "foam.toml"',
 }
 _LEAST = {"seed": 0, "cycle": 1, "starts": 1}  # of whole numbers
-_KEYS = (*_EXAMPLES, *_LEAST, "relaxation", *OPTIONS, "drive", "specimens", "parameters")
+_KEYS = (*_EXAMPLES, *_LEAST, "cycles", "relaxation", *OPTIONS, "drive", "specimens", "parameters")
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,7 @@ class Study:
     held: Mapping[str, float]
     seed: int
     cycle: int | None
+    cycles: tuple[int, int] | None  # first and last of several that are one history
     starts: int | None
 
 
@@ -77,6 +78,11 @@ def _read(path: Path, content: Mapping[str, Any]) -> Study:
             raise InputError(f"{key} = {value!r} must be a whole number from {least} up")
     if content.get("drive") not in (None, *DRIVES):
         raise InputError(f"drive = {content['drive']!r} must be one of {', '.join(DRIVES)}")
+    if "cycles" in content and ("cycle" in content or not is_range(content["cycles"])):
+        raise InputError(
+            f"cycles = {content['cycles']!r} must be the numbers of the first and the last one, "
+            "like [1, 3], without cycle beside it"
+        )
     for key in OPTIONS:
         if content.get(key) not in (None, True, False):
             raise InputError(f"{key} = {content[key]!r} must be true or false")
@@ -95,6 +101,7 @@ def _read(path: Path, content: Mapping[str, Any]) -> Study:
         held=held,
         seed=content.get("seed", 0),
         cycle=content.get("cycle"),
+        cycles=tuple(content["cycles"]) if "cycles" in content else None,
         starts=content.get("starts"),
     )
 

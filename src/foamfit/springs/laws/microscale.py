@@ -151,11 +151,11 @@ class MicroscaleSpring(Spring):
     def elastic_branches(self, stress: Array) -> dict[str, Array]:
         """Strains of branches a (none has snapped) and c (all have) at these stresses (Pa).
 
-        With softening also that of branch a where all have snapped once.
+        With softening also a′, branch a of what has snapped once.
         """
         out = {"a": self._on_a(stress, self.k0)}
         if self.softening > 0.0:
-            out["a, once snapped"] = self._on_a(stress, self.k0 * math.exp(-self.softening))
+            out["a′"] = self._on_a(stress, self.k0 * math.exp(-self.softening))
         return out | {"c": self.eps_star + stress / (self.kc + stress)}
 
     def _on_a(self, stress: Array, k: float) -> Array:
@@ -402,6 +402,8 @@ def _with(*options: str) -> Law:
         exchanged=None,
         compared=(*LAW.compared[:-1], *map(_compared, extra), LAW.compared[-1]),
         places={"stiffening": 8, "softening": 9, "weakening": 10},
+        note=LAW.note
+        + (" The branch a′ is that of what has snapped once." if options[-1] == "mullins" else ""),
         options={},
     )
 
