@@ -517,13 +517,13 @@ def _partials(
     if never < 1.0:
         by_ever = weight_ever * (one - a)
     if moves(branch):
-        place, scale = line(row, branch)
-        pace = 1.0 / (scale * sigma)
-        first = 5 if branch == BACK else 3
-        middle = row[LOG_PLUS] if branch in (AGAIN, BOTH) else place
-        out[first], out[first + 1] = -math.exp(-middle) / scale, -rank / scale
+        back = branch == BACK
+        per_scale, first = 1.0 / row[SPREAD_MINUS if back else SPREAD_PLUS], 5 if back else 3
+        pace = per_scale / sigma
+        out[first] = -math.exp(-row[LOG_MINUS if back else LOG_PLUS]) * per_scale
+        out[first + 1] = -rank * per_scale
         if branch in (AGAIN, BOTH):
-            out[OF_WEAKENING] = 1.0 / scale
+            out[OF_WEAKENING] = per_scale
     return soft, by_rank, by_ever, pace
 
 
@@ -558,18 +558,24 @@ def tangents(
     soft, by_rank, by_ever, pace = _partials(row, branch, rank, ever, sigma, out)
     slope = 1.0 / (soft + by_rank * pace)
     out[OF_STRAIN] = -eps
-    if branch == HELD and rank == ever:
+    if not moves(branch):
         for c in range(CARRIED):
-            d_rank[c] = d_ever[c]
-    elif branch != HELD:
-        for c in range(CARRIED):
-            d_rank[c] = 0.0
-        for c in range(3, OF_STRAIN):
-            d_rank[c], out[c] = out[c], 0.0
-        d_rank[OF_WEAKENING], out[OF_WEAKENING] = out[OF_WEAKENING], 0.0
+            if branch == A:
+                d_rank[c] = 0.0
+            elif rank == ever:
+                d_rank[c] = d_ever[c]
+            out[c] = -slope * (out[c] + by_rank * d_rank[c] + by_ever * d_ever[c])
+        return slope
+    first = 5 if branch == BACK else 3
+    by_middle, by_spread, by_weakening = out[first], out[first + 1], out[OF_WEAKENING]
+    out[first], out[first + 1] = by_rank * by_middle, by_rank * by_spread
+    out[OF_WEAKENING] = by_rank * by_weakening
     for c in range(CARRIED):
-        out[c] = -slope * (out[c] + by_rank * d_rank[c] + by_ever * d_ever[c])
-        d_rank[c] += pace * out[c]
+        out[c] = -slope * (out[c] + by_ever * d_ever[c])
+        d_rank[c] = pace * out[c]
+    d_rank[first] += by_middle
+    d_rank[first + 1] += by_spread
+    d_rank[OF_WEAKENING] += by_weakening
     if branch == SNAP:
         for c in range(CARRIED):
             d_ever[c] = d_rank[c]
