@@ -130,7 +130,7 @@ def fit(
             f"relaxation = {chosen.relaxation} belongs to one model; name it instead of 'auto', "
             "which tries relaxation by itself"
         )
-    with_options(model, stiffening=chosen.stiffening, mullins=chosen.mullins)
+    with_options(model, **chosen.of_springs)
     from foamfit.auto import compare_models
 
     return FitResult(**vars(compare_models(measurement, chosen, progress, tell)))

@@ -57,7 +57,7 @@ LADDER = tuple(
 HISTORY = (
     *((Model.parse(kind, 1),) for kind in _SLOW),
     *(
-        (Model.parse(with_options(kind, stiffening=True, mullins=True), terms),)
+        (Model.parse(with_options(kind, **dict.fromkeys(laws.OPTIONS, True)), terms),)
         for kind in _SLOW
         for terms in (1, 2)
         if laws.law(kind).options

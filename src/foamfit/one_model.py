@@ -33,6 +33,7 @@ from foamfit.fitting.search import (
 )
 from foamfit.results import Fit, Intervals
 from foamfit.springs.model import with_options
+from foamfit.springs.options import OPTIONS
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
@@ -141,11 +142,16 @@ class Options:
         draws = DRAWS.get(self.intervals, 0) if self.draws is None else self.draws
         return Choice(self.intervals, draws, self.seed)
 
+    @property
+    def of_springs(self) -> dict[str, bool]:
+        """Options that free more parameters of some springs."""
+        return {name: getattr(self, name) for name in OPTIONS}
+
     def problem(
         self, measurement: Measurement, model: str, params: lmfit.Parameters | None = None
     ) -> Problem:
         """Set up the fit of one model."""
-        model = with_options(model, stiffening=self.stiffening, mullins=self.mullins)
+        model = with_options(model, **self.of_springs)
         more = {name: getattr(self, name) for name in ("time_shift", "loss", "relaxation")}
         given = (self.drive, params, self.weights, self.interior_mass)
         return make_problem(measurement, model, *given, **more)

@@ -15,6 +15,7 @@ from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate
 from foamfit.springs.chain import Chain
+from foamfit.springs.options import OPTIONS
 from foamfit.springs.spring import Spring
 from foamfit.text import counted, listed
 
@@ -228,9 +229,6 @@ class Check:
     fatal: bool = False  # Whether a "no" means that no acceptable fit was found
 
 
-OPTIONS_IN_WORDS = {"stiffening": ("stiffening",), "mullins": ("softening", "weakening")}
-
-
 def rung_name(model: str, damping: str, relaxation: int = 0) -> str:
     """Model, relaxation and damping in words."""
     words, more = _in_words(model)
@@ -250,7 +248,7 @@ def _in_words(model: str) -> tuple[str, list[str]]:
         return model, []
     read = Model.parse(model)
     asked = (name for name, there in read.options.items() if there)
-    return read.words, [word for name in asked for word in OPTIONS_IN_WORDS[name]]
+    return read.words, [word for name in asked for word in OPTIONS[name].names]
 
 
 @dataclass(frozen=True)

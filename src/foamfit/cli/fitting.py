@@ -13,15 +13,15 @@ import click
 from foamfit.cli.options import (
     COUNT,
     DRIVE,
-    MULLINS,
+    MORE,
     RELAXATION,
-    STIFFENING,
     WHOLE,
     option,
     together,
 )
 from foamfit.cli.progress import Progress
 from foamfit.errors import InputError
+from foamfit.springs.options import OPTIONS
 
 if TYPE_CHECKING:
     import lmfit
@@ -68,8 +68,7 @@ fit_options = together(
     option("--interior-mass", "Put the specimen's mass between the springs."),
     option("--time-shift", "Fit the delay of the motion against the force."),
     RELAXATION,
-    STIFFENING,
-    MULLINS,
+    *MORE,
     option(
         "--loss",
         "All but linear weigh large residuals less.",
@@ -86,7 +85,6 @@ fit_options = together(
 
 def model_name(asked: Mapping[str, Any]) -> str:
     """Return a model's name without spaces; InputError if there is no such model."""
-    from foamfit.springs.laws import OPTIONS
     from foamfit.springs.model import Model, with_options
 
     model = asked["model"].strip()
@@ -160,7 +158,6 @@ def _params(
     """Return the parameters of a model as --fix and --vary want them; None for auto."""
     from foamfit.fitting.curves import check_time_shift, choose_drive
     from foamfit.fitting.problem import fix_and_vary, make_params
-    from foamfit.springs.laws import OPTIONS
 
     drive, fix, vary = (options[name] for name in ("drive", "fix", "vary"))
     more = {name: options[name] for name in ("time_shift", "relaxation", *OPTIONS)}

@@ -16,6 +16,7 @@ import click
 from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
 from foamfit.files import check_file
+from foamfit.springs.options import OPTIONS
 from foamfit.terminal import say, without_ctrl_c
 
 if TYPE_CHECKING:
@@ -87,8 +88,7 @@ RELAXATION = option(
     default=0,
     metavar="N",
 )
-STIFFENING = option("--stiffening", "Let branch a of microscale springs stiffen as the test says.")
-MULLINS = option("--mullins", "Let what has snapped once soften and weaken (microscale springs).")
+MORE = tuple(option(f"--{name}", freed.told) for name, freed in OPTIONS.items())
 PLOT = option("--plot", "Also draw a PNG, PDF or SVG.", FILE)
 WIDTH = option(
     "--figure-width",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from foamfit.data import outliers as spoilt
 from foamfit.data import zeros
 from foamfit.data.contact import (
     STILL_MOTION,
+    Levels,
     Start,
     leave_rest,
     start_of_impact,
@@ -98,15 +100,10 @@ def condition(
     curves = first.curves("acceleration")
     levels = {c: estimated_noise(v) for c, v in curves.items()} | held
     if impact:
-        start = start_of_impact(first, levels)
-        start = replace(start, gauge=zeros.gauge_before(first, start, levels, known))
-        span = zeros.Span.of_impact(first, start, levels)
-        notes += zeros.flight_notes(first, start, span, levels, known, spread)
+        start, span, more = _impact(first, levels, known, spread)
+        notes += more
     else:
-        start = start_of_slow_test(first, levels)
-        begun = chosen is not None and not chosen.place  # with the first contact
-        kept = cut_to_cycle(record, cycles, chosen)[0] if chosen and begun else first
-        span = zeros.Span.of_slow_test(kept, start)
+        start, span = _slow_test(record, first, cycles, chosen, levels)
     record, found = zeros.take_zeros(record, first, start, span, levels, impact=impact)
     notes += found.notes
     later = chosen if chosen is not None and chosen.place else None  # with a contact of its own
@@ -120,15 +117,17 @@ def condition(
     record, motion = integrate_motion(record, specimen, known)
     if impact:
         record = done(start_within_height(record, specimen, known, motion, found.origins))
-    notes += checks(record, specimen, known, motion, several=bool(chosen and chosen.last))
+    notes += checks(
+        record, specimen, known, motion, several=chosen is not None and chosen.last is not None
+    )
     whole, record = record, done(thin(record))
     block = -(-len(whole) // len(record))
     resting = max(0, start.first - 2) if start.free else 0
     noise = noise_before_contact(curves, resting, record.curves("acceleration"), block)
     noise |= {c: noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
     outliers = spoilt.outliers_of_blocks(whole, block)
-    for name, n in spikes.items():
-        notes.append(spoilt.outlier_note(name, n, outliers.get(name), record.time is not None))
+    timed = record.time is not None
+    notes += [spoilt.outlier_note(c, n, outliers.get(c), timed) for c, n in spikes.items()]
     notes += spoilt.standstill_notes(whole, specimen.height)
     channels = record.time, record.stress, record.displacement
     return Measurement(
@@ -140,9 +139,7 @@ def condition(
         outliers=outliers,
         contact="stress" if later else start.by,
         count=count_rows(whole, outliers, block),
-        cycle=chosen.number if chosen else 1,
-        cycles=tuple(cycle.number for cycle in cycles) or (1,),
-        last_cycle=chosen.last if chosen else None,
+        **_numbers(cycles, chosen),
         start_strain=found.origins.pop("start_strain", 0.0),
         sampled=record.sampled,
         zeros=found.errors,
@@ -153,6 +150,34 @@ def condition(
         block=block,
         standstills=spoilt.standstill_spans(whole, block),
     )
+
+
+def _impact(
+    record: Record, levels: Levels, striker: Striker, spread: float
+) -> tuple[Start, zeros.Span, list[str]]:
+    """Start of an impact, the rows around it, and what its free flight says."""
+    start = start_of_impact(record, levels)
+    start = replace(start, gauge=zeros.gauge_before(record, start, levels, striker))
+    span = zeros.Span.of_impact(record, start, levels)
+    return start, span, zeros.flight_notes(record, start, span, levels, striker, spread)
+
+
+def _slow_test(
+    record: Record, first: Record, cycles: list[Cycle], chosen: Cycle | None, levels: Levels
+) -> tuple[Start, zeros.Span]:
+    """Start of a slow test, which its first cycle shows, and the rows around it."""
+    start = start_of_slow_test(first, levels)
+    begun = chosen is not None and not chosen.place  # with the first contact
+    kept = cut_to_cycle(record, cycles, chosen)[0] if chosen and begun else first
+    return start, zeros.Span.of_slow_test(kept, start)
+
+
+def _numbers(cycles: list[Cycle], chosen: Cycle | None) -> dict[str, Any]:
+    """Numbers of the cycles of a record, and of those that are used."""
+    if chosen is None:
+        return {}
+    numbers = tuple(cycle.number for cycle in cycles)
+    return {"cycle": chosen.number, "cycles": numbers, "last_cycle": chosen.last}
 
 
 def _later_cycle(

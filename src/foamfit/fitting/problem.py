@@ -30,8 +30,7 @@ def make_params(
     *,
     time_shift: bool = False,
     relaxation: int = 0,
-    stiffening: bool = False,
-    mullins: bool = False,
+    **options: bool,
 ) -> lmfit.Parameters:
     """Parameters of a model for a test, with bounds from its scales; change them, then `fit`.
 
@@ -52,8 +51,8 @@ def make_params(
         has its own clock and its delay has a ±.
     relaxation : int
         Relaxation terms of every hysteretic spring of a model that is given by its name.
-    stiffening, mullins : bool
-        Whether stiffening, and softening and weakening, of its microscale springs are parameters.
+    options : bool
+        "stiffening" and "mullins", as for `fit`: whether they free more parameters.
 
     Returns
     -------
@@ -61,7 +60,7 @@ def make_params(
         Values in SI, named s1_k0 … site_eta.
     """
     if isinstance(model, str):
-        model = with_options(model, stiffening=stiffening, mullins=mullins)
+        model = with_options(model, **options)
         model = Model.parse(model, relaxation)
     drive = choose_drive(measurement) if drive is None else drive
     scales = Scales.of(measurement)

@@ -211,6 +211,8 @@ def with_options(model: str, **options: bool) -> str:
     InputError
         If no spring of the model has the parameters of an option.
     """
+    if unknown := [name for name in options if name not in laws.OPTIONS]:
+        raise TypeError(f"unexpected option {unknown[0]!r}; there are {', '.join(laws.OPTIONS)}")
     asked = tuple(name for name in laws.OPTIONS if options.get(name))
     if not asked:
         return model

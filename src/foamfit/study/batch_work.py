@@ -18,7 +18,7 @@ from typing import Any
 
 import lmfit
 
-from foamfit.api import FitResult, fit
+from foamfit.api import fit
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.data.toml_file import motion_file
@@ -30,6 +30,7 @@ from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
 from foamfit.report.studies.batch import REFUSED, Row, row_of
 from foamfit.report.studies.cycles import write_cycles
+from foamfit.results import Fit
 from foamfit.springs import laws
 from foamfit.study.cycles import fit_cycles
 
@@ -235,7 +236,7 @@ def _several(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write
         **recipe.options,
     )
 
-    def row(number: int, result: FitResult | None) -> Row:
+    def row(number: int, result: Fit | None) -> Row:
         name = f"{task.name}/cycle-{number}"
         if result is None:
             return Row(name, str(task.path), REFUSED, " ".join(found.refused[number].split()))

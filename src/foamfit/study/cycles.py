@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from importlib.metadata import version
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import Unpack
 
 import lmfit
 
-from foamfit.api import FitResult, fit
+from foamfit.api import fit
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
@@ -18,113 +16,15 @@ from foamfit.fitting.search import what_stopped
 from foamfit.one_model import Keywords, Options, Progress
 from foamfit.report.figures import TWO, inches
 from foamfit.report.studies.cycles import save_cycles
-from foamfit.results import plain
-from foamfit.springs.parameters import NUISANCE, springs_first
+from foamfit.results import Fit
+from foamfit.study.cycle_fits import FittedCycles
 from foamfit.trust.intervals import Announce
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-SCHEMA = 1
-CURVES = ("stress_time", "displacement_time", "stress_strain")
-ENERGY = "dissipated_energy"
 Params = Callable[[Measurement], lmfit.Parameters | None]
 
 
-@dataclass(frozen=True, eq=False)
-class CycleFits:
-    """Fits of the cycles of one record.
-
-    Attributes
-    ----------
-    test, model
-        Names of the test and of the model.
-    recorded : tuple of int
-        Numbers of all cycles in the record.
-    results : dict of int to FitResult
-        The fit of each cycle that could be read and fitted.
-    refused : dict of int to str
-        Why the others could not, one sentence each.
-    """
-
-    test: str
-    model: str
-    recorded: tuple[int, ...]
-    results: dict[int, FitResult]
-    refused: dict[int, str]
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the parameters of any fit, in their order, those of the springs first."""
-        return springs_first(name for one in self.results.values() for name in one.parameters)
-
-    @property
-    def varied(self) -> list[str]:
-        """Names of the parameters of the springs that vary in any fit."""
-        fits = [one.parameters for one in self.results.values()]
-        return [
-            name
-            for name in self.names
-            if name not in NUISANCE and any(name in one and one[name].vary for one in fits)
-        ]
-
-    def rows(self) -> Iterator[list[object]]:
-        """Rows of cycles.csv, the header first: SI, one row for each cycle, empty = not there."""
-        head = [
-            "cycle",
-            "start_strain",
-            "peak_strain",
-            "peak_stress",
-            ENERGY,
-            *(f"misfit_{name}" for name in CURVES),
-            "status",
-            "error",
-        ]
-        parts = "", "_stderr", "_lo", "_hi", "_state"
-        yield [*head, *(f"{name}{part}" for name in self.names for part in parts)]
-        for number in sorted({*self.results, *self.refused}):
-            one = self.results.get(number)
-            if one is None:
-                blank = [None] * (5 * len(self.names))
-                yield [number, *[None] * 7, "refused", self.refused[number], *blank]
-                continue
-            m = one.measurement
-            strain = None if m.displacement is None else m.displacement.max() / m.specimen.height
-            cells: list[object] = [
-                number,
-                m.start_strain,
-                strain,
-                None if m.stress is None else m.stress.max(),
-                one.energy.get(ENERGY),
-                *(one.misfit.get(name) for name in CURVES),
-                one.status,
-                None,
-            ]
-            for name in self.names:
-                p, none = one.parameters.get(name), (None, None)
-                cells += (p.value, p.stderr, *(p.ci95 or none), p.state) if p else [None] * 5
-            yield [plain(cell) for cell in cells]
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """The rows of cycles.csv, indexed by the cycle."""
-        import pandas as pd
-
-        head, *rows = self.rows()
-        return pd.DataFrame(rows, columns=[str(name) for name in head]).set_index("cycle")
-
-    def to_json_dict(self) -> dict[str, Any]:
-        """Return the content of cycles.json, in plain types."""
-        content: dict[str, Any] = {
-            "schema": SCHEMA,
-            "foamfit": version("foamfit"),
-            "test": self.test,
-            "model": self.model,
-            "recorded": self.recorded,
-            "fitted": sorted(self.results),
-            "refused": self.refused,
-        }
-        return dict(plain(content))
+class CycleFits(FittedCycles):
+    """Fits of the cycles of one record, as `FittedCycles`; `save` writes them."""
 
     def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
         """Write ``cycle-<n>/``, cycles.csv, cycles.png and cycles.json whole; returns the folder.
@@ -180,7 +80,7 @@ def fit_cycles(
     wanted = first.cycles if cycles is None else tuple(dict.fromkeys(cycles))
     if not wanted:
         raise InputError("no cycle is named; name one or leave cycles out for all")
-    results, refused = dict[int, FitResult](), dict[int, str]()
+    results, refused = dict[int, Fit](), dict[int, str]()
     stopped = None
     for i, number in enumerate(wanted):
 

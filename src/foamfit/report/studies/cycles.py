@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from foamfit.report.result_figures import Mapped
-    from foamfit.study.cycles import CycleFits
+    from foamfit.study.cycle_fits import FittedCycles
 
 COLUMNS, PANEL = 4, (1.85, 1.5)  # of the picture; inches
 LEAST = 1.55  # in, of a panel
@@ -30,7 +30,7 @@ FAR = 20  # a last cycle that is so many times the first is drawn on a logarithm
 
 
 def save_cycles(
-    found: CycleFits,
+    found: FittedCycles,
     folder: str | Path,
     *,
     report: bool = True,
@@ -47,7 +47,7 @@ def save_cycles(
 
 
 def write_cycles(
-    found: CycleFits, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
+    found: FittedCycles, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
 ) -> None:
     """Write all files of the cycles into a folder that is there; reports and pictures if wanted."""
     for number, result in found.results.items():
@@ -61,7 +61,7 @@ def write_cycles(
         (folder / "cycles.png").write_bytes(image(figure, "png", DPI))
 
 
-def cycles_text(found: CycleFits) -> str:
+def cycles_text(found: FittedCycles) -> str:
     """Return what the command prints of the cycles of a record."""
     names = found.varied if len(found.varied) <= MOST_NAMES else []
     rows = [["cycle", "start strain", "misfit", *(own_name(name, found.model) for name in names)]]
@@ -72,7 +72,7 @@ def cycles_text(found: CycleFits) -> str:
     return words("cycles", found=found, table=rows)
 
 
-def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
+def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
     """Draw the loops laid over each other, and start strain, energy, misfit, parameters by cycle.
 
     Bars are 95 % intervals; a hollow mark is a parameter that its cycle does not determine well.
@@ -121,7 +121,7 @@ def _scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else factor * value
 
 
-def _loops(ax: Axes, found: CycleFits) -> None:
+def _loops(ax: Axes, found: FittedCycles) -> None:
     """Measured loops over each other, from light to dark; the first and the last one fitted."""
     import matplotlib
 
@@ -149,7 +149,7 @@ def _loops(ax: Axes, found: CycleFits) -> None:
         ax.legend(loc="upper left", fontsize=6.5, handlelength=1.2, labelspacing=0.25)
 
 
-def _parameter(ax: Axes, found: CycleFits, name: str) -> None:
+def _parameter(ax: Axes, found: FittedCycles, name: str) -> None:
     """One parameter with its 95 % intervals against the cycle."""
     results = sorted(found.results.items())
     points = [(n, r.parameters[name]) for n, r in results if name in r.parameters]

@@ -21,10 +21,10 @@ from foamfit.springs.laws.microscale import MicroscaleSpring as MicroscaleSpring
 from foamfit.springs.laws.record import Functions as Functions
 from foamfit.springs.laws.record import Law as Law
 from foamfit.springs.laws.record import Param as Param
+from foamfit.springs.options import OPTIONS as OPTIONS
 from foamfit.springs.spring import LawSpring, Relaxation
 
 ENTRY_POINTS = "foamfit.laws"
-OPTIONS = ("stiffening", "mullins")  # of a fit, that free more parameters of a law
 _PAPER = (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)
 _OPTIONAL = (microscale.STIFFENING_LAW, microscale.MULLINS_LAW, microscale.MEMORY_LAW)
 _LAWS = {law.kind: law for law in (*_PAPER, *_OPTIONAL)}
