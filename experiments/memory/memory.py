@@ -28,7 +28,7 @@ import pandas as pd
 import foamfit as ff
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
-from foamfit.report.figures import DPI
+from foamfit.report.figures import DPI, GREY
 from foamfit.results import Fit
 
 HERE = Path(__file__).parent
@@ -36,8 +36,8 @@ sys.path.insert(0, str(HERE.parent))
 import real_foams  # noqa: E402
 import studies  # noqa: E402
 
-TABLE, PARAMETERS, CURVES = HERE / "memory.csv", HERE / "parameters.csv", HERE / "curves.csv"
-SHOWN = "new-heel-comp-1"  # in the picture
+TABLE, PARAMETERS = HERE / "memory.csv", HERE / "parameters.csv"
+SHOWN = "new-heel-comp-3"  # in the picture
 FIRST, HISTORY, PREDICTED = "first cycle", "cycles 1 to 3", "predicted"
 BARS = {FIRST: (0.56, 0.75), HISTORY: (0.90, 1.10), PREDICTED: (1.0, 1.25)}  # mean, worst, %
 MEMORY: dict[str, Any] = {"model": "microscale", "stiffening": True, "mullins": True}
@@ -84,7 +84,7 @@ class Table:
                 "test": test, "what": what, "parameter": name, "value": p.value,
                 "stderr": p.stderr, "unit": p.unit, "state": p.state,
             }
-            for name, p in real_foams.varied(result).items()
+            for name, p in (real_foams.varied(result) if what != PREDICTED else {}).items()
         ]  # fmt: skip
         studies.write_csv(self.rows, TABLE)
         studies.write_csv(self.values, PARAMETERS)
@@ -119,22 +119,35 @@ def study(data: Path, table: Table) -> None:
             told = [{"cycle": n, **one} for n, one in later.by_cycle.items() if n > 3]
             table.add(specimen, PREDICTED, told, result)
             if specimen == SHOWN:
-                keep_curves(later)
+                draw(later, HERE / "memory.png")
 
 
-def keep_curves(later: ff.Prediction) -> None:
-    """Write measured and predicted curves of the specimen in the picture, thinned."""
-    curve = next(iter(later.curves.values()))
-    test, some = later.measurement, slice(None, None, 2)
+def draw(later: ff.Prediction, path: Path) -> None:
+    """Draw measured cycles, and the fitted and predicted ones, of one specimen."""
+    curve, test = next(iter(later.curves.values())), later.measurement
     assert test.displacement is not None
-    frame = pd.DataFrame({
-        "strain": test.displacement / test.specimen.height,
-        "predicted (Pa)": curve.predicted, "low (Pa)": curve.lo, "high (Pa)": curve.hi,
-        "cycle": np.concatenate([
-            np.full(len(test.displacement[part]), n) for n, part in cycles_of(test).items()
-        ]),
-    })  # fmt: skip
-    studies.write_csv(frame[some], CURVES, 5)
+    strain, spans = test.displacement / test.specimen.height, cycles_of(test)
+    with studies.sheet(path, 7.0, 3.3, DPI) as figure:
+        axes = figure.subplots(1, 2, sharey=True)
+        for ax, fits, title in zip(axes, (True, False), ("fitted", "predicted"), strict=True):
+            for number, part in spans.items():
+                if (number <= 3) != fits:
+                    continue
+                x = strain[part]
+                (line,) = ax.plot(x, curve.predicted[part] / 1e3, lw=1.1, label=f"cycle {number}")
+                ax.plot(x[::6], curve.measured[part][::6] / 1e3, "o", ms=2.4, mfc="none",
+                        mec=line.get_color(), mew=0.5)  # fmt: skip
+                if not fits:
+                    ends = curve.lo[part] / 1e3, curve.hi[part] / 1e3
+                    ax.fill_between(x, *ends, color=line.get_color(), alpha=0.15, lw=0)
+            ax.plot([], [], "o", ms=2.4, mfc="none", mec=GREY, mew=0.5, label="measured")
+            ax.set(title=title, xlabel="strain (–)")
+            ax.legend(loc="upper left")
+        axes[0].set_ylabel("stress (kPa)")
+        figure.suptitle(
+            f"{SHOWN}, one set of parameters; measured: {real_foams.SOURCE}",
+            x=0.012, ha="left", fontsize=8.0,
+        )  # fmt: skip
 
 
 def summary(table: pd.DataFrame) -> str:
@@ -179,28 +192,6 @@ def values_table(values: pd.DataFrame) -> str:
     return studies.markdown(head, rows)
 
 
-def draw(path: Path) -> None:
-    """Draw the predicted cycles of one specimen."""
-    curves = pd.read_csv(CURVES)
-    with studies.sheet(path, 7.0, 3.2, DPI) as figure:
-        axes = figure.subplots(1, 2, sharey=True)
-        parts = {"fitted: cycles 1 to 3": curves["cycle"] <= 3, "predicted: 4 and 5": None}
-        for ax, (title, mask) in zip(axes, parts.items(), strict=True):
-            own = curves[mask if mask is not None else curves["cycle"] > 3]
-            for number, one in own.groupby("cycle"):
-                ax.plot(one["strain"], one["predicted (Pa)"] / 1e3, lw=1.1, label=f"cycle {number}")
-                if mask is None:
-                    ends = one["low (Pa)"] / 1e3, one["high (Pa)"] / 1e3
-                    ax.fill_between(one["strain"], *ends, alpha=0.2, lw=0)
-            ax.set(title=title, xlabel="strain (–)")
-            ax.legend(loc="upper left")
-        axes[0].set_ylabel("stress (kPa)")
-        figure.suptitle(
-            f"Running-shoe foam, {SHOWN}: one set of parameters ({real_foams.SOURCE})",
-            x=0.012, ha="left", fontsize=8.5, weight="bold",
-        )  # fmt: skip
-
-
 def main(fresh: bool) -> None:
     data = studies.measurements("shoe-foam", "shoe-foam-twins")
     study(data, Table(fresh))
@@ -211,8 +202,6 @@ def main(fresh: bool) -> None:
         values=values_table(values),
     )  # fmt: skip
     (HERE / "README.md").write_text(text, encoding="utf-8")
-    if CURVES.exists():
-        draw(HERE / "memory.png")
 
 
 if __name__ == "__main__":
