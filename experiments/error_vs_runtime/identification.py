@@ -197,8 +197,8 @@ def recorded(recorder: Recorder) -> Iterator[None]:
     """
     plain, derivative = Objective.residual, Objective.jacobian
 
-    def residual(self: Objective, values: Array) -> Array:
-        out = plain(self, values)
+    def residual(self: Objective, values: Array, shift: Array | float = 0.0) -> Array:
+        out = plain(self, values, shift)
         recorder.note(self, values, out)
         return out
 

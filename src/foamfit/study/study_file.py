@@ -48,8 +48,8 @@ class Study:
     held: Mapping[str, float]
     seed: int
     cycle: int | None
-    cycles: tuple[int, int] | None  # first and last of several that are one history
     starts: int | None
+    cycles: tuple[int, int] | None = None  # first and last of several that are one history
 
 
 def read_study(path: str | Path) -> Study:
