@@ -179,7 +179,7 @@ def _samples(given: _Part) -> Array:
 
 
 def check_target(path: Path) -> None:
-    """Raise InputError if a file stands there that is no response of an earlier run."""
+    """Refuse to replace a file that is not the response of an earlier run."""
     if path.is_file() and not read_whole(path, len(RESPONSE)).startswith(RESPONSE.encode()):
         raise InputError(
             f"{path} stands where the response is to go, and is not one; choose another name"

@@ -273,7 +273,7 @@ def begin(row: Row, state: Array, least: float) -> None:
     state[:] = 0.0
     state[RANK], state[EVER], state[REST], state[NEVER] = -math.inf, -math.inf, 1.0, 1.0
     state[LEAST_AT] = least
-    _enter(row, state, A, True)
+    _enter(row, state, A)
 
 
 @inner
@@ -315,8 +315,8 @@ def _last_stress(row: Row) -> float:
 
 
 @inner
-def _enter(row: Row, state: Array, branch: int, up: bool) -> None:
-    """Enter a branch at the strain and stress where the spring is, upwards or downwards."""
+def _enter(row: Row, state: Array, branch: int) -> None:
+    """Enter a branch at the strain and stress where the spring is."""
     state[BRANCH], state[FLEXIBILITY] = branch, 0.0
     state[LOW], state[SIGMA_LOW] = -math.inf, -math.inf
     state[HIGH], state[SIGMA_HIGH] = math.inf, math.inf
@@ -368,9 +368,9 @@ def turned(state: Array, up: bool) -> bool:
 def _snap_again(row: Row, state: Array) -> None:
     """Snap through once more what has snapped before; or go on with first loading."""
     if state[RANK] >= state[EVER]:
-        _enter(row, state, SNAP, True)
+        _enter(row, state, SNAP)
     else:
-        _enter(row, state, AGAIN if _has_loop(row, state[SIGMA], True) else BOTH, True)
+        _enter(row, state, AGAIN if _has_loop(row, state[SIGMA], True) else BOTH)
 
 
 @inner
@@ -378,7 +378,7 @@ def _reach(row: Row, state: Array) -> None:
     """Go over from what snaps once more to what is held at all that ever snapped."""
     state[RANK] = state[EVER]
     if row[LOG_AGAIN] == row[LOG_PLUS]:
-        _enter(row, state, SNAP, True)
+        _enter(row, state, SNAP)
     else:
         _hold(row, state, state[EVER])
 
@@ -393,30 +393,30 @@ def switch(row: Row, state: Array, up: bool) -> None:
             state[EVER], state[NEVER] = rank, share(-rank)
         _hold(row, state, rank)
         if not up and row[LOG_AGAIN] == row[LOG_PLUS] and not _has_loop(row, state[SIGMA], False):
-            _enter(row, state, BOTH, False)
+            _enter(row, state, BOTH)
         return
     end = HIGH if up else LOW
     state[EPS], state[SIGMA] = state[end], state[end + SIGMA_LOW - LOW]
     sigma = state[SIGMA]
     if branch == A:
         if state[NEVER] == 1.0:
-            _enter(row, state, SNAP, True)
+            _enter(row, state, SNAP)
         else:
             _snap_again(row, state)
     elif branch == HELD and up:
         _snap_again(row, state)
     elif branch == HELD:
-        _enter(row, state, BACK if _has_loop(row, sigma, False) else BOTH, False)
+        _enter(row, state, BACK if _has_loop(row, sigma, False) else BOTH)
     elif up:
         log = row[LOG_AGAIN] + row[SPREAD_PLUS] * state[EVER]
         if math.log(sigma) >= log - 1e-14 * max(abs(log), 1.0):
             _reach(row, state)
         else:
-            _enter(row, state, BOTH if branch == AGAIN else AGAIN, True)
+            _enter(row, state, BOTH if branch == AGAIN else AGAIN)
     elif sigma <= _last_stress(row) or state[EPS] <= state[LEAST_AT]:
-        _enter(row, state, A, False)
+        _enter(row, state, A)
     else:
-        _enter(row, state, BOTH if branch == BACK else BACK, False)
+        _enter(row, state, BOTH if branch == BACK else BACK)
 
 
 @inner
