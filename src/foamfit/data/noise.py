@@ -136,7 +136,7 @@ def noise_before_contact(
     for name, values in ((c, v[:n]) for c, v in whole.items() if n >= MIN_REST):
         (sigma, time), bent = (_noise_about(values, degree) for degree in (1, 3))
         # A machine that speeds up before contact: its bend is no correlated noise (BIC).
-        if n / bent[1] * np.log(sigma / max(bent[0], 1e-300)) > 2.0 * np.log(n):
+        if sigma > bent[0] * n ** (2.0 * bent[1] / n):
             sigma, time = bent
         how = f"estimated from {n} samples before contact"
         level = averaged(NoiseLevel(sigma, False, how, time), block)
