@@ -472,6 +472,7 @@ class Fit:
                 "rate": loading_rate(test),
                 "notes": test.notes,
             },
+            "specimen": asdict(test.specimen),
             **{name: getattr(self, name) for name in (*asked, "loss", "warnings", "notes")},
             **model.options,
             "model": model.words,
