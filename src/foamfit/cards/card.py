@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ import pandas as pd
 from foamfit.arrays import Array
 from foamfit.cards.curves import Curves, fitted_rates, follow, guessed, loading_curves
 from foamfit.cards.figure import draw
-from foamfit.cards.replay import REPLAYS, Unloading, fit_unloading, rate_of, unloading_curve
+from foamfit.cards.replay import REPLAYS, Replay, Unloading, fit_unloading, rate_of, unloading_curve
 from foamfit.data.units import factor
 from foamfit.errors import InputError
 from foamfit.files import check_file, write_file
@@ -46,21 +45,42 @@ UNITS = {
 }
 _LINE = 78  # characters of a comment
 _COLUMNS = (
-    *("time (s)", "measured stress (Pa)"),
+    *("time (s)", "measured stress (Pa)", "fitted stress (Pa)"),
     *("measured displacement (m)", "fitted displacement (m)"),
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """A fitted test with the stress (Pa) of law and card along its record."""
+    """The record of a fitted test, SI, with the stress that the card has along its strain."""
 
-    rate: float | None  # mean on loading, 1/s
+    rate: float | None  # mean on loading
+    time: Array
     strain: Array  # measured; fitted where the test has only the force
     stress: Array  # measured
-    motion: Array  # strain along which the law is followed: fitted; measured where that drives
-    law: Array  # along `motion`
-    card: Array  # along `strain`
+    motion: Array  # strain along which the law is followed: fitted, or measured where that drives
+    fitted: Array  # stress along `motion`
+    misfit: float | None  # of the fit
+    density: float | None
+    card: Array = field(default_factory=lambda: np.empty(0))
+
+    @classmethod
+    def of(cls, where: str, content: Mapping[str, Any], columns: Sequence[Array | None]) -> Record:
+        """Make it of the content of fit.json and `_COLUMNS`; `where` is for messages."""
+        time, stress, fitted, displacement, simulated = columns
+        specimen, off = content.get("specimen"), content["misfit"]
+        moved = simulated if displacement is None else displacement
+        if specimen is None or stress is None or moved is None:
+            lack = "height of the specimen" if specimen is None else "measured loop"
+            raise InputError(f"{where} has no {lack}, which a card needs; fit the test again")
+        height, mass = specimen["height"], specimen["mass"]
+        motion = (moved if simulated is None else simulated) / height
+        if time is None:  # the law depends on none
+            time = np.cumsum(np.abs(np.diff(motion, prepend=motion[0])) + 1e-9)
+        density = None if mass is None else mass / (height * specimen["area"])
+        misfit = off.get("stress_strain") or off.get("stress_time")
+        rate, fitted = content["data"].get("rate"), stress if fitted is None else fitted
+        return cls(rate, time, moved / height, stress, motion, fitted, misfit, density)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +123,8 @@ class Card:
         """The card in its units."""
         mass, length, time, stress = UNITS[self.units]
         ending, sign, unknown = FORMATS[self.format]
-        pa, dense = _per(stress, "Pa"), _per(f"{mass}/{length}^3", "kg/m^3")
+        units = ((stress, "Pa"), (f"{mass}/{length}^3", "kg/m^3"), (f"1/{time}", "1/s"))
+        pa, dense, per_time = (1.0 / (factor(*one) or math.nan) for one in units)
         rates, stresses = self._written()
         slopes = pa * np.diff(self.curves.stress) / np.diff(self.curves.strain)
         values = {
@@ -112,18 +133,15 @@ class Card:
             "density": unknown if self.density is None else dense * self.density,
             "modulus": float(slopes[:, : self.curves.measured - 1].max()),
             "stiffest": float(slopes.max()),
-            "rates": (_per(f"1/{time}", "1/s") * rates).tolist(),
+            "rates": (per_time * rates).tolist(),
             "strain": self.curves.strain.tolist(),
             "stresses": (pa * stresses).tolist(),
         }
-        environ = environment().overlay(loader=_loader())
-        environ.filters["field"] = _field
-        told = environ.get_template("comments.txt").render(values)
-        told = told.encode("ascii", "replace").decode()
-        lines = [line for one in told.splitlines() for line in textwrap.wrap(one, _LINE) or [""]]
-        comments = "\n".join(f"{sign} {line}".rstrip() for line in lines)
-        template = environ.get_template(f"{self.format}{ending}")
-        return template.render(values, comments=comments) + "\n"
+        told = _words("comments", **values).encode("ascii", "replace").decode()
+        lines = [line for one in told.splitlines() for line in textwrap.wrap(one, _LINE)]
+        values["comments"] = "\n".join(f"{sign} {line}" for line in lines)
+        template = _templates().get_template(f"{self.format}{ending}")
+        return f"{template.render(values).rstrip()}\n"
 
     def _written(self) -> tuple[Array, Array]:
         """Rates and stresses of the curves in the file: of Abaqus with the unloading curve.
@@ -159,8 +177,14 @@ class Card:
         with laid_out(figure):
             pictures = (image(figure, "png"), image(figure, "pdf"))
         told = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
-        for one, content in zip(files, (self.text.encode(), told.encode(), *pictures), strict=True):
-            write_file(one, content)
+        contents = (self.text.encode(), told.encode(), *pictures)
+        try:
+            for one, content in zip(files, contents, strict=True):
+                write_file(one, content)
+        except InputError:
+            for one in files:
+                one.unlink(missing_ok=True)
+            raise
         return path
 
 
@@ -169,7 +193,7 @@ def card(
     *,
     format: str,
     units: str = "kg-mm-ms",
-    rates: Iterable[float | str] | None = None,
+    rates: float | Iterable[float | str] | None = None,
     out: str | Path | None = None,
 ) -> Card:
     r"""Make a material card of a fitted law.
@@ -183,7 +207,7 @@ def card(
         (Radioss), "abaqus" (\*LOW DENSITY FOAM) or "csv" (the curves alone).
     units : str
         "kg-mm-ms", "t-mm-s" or "SI".
-    rates : iterable of float, optional
+    rates : float or iterable of float, optional
         Strain rates of the loading curves, 1/s; by default those of the fitted tests.
     out : str or Path, optional
         File to write; FILE.json, FILE.png and FILE.pdf stand beside it.
@@ -208,31 +232,27 @@ def card(
             f"{source.where} has no hysteretic spring (model {source.model.words}), so it has no "
             "unloading; fit a bistable or a microscale spring"
         )
-    tests = [_Test.of(*one) for one in _contents(result, source)]
+    records = [Record.of(*one) for one in _contents(result, source)]
     asked = asked or fitted_rates(source) or [1.0]
     chosen = [asked[(len(asked) - 1) // 2]] if format == "mat057" else asked
-    measured_to = max(float(one.strain.max()) for one in tests)
+    measured_to = max(float(one.strain.max()) for one in records)
     curves, crossed = loading_curves(source, chosen, measured_to)
 
-    def replayed(strain: Array, time: Array) -> Any:
+    def replay(strain: Array, time: Array) -> Replay:
         return REPLAYS[format](curves, np.maximum(strain, 0.0), rate_of(strain, time))
 
-    laws = [follow(source, one.rate, one.motion, one.time).base_stress for one in tests]
     unloading = fit_unloading(
-        [replayed(one.motion, one.time) for one in tests], laws, expon=format != "mat057"
+        [replay(one.motion, one.time) for one in records],
+        [  # a card has no tension
+            np.where(
+                one.motion > 0.0, follow(source, one.rate, one.motion, one.time).base_stress, 0.0
+            )
+            for one in records
+        ],
+        expon=format != "mat057",
     )
-    records = tuple(
-        Record(
-            one.rate,
-            one.strain,
-            one.stress,
-            one.motion,
-            law,
-            replayed(one.strain, one.time)(unloading),
-        )
-        for one, law in zip(tests, laws, strict=True)
-    )
-    known = [one.density for one in tests if one.density is not None]
+    records = [replace(one, card=replay(one.strain, one.time)(unloading)) for one in records]
+    known = [one.density for one in records if one.density is not None]
     told = _words(
         "warnings",
         source=source,
@@ -240,7 +260,7 @@ def card(
         asked=asked,
         chosen=chosen,
         crossed=crossed,
-        untold=guessed(source, curves),
+        guessed=guessed(source, curves),
         density=bool(known),
     )
     found = Card(
@@ -251,40 +271,34 @@ def card(
         curves=curves,
         unloading=unloading,
         misfit={
-            "fit": _rms(one.misfit for one in tests),
+            "fit": _rms(one.misfit for one in records),
             "card": _rms(_rms(one.card - one.stress) / np.ptp(one.stress) for one in records),
         },
         density=float(np.mean(known)) if known else None,
         warnings=tuple(told.splitlines()),
-        records=records,
+        records=tuple(records),
     )
     if out is not None:
         found.save(out)
     return found
 
 
-def check(format: str, units: str, rates: Iterable[float | str] | None) -> list[float]:
+def check(format: str, units: str, rates: float | Iterable[float | str] | None) -> list[float]:
     """Return the rates, ascending; InputError for an unknown format, units or rates."""
     for name, value, known in (("format", format, FORMATS), ("units", units, UNITS)):
         if value not in known:
             raise InputError(f"{name} = {value!r} is unknown; it must be one of {', '.join(known)}")
-    given = (
-        None if rates is None else [rates] if isinstance(rates, str | float | int) else list(rates)
-    )
+    if rates is None:
+        return []
+    given = [rates] if isinstance(rates, str | int | float) else list(rates)
     try:
-        found = sorted({float(rate) for rate in given or ()})
+        found = sorted({float(rate) for rate in given})
     except (TypeError, ValueError):
-        found = [math.nan]
-    if given == [] or not all(math.isfinite(rate) and rate > 0.0 for rate in found):
-        told = ",".join(map(str, given or ()))
-        raise InputError(f"rates = {told!r} must be positive numbers in 1/s, like 0.01,1,100")
+        found = []
+    if not found or not all(0.0 < rate < math.inf for rate in found):
+        told = ",".join(map(str, given))
+        raise InputError(f"rates = {told} must be positive numbers in 1/s, like 0.01,1,100")
     return found
-
-
-def default_file(source: Source, format: str) -> Path:
-    """Where the command writes a card: cards/<test>-<format> under the current directory."""
-    name = re.sub(r"[^\w.+-]+", "-", source.name).strip("-.") or "card"
-    return Path("cards", f"{name}-{format}{FORMATS[format][0]}")
 
 
 # ------------------------------------------------------------------------------- the fitted tests
@@ -299,7 +313,7 @@ def _contents(
             yield from _contents(one.fit(), source)
     elif isinstance(result, Fit):
         c = result.curves
-        columns = (c.time, c.measured_stress, c.measured_displacement, c.displacement)
+        columns = (c.time, c.measured_stress, c.stress, c.measured_displacement, c.displacement)
         yield result.measurement.name, result.to_json_dict(), columns
     elif isinstance(result, str | Path):
         folder = Path(result) if Path(result).is_dir() else Path(result).parent
@@ -313,38 +327,6 @@ def _contents(
             yield str(place), load_result(place), there
 
 
-@dataclass(frozen=True, eq=False)
-class _Test:
-    """A fitted test, SI; `strain`, `stress`, `motion` and `rate` as in `Record`."""
-
-    rate: float | None
-    time: Array
-    strain: Array
-    stress: Array
-    motion: Array
-    misfit: float | None
-    density: float | None
-
-    @classmethod
-    def of(cls, where: str, content: Mapping[str, Any], columns: Sequence[Array | None]) -> _Test:
-        """Make it of the content of fit.json and `_COLUMNS`; `where` is for messages."""
-        time, stress, measured, fitted = columns
-        specimen, misfit = content.get("specimen"), content["misfit"]
-        strain, motion = (fitted, fitted) if measured is None else (measured, fitted)
-        if specimen is None or stress is None or strain is None:
-            lack = "height of the specimen" if specimen is None else "measured loop"
-            raise InputError(f"{where} has no {lack}, which a card needs; fit the test again")
-        height = specimen["height"]
-        strain, motion = strain / height, (strain if motion is None else motion) / height
-        if time is None:  # the law depends on none
-            time = np.cumsum(np.abs(np.diff(motion, prepend=motion[0])) + 1e-9)
-        off = [misfit[name] for name in ("stress_strain", "stress_time") if misfit.get(name)]
-        mass = specimen["mass"]
-        density = None if mass is None else mass / (height * specimen["area"])
-        rate = content["data"].get("rate")
-        return cls(rate, time, strain, stress, motion, off[0] if off else None, density)
-
-
 def _rms(values: Iterable[float | None]) -> float | None:
     """Root mean square of what is known."""
     known = [value for value in values if value is not None]
@@ -354,15 +336,17 @@ def _rms(values: Iterable[float | None]) -> float | None:
 # ------------------------------------------------------------------------------- the text
 
 
-def _loader() -> Any:
+def _templates() -> Any:
     from jinja2 import PackageLoader
 
-    return PackageLoader("foamfit.cards")
+    made = environment().overlay(loader=PackageLoader("foamfit.cards"))
+    made.filters["field"] = _field
+    return made
 
 
 def _words(name: str, **values: Any) -> str:
     """Return a text of a template, without empty lines."""
-    told = environment().overlay(loader=_loader()).get_template(f"{name}.txt").render(**values)
+    told = _templates().get_template(f"{name}.txt").render(**values)
     return "\n".join(line for line in told.splitlines() if line.strip())
 
 
@@ -374,10 +358,3 @@ def _field(value: float | str, width: int = 10) -> str:
         if len(text) < width:
             return text.rjust(width)
     raise ValueError(f"{value} has no room in {width} columns")
-
-
-def _per(unit: str, si: str) -> float:
-    """Return how many of a unit one SI unit is."""
-    one = factor(unit, si)
-    assert one is not None
-    return 1.0 / one

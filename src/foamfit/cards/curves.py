@@ -52,7 +52,7 @@ class Curves:
         return int(np.sum(self.strain <= self.measured_to))
 
     def at(self, values: Array, strain: Array, rate: Array) -> Array:
-        """Interpolate `stress` or `work`, linearly in strain and rate, and clamped at their ends."""
+        """Interpolate `stress` or `work` linearly in strain and rate, clamped at the ends."""
         each = np.array([np.interp(strain, self.strain, one) for one in values])
         place = np.interp(rate, self.rates, np.arange(self.rates.size))
         low, samples = place.astype(int), np.arange(strain.size)
@@ -77,14 +77,9 @@ def follow(
 
 
 def fitted_rates(source: Source) -> list[float]:
-    """Return the rates of the fitted tests, ascending; about equal ones as their geometric mean."""
-    groups = list[list[float]]()
-    for rate in sorted(source.rates):
-        if groups and rate <= groups[-1][0] * (1.0 + _SAME):
-            groups[-1].append(rate)
-        else:
-            groups.append([rate])
-    return [float(np.exp(np.mean(np.log(group)))) for group in groups]
+    """Return the rates of the fitted tests, ascending, one of each group of about the same rate."""
+    rates = np.sort(source.rates)
+    return [float(rates[at]) for at in np.unique(np.round(np.log(rates) / _SAME), True)[1]]
 
 
 def loading_curves(
@@ -134,15 +129,10 @@ def _points(fine: Array, stress: Array, measured_to: float) -> Array:
 
 
 def guessed(source: Source, curves: Curves) -> list[str]:
-    """Return the parameters that the tests do not determine and that change the curves."""
+    """Return the parameters on which the curves depend and which the tests do not determine."""
     open_ = [name for name, one in source.parameters.items() if one.state == "not determined"]
-    rate = float(
-        np.clip(curves.rates[-1], min(source.rates, default=0.0), max(source.rates, default=np.inf))
-    )
-    found = follow(source, rate, curves.strain, curves.strain / rate, open_).sensitivities
-    return [
-        name
-        for name in open_
-        if np.max(np.abs(found[name].base_stress * source.parameters[name].value))
-        > _CLOSE * curves.stress.max()
-    ]
+    rate = source.rates[0] if source.rates else 1.0
+    slopes = follow(source, rate, curves.strain, curves.strain / rate, open_).sensitivities
+    changes = {name: slopes[name].base_stress * source.parameters[name].value for name in open_}
+    least = _CLOSE * curves.stress.max()
+    return [name for name in open_ if np.abs(changes[name]).max() > least]

@@ -39,25 +39,23 @@ def draw(card: Card) -> Figure:
     with figures.drawing(width, HEIGHT, title) as figure:
         axes = figure.subplots(1, len(shown) + 1)
         for ax, one in zip(axes, shown, strict=False):
-            loops = ((one.strain, one.stress), (one.motion, one.law), (one.strain, one.card))
-            drawn = [
-                ax.plot(strain, stress / factor, label=name, **style)[0]
-                for (strain, stress), (name, style) in zip(loops, STYLES.items(), strict=True)
-            ]
+            loops = ((one.strain, one.stress), (one.motion, one.fitted), (one.strain, one.card))
+            drawn = {
+                name: ax.plot(strain, stress / factor, **style)[0]
+                for (name, style), (strain, stress) in zip(STYLES.items(), loops, strict=True)
+            }
             rate = "rate not known" if one.rate is None else f"{one.rate:.3g} 1/s"
             ax.set(title=rate, xlabel="strain", ylabel=f"stress ({unit})")
         _loading(axes[-1], card)
-        figures.legend_below(figure, {str(line.get_label()): line for line in drawn})
+        figures.legend_below(figure, drawn)
     return figure
 
 
 def _loading(ax: Axes, card: Card) -> None:
     curves = card.curves
     factor, unit = readable_unit(float(curves.stress.max()), "Pa")
-    inside = curves.measured
-    for shade, stress in zip(
-        np.linspace(0.4, 1.0, len(curves.rates))[::-1], curves.stress, strict=True
-    ):
+    inside, shades = curves.measured, np.linspace(1.0, 0.4, len(curves.rates))[::-1]
+    for shade, stress in zip(shades, curves.stress, strict=True):
         style: Any = {"color": VERMILION, "alpha": float(shade), "linewidth": 1.0}
         ax.plot(curves.strain[:inside], stress[:inside] / factor, **style)
         ax.plot(curves.strain[inside - 1 :], stress[inside - 1 :] / factor, linestyle=":", **style)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import click
@@ -47,7 +48,8 @@ def card(result: Path, format: str, units: str, rates: str | None, out: Path | N
     asked = None if rates is None else rates.split(",")
     cards.check(format, units, asked)
     source = read_source(result)
-    file = out or cards.default_file(source, format)
+    name = re.sub(r"[^\w.+-]+", "-", source.name).strip("-.") or "card"
+    file = out or Path("cards", f"{name}-{format}{cards.FORMATS[format][0]}")
     folder = result if result.is_dir() else result.parent
     if folder.resolve() in file.resolve().parents:
         raise InputError(
