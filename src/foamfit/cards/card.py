@@ -5,28 +5,26 @@ from __future__ import annotations
 import json
 import math
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from foamfit.arrays import Array
 from foamfit.cards.curves import Curves, fitted_rates, follow, guessed, loading_curves
 from foamfit.cards.figure import draw
+from foamfit.cards.records import Record, read_records
 from foamfit.cards.replay import REPLAYS, Replay, Unloading, fit_unloading, rate_of, unloading_curve
 from foamfit.data.units import factor
 from foamfit.errors import InputError
 from foamfit.files import check_file, write_file
 from foamfit.report.figures import image, laid_out
-from foamfit.report.folder import load_result
 from foamfit.report.render import environment
-from foamfit.results import Fit, law_in_words, plain
-from foamfit.study.joint_result import JointData
-from foamfit.study.prediction.identified import HasContent, Source, read_source
+from foamfit.results import law_in_words, plain
+from foamfit.study.prediction.identified import HasContent, read_source
 
 # Of each format: ending of its file, what begins a comment, and what stands for a density that is
 # not known, a parameter that is nowhere defined: the solvers refuse it.
@@ -44,43 +42,6 @@ UNITS = {
     "SI": ("kg", "m", "s", "Pa"),
 }
 _LINE = 78  # characters of a comment
-_COLUMNS = (
-    *("time (s)", "measured stress (Pa)", "fitted stress (Pa)"),
-    *("measured displacement (m)", "fitted displacement (m)"),
-)
-
-
-@dataclass(frozen=True, eq=False)
-class Record:
-    """The record of a fitted test, SI, with the stress that the card has along its strain."""
-
-    rate: float | None  # mean on loading
-    time: Array
-    strain: Array  # measured; fitted where the test has only the force
-    stress: Array  # measured
-    motion: Array  # strain along which the law is followed: fitted, or measured where that drives
-    fitted: Array  # stress along `motion`
-    misfit: float | None  # of the fit
-    density: float | None
-    card: Array = field(default_factory=lambda: np.empty(0))
-
-    @classmethod
-    def of(cls, where: str, content: Mapping[str, Any], columns: Sequence[Array | None]) -> Record:
-        """Make it of the content of fit.json and `_COLUMNS`; `where` is for messages."""
-        time, stress, fitted, displacement, simulated = columns
-        specimen, off = content.get("specimen"), content["misfit"]
-        moved = simulated if displacement is None else displacement
-        if specimen is None or stress is None or moved is None:
-            lack = "height of the specimen" if specimen is None else "measured loop"
-            raise InputError(f"{where} has no {lack}, which a card needs; fit the test again")
-        height, mass = specimen["height"], specimen["mass"]
-        motion = (moved if simulated is None else simulated) / height
-        if time is None:  # the law depends on none
-            time = np.cumsum(np.abs(np.diff(motion, prepend=motion[0])) + 1e-9)
-        density = None if mass is None else mass / (height * specimen["area"])
-        misfit = off.get("stress_strain") or off.get("stress_time")
-        rate, fitted = content["data"].get("rate"), stress if fitted is None else fitted
-        return cls(rate, time, moved / height, stress, motion, fitted, misfit, density)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +134,7 @@ class Card:
         files = [path, *(path.with_name(f"{path.name}.{form}") for form in ("json", "png", "pdf"))]
         for one in files:
             check_file(one)
-        figure = draw(self)
+        figure = draw(f"{self.name} as {self.format}", self.misfit, self.records, self.curves)
         with laid_out(figure):
             pictures = (image(figure, "png"), image(figure, "pdf"))
         told = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
@@ -230,9 +191,9 @@ def card(
     if not any(law.hysteretic for law in source.model.laws):
         raise InputError(
             f"{source.where} has no hysteretic spring (model {source.model.words}), so it has no "
-            "unloading; fit a bistable or a microscale spring"
+            "unloading; make the card of a fit with a hysteretic one"
         )
-    records = [Record.of(*one) for one in _contents(result, source)]
+    records = read_records(result)
     asked = asked or fitted_rates(source) or [1.0]
     chosen = [asked[(len(asked) - 1) // 2]] if format == "mat057" else asked
     measured_to = max(float(one.strain.max()) for one in records)
@@ -272,7 +233,7 @@ def card(
         unloading=unloading,
         misfit={
             "fit": _rms(one.misfit for one in records),
-            "card": _rms(_rms(one.card - one.stress) / np.ptp(one.stress) for one in records),
+            "card": _rms(one.misfit_of_card for one in records),
         },
         density=float(np.mean(known)) if known else None,
         warnings=tuple(told.splitlines()),
@@ -301,39 +262,10 @@ def check(format: str, units: str, rates: float | Iterable[float | str] | None) 
     return found
 
 
-# ------------------------------------------------------------------------------- the fitted tests
-
-
-def _contents(
-    result: object, source: Source
-) -> Iterator[tuple[str, Mapping[str, Any], Sequence[Array | None]]]:
-    """Give of each fitted test where it stands, the content of its fit.json, and `_COLUMNS`."""
-    if isinstance(result, JointData):
-        for one in result.test_fits():
-            yield from _contents(one.fit(), source)
-    elif isinstance(result, Fit):
-        c = result.curves
-        columns = (c.time, c.measured_stress, c.stress, c.measured_displacement, c.displacement)
-        yield result.measurement.name, result.to_json_dict(), columns
-    elif isinstance(result, str | Path):
-        folder = Path(result) if Path(result).is_dir() else Path(result).parent
-        names = load_result(folder / "joint.json")["tests"] if source.joint else [""]
-        for place in (folder / name for name in names):
-            try:
-                table = pd.read_csv(place / "curves.csv")
-            except (OSError, ValueError) as error:
-                raise InputError(f"{place / 'curves.csv'} cannot be read: {error}") from None
-            there = [table[name].to_numpy(float) if name in table else None for name in _COLUMNS]
-            yield str(place), load_result(place), there
-
-
 def _rms(values: Iterable[float | None]) -> float | None:
     """Root mean square of what is known."""
     known = [value for value in values if value is not None]
     return float(np.sqrt(np.mean(np.square(known)))) if known else None
-
-
-# ------------------------------------------------------------------------------- the text
 
 
 def _templates() -> Any:

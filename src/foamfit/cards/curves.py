@@ -44,7 +44,7 @@ class Curves:
     @cached_property
     def work(self) -> Array:
         """Energy under the curves up to each strain, (n_rates, n), J/m³."""
-        return np.asarray(cumulative_trapezoid(self.stress, self.strain, initial=0.0))
+        return np.asarray(cumulative_trapezoid(self.stress, self.strain, initial=0))
 
     @property
     def measured(self) -> int:
@@ -58,7 +58,7 @@ class Curves:
         low, samples = place.astype(int), np.arange(strain.size)
         high = np.minimum(low + 1, self.rates.size - 1)
         below: Array = each[low, samples]
-        return below + (place - low) * (each[high, samples] - below)
+        return np.asarray(below + (place - low) * (each[high, samples] - below))
 
 
 def follow(
@@ -122,7 +122,7 @@ def _points(fine: Array, stress: Array, measured_to: float) -> Array:
     bend = np.abs(np.gradient(np.gradient(stress, fine, axis=1), fine, axis=1))
     density = np.sqrt((bend / np.maximum(stress, 1.0)).max(axis=0))
     density = density / density.mean() + 0.5
-    share = cumulative_trapezoid(density, fine, initial=0.0)
+    share = cumulative_trapezoid(density, fine, initial=0)
     strain = np.interp(np.linspace(0.0, share[-1], POINTS), share, fine)
     strain[np.argmin(np.abs(strain - measured_to))] = measured_to
     return np.asarray(strain)

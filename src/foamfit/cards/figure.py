@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foamfit.cards.curves import Curves
+from foamfit.cards.records import Record
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, VERMILION
 from foamfit.report.readable import readable_unit
@@ -15,7 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.cards.card import Card
 
 STYLES: dict[str, Any] = {
     "measured": {"color": "0.65", "linewidth": 1.8},
@@ -26,15 +28,17 @@ WIDTH, HEIGHT = 2.7, 2.9  # of a panel, inches
 MOST = 3  # records that are drawn: the slowest, the middle and the fastest
 
 
-def draw(card: Card) -> Figure:
+def draw(
+    name: str, misfit: Mapping[str, float | None], records: Sequence[Record], curves: Curves
+) -> Figure:
     """Draw the records with law and card along them, and the loading curves to their ends."""
-    known = {name: value for name, value in card.misfit.items() if value is not None}
+    known = {name: value for name, value in misfit.items() if value is not None}
     told = ", ".join(f"{name} {percent(value)}" for name, value in known.items())
-    shown = sorted(card.records, key=lambda one: one.rate or 0.0)
+    shown = sorted(records, key=lambda one: one.rate or 0.0)
     if len(shown) > MOST:
         shown = [shown[0], shown[len(shown) // 2], shown[-1]]
     width = WIDTH * (len(shown) + 1)
-    title = figures.title_lines(width, f"{card.name} as {card.format}", f"misfit: {told}")
+    title = figures.title_lines(width, name, f"misfit: {told}")
     factor, unit = readable_unit(max(float(one.stress.max()) for one in shown), "Pa")
     with figures.drawing(width, HEIGHT, title) as figure:
         axes = figure.subplots(1, len(shown) + 1)
@@ -46,13 +50,12 @@ def draw(card: Card) -> Figure:
             }
             rate = "rate not known" if one.rate is None else f"{one.rate:.3g} 1/s"
             ax.set(title=rate, xlabel="strain", ylabel=f"stress ({unit})")
-        _loading(axes[-1], card)
+        _loading(axes[-1], curves)
         figures.legend_below(figure, drawn)
     return figure
 
 
-def _loading(ax: Axes, card: Card) -> None:
-    curves = card.curves
+def _loading(ax: Axes, curves: Curves) -> None:
     factor, unit = readable_unit(float(curves.stress.max()), "Pa")
     inside, shades = curves.measured, np.linspace(1.0, 0.4, len(curves.rates))[::-1]
     for shade, stress in zip(shades, curves.stress, strict=True):

@@ -50,7 +50,7 @@ def rate_of(strain: Array, time: Array) -> Array:
     """Return the smoothed strain rate along a record, 1/s; the time is in s."""
     window = max(3, int(_WINDOW * strain.size)) | 1
     smooth = savgol_filter(strain, window, 1) if strain.size > window else strain
-    return np.gradient(smooth, time)
+    return np.asarray(np.gradient(smooth, time))
 
 
 def by_energy(curves: Curves, strain: Array, rate: Array) -> Replay:
@@ -68,7 +68,8 @@ def by_slowest(curves: Curves, strain: Array, rate: Array) -> Replay:
     """
     back = rate < 0.0
     load = curves.at(curves.stress, strain, np.where(back, 0.0, rate))
-    work = np.maximum(cumulative_trapezoid(load, strain, initial=0.0), 0.0)
+    summed: Array = cumulative_trapezoid(load, strain, initial=0)
+    work = np.maximum(summed, 0.0)
     energy = _ratio(work, np.maximum.accumulate(work))
     return lambda unloading: np.where(back, unloading.share(energy), 1.0) * load
 
@@ -80,7 +81,7 @@ def by_rate(curves: Curves, strain: Array, rate: Array) -> Replay:
 
     def stress(unloading: Unloading) -> Array:
         below = np.interp(strain, curves.strain, unloading_curve(curves, unloading))
-        return back * below + (1.0 - back) * load
+        return np.asarray(back * below + (1.0 - back) * load)
 
     return stress
 
@@ -100,7 +101,8 @@ def unloading_curve(curves: Curves, unloading: Unloading) -> Array:
     Beyond that it stays just below the loading curve, which it must not meet.
     """
     most = np.interp(curves.measured_to, curves.strain, curves.work[0])
-    return np.minimum(unloading.share(curves.work[0] / most), 0.999) * curves.stress[0]
+    share = np.minimum(unloading.share(curves.work[0] / most), 0.999)
+    return np.asarray(share * curves.stress[0])
 
 
 def fit_unloading(
