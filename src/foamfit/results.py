@@ -469,6 +469,7 @@ class Fit:
                 "last_cycle": test.last_cycle,
                 "cycles": len(test.cycles),
                 "start_strain": test.start_strain,
+                "origins": test.origins,
                 "rate": loading_rate(test),
                 "notes": test.notes,
             },
