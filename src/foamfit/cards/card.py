@@ -17,7 +17,7 @@ from foamfit.arrays import Array
 from foamfit.cards.curves import Curves, fitted_rates, follow, guessed, loading_curves
 from foamfit.cards.figure import draw
 from foamfit.cards.records import Record, read_records
-from foamfit.cards.replay import REPLAYS, Replay, Unloading, fit_unloading, rate_of, unloading_curve
+from foamfit.cards.replay import REPLAYS, Motion, Replay, Unloading, fit_unloading, unloading_curve
 from foamfit.data.units import factor
 from foamfit.errors import InputError
 from foamfit.files import check_file, write_file
@@ -200,7 +200,7 @@ def card(
     curves, crossed = loading_curves(source, chosen, measured_to)
 
     def replay(strain: Array, time: Array) -> Replay:
-        return REPLAYS[format](curves, np.maximum(strain, 0.0), rate_of(strain, time))
+        return REPLAYS[format](curves, Motion.of(strain, time))
 
     unloading = fit_unloading(
         [replay(one.motion, one.time) for one in records],

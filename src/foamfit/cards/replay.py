@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 from scipy.signal import savgol_filter
@@ -25,8 +26,8 @@ from foamfit.cards.curves import Curves
 # hysteresis off.
 _LEAST, _MOST = (1e-3, 0.05, 0.05), (1.0, 50.0, 50.0)
 _STARTS = ((0.2, 0.5, 0.9), (0.2, 2.0, 0.9), (0.5, 5.0, 1.1), (0.1, 1.0, 0.5))
-# Window of the strain rate of a record, as a share of its samples.
-_WINDOW = 0.02
+# Window over which the strain of a record is smoothed, as a share of its samples.
+_WINDOW = 0.03
 
 
 class Unloading(NamedTuple):
@@ -46,41 +47,54 @@ class Unloading(NamedTuple):
 Replay = Callable[[Unloading], Array]
 
 
-def rate_of(strain: Array, time: Array) -> Array:
-    """Return the smoothed strain rate along a record, 1/s; the time is in s."""
-    window = max(3, int(_WINDOW * strain.size)) | 1
-    smooth = savgol_filter(strain, window, 1) if strain.size > window else strain
-    return np.asarray(np.gradient(smooth, time))
+class Motion(NamedTuple):
+    """Strain of a record, its strain rate (1/s), and where it is the largest so far.
+
+    The last two are those of the smoothed strain: noise neither loads nor unloads.
+    """
+
+    strain: Array
+    rate: Array
+    first: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, strain: Array, time: Array) -> Motion:
+        """Return the motion of a record in compression; the time is in s."""
+        strain = np.maximum(strain, 0.0)
+        window = max(3, int(_WINDOW * strain.size)) | 1
+        smooth = savgol_filter(strain, window, 1) if strain.size > window else strain
+        return cls(strain, np.gradient(smooth, time), smooth >= np.maximum.accumulate(smooth))
 
 
-def by_energy(curves: Curves, strain: Array, rate: Array) -> Replay:
+def by_energy(curves: Curves, motion: Motion) -> Replay:
     """LS-DYNA: below the largest strain so far the stress is the share, also in loading again."""
-    speed, most = np.abs(rate), np.maximum.accumulate(strain)
-    load = curves.at(curves.stress, strain, speed)
-    now, then = curves.at(curves.work, strain, speed), curves.at(curves.work, most, speed)
-    return lambda unloading: unloading.share(_ratio(now, then)) * load
+    strain, speed = motion.strain, np.abs(motion.rate)
+    load, work = (curves.at(values, strain, speed) for values in (curves.stress, curves.work))
+    most = curves.at(curves.work, np.maximum.accumulate(strain), speed)
+    energy = np.where(motion.first, 1.0, _ratio(work, most))
+    return lambda unloading: unloading.share(energy) * load
 
 
-def by_slowest(curves: Curves, strain: Array, rate: Array) -> Replay:
+def by_slowest(curves: Curves, motion: Motion) -> Replay:
     """Radioss LAW90: unloading takes a share of the slowest curve, any loading the whole stress.
 
     The energy is summed up along the path.
     """
-    back = rate < 0.0
-    load = curves.at(curves.stress, strain, np.where(back, 0.0, rate))
-    summed: Array = cumulative_trapezoid(load, strain, initial=0)
+    back = (motion.rate < 0.0) & ~motion.first
+    load = curves.at(curves.stress, motion.strain, np.where(back, 0.0, motion.rate))
+    summed: Array = cumulative_trapezoid(load, motion.strain, initial=0)
     work = np.maximum(summed, 0.0)
-    energy = _ratio(work, np.maximum.accumulate(work))
-    return lambda unloading: np.where(back, unloading.share(energy), 1.0) * load
+    energy = np.where(back, _ratio(work, np.maximum.accumulate(work)), 1.0)
+    return lambda unloading: unloading.share(energy) * load
 
 
-def by_rate(curves: Curves, strain: Array, rate: Array) -> Replay:
+def by_rate(curves: Curves, motion: Motion) -> Replay:
     """Abaqus: interpolated in the rate between an unloading curve and the loading curves."""
-    load = curves.at(curves.stress, strain, np.maximum(rate, 0.0))
-    back = np.clip(0.5 * (1.0 - rate / curves.rates[0]), 0.0, 1.0)
+    load = curves.at(curves.stress, motion.strain, np.maximum(motion.rate, 0.0))
+    back = np.clip(0.5 * (1.0 - motion.rate / curves.rates[0]), 0.0, 1.0)
 
     def stress(unloading: Unloading) -> Array:
-        below = np.interp(strain, curves.strain, unloading_curve(curves, unloading))
+        below = np.interp(motion.strain, curves.strain, unloading_curve(curves, unloading))
         return np.asarray(back * below + (1.0 - back) * load)
 
     return stress
