@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 import fabricated
 import foamfit as ff
-from conftest import DATA, needs_data
+from conftest import DATA, needs_data, thinned
 from foamfit.cards import replay
 from foamfit.cards.card import FORMATS, UNITS
 from foamfit.cards.curves import Curves
@@ -193,16 +193,16 @@ def test_what_the_card_loses_is_said(fit: Path, joint: Path) -> None:
 def test_on_real_foam_three_parameters_lose_little_and_two_more(tmp_path: Path) -> None:
     toml = tmp_path / "foam.toml"
     toml.write_text('[specimen]\nheight = "10.53 mm"\ndiameter = "7.63 mm"\n')
-    test = ff.read_test(DATA / "shoe-foam" / "turbo-comp-1_cycle1.csv", toml)
-    fit = ff.fit(test, model="microscale", relaxation=1, starts=2)
+    file = thinned(DATA / "shoe-foam" / "turbo-comp-1_cycle1.csv", tmp_path, 4)
+    fit = ff.fit(ff.read_test(file, toml), model="microscale", relaxation=1, starts=3)
     three, two = (ff.card(fit, format=style) for style in ("mat083", "mat057"))
     assert fit.misfit["stress_strain"] < 0.007
-    assert three.misfit["card"] < 0.0095
-    assert two.misfit["card"] < 0.018
+    assert three.misfit["card"] < 0.012
+    assert 1.2 * three.misfit["card"] < two.misfit["card"] < 0.02
     # The loss is at the turn, where the foam relaxes and a card does not.
     one = three.records[0]
     off = (one.card - one.stress)[one.strain < one.strain.max() - 0.01]
-    assert np.sqrt(np.mean(off**2)) / np.ptp(one.stress) < 0.007
+    assert np.sqrt(np.mean(off**2)) / np.ptp(one.stress) < 0.009
 
 
 # ------------------------------------------------------------------------------- texts

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import textwrap
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from foamfit.arrays import Array
 from foamfit.cards.curves import Curves, fitted_rates, follow, guessed, loading_curves
 from foamfit.cards.figure import draw
 from foamfit.cards.records import Record, read_records
-from foamfit.cards.replay import REPLAYS, Motion, Replay, Unloading, fit_unloading, unloading_curve
+from foamfit.cards.replay import REPLAYS, Motion, Unloading, fit_unloading, unloading_curve
 from foamfit.data.units import factor
 from foamfit.errors import InputError
 from foamfit.files import check_file, write_file
@@ -196,23 +197,17 @@ def card(
     records = read_records(result)
     asked = asked or fitted_rates(source) or [1.0]
     chosen = [asked[(len(asked) - 1) // 2]] if format == "mat057" else asked
-    measured_to = max(float(one.strain.max()) for one in records)
-    curves, crossed = loading_curves(source, chosen, measured_to)
-
-    def replay(strain: Array, time: Array) -> Replay:
-        return REPLAYS[format](curves, Motion.of(strain, time))
-
-    unloading = fit_unloading(
-        [replay(one.motion, one.time) for one in records],
-        [  # a card has no tension
-            np.where(
-                one.motion > 0.0, follow(source, one.rate, one.motion, one.time).base_stress, 0.0
-            )
-            for one in records
-        ],
-        expon=format != "mat057",
-    )
-    records = [replace(one, card=replay(one.strain, one.time)(unloading)) for one in records]
+    curves, crossed = loading_curves(source, chosen, max(one.motion.max() for one in records))
+    replays = [REPLAYS[format](curves, Motion.of(one.motion, one.time)) for one in records]
+    laws = [follow(source, one.rate, one.motion, one.time).base_stress for one in records]
+    targets = [  # a card has no tension
+        np.where(one.motion > 0.0, law, 0.0) for one, law in zip(records, laws, strict=True)
+    ]
+    unloading = fit_unloading(replays, targets, expon=format != "mat057")
+    records = [
+        dataclasses.replace(one, card=replay(unloading))
+        for one, replay in zip(records, replays, strict=True)
+    ]
     known = [one.density for one in records if one.density is not None]
     told = _words(
         "warnings",

@@ -43,7 +43,7 @@ def draw(
     with figures.drawing(width, HEIGHT, title) as figure:
         axes = figure.subplots(1, len(shown) + 1)
         for ax, one in zip(axes, shown, strict=False):
-            loops = ((one.strain, one.stress), (one.motion, one.fitted), (one.strain, one.card))
+            loops = ((one.strain, one.stress), (one.motion, one.fitted), (one.motion, one.card))
             drawn = {
                 name: ax.plot(strain, stress / factor, **style)[0]
                 for (name, style), (strain, stress) in zip(STYLES.items(), loops, strict=True)

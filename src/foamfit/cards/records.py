@@ -24,14 +24,14 @@ _COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """The record of a fitted test, SI, with the stress that the card has along its strain."""
+    """The record of a fitted test, SI, with the stress that the card has along its motion."""
 
     rate: float | None  # mean on loading
     time: Array
     strain: Array  # measured; fitted where the test has only the force
     stress: Array  # measured
-    motion: Array  # strain along which the law is followed: fitted, or measured where that drives
-    fitted: Array  # stress along `motion`
+    motion: Array  # strain of the fit: measured where that drives
+    fitted: Array  # stress of the fit
     misfit: float | None  # of the fit
     density: float | None
     card: Array = field(default_factory=lambda: np.empty(0))
