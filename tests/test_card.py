@@ -57,8 +57,8 @@ def write_fit(
     (folder / "fit.json").write_text(json.dumps(content))
     np.savetxt(
         folder / "curves.csv", np.transpose([time, measured, fitted, strain * HEIGHT]), comments="",
-        delimiter=",", header="time (s),measured stress (Pa),fitted stress (Pa),"
-        "measured displacement (m)",
+        delimiter=",", header="time (s),measured stress (Pa),"
+        "stress along measured displacement (Pa),measured displacement (m)",
     )  # fmt: skip
     return content
 

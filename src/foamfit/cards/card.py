@@ -140,12 +140,14 @@ class Card:
             pictures = (image(figure, "png"), image(figure, "pdf"))
         told = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
         contents = (self.text.encode(), told.encode(), *pictures)
+        written = list[Path]()
         try:
             for one, content in zip(files, contents, strict=True):
                 write_file(one, content)
+                written.append(one)
         except InputError:
-            for one in files:
-                one.unlink(missing_ok=True)
+            for one in written:
+                one.unlink()
             raise
         return path
 

@@ -17,8 +17,8 @@ from foamfit.results import Fit
 from foamfit.study.joint_result import JointData
 
 _COLUMNS = (
-    *("time (s)", "measured stress (Pa)", "fitted stress (Pa)"),
-    *("measured displacement (m)", "fitted displacement (m)"),
+    *("time (s)", "measured stress (Pa)", "measured displacement (m)"),
+    *("fitted stress (Pa)", "fitted displacement (m)", "stress along measured displacement (Pa)"),
 )
 
 
@@ -30,8 +30,8 @@ class Record:
     time: Array
     strain: Array  # measured; fitted where the test has only the force
     stress: Array  # measured
-    motion: Array  # strain of the fit: measured where that drives
-    fitted: Array  # stress of the fit
+    motion: Array  # strain that law and card follow: fitted of an impact, else measured
+    fitted: Array  # stress of the fit along `motion`
     misfit: float | None  # of the fit
     density: float | None
     card: Array = field(default_factory=lambda: np.empty(0))
@@ -53,25 +53,31 @@ class Record:
             found = content["parameters"].get(name)
             return found["value"] - content["data"]["origins"].get(name, 0.0) if found else 0.0
 
-        time, stress, fitted, displacement, simulated = columns
-        specimen, off = content.get("specimen"), content["misfit"]
-        moved = simulated if displacement is None else displacement
+        time, stress, displacement, pressed, simulated, along = columns
+        specimen, moved = (
+            content.get("specimen"),
+            simulated if displacement is None else displacement,
+        )
         if specimen is None or stress is None or moved is None:
             lack = "height of the specimen" if specimen is None else "measured loop"
             raise InputError(f"{where} has no {lack}, which a card needs; fit the test again")
-        height, mass = specimen["height"], specimen["mass"]
-        motion = ((moved if simulated is None else simulated) - zero("displacement")) / height
+        height, mass, off = specimen["height"], specimen["mass"], content["misfit"]
+        impact = content["drive"] == "impact"
+        fitted = pressed if impact else along
+        strain, motion = (
+            (one - zero("displacement")) / height
+            for one in (moved, simulated if impact and simulated is not None else moved)
+        )
         if time is None:  # the law depends on none
             time = np.cumsum(np.abs(np.diff(motion, prepend=motion[0])) + 1e-9)
-        strain, pressed = (moved - zero("displacement")) / height, zero("stress")
         return cls(
             rate=content["data"].get("rate"),
             time=time,
             strain=strain,
-            stress=stress - pressed,
+            stress=stress - zero("stress"),
             motion=motion,
-            fitted=(stress if fitted is None else fitted) - pressed,
-            misfit=off.get("stress_strain") or off.get("stress_time"),
+            fitted=(stress if fitted is None else fitted) - zero("stress"),
+            misfit=off["stress_time" if impact else "stress_strain"],
             density=None if mass is None else mass / (height * specimen["area"]),
         )
 
@@ -82,7 +88,8 @@ def read_records(result: object) -> list[Record]:
         return [record for one in result.test_fits() for record in read_records(one.fit())]
     if isinstance(result, Fit):
         c = result.curves
-        columns = (c.time, c.measured_stress, c.stress, c.measured_displacement, c.displacement)
+        measured = (c.time, c.measured_stress, c.measured_displacement)
+        columns = (*measured, c.stress, c.displacement, c.stress_along)
         return [Record.of(result.measurement.name, result.to_json_dict(), columns)]
     if not isinstance(result, str | Path):
         raise InputError(f"a card is made of a result of fit or joint, not of {result!r}")
