@@ -93,12 +93,8 @@ def loading_curves(
     ends = (min(source.rates), max(source.rates)) if source.rates else (rates[0], rates[0])
     fine = np.linspace(0.0, max(END, measured_to), _FINE + 1)
     within = fine <= measured_to
-    raw = np.array(
-        [
-            follow(source, rate, fine, fine / rate).base_stress
-            for rate in np.clip(rates, *ends).tolist()
-        ]
-    )
+    known = np.clip(rates, *ends).tolist()
+    raw = np.array([follow(source, rate, fine, fine / rate).base_stress for rate in known])
     jumps = np.maximum(2.0 * raw[:, 1:2] - raw[:, 2:3], 0.0)
     raw = raw - jumps * np.maximum(1.0 - fine / _START, 0.0)
     raw[:, 0] = 0.0

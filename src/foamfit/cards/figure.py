@@ -12,7 +12,7 @@ from foamfit.cards.records import Record
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, VERMILION
 from foamfit.report.readable import readable_unit
-from foamfit.text import percent
+from foamfit.text import percent, significant
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,7 +48,7 @@ def draw(
                 name: ax.plot(strain, stress / factor, **style)[0]
                 for (name, style), (strain, stress) in zip(STYLES.items(), loops, strict=True)
             }
-            rate = "rate not known" if one.rate is None else f"{one.rate:.3g} 1/s"
+            rate = "rate not known" if one.rate is None else f"{significant(one.rate, 3)} 1/s"
             ax.set(title=rate, xlabel="strain", ylabel=f"stress ({unit})")
         _loading(axes[-1], curves)
         figures.legend_below(figure, drawn)
