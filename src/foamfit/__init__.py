@@ -34,6 +34,8 @@ _HOME = {
     "predict": "study.predict",
     "JointResult": "study.joint",
     "joint": "study.joint",
+    "Card": "cards.card",
+    "card": "cards.card",
     "FitResult": "api",
     "fit": "api",
     "make_params": "fitting.problem",

@@ -27,7 +27,7 @@ KEYS = {
     "status", "warnings",
     "notes", "checklist", "data",
     "parameters", "relaxation", "stiffening", "mullins", "derived", "visited", "misfit", "weights",
-    "statistics", "energy",
+    "specimen", "statistics", "energy",
     "runtime_s", "stopped", "loss", "noise", "outliers",
 }  # fmt: skip
 
