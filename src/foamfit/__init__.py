@@ -36,6 +36,8 @@ _HOME = {
     "joint": "study.joint",
     "FitResult": "api",
     "fit": "api",
+    "load": "saved",
+    "SavedJoint": "saved",
     "make_params": "fitting.problem",
 }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import lmfit
 
@@ -12,13 +12,38 @@ from foamfit.errors import InputError
 from foamfit.one_model import SEARCHED, Keywords, Options, Progress, identify, judge
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_result
+from foamfit.report.plots import draw_panel
+from foamfit.report.shown import fit_shown
+from foamfit.report.tables import frame
 from foamfit.results import Fit
 from foamfit.springs.model import with_options
 from foamfit.trust.intervals import Announce
 
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
 
 class FitResult(Fit):
     """The result of a fit: parameters, intervals, curves and verdict."""
+
+    def plot(self, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
+        """Draw a panel, measured and fitted, into axes or into those of a new figure.
+
+        `what` is "stress-strain", "stress-time" or "displacement-time". Returns the axes.
+        """
+        return draw_panel(self, ax, what)
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each parameter, SI; the LaTeX of its `to_latex` compiles."""
+        return frame(self.parameters)
+
+    def __repr__(self) -> str:
+        """Return status, model, misfit and parameters."""
+        return fit_shown(self)
+
+    def _repr_html_(self) -> str:
+        return fit_shown(self, html=True)
 
     def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
         """Write the result folder whole, as `report.folder.save_result` does; returns it.

@@ -104,6 +104,19 @@ def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[
                 line.set_data(x[kept], y[kept])
 
 
+@contextmanager
+def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
+    """Give axes of the user's, or those of a new pyplot figure in the style of all figures."""
+    if ax is not None:
+        yield ax
+        return
+    import matplotlib
+    from matplotlib import pyplot
+
+    with matplotlib.rc_context(STYLE):
+        yield pyplot.subplots(figsize=(4.5, 3.2), layout="constrained")[1]
+
+
 def _seen(x: Array, y: Array) -> NDArray[np.intp]:
     """Return samples of a long line through which it looks the same as through all."""
     ends = np.linspace(0, x.size, STRETCHES + 1).astype(np.intp)

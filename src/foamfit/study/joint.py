@@ -23,6 +23,7 @@ from foamfit.fitting.search import Tracker, descend
 from foamfit.one_model import Options, Progress, identify, weigh_motion
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import check_target, try_target
+from foamfit.report.shown import JointViews
 from foamfit.report.studies.joint import save_joint
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
@@ -51,7 +52,7 @@ ONE_FOR_ALL = 2
 SAME_RATE = 0.02
 
 
-class JointResult(JointData):
+class JointResult(JointViews, JointData):
     """Everything that a joint fit found, and how it is written; its fields are `JointData`'s."""
 
     def save(

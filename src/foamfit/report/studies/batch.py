@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import math
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +15,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from foamfit.files import csv_bytes, write_file
+from foamfit.errors import InputError
+from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.report.readable import readable_unit, symbol
 from foamfit.report.render import page, words
 from foamfit.results import Fit, plain
@@ -105,9 +108,24 @@ def table_rows(rows: Sequence[Row]) -> Iterator[list[Any]]:
 
 def table(rows: Sequence[Row]) -> pd.DataFrame:
     """The rows of summary.csv as pandas reads them."""
+    return _frame(*table_rows(rows))
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Return the table in a summary.csv; InputError if it is none."""
+    try:
+        text = read_whole(path).decode()
+        rows = [[cell or None for cell in row] for row in csv.reader(text.splitlines(True))]
+        return _frame(
+            *([cell and re.sub("^'(?=[=+@-])", "", cell) for cell in row] for row in rows)
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} is no summary of a batch: {error}") from None
+
+
+def _frame(head: list[Any], *cells: list[Any]) -> pd.DataFrame:
     import pandas as pd
 
-    head, *cells = table_rows(rows)
     frame = pd.DataFrame(cells, columns=head)
     words = ("test", "file", "status", "error", *(n for n in head if n.endswith("_state")))
     return frame.astype({name: float for name in head if name not in words})

@@ -14,10 +14,12 @@ import numpy as np
 from foamfit.fitting.links import RATES, law_values
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, TWO, VERMILION, image
-from foamfit.report.folder import save_whole, write_json, write_result
-from foamfit.report.readable import Readable, in_unit, own_name, readable, readable_unit, symbol
+from foamfit.report.folder import save_whole, write_json, write_result, write_text
+from foamfit.report.readable import in_unit, own_name, readable, readable_unit, symbol
 from foamfit.report.render import page, words
-from foamfit.results import ParameterEstimate, law_in_words
+from foamfit.report.shown import Joint
+from foamfit.report.tables import parameters_tex
+from foamfit.results import law_in_words
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import percent
 from foamfit.trust.covariance import RULE
@@ -70,6 +72,7 @@ def save_joint(
             failed.append(error)
 
     def show(fresh: Path) -> None:
+        write_text(fresh / "table.tex", joint_tex(found))
         folders = [fresh / name for name in found.tests]
         # Where other processes make the folders, the picture of all is drawn beside them.
         n = len(folders)
@@ -80,7 +83,7 @@ def save_joint(
         if width != TWO:  # the page is as wide as two columns
             png = image(plot_joint(found), "png", DPI)
         text = joint_page(found, png, linked=reports)
-        (fresh / "joint.html").write_text(text, encoding="utf-8", errors="replace")
+        write_text(fresh / "joint.html", text)
         for _ in made:
             pass
 
@@ -90,6 +93,22 @@ def save_joint(
             f"{failed[0]!r}; {Path(folder) / 'joint.json'} is written, but not all reports"
         ) from failed[0]
     return Path(folder)
+
+
+def joint_tex(found: Joint) -> str:
+    """Return table.tex: a row for each parameter of the springs."""
+    shown = _of_springs(found)
+    return parameters_tex(
+        {name: one.estimate() for name, one in shown.items()},
+        kinds={name: one.kind for name, one in shown.items()},
+        between={name: between(one) for name, one in shown.items()},
+    )
+
+
+def _of_springs(found: Joint) -> dict[str, JointParameter]:
+    """Parameters of the springs but for those that are held at zero."""
+    every = found.parameters.items()
+    return {n: p for n, p in every if n not in NUISANCE and (p.kind != "fixed" or p.value)}
 
 
 def _write_test(one: TestFit, folder: Path, reports: bool, width: str) -> None:
@@ -131,9 +150,8 @@ def joint_page(found: JointData, picture: bytes, *, linked: bool = True) -> str:
         version=version("foamfit"),
         picture=base64.b64encode(picture).decode("ascii"),
         parameters=[
-            (one, _readable(name, one), between(one))
-            for name, one in found.parameters.items()
-            if name not in NUISANCE and (one.kind != "fixed" or one.value)
+            (one, readable(name, one.estimate()), between(one))
+            for name, one in _of_springs(found).items()
         ],
         rule=RULE,
         ranged=any(one.range for one in found.parameters.values()),
@@ -144,13 +162,6 @@ def joint_page(found: JointData, picture: bytes, *, linked: bool = True) -> str:
         each=each,
         linked=linked,
     )
-
-
-def _readable(name: str, one: JointParameter) -> Readable:
-    shared = ("value", "stderr", "ci95", "unit", "range")
-    given: dict[str, Any] = {key: getattr(one, key) for key in shared}
-    state, why = one.state or "", one.why or ""
-    return readable(name, ParameterEstimate(**given, vary=True, state=state, why=why))
 
 
 def _evidence(found: JointData) -> dict[str, list[Any]]:
