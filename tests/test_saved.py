@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -163,6 +164,38 @@ def test_tables_compile(tmp_path: Path) -> None:
     command = ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "t.tex"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-500:]
+
+
+@pytest.fixture(scope="module")
+def chained() -> ff.FitResult:
+    pytest.importorskip("emcee")
+    pytest.importorskip("xarray")
+    _, test = synthetic_impact(samples=101)
+    return ff.fit(test, model="bistable", starts=2, intervals="mcmc", draws=100)
+
+
+def test_samples_of_a_chain_are_kept(chained, tmp_path: Path, monkeypatch) -> None:
+    import xarray
+
+    samples = chained.samples
+    assert dict(samples.sizes) == {"chain": 2 * len(samples) + 4, "draw": 80}
+    assert samples["s1_k0"].attrs["units"] == "Pa"
+    low, high = np.percentile(samples["s1_k0"], [2.5, 97.5])
+    assert chained.parameters["s1_k0"].ci95 == pytest.approx((low, high))
+    chained.save(tmp_path / "x", report=False)
+    with xarray.open_dataset(tmp_path / "x" / "samples.nc", engine="scipy") as kept:
+        xarray.testing.assert_equal(kept.load(), samples)
+    read = ff.load(tmp_path / "x")
+    xarray.testing.assert_identical(read.samples, samples)
+    assert fabricated.result().samples is None
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(ff.InputError, match=r'pip install "foamfit\[mcmc\]"'):
+        _ = read.samples
+
+
+def test_arviz_takes_the_samples(chained) -> None:
+    arviz = pytest.importorskip("arviz", reason="arviz is not installed; no extra brings it")
+    assert "posterior" in arviz.convert_to_inference_data(chained.samples).groups()
 
 
 def test_a_loaded_result_is_compared_and_predicts_as_the_first(tmp_path: Path) -> None:

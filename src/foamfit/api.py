@@ -13,6 +13,7 @@ from foamfit.one_model import SEARCHED, Keywords, Options, Progress, identify, j
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_result
 from foamfit.report.plots import draw_panel
+from foamfit.report.samples import dataset
 from foamfit.report.shown import fit_shown
 from foamfit.report.tables import frame
 from foamfit.results import Fit
@@ -21,6 +22,7 @@ from foamfit.trust.intervals import Announce
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray
     from matplotlib.axes import Axes
 
 
@@ -37,6 +39,15 @@ class FitResult(Fit):
     def table(self) -> pd.DataFrame:
         """Return a row for each parameter, SI; the LaTeX of its `to_latex` compiles."""
         return frame(self.parameters)
+
+    @property
+    def samples(self) -> xarray.Dataset | None:
+        """Samples of `intervals="mcmc"` as ArviZ takes them, SI; None if no chain was made.
+
+        InputError if xarray is not installed.
+        """
+        about = {"test": self.measurement.name, "model": self.words}
+        return dataset(self.draws, **about) if self.draws else None
 
     def __repr__(self) -> str:
         """Return status, model, misfit and parameters."""

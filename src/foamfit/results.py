@@ -140,6 +140,8 @@ class Intervals:
     elsewhere: dict[str, float] = field(default_factory=dict)
     # Ends of the ranges that include the error of the law, where there is one
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+    # Samples of a Markov chain, (walkers, steps) by parameter, SI; kept in `Fit.draws`
+    draws: dict[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -409,6 +411,8 @@ class Fit:
     relaxation: int = 0  # terms of each hysteretic spring
     interior_mass: bool = False  # whether the specimen's mass sat between the springs
     budget: Budget | None = None
+    # Samples of a Markov chain, (walkers, steps) by parameter, SI; empty if none was made
+    draws: dict[str, Array] = field(default_factory=dict)
 
     @property
     def springs(self) -> dict[str, Spring]:
@@ -558,8 +562,9 @@ class Fit:
         return found
 
 
-# What fit.json and curves.csv keep of a fit; its insight is all derivatives of the curves.
-KEPT = tuple(name for name in Fit.__dataclass_fields__ if name != "insight")
+# What fit.json and curves.csv keep of a fit; its insight is all derivatives of the curves, and
+# samples have a file of their own.
+KEPT = tuple(name for name in Fit.__dataclass_fields__ if name not in ("insight", "draws"))
 
 
 def plain(value: Any) -> Any:

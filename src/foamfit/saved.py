@@ -17,6 +17,8 @@ from foamfit.codec import build, decode
 from foamfit.errors import InputError
 from foamfit.files import read_whole, reason
 from foamfit.report.folder import load_result
+from foamfit.report.samples import FILE as SAMPLES
+from foamfit.report.samples import read_samples
 from foamfit.report.shown import JointViews
 from foamfit.report.studies.batch import read_table
 from foamfit.results import KEPT, Loop
@@ -72,6 +74,7 @@ def _fit(folder: Path) -> FitResult:
     try:
         given = {name: kept[name] for name in KEPT if name in kept}
         result: FitResult = build(FitResult, given, columns, lmfit=lmfit, Insight=Insight)
+        result.draws.update(read_samples(folder / SAMPLES))
         return result
     except KeyError as error:
         why = f"{error} is missing"

@@ -89,7 +89,7 @@ def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path,
     found.save(folder)
     names = {path.name for path in folder.iterdir()}
     assert names == {
-        "cycle-1", "cycle-2", "cycle-3", "cycles.csv", "cycles.json", "cycles.png",
+        "cycle-1", "cycle-2", "cycle-3", "cycles.csv", "cycles.json", "cycles.png", "table.tex",
     }  # fmt: skip
     assert json.loads((folder / "cycle-2" / "fit.json").read_text())["data"]["cycle"] == 2
     with (folder / "cycles.csv").open(newline="") as file:

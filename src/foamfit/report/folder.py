@@ -18,6 +18,8 @@ from foamfit.files import csv_bytes, read_whole, reason, replacing
 from foamfit.report.figures import TWO
 from foamfit.report.page import render_report
 from foamfit.report.result_figures import Mapped, draw_all
+from foamfit.report.samples import FILE as SAMPLES
+from foamfit.report.samples import write_samples
 from foamfit.report.tables import parameters_tex
 from foamfit.results import SCHEMA, Fit, Intervals, ParameterEstimate, plain
 
@@ -26,7 +28,7 @@ from foamfit.results import SCHEMA, Fit, Intervals, ParameterEstimate, plain
 RESULT_FILES = {
     *("fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png"),
     *("fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "budget.csv", "report.html"),
-    "table.tex",
+    *("table.tex", SAMPLES),
 }
 CYCLES_FILES = {"cycles.json", "cycles.csv", "cycles.png", "cycles-plotted.csv", "table.tex"}
 JOINT_FILES = {"joint.json", "joint.html", "joint.png", "joint.csv", "table.tex"}
@@ -223,6 +225,8 @@ def write_result(
     write_table(folder / "curves.csv", _curve_rows(result.columns))
     if result.intervals is not None and result.intervals.profiles:
         write_table(folder / "profiles.csv", _profile_rows(result.intervals))
+    if result.draws:
+        write_samples(folder / SAMPLES, result.draws)
     if pages and result.budget is not None and result.budget.telling:
         write_table(folder / "budget.csv", result.budget.rows())
     if result.ladder is not None:

@@ -91,8 +91,9 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         relaxation=problem.model.relaxation,
         interior_mass=objective.interior_mass,
         noise=noise_of(best, best.errors if best.names else ()),
-        intervals=intervals,
+        intervals=replace(intervals, draws={}),
         budget=budget,
+        draws={n: one + measurement.origins.get(n, 0.0) for n, one in intervals.draws.items()},
     )
 
 

@@ -159,4 +159,4 @@ def _parameter(ax: Axes, found: FittedCycles, name: str) -> None:
     factor, unit = readable_unit(max(abs(p.value) for _, p in points), points[0][1].unit)
     ax.set_title(own_name(name, found.model) + (f" ({unit})" if unit else ""))
     values, ends = figures.draw_estimates(ax, points, factor)
-    figures.limit(ax, values, ends)
+    ax.set_ylim(figures.limits(values, ends))
