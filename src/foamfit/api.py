@@ -121,6 +121,10 @@ def fit(
         along which the cost is not parabolic), "local", "profile", "bootstrap" or "mcmc".
     draws : int, optional
         Refits of the bootstrap (by default 500) or steps of the Markov chain (2000).
+    priors : mapping, optional
+        What is known of parameters of the springs before the fit: mean and standard deviation of a
+        normal distribution, (5.5e6, 1e5) in SI or "5.5 ± 0.1 MPa". Each counts as one residual.
+        [priors] of the TOML are used too.
     watch : callable, optional
         Called with the problem and the best parameters so far whenever these improve; it must be
         quick.
@@ -166,6 +170,8 @@ def fit(
             f"relaxation = {chosen.relaxation} belongs to one model; name it instead of 'auto', "
             "which tries relaxation by itself"
         )
+    if chosen.priors or measurement.priors:
+        raise InputError("priors belong to one model; name it instead of 'auto'")
     with_options(model, **chosen.of_springs)
     from foamfit.auto import compare_models
 

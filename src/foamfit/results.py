@@ -411,6 +411,8 @@ class Fit:
     relaxation: int = 0  # terms of each hysteretic spring
     interior_mass: bool = False  # whether the specimen's mass sat between the springs
     budget: Budget | None = None
+    # Mean and standard deviation of what was known of parameters before, SI
+    priors: dict[str, tuple[float, float]] = field(default_factory=dict)
     # Samples of a Markov chain, (walkers, steps) by parameter, SI; empty if none was made
     draws: dict[str, Array] = field(default_factory=dict)
 
@@ -488,6 +490,7 @@ class Fit:
             "budget": self.budget and self.budget.contributions,
             "ladder": self.ladder and asdict(self.ladder),
             "by_cycle": self.by_cycle,
+            "priors": self.priors,
         }
         content = {
             "schema": SCHEMA,

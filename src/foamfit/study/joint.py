@@ -172,6 +172,11 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
         tell(0.1 * i / len(pairs), "reading")
         try:
             test = read_test(path, specimen, study.cycle, cycles=study.cycles)
+            if test.priors:
+                raise InputError(
+                    f"{path}: [priors] are those of one test, and a joint fit takes none; leave "
+                    "them out of its TOML"
+                )
             options.problem(test, study.model)
             found.append((name, path, test))
         except (InputError, SimulationError) as error:
