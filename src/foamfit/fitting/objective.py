@@ -580,10 +580,8 @@ class Objective:
 
     def off_priors(self, values: Array) -> Array:
         """How far parameters are off their priors, in standard deviations."""
-        there = values[self._prior_places]
-        return np.array(
-            [(v - one.mean) / one.sigma for v, one in zip(there, self.priors, strict=True)]
-        )
+        pairs = zip(values[self._prior_places], self.priors, strict=True)
+        return np.array([(value - one.mean) / one.sigma for value, one in pairs])
 
     def compare(self, curves: Simulated, values: Array) -> Array:
         """Residuals of simulated curves before the loss gives way to large ones; see `residual`."""

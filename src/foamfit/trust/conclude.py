@@ -142,8 +142,8 @@ def _notes(best: BestPoint) -> Iterator[str]:
     for one in best.problem.objective.given:
         found, unit = float(best.values[best.index[one.name]]), unit_of(one.name)
         told = [engineering(v, unit) if unit else f"{v:.4g}" for v in (one.mean, one.sigma)]
-        off = abs(found - one.mean) / one.sigma
-        yield say("note", "prior", name=one.name, mean=told[0], sigma=told[1], off=off)
+        away = abs(found - one.mean) / one.sigma
+        yield say("note", "prior", name=one.name, mean=told[0], sigma=told[1], off=away)
     test, simulated, objective = best.problem.measurement, best.simulated, best.problem.objective
     single = len(best.problem.model.kinds) == 1
     off = [

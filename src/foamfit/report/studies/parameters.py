@@ -121,22 +121,26 @@ def _panel(ax: Axes, one: Compared, tests: Sequence[str], roomy: bool) -> None:
     ax.grid(axis="y", color="0.9", lw=0.5)
     ax.set_axisbelow(True)
     _common(ax, one, there, factor)
-    size = 3.4 if len(tests) <= 25 else 2.4 if len(tests) <= MOST_ROWS else 1.4
     bars = [(y, *p.ci95) for y, p in there if p.ci95 is not None and np.all(np.isfinite(p.ci95))]
     if bars:
         y, left, right = np.array(bars).T
         ax.hlines(y, left / factor, right / factor, color=GREY, lw=0.9, label="95 % interval")
-    shown = [] if one.kind in RATES else there
-    for state, (edge, face, label) in _MARKS.items():
-        own = [(p.value / factor, y) for y, p in shown if p.state == state]
-        inside = np.array([at for at in own if low <= at[0] <= high]).reshape(-1, 2)
-        style: Any = {"color": edge, "ls": "none", "ms": size, "mew": 0.8, "zorder": 4}
-        if len(inside):
-            ax.plot(*inside.T, "o", mfc=face, label=label, **style)
-        for mark, edge_at, sign in (("<", low, -1.0), (">", high, 1.0)):
-            if at := [y for x, y in own if sign * (x - edge_at) > 0.0]:
-                more = {"mfc": face, "clip_on": False, "label": _BEYOND}
-                ax.plot([edge_at] * len(at), at, mark, **style | more)
+    size = 3.4 if len(tests) <= 25 else 2.4 if len(tests) <= MOST_ROWS else 1.4
+    for state in () if one.kind in RATES else _MARKS:
+        _points(ax, [(p.value / factor, y) for y, p in there if p.state == state], state, size)
+
+
+def _points(ax: Axes, points: Sequence[tuple[float, int]], state: str, size: float) -> None:
+    """Draw the values of one state; those beyond the panel as arrows at its edge."""
+    edge, face, label = _MARKS[state]
+    style: Any = {"color": edge, "mfc": face, "ls": "none", "ms": size, "mew": 0.8, "zorder": 4}
+    low, high = ax.get_xlim()
+    inside = [at for at in points if low <= at[0] <= high]
+    if inside:
+        ax.plot(*np.array(inside).T, "o", label=label, **style)
+    for mark, end, sign in (("<", low, -1.0), (">", high, 1.0)):
+        if at := [y for x, y in points if sign * (x - end) > 0.0]:
+            ax.plot([end] * len(at), at, mark, clip_on=False, label=_BEYOND, **style)
 
 
 def _common(
