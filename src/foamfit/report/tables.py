@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from foamfit.report.readable import readable, readable_unit, symbol
+from foamfit.report.readable import own_symbol, readable, readable_unit
 from foamfit.report.render import environment
 from foamfit.results import ParameterEstimate
 
@@ -65,11 +66,12 @@ def numbers(told: str) -> str:
 
 
 def parameters_tex(parameters: Mapping[str, ParameterEstimate], **more: Any) -> str:
-    """Return table.tex of a fit: a row for each parameter.
+    """Return table.tex of a fit: a row for each parameter that is not held at zero.
 
     `more` may hold `kinds` and `between` of a joint fit, by the name of the parameter.
     """
-    rows = [readable(name, p) for name, p in parameters.items()]
+    shown = {n: p for n, p in parameters.items() if p.state != "fixed" or p.value}
+    rows = list(zip(_symbols(shown), itertools.starmap(readable, shown.items()), strict=True))
     return _tex("parameters", rows=rows, **({"kinds": {}, "between": {}} | more))
 
 
@@ -78,9 +80,9 @@ def by_test(
 ) -> dict[str, Any]:
     """Return heads and rows of a table: a row for each test, for each parameter a column."""
     heads, cells = [], []
-    for name, each in parameters.items():
+    for own, (name, each) in zip(_symbols(parameters), parameters.items(), strict=True):
         factor, unit = unit_of_all(each)
-        heads.append((symbol(name), unit))
+        heads.append((own, unit))
         cells.append([one and readable(name, one, (factor, unit)) for one in each])
     return {"heads": heads, "rows": list(zip(tests, *cells, strict=True))}
 
@@ -88,6 +90,13 @@ def by_test(
 def by_test_tex(first: str, table: Mapping[str, Any]) -> str:
     """Return a table of `by_test` as LaTeX; `first` is the head of its first column."""
     return _tex("by_test", first=first, **table)
+
+
+def _symbols(names: Iterable[str]) -> list[tuple[str, str]]:
+    """Return the symbols of parameters, without the spring where there is only one."""
+    names = list(names)
+    springs = 1 + any(name.startswith("s2_") for name in names)
+    return [own_symbol(name, springs) for name in names]
 
 
 def unit_of_all(each: Iterable[ParameterEstimate | None]) -> tuple[float, str]:
@@ -110,10 +119,10 @@ def frame(parameters: Mapping[str, Any], **more: Mapping[str, Any]) -> pd.DataFr
 
 
 def _rows(parameters: Mapping[str, Any], more: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    for name, p in parameters.items():
+    for own, (name, p) in zip(_symbols(parameters), parameters.items(), strict=True):
         ends = (*(p.ci95 or (None, None)), *(getattr(p, "range", None) or (None, None)))
         spans = zip(("ci95_low", "ci95_high", "range_low", "range_high"), ends, strict=True)
-        row = {"parameter": name, "symbol": formula(symbol(name)), "value": p.value}
+        row = {"parameter": name, "symbol": formula(own), "value": p.value}
         row |= {"stderr": p.stderr, **dict(spans), "systematic": getattr(p, "systematic", None)}
         numbers = {key: _number(one) for key, one in row.items()}
         others = {key: _number(values.get(name)) for key, values in more.items()}
