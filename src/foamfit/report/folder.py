@@ -239,9 +239,15 @@ def write_result(
         write_text(folder / "report.html", render_report(result, drawn))
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write plain types as JSON; a non-UTF-8 name keeps its bytes as a JSON escape."""
-    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write an object as JSON; a non-UTF-8 name keeps its bytes as a JSON escape.
+
+    What `load` needs, which nobody reads, is one line at the end.
+    """
+    form: Any = {"ensure_ascii": False, "allow_nan": False}
+    text = json.dumps({k: v for k, v in content.items() if k != "load"}, indent=2, **form)
+    if "load" in content:
+        text = f'{text[:-2]},\n  "load": {json.dumps(content["load"], **form)}\n}}'
     path.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 

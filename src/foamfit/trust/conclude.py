@@ -28,7 +28,14 @@ from foamfit.text import engineering, listed, percent
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import make_budget
-from foamfit.trust.checklist import Findings, make_checklist, may_vanish, status_of, warnings_of
+from foamfit.trust.checklist import (
+    POOR,
+    Findings,
+    make_checklist,
+    may_vanish,
+    status_of,
+    warnings_of,
+)
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
 from foamfit.trust.sentences import say
@@ -212,13 +219,15 @@ def _estimates(
 ) -> dict[str, ParameterEstimate]:
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
     problem, out = best.problem, {}
+    objective = problem.objective
+    missed = max((objective.off(best.simulated, c) or 0.0, c) for c in objective.counted)
     for name, value in zip(problem.names, best.values.tolist(), strict=True):
         if problem.is_exact(name):
             continue
         parameter = problem.params[name]
         if name in best.names:
             assert insight is not None
-            one = _varied(best, name, insight, intervals)
+            one = _followed(_varied(best, name, insight, intervals), missed)
         else:
             vary, spring = bool(parameter.vary), split_name(name)[0] + 1
             state, key = ("not determined", "unreached") if vary else ("fixed", "held")
@@ -228,6 +237,15 @@ def _estimates(
         parameter.stderr = one.stderr
         out[name] = one.counted_from(-problem.measurement.origins.get(name, 0.0))
     return out
+
+
+def _followed(one: ParameterEstimate, missed: tuple[float, str]) -> ParameterEstimate:
+    """Call nothing determined that belongs to curves which the model does not follow."""
+    off, curve = missed
+    if off <= POOR or one.state != "determined":
+        return one
+    told = say("why", "poor", off=off, curve=curve.replace("_", "-"), why=one.why)
+    return replace(one, state="weak", why=told)
 
 
 def _varied(
