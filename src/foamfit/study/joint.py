@@ -63,11 +63,12 @@ class JointResult(JointViews, JointData):
         report: bool = True,
         figure_width: str = TWO,
     ) -> Path:
-        """Write joint.json, joint.html, joint.png and a result folder per test; returns the folder.
+        """Write joint.json, its page, pictures and table.tex, and a result folder per test.
 
         An older result there is replaced as a whole, at the end. The folders of the tests are made
         by `jobs` processes (by default one for each core), without `report` with tables alone.
-        Figures are "one" or "two" columns wide, or as wide as a length ("85 mm").
+        Figures are "one" or "two" columns wide, or as wide as a length ("85 mm"). Returns the
+        folder.
         """
         inches(figure_width)  # refuses what is no width
         check_target(folder)
