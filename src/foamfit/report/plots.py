@@ -85,7 +85,8 @@ def draw_panel(result: Fit, ax: Axes | None = None, what: str = "stress-strain")
 def draw_loops(loops: Iterable[Loop], ax: Axes | None = None) -> Axes:
     """Draw the loops of several tests into axes, or into those of a new figure; returns them.
 
-    Measured curves are grey and wide, fitted ones thin and coloured from light to dark.
+    Measured curves are grey and wide, fitted ones thin and coloured from light to dark; of many the
+    key names the first and the last.
     """
     import matplotlib
 
@@ -93,12 +94,14 @@ def draw_loops(loops: Iterable[Loop], ax: Axes | None = None) -> Axes:
     factor, unit = readable_unit(max((_size(one.measured) for one in shown), default=0.0), "Pa")
     colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, max(len(shown), 1)))
     with figures.axes_or_new(ax) as ax:
-        for one, colour in zip(shown, colours, strict=False):
+        for place, (one, colour) in enumerate(zip(shown, colours, strict=False)):
             ax.plot(one.along, one.measured / factor, color="0.75", lw=2.0, label="_measured")
             if one.fitted is not None:
-                ax.plot(one.along, one.fitted / factor, color=colour, lw=0.9, label=one.name)
+                named = len(shown) <= MOST_NAMED or place in (0, len(shown) - 1)
+                label = one.name if named else f"_{one.name}"
+                ax.plot(one.along, one.fitted / factor, color=colour, lw=0.9, label=label)
         ax.set(xlabel=shown[0].label if shown else "strain", ylabel=f"stress ({unit})")
-        if 0 < len(shown) <= MOST_NAMED:
+        if shown:
             ax.legend(
                 loc="best", fontsize="small", title="fitted; measured grey", title_fontsize="small"
             )
