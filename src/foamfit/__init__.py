@@ -38,6 +38,8 @@ _HOME = {
     "card": "cards.card",
     "FitResult": "api",
     "fit": "api",
+    "load": "saved",
+    "SavedJoint": "saved",
     "make_params": "fitting.problem",
 }
 

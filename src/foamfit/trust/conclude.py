@@ -98,8 +98,10 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         relaxation=problem.model.relaxation,
         interior_mass=objective.interior_mass,
         noise=noise_of(best, best.errors if best.names else ()),
-        intervals=intervals,
+        intervals=replace(intervals, draws={}),
         budget=budget,
+        priors={one.name: (one.mean, one.sigma) for one in objective.given},
+        draws={n: one + measurement.origins.get(n, 0.0) for n, one in intervals.draws.items()},
     )
 
 
@@ -144,6 +146,11 @@ def _noise_notes(objective: Objective) -> Iterator[str]:
 def _notes(best: BestPoint) -> Iterator[str]:
     """What was left out of the model, and what it would change."""
     yield from _inner_loops(best)
+    for one in best.problem.objective.given:
+        found, unit = float(best.values[best.index[one.name]]), unit_of(one.name)
+        told = [engineering(v, unit) if unit else f"{v:.4g}" for v in (one.mean, one.sigma)]
+        away = abs(found - one.mean) / one.sigma
+        yield say("note", "prior", name=one.name, mean=told[0], sigma=told[1], off=away)
     test, simulated, objective = best.problem.measurement, best.simulated, best.problem.objective
     single = len(best.problem.model.kinds) == 1
     off = [

@@ -242,7 +242,9 @@ def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker, announce: Announ
     lost = ", ".join(name for name in best.names if name not in best.known)
     note = say("interval", "lost", told=note, names=lost) if lost else note
     fine = chain.converged and chain.stopped is None
-    return _percentiles(best, chain.samples, "MCMC", note, fine)
+    made = _percentiles(best, chain.samples, "MCMC", note, fine)
+    columns = chain.samples.reshape(-1, chain.walkers, len(best.names)).T  # (k, walkers, steps)
+    return replace(made, draws=dict(zip(best.names, columns, strict=True)))
 
 
 def _percentiles(best: BestPoint, drawn: Array, method: str, note: str, fine: bool) -> Intervals:

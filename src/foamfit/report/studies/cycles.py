@@ -9,9 +9,11 @@ import numpy as np
 
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, TWO, image
-from foamfit.report.folder import save_whole, write_json, write_result, write_table
+from foamfit.report.folder import save_whole, write_json, write_result, write_table, write_text
 from foamfit.report.readable import own_name, readable_unit
 from foamfit.report.render import words
+from foamfit.report.shown import cycles_by_test
+from foamfit.report.tables import by_test_tex
 from foamfit.text import percent
 
 if TYPE_CHECKING:
@@ -56,6 +58,7 @@ def write_cycles(
         write_result(result, inner, pages=pages, width=width, mapped=mapped)
     write_table(folder / "cycles.csv", found.rows())
     write_json(folder / "cycles.json", found.to_json_dict())
+    write_text(folder / "table.tex", by_test_tex("Cycle", cycles_by_test(found)))
     if pages:
         figure = plot_cycles(found, width=width)
         (folder / "cycles.png").write_bytes(image(figure, "png", DPI))
@@ -156,4 +159,4 @@ def _parameter(ax: Axes, found: FittedCycles, name: str) -> None:
     factor, unit = readable_unit(max(abs(p.value) for _, p in points), points[0][1].unit)
     ax.set_title(own_name(name, found.model) + (f" ({unit})" if unit else ""))
     values, ends = figures.draw_estimates(ax, points, factor)
-    figures.limit(ax, values, ends)
+    ax.set_ylim(figures.limits(values, ends))
