@@ -34,6 +34,7 @@ MICRO_SPRINGS, STEPS, CYCLE = 4000, 2000, 4.0  # springs; steps of a leg; s of a
 HEIGHT, AREA = 10e-3, 4.5e-5  # m, m²
 ROWS, NOISE = 1200, 1e-3  # samples; noise of each channel over its range
 LEAST = 0.02  # share of the peak stress at which the machine turns back
+DEEPEST, BACK = 0.82, 0.3  # largest strain; what is left of it where it turns back, at most
 
 
 @dataclass
@@ -103,14 +104,12 @@ def draw(rng: np.random.Generator) -> tuple[dict[str, float], float]:
         values["eps_star"] = least + rng.uniform(0.02, 0.2)
         row = Ensemble(values)
         top = row.strain(most, row.after(most))
-        if top < 0.85:
+        if top < DEEPEST:
             return values, top
 
 
-def record(seed: int) -> tuple[dict[str, float], pd.DataFrame]:
-    """Make the true parameters and the noisy record of one test."""
-    rng = np.random.default_rng([seed, 11])
-    values, top = draw(rng)
+def pressed(values: dict[str, float], top: float) -> tuple[list[float], list[float]]:
+    """Press a foam three times, to `top` and a little further each; its strains and stresses."""
     row, g, tau = Ensemble(values), values["g1"], values["tau1"]
     step = 0.5 * CYCLE / STEPS
     fade, gain = math.exp(-step / tau), g * tau / step * (1.0 - math.exp(-step / tau))
@@ -127,6 +126,18 @@ def record(seed: int) -> tuple[dict[str, float], pd.DataFrame]:
             peak = max(peak, stresses[-1])
             if not ups and stresses[-1] < LEAST * peak:
                 break
+    return strains, stresses
+
+
+def record(seed: int) -> tuple[dict[str, float], pd.DataFrame]:
+    """Make the true parameters and the noisy record of one test."""
+    rng = np.random.default_rng([seed, 11])
+    values, top = draw(rng)
+    strains, stresses = pressed(values, top)
+    while strains[-1] > BACK * top:
+        values, top = draw(rng)
+        strains, stresses = pressed(values, top)
+    step = 0.5 * CYCLE / STEPS
     own = np.linspace(0, len(strains) - 1, ROWS)
     at = np.arange(len(strains))
     early = int(rng.uniform(30, 120))  # rows before contact, at the speed of the first leg
