@@ -404,6 +404,14 @@ def test_one_cycle_of_a_slow_test_is_kept(cycle):
     assert any(f"Cycle {cycle} of 3" in note for note in conditioned.notes)
 
 
+def test_cycles_are_told_from_each_other_however_far_the_machine_came_from():
+    """They go back to a third of their own way, which is most of the machine's."""
+    w = np.interp(np.arange(1000), [0, 400, 500, 600, 700, 800, 900, 999],
+                  [-8e-3, 0, 1e-3, 3e-4, 1e-3, 3e-4, 1e-3, 0])  # fmt: skip
+    record = Record(np.arange(1000) * 0.01, np.maximum(1e9 * w, 0.0), w)
+    assert condition(record, SPECIMEN, window=Window(cycle=2)).cycles == (1, 2, 3)
+
+
 def preconditioned(set_strain, offset=0.0, noise=0.0, n=4, held=1.0, lowest=0.0):
     """Triangles of 1 mm on a foam of 10 mm that bears nothing below its set; MPa over mm."""
     corners = [0.0, *(level for _ in range(n) for level in (1e-3, lowest))]

@@ -145,6 +145,29 @@ def test_a_driving_motion_is_smooth_and_what_is_unsure_of_it_moves_the_residual(
         np.testing.assert_allclose(found, wanted, atol=1e-4 * largest)
 
 
+def test_springs_that_relax_start_at_the_contact_and_not_at_the_first_sample():
+    """What the strain at the first sample has put into the relaxing stress is there."""
+    spring = replace(SPRING, relaxation=[(0.8, 0.4)])
+    time = np.linspace(0.0, 4.0, 401)
+    w = HEIGHT * np.interp(time, [0.0, 2.0, 4.0], [0.0, 0.5, 0.0])
+    chain = ff.Chain([spring], [HEIGHT], AREA)
+    stress = ff.simulate(chain, ff.DisplacementDrive(w), time).base_stress
+    test = Measurement(
+        name="synthetic loop", path=None, data_sha256="", time=time[3:], stress=stress[3:],
+        displacement=w[3:], specimen=Specimen(HEIGHT, AREA), noise=Noise(1e2, 0.0),
+        motion="measured", contact="stress",
+    )  # fmt: skip
+    model = Model.parse("microscale", relaxation=1)
+    objective = Objective(test, model, "displacement", {"stress_strain": 1.0})
+    known = dict(zip(Model.parse("microscale").names, OF_SPRING, strict=True)) | objective.usual
+    known |= {"s1_g1": 0.8, "s1_tau1": 0.4}
+    values = np.array([known[name] for name in (*model.names, *objective.nuisance)])
+    off = objective.residual(values) / objective.span("stress_strain")
+    assert np.abs(off).max() < 1e-5
+    late = Objective(replace(test, contact="file"), model, "displacement", {"stress_strain": 1.0})
+    assert np.abs(late.residual(values) / late.span("stress_strain")).max() > 1e-3
+
+
 def test_residuals_of_a_driven_loop_are_weighed_by_their_full_covariance(driven):
     """Of noise and of what the motion leaves open: weighed, it is that of the noise alone."""
     values = np.array([*OF_SPRING, *(driven.usual[name] for name in driven.nuisance)])

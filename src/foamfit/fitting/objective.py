@@ -52,6 +52,8 @@ MAX_STEPS = 20_000  # a trial that needs more is too stiff to be worth waiting f
 RTOL_OF_ANY_LAW = 1e-5  # of a registered law, whose halved steps cost more
 # Standard deviation of normal residuals over the median of their sizes.
 NORMAL = 1.4826
+# Gaps between samples by which the first may lie after contact, for it to be simulated from there.
+LATEST = 50.0
 # Most instants that are simulated for each sample that averages rows of the file.
 FINEST = 8
 # Steps of differences: of the velocity and the mass, relative, of times over the instants' gap, and
@@ -123,9 +125,8 @@ class Objective:
         self.time = np.arange(self._stress.size, dtype=float) if time is None else time
         self._fine = min(self.measurement.block, FINEST) if self.drive != "stress" else 1
         self._clock, self._own = instants(self.time, self._fine), None
-        if self._driven and self.motion is not None and self.motion.turns.size:
-            # A motion turns between samples: how far it goes there is what the springs remember.
-            own, self._clock = self._clock, np.union1d(self._clock, self.motion.turns)
+        if self._driven and (more := [*self._turns(), *self._contact()]):
+            own, self._clock = self._clock, np.union1d(self._clock, more)
             self._own = np.searchsorted(self._clock, own)
         self._absent = {"stress": ["stress_time"], "displacement": ["displacement_time"]}.get(
             self.drive, []
@@ -156,14 +157,34 @@ class Objective:
         """
         return self.followed[0] if self.followed else driving_motion(self.measurement, self.time)
 
-    @cached_property
-    def _moved(self) -> Array:
-        """The measured motion at the instants that are simulated, m."""
+    def _turns(self) -> Array:
+        """Instants between samples at which a motion turns: how far it goes is remembered."""
+        return np.empty(0) if self.motion is None else self.motion.turns
+
+    def _contact(self) -> list[float]:
+        """Instant of contact, where the first sample lies a little after it.
+
+        The springs start there without strain: what they carry at the first sample relaxes already.
+        """
+        if self.measurement.contact == "file" or self.measurement.start_strain:
+            return []
+        (at, then), (first, second) = self._clock[:2], self._motion_at(self._clock[:2])
+        late = first / (second - first) if second > first else -1.0
+        return [float(at - late * (then - at))] if 0.0 < late < LATEST else []
+
+    def _motion_at(self, times: Array) -> Array:
+        """The measured motion at some times, m; it goes straight on before its first sample."""
         values = self.measurement.displacement
         assert values is not None
         if self.motion is not None:
-            return self.motion.at(self._clock)
-        return np.interp(self._clock, self.time, values)
+            return self.motion.at(times)
+        before = np.minimum(times - self.time[0], 0.0) / (self.time[1] - self.time[0])
+        return np.interp(times, self.time, values) + before * (values[1] - values[0])
+
+    @cached_property
+    def _moved(self) -> Array:
+        """The measured motion at the instants that are simulated, m."""
+        return self._motion_at(self._clock)
 
     @cached_property
     def _along(self) -> dict[bool, AnyPlan]:
