@@ -51,6 +51,7 @@ DPI = 250  # of a PNG
 TWO = "two"
 COLUMNS = {"one": 3.25, TWO: 7.0}
 NARROWEST, WIDEST = 2.5, 20.0
+UNTITLED = "untitled"  # after a width and a comma: no title
 # Lines with more points are drawn through the first, last and extreme samples of this many
 # stretches, which looks the same in print.
 MOST_POINTS, STRETCHES = 3000, 500
@@ -58,6 +59,7 @@ MOST_POINTS, STRETCHES = 3000, 500
 
 def inches(width: str) -> float:
     """Return the width of a figure that "one" or "two" columns or a length ("85 mm") name."""
+    width = width.rpartition(",")[0] if not is_titled(width) else width
     if (known := COLUMNS.get(width.strip().lower())) is not None:
         return known
     from foamfit.data.units import parse_quantity
@@ -70,6 +72,11 @@ def inches(width: str) -> float:
             f"a length from {low} to {high} mm"
         )
     return wide
+
+
+def is_titled(width: str) -> bool:
+    """Whether a figure of such a width has a title: all but "two, untitled" and its like."""
+    return width.rpartition(",")[2].strip().lower() != UNTITLED
 
 
 def abreast(width: float, panels: int, least: float = 2.1) -> int:
