@@ -18,6 +18,7 @@ from foamfit.errors import InputError
 from foamfit.report.figures import MOST_POINTS, STYLE, drawing, image, laid_out
 from foamfit.report.plots import origin_word, plot_fit, plot_residuals, plot_response
 from foamfit.report.readable import readable_unit
+from foamfit.report.snapping_plots import plot_snapping
 from foamfit.results import Switch
 
 
@@ -358,3 +359,19 @@ def test_a_long_line_is_drawn_through_what_can_be_seen() -> None:
         assert {3.0, -2.0} <= set(kept[:, 1])
     thin, whole = (imread(io.BytesIO(png))[..., :3] for png in pictures)
     assert np.mean(np.abs(thin - whole) > 0.1) < 0.002
+
+
+def test_the_fraction_snapped_is_drawn_over_time_and_in_pictures_of_the_foam() -> None:
+    result = fabricated.microscale_result()
+    figure = plot_snapping(result)
+    assert figure is not None
+    strip, below = figure.axes
+    fraction = result.snapping["s1"].fraction
+    np.testing.assert_allclose(line(below, "snapped").get_ydata(), 100 * fraction)
+    np.testing.assert_allclose(
+        line(below, "ever snapped").get_ydata(), 100 * np.maximum.accumulate(fraction)
+    )
+    whole, shaded = strip.patches[6:8]  # of the fourth of seven pictures, at the turn
+    assert whole.get_height() == pytest.approx(0.4, abs=0.004)  # of its height, at a strain of 60 %
+    assert shaded.get_height() / whole.get_height() == pytest.approx(fraction.max(), 0.01)
+    assert plot_snapping(fabricated.result()) is None

@@ -61,7 +61,7 @@ def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -
     no wider than these need. Saved at `path`, if one is given, in the format of its suffix.
     """
     panels = _panels(result)
-    with _panelled(panels, width, known=_is_known(result)) as (figure, axes, sizes):
+    with _panelled(panels, width, known=is_known(result)) as (figure, axes, sizes):
         for ax, panel, size in zip(axes, panels, sizes, strict=False):
             _mark_outliers(ax, panel, result)
             _shade_standstills(ax, panel, result)
@@ -193,7 +193,7 @@ def _panels(result: Fit) -> list[_Panel]:
         _measured(strain, c.measured_stress, motion),
         _fitted(None if moved is None else moved / height, pushed),
     ]
-    if strain is not None and c.stress_along is not None and not _is_known(result):
+    if strain is not None and c.stress_along is not None and not is_known(result):
         # Wide and pale below the others, with which it coincides where the fit is good.
         pale = {"color": PALE, "lw": 3.2, "zorder": 2}
         loop.append(_Line(strain, c.stress_along, "springs along measured strain", pale))
@@ -203,7 +203,7 @@ def _panels(result: Fit) -> list[_Panel]:
         ("displacement_time", "time", "s", "displacement", "m", moving),
         ("stress_strain", "strain", "–", "stress", "Pa", loop),
     ]
-    if _is_known(result):
+    if is_known(result):
         panels = [panels[2], panels[0]]
     made = (
         _Panel(key, x, x_unit, y, y_unit, [line for line in lines if line])
@@ -212,7 +212,7 @@ def _panels(result: Fit) -> list[_Panel]:
     return [panel for panel in made if panel.lines]
 
 
-def _is_known(result: Fit) -> bool:
+def is_known(result: Fit) -> bool:
     """Whether the motion is the input and nothing else of it is compared."""
     return result.drive == "displacement" and not result.curves.interior
 

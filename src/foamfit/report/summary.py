@@ -101,6 +101,13 @@ def conclusions(result: Fit) -> tuple[str, ...]:
     )
 
 
+def determined(result: Fit) -> str:
+    """Say how many of the springs' parameters are determined, "" if none is varied."""
+    varied = [p for name, p in result.parameters.items() if p.vary and name not in NUISANCE]
+    found = sum(p.state == "determined" for p in varied)
+    return f"{found} of {len(varied)} parameters determined" if varied else ""
+
+
 def _unknown(parameters: dict[str, ParameterEstimate]) -> dict[str, dict[str, list[str]]]:
     """Group the parameters that are not determined, or weakly, by their state and its reason."""
     found = dict[str, dict[str, list[str]]]()
