@@ -215,8 +215,8 @@ def test_number(value: object, text: str) -> None:
 
 def test_summary_is_short_and_aligned() -> None:
     lines = summary_text(fabricated.chain_result()).splitlines()
-    assert len(lines) <= 30
-    assert max(map(len, lines)) <= 100
+    assert len(lines) <= 22
+    assert max(map(len, lines)) <= 80
     table = [line for line in lines if line.startswith(("s1_", "s2_"))]
     column = next(line for line in lines if line.startswith("parameter")).index("unit")
     assert {line[column:].split()[0] for line in table} == {"MPa", "kPa", "–"}
@@ -225,16 +225,34 @@ def test_summary_is_short_and_aligned() -> None:
 
 def test_summary_says_what_matters() -> None:
     text = summary_text(fabricated.result())
-    assert text.startswith("VACNT foam-1, reconstruction: bistable, impact drive, seed 3: warnings")
-    assert "stress-time 1.2 %, displacement-time 0.4 %\n" in text
+    first, second, *_, last = text.splitlines()
+    assert first == "VACNT foam-1, reconstruction: bistable, impact drive: warnings"
+    assert second == "misfit stress-time 1.2 %, displacement-time 0.4 %; 5 of 7 determined"
     assert "fixed: s1_eta 0 Pa·s" in text
-    assert text.endswith("warning: s1_kh_minus is not determined: branch e was never reached.")
+    assert "\nwarning: s1_kh_minus is not determined: branch e was never reached.\n" in text
+    assert last.startswith("next: --fix NAME=VALUE")
     assert html.unescape(text) == text
 
 
-def test_long_warnings_are_wrapped() -> None:
-    text = summary_text(fabricated.result(warnings=("word " * 60,)))
-    assert max(map(len, text.splitlines())) <= 100
+@pytest.mark.parametrize("long", ["word " * 60, "word " * 6])
+def test_many_parameters_and_warnings_are_still_one_screen(long: str) -> None:
+    """What is not determined, and of the record, is a line; warnings are cut, then counted."""
+    one = fabricated.chain_result().parameters
+    zeros = {name: fabricated.estimate(name, 1.0) for name in ("contact_time", "stress_zero")}
+    more = {
+        f"s3{name[2:]}": replace(p, state="not determined", why="so")
+        for name, p in one.items()
+        if name.startswith("s2")
+    }
+    warnings = tuple(f"{i} {long}" for i in range(9))
+    result = fabricated.result(warnings=warnings, parameters=one | more | zeros)
+    text = summary_text(result)
+    assert len(text.splitlines()) == 22
+    assert max(map(len, text.splitlines())) <= 80
+    assert re.search(r"\nnot determined: s2_kh_minus .*s3_k0, s3_kc", text)
+    assert {name for name in one if f"\n{name} " in text} == {*one} - {"s2_eta", "s2_kh_minus"}
+    assert "\nwarning: 0 word word" in text
+    assert re.search(r"\nand \d more warnings: see the report, or --verbose\n", text)
 
 
 def test_the_terminal_says_why_a_parameter_is_not_determined() -> None:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 Mapped = Callable[..., Iterable[Any]]  # as the built-in `map`
 SHOWN, COARSE = 200, 160  # dots per inch of figures that are only on the page, to save time
-# In the order in which they are begun: what takes longest first. "shown" and "narrow" are the fit on
-# the page, which has its title in the text, on a screen and on a phone.
+# In the order in which they are begun: what takes longest first. "shown" and "narrow" are the fit
+# on the page, which has its title in the text, on a screen and on a phone.
 _NAMES = ("fit", "shown", "narrow", "information", "residuals", "snapping", "profiles")
 
 
