@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 import foamfit as ff
-from conftest import EXPERIMENTS, synthetic_impact, synthetic_loop, without_pictures
+from conftest import EXPERIMENTS, few_bytes, synthetic_impact, synthetic_loop, without_pictures
 from cycled import write_record
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Specimen
@@ -183,7 +183,7 @@ def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkey
     assert desk.command == f"foamfit fit synthetic.csv {' '.join(asked)}"
     assert "2 of 3 cycles fitted" in desk.told
     without_pictures(monkeypatch)
-    monkeypatch.setattr(cycles_report, "image", lambda *_: b"")
+    monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
     told = CliRunner().invoke(main, ["fit", str(record), *asked, "--json", f"--out={tmp_path}/r"])
     command = json.loads(told.stdout)["cycles"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -84,9 +84,10 @@ def abreast(width: float, panels: int, least: float = 2.1) -> int:
     return max(1, min(panels, int(width / least)))
 
 
-def title_lines(width: float, *parts: str) -> list[str]:
-    """Break the parts of a title into lines for a figure of a width in inches."""
-    return [line for part in parts for line in wrapped(part, 0, int(16 * width))]
+def title_lines(width: str, wide: float, *parts: str) -> list[str]:
+    """Break the parts of a title into lines for a figure of `wide` inches; none if untitled."""
+    parts = parts if is_titled(width) else ()
+    return [line for part in parts for line in wrapped(part, 0, int(16 * wide))]
 
 
 @contextmanager
@@ -120,6 +121,17 @@ def _seen(x: Array, y: Array) -> NDArray[np.intp]:
         for start, stop in pairwise(ends):
             kept.append(start + np.array([low[start:stop].argmin(), high[start:stop].argmax()]))
     return np.unique(np.concatenate(kept))
+
+
+def key_of(axes: Iterable[Axes]) -> dict[str, Any]:
+    """Return what is drawn by its label, less the "_" that keeps it off other legends."""
+    found: dict[str, Any] = {}
+    for artist in (one for ax in axes for one in (*ax.lines, *ax.collections, *ax.patches)):
+        label = str(artist.get_label())
+        empty = hasattr(artist, "get_xdata") and not len(artist.get_xdata())
+        if label.startswith("_") and not label.startswith("_child") and not empty:
+            found.setdefault(label[1:], artist)
+    return found
 
 
 def legend_below(figure: Figure, entries: dict[str, Any]) -> int:
@@ -241,6 +253,15 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
         case ("png" | "pdf" | "svg") as form:
             return form
     raise InputError(f"a figure is saved as .png, .pdf or .svg, not {Path(path).name!r}")
+
+
+def write_both(figure: Figure, place: Path, dpi: int = DPI) -> bytes:
+    """Write a figure as PNG and, for print, as PDF; returns the PNG. `place` has no suffix."""
+    with laid_out(figure, dpi):
+        png = image(figure, "png", dpi)
+        place.with_suffix(".png").write_bytes(png)
+        place.with_suffix(".pdf").write_bytes(image(figure, "pdf"))
+    return png
 
 
 def save(figure: Figure, path: str | Path | None) -> Figure:

@@ -27,8 +27,8 @@ RESULT_FILES = {
     *("fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png"),
     *("fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "budget.csv", "report.html"),
 }
-CYCLES_FILES = {"cycles.json", "cycles.csv", "cycles.png", "cycles-plotted.csv"}
-JOINT_FILES = {"joint.json", "joint.html", "joint.png", "joint.csv"}
+CYCLES_FILES = {*("cycles.json", "cycles.csv", "cycles.png", "cycles.pdf", "cycles-plotted.csv")}
+JOINT_FILES = {"joint.json", "joint.html", "joint.png", "joint.pdf", "joint.csv"}
 BATCH_FILES = {"summary.csv", "summary.html", "batch.json"}
 PREDICTION_FILES = {"prediction.json", "prediction.csv", "prediction.png", "prediction.pdf"}
 # One of these is in every result.

@@ -74,9 +74,7 @@ def save_joint(
         # Where other processes make the folders, the picture of all is drawn beside them.
         n = len(folders)
         made = each(_write_test, found.test_fits(), folders, [reports] * n, [width] * n)
-        figure = plot_joint(found, width=width)
-        png = image(figure, "png", DPI)
-        (fresh / "joint.png").write_bytes(png)
+        png = figures.write_both(plot_joint(found, width=width), fresh / "joint", DPI)
         if width != TWO:  # the page is as wide as two columns
             png = image(plot_joint(found), "png", DPI)
         text = joint_page(found, png, linked=reports)
@@ -223,13 +221,9 @@ def plot_joint(found: JointData, *, width: str = TWO) -> Figure:
     rows, low = -(-len(shown) // across), -(-panels // columns)
     heights = [rows * LOOP[1], low * PANEL[1]]
     more = f"; {len(shown)} of {len(found.tests)} drawn" if len(shown) < len(found.tests) else ""
-    lines = figures.title_lines(
-        wide,
-        f"{found.study.name} · {found.study.model} · {len(found.tests)} tests together",
-        f"loops: measured grey and wide, fitted blue and thin{more}; below: 95 % intervals by "
-        "test, hollow if not well determined; lines: in common",
-    )
-    with figures.drawing(wide, sum(heights) + 0.2 + 0.13 * len(lines), lines) as figure:
+    told = f"{found.study.name} · {found.study.model} · {len(found.tests)} tests together{more}"
+    lines = figures.title_lines(width, wide, told)
+    with figures.drawing(wide, sum(heights) + 0.6 + 0.13 * len(lines), lines) as figure:
         top, bottom = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
         most = int(72.0 * wide / across / 4.2)  # letters of a name
         loops = top.subplots(rows, across, squeeze=False).ravel().tolist()
@@ -242,6 +236,7 @@ def plot_joint(found: JointData, *, width: str = TWO) -> Figure:
             ax.set_axis_off()
         if shared:
             _list(axes[len(names)], found, shared, stacked=narrow)
+        figures.legend_below(figure, figures.key_of([*loops, *axes]))
     return figure
 
 
