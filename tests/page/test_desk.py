@@ -390,5 +390,9 @@ def test_ticks_say_what_a_fit_holds_and_varies():
     curves._moved(SimpleNamespace(data={"held": {"s1_k0": False, "site_eta": False}}))
     assert (set(curves.chosen()[0]), curves.chosen()[1]) == ({"s1_eta"}, ["site_eta"])
     # A chain holds its dashpots and varies the striker's by itself: the ticks say nothing else.
+    curves.found = {"s2_kc": {"ci95": [80e6, 85e6], "range": None}}
     curves.show(Turning(ff.read_test(TEST), "linear+bistable"))
+    bars = {r["name"]: r["interval"] for r in curves.sliders.rows if "interval" in r}
+    assert bars == {"s2_kc": [80.0, 85.0]}  # MPa, as its slider
+    assert not any("range" in row for row in curves.sliders.rows)
     assert curves.chosen() == ({}, [])
