@@ -151,7 +151,7 @@ def choose(page, *files):
 
 
 def press(button):
-    """Click after scrolling: in the same frame the click would go to the report that stood there."""
+    """Click after scrolling: in the same frame the click goes to the report that stood there."""
     button.scroll_into_view_if_needed()
     button.page.wait_for_timeout(300)
     button.click()

@@ -87,7 +87,7 @@ def test_misfit_figure_parameters_and_warnings_come_first_and_the_rest_is_folded
              "s1_kh_minus is not determined: branch e was never reached.", "In words"]  # fmt: skip
     assert [shown.index(one) for one in order] == sorted(shown.index(one) for one in order)
     assert text.index("Misfit\n") < text.index("<img") < text.index("<h2>Parameters")
-    assert "Identified with foamfit" not in shown
+    assert "Journal of Applied Mechanics" not in shown
     assert "Warnings" not in page(warnings=(), status="ok").words
     assert shown.count("No acceptable fit was found") == 0
     assert "No acceptable fit was found" in page(status="failed").shown

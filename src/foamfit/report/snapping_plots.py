@@ -34,10 +34,10 @@ def plot_snapping(result: Fit, path: str | Path | None = None) -> Figure | None:
         return None
     first = next(iter(cycles_of(result.measurement).values()), slice(None))
     along = np.cumsum(np.abs(np.diff(strain[first], prepend=strain[0])))
-    at = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], INSTANTS)))
+    at = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], INSTANTS))).tolist()
     with figures.drawing(7.0, 3.0) as figure:
         above, below = figure.subplots(2, 1, height_ratios=[1.0, 1.2])
-        _draw_strip(above, result, at)
+        _draw_strip(above, result, strain, at)
         factor, unit = readable_unit(float(time[-1]), "s")
         for (name, one), colour in zip(snapping.items(), (BLUE, VERMILION, *INSIDE), strict=False):
             of = f" of {name}" if len(result.chain.springs) > 1 else ""
@@ -53,10 +53,10 @@ def plot_snapping(result: Fit, path: str | Path | None = None) -> Figure | None:
     return figures.save(figure, path)
 
 
-def _draw_strip(ax: Axes, result: Fit, at: Array) -> None:
+def _draw_strip(ax: Axes, result: Fit, overall: Array, at: list[int]) -> None:
     """Draw the chain at some samples, each spring shaded from below by its fraction snapped."""
     chain, snapping = result.chain, result.snapping
-    strains = [result.strain]
+    strains = [overall]
     if len(chain.springs) > 1:  # all in equilibrium, else no fraction is known
         stress = next(iter(snapping.values())).stress
         strains = [np.asarray(spring.strain(stress)) for spring in chain.springs]
@@ -69,7 +69,7 @@ def _draw_strip(ax: Axes, result: Fit, at: Array) -> None:
             ax.bar(number, tall, 0.5, floor, color=STANDING, edgecolor=GREY, lw=0.6)
             ax.bar(number, share * tall, 0.5, floor, color=SNAPPED)
             floor += tall
-        told = f"{number}: {100 * float(result.strain[sample]):.0f} %"
+        told = f"{number}: {100 * float(overall[sample]):.0f} %"
         ax.annotate(told, (number, floor), (0, 3), textcoords="offset points", ha="center")
     ax.set(ylim=(0.0, 1.25), xlim=(0.4, len(at) + 0.6))
     ax.set_title("shaded: the fraction snapped; written: the strain", loc="left", fontsize=7.5)

@@ -33,56 +33,53 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     no room for them; warnings are cut. `verbose` prints all of that, and what else is only in the
     report: the ladder, the reasons of each state, the checklist and the notes.
     """
+    ladder, measured = result.ladder, result.measurement
     rows = [readable(name, p) for name, p in result.parameters.items()]
     given: dict[str, Any] = {
         "result": result,
-        "m": result.measurement,
-        "ladder": result.ladder,
+        "m": measured,
+        "ladder": ladder,
         "shown": [(name, percent(off)) for name, off in _compared(result).items()],
         "fixed": [f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed"],
         "determined": determined(result),
+        "unknown": _unknown({n: p for n, p in result.parameters.items() if n not in NUISANCE}),
     }
+    *lines, following = _screen(result, rows, given, verbose=verbose)
     if verbose:
-        return words(
-            "summary",
-            cycles=cycle_rows(result),
-            ladder_rows=[] if result.ladder is None else [LADDER, *ladder_cells(result.ladder)],
-            rows=rows,
-            table=_table([row for row in rows if row.state != "fixed"], short=False),
-            conclusions=conclusions(result),
-            answers=ANSWERS,
-            **given,
-        )
-    return "\n".join(_short(result, rows, given))
+        ladder_rows = [] if ladder is None else [LADDER, *ladder_cells(ladder)]
+        more = {"cycles": cycle_rows(result), "ladder_rows": ladder_rows, "rows": rows}
+        more |= {"conclusions": conclusions(result), "answers": ANSWERS}
+        lines.append("\n" + words("summary", **more, **given) + "\n")
+    return "\n".join([*lines, following])
 
 
-def _short(result: Fit, rows: list[Readable], given: dict[str, Any]) -> list[str]:
-    """Return the lines of one screen: as much as it has room for."""
+def _screen(
+    result: Fit, rows: list[Readable], given: dict[str, Any], *, verbose: bool
+) -> Iterator[str]:
+    """Give the lines of one screen: as much as it has room for, all with `verbose`."""
     head = words("short", part="head", **given).split("\n")
     head = [line for one in head for line in wrapped(one, 2, COLUMNS)[:2]]
-    unknown = _unknown({n: p for n, p in result.parameters.items() if n not in NUISANCE})
-    said = [w for check in result.checklist if check.key == "determined" for w in check.warnings]
-    warnings = [warning for warning in result.warnings if warning not in said]
+    states = [w for check in result.checklist if check.key == "determined" for w in check.warnings]
+    warnings = [one for one in result.warnings if verbose or one not in states]
     varied = [row for row in rows if row.state != "fixed"]
     sure = [row for row in varied if row.state != "not determined"]
     springs = [row for row in sure if row.name not in NUISANCE]
-    kept = min(len(warnings), WARNING_LINES)
-    for shown, whole, least in (
-        (varied, True, kept),
-        (varied, False, kept),
-        (sure, False, kept),
-        (springs, False, kept),
-        (springs, False, min(kept, 1)),
-    ):
+    lines, kept = 10**6 if verbose else LINES, min(len(warnings), WARNING_LINES)
+    stages = [(varied, True), (varied, False), (sure, False), (springs, False)]
+    for shown, whole in stages:
         left = [row for row in varied if row not in shown and row.name in NUISANCE]
         record = [f"{row.label} {row.with_unit(row.with_error)}" for row in left]
-        parts = {"part": "foot", "unknown": unknown, "whole": whole, "of_record": record}
-        foot = words("short", **parts, **given).split("\n")
-        room = LINES - len(head) - len(foot) - (len(shown) + 2 if shown else 0)
-        if room >= least:
+        foot = words("short", part="foot", whole=whole, of_record=record, **given).split("\n")
+        room = lines - len(head) - len(foot) - (len(shown) + 2 if shown else 0)
+        if room >= kept:
             break
-    table = ["", *aligned(_table(shown, short=True))] if shown else []
-    return [*head, *table, *map(_cut, foot[:-1]), *_fitting(warnings, max(room, least)), foot[-1]]
+    yield from head
+    if shown:
+        yield from ("", *aligned(_table(shown, short=not verbose)))
+    for line in foot[:-1]:
+        yield from wrapped(line) if verbose else [_cut(line)]
+    yield from _fitting(warnings, max(room, min(kept, 1)))
+    yield foot[-1]
 
 
 def _table(rows: list[Readable], *, short: bool) -> list[list[str]]:
@@ -160,7 +157,7 @@ def determined(result: Fit) -> str:
     """Say how many of the springs' parameters are determined, "" if none is varied."""
     varied = [p for name, p in result.parameters.items() if p.vary and name not in NUISANCE]
     found = sum(p.state == "determined" for p in varied)
-    return f"{found} of {len(varied)} parameters determined" if varied else ""
+    return f"{found} of {len(varied)} determined" if varied else ""
 
 
 def _unknown(parameters: dict[str, ParameterEstimate]) -> dict[str, dict[str, list[str]]]:
