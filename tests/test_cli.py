@@ -22,7 +22,7 @@ from foamfit.cli import main
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 FILES = {
-    "fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf",
+    "fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf", "table.tex",
 }  # fmt: skip
 COMMANDS = (
     "batch", "check", "fit", "init", "simulate", "compare", "published", "joint", "predict"

@@ -225,7 +225,7 @@ def test_a_full_disk_loses_no_numbers(here: Path, monkeypatch: pytest.MonkeyPatc
     assert result.stderr == "foamfit: the result cannot be written to r: No space left on device\n"
 
 
-TABLES = ["curves.csv", "fit.json", "parameters.csv"]
+TABLES = ["curves.csv", "fit.json", "parameters.csv", "table.tex"]
 CALL = ("fit", str(RECONSTRUCTION), "--starts", "1", "--max-time", "0.1", "--out", "r")
 
 

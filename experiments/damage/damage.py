@@ -64,7 +64,7 @@ def fit_twins(data: Path, toml: Path) -> tuple[pd.DataFrame, list[Group]]:
         studies.write_specimen(toml, height, diameter)
         path = data / "shoe-foam-twins" / f"{name}_raw.txt"
         found = ff.fit_cycles(path, toml, intervals="local", **MODEL)
-        rows.append(found.table.reset_index().assign(specimen=name))
+        rows.append(found.by_cycle.reset_index().assign(specimen=name))
         fits = [found.results[n] for n in TOGETHER]
         options = Options(relaxation=1)
         problems = tuple(options.problem(r.measurement, r.model, r.params) for r in fits)
@@ -192,7 +192,7 @@ def fit_lattices(data: Path, toml: Path) -> tuple[pd.DataFrame, dict[str, ff.Cyc
         )
         for name in LATTICES
     }  # fmt: skip
-    tables = [one.table.reset_index().assign(specimen=name) for name, one in found.items()]
+    tables = [one.by_cycle.reset_index().assign(specimen=name) for name, one in found.items()]
     return specimen_first(tables), found
 
 

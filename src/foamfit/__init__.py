@@ -34,8 +34,12 @@ _HOME = {
     "predict": "study.predict",
     "JointResult": "study.joint",
     "joint": "study.joint",
+    "Card": "cards.card",
+    "card": "cards.card",
     "FitResult": "api",
     "fit": "api",
+    "load": "saved",
+    "SavedJoint": "saved",
     "make_params": "fitting.problem",
 }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import lmfit
 
@@ -12,13 +12,49 @@ from foamfit.errors import InputError
 from foamfit.one_model import SEARCHED, Keywords, Options, Progress, identify, judge
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_result
+from foamfit.report.plots import draw_panel
+from foamfit.report.samples import dataset
+from foamfit.report.shown import fit_shown
+from foamfit.report.tables import frame
 from foamfit.results import Fit
 from foamfit.springs.model import with_options
 from foamfit.trust.intervals import Announce
 
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray
+    from matplotlib.axes import Axes
+
 
 class FitResult(Fit):
     """The result of a fit: parameters, intervals, curves and verdict."""
+
+    def plot(self, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
+        """Draw a panel, measured and fitted, into axes or into those of a new figure.
+
+        `what` is "stress-strain", "stress-time" or "displacement-time". Returns the axes.
+        """
+        return draw_panel(self, ax, what)
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each parameter, SI; the LaTeX of its `to_latex` compiles."""
+        return frame(self.parameters)
+
+    @property
+    def samples(self) -> xarray.Dataset | None:
+        """Samples of `intervals="mcmc"` as ArviZ takes them, SI; None if no chain was made.
+
+        InputError if xarray is not installed.
+        """
+        about = {"test": self.measurement.name, "model": self.words}
+        return dataset(self.draws, **about) if self.draws else None
+
+    def __repr__(self) -> str:
+        """Return status, model, misfit and parameters."""
+        return fit_shown(self)
+
+    def _repr_html_(self) -> str:
+        return fit_shown(self, html=True)
 
     def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
         """Write the result folder whole, as `report.folder.save_result` does; returns it.
@@ -85,6 +121,10 @@ def fit(
         along which the cost is not parabolic), "local", "profile", "bootstrap" or "mcmc".
     draws : int, optional
         Refits of the bootstrap (by default 500) or steps of the Markov chain (2000).
+    priors : mapping, optional
+        What is known of parameters of the springs before the fit: mean and standard deviation of a
+        normal distribution, (5.5e6, 1e5) in SI or "5.5 ± 0.1 MPa". Each counts as one residual.
+        [priors] of the TOML are used too.
     watch : callable, optional
         Called with the problem and the best parameters so far whenever these improve; it must be
         quick.
@@ -130,6 +170,8 @@ def fit(
             f"relaxation = {chosen.relaxation} belongs to one model; name it instead of 'auto', "
             "which tries relaxation by itself"
         )
+    if chosen.priors or measurement.priors:
+        raise InputError("priors belong to one model; name it instead of 'auto'")
     with_options(model, **chosen.of_springs)
     from foamfit.auto import compare_models
 

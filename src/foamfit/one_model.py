@@ -82,6 +82,7 @@ class Keywords(TypedDict, total=False):
     loss: str
     intervals: str
     draws: int | None
+    priors: Mapping[str, str | tuple[float, float]] | None
     watch: Watch | None
 
 
@@ -105,6 +106,7 @@ class Options:
     loss: str = "linear"
     intervals: str = "auto"
     draws: int | None = None
+    priors: Mapping[str, str | tuple[float, float]] | None = None
     watch: Watch | None = None
 
     @classmethod
@@ -134,6 +136,11 @@ class Options:
             raise InputError(
                 "weights must be a mapping of curves to numbers, like {'stress_time': 1}"
             )
+        if not isinstance(self.priors or {}, Mapping):
+            raise InputError(
+                "priors must be a mapping of parameters to mean and standard deviation, like "
+                "{'s1_k0': '5.5 ± 0.1 MPa'}"
+            )
         _ = self.choice
 
     @property
@@ -152,8 +159,11 @@ class Options:
     ) -> Problem:
         """Set up the fit of one model."""
         model = with_options(model, **self.of_springs)
-        more = {name: getattr(self, name) for name in ("time_shift", "loss", "relaxation")}
+        more: dict[str, Any] = {
+            name: getattr(self, name) for name in ("time_shift", "loss", "relaxation")
+        }
         given = (self.drive, params, self.weights, self.interior_mass)
+        more["priors"] = measurement.priors | dict(self.priors or {})
         return make_problem(measurement, model, *given, **more)
 
 

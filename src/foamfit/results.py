@@ -6,13 +6,14 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.codec import encode
 from foamfit.data.cycles import cycles_of
-from foamfit.data.measurement import Measurement
+from foamfit.data.measurement import Measurement, interior_channel
 from foamfit.data.rate import loading_rate
 from foamfit.springs.chain import Chain
 from foamfit.springs.options import OPTIONS
@@ -81,6 +82,16 @@ class Curves:
     interior: dict[int, tuple[Array, Array]] = field(default_factory=dict)
 
 
+class Loop(NamedTuple):
+    """The stress (Pa) of a test, measured and fitted, along its strain, or else its time (s)."""
+
+    name: str
+    along: Array
+    label: str  # of what it is along
+    measured: Array
+    fitted: Array | None
+
+
 @dataclass(frozen=True, eq=False)
 class Correlation:
     """Correlation matrix of the identified parameters, in the order of `names`."""
@@ -129,6 +140,8 @@ class Intervals:
     elsewhere: dict[str, float] = field(default_factory=dict)
     # Ends of the ranges that include the error of the law, where there is one
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+    # Samples of a Markov chain, (walkers, steps) by parameter, SI; kept in `Fit.draws`
+    draws: dict[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,6 +361,16 @@ def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dic
     return out
 
 
+def loop_of(test: Measurement, along: Array | None, over_time: Array | None) -> Loop | None:
+    """The loop of a test, fitted along its displacement, or else over time; None without stress."""
+    if test.stress is not None and test.displacement is not None and along is not None:
+        strain = test.displacement / test.specimen.height
+        return Loop(test.name, strain, "strain", test.stress, along)
+    if test.stress is None or test.time is None:
+        return None
+    return Loop(test.name, test.time, "time (s)", test.stress, over_time)
+
+
 def law_in_words(model: str, relaxation: int) -> str:
     """Model, what its springs remember, and relaxation in words."""
     words, more = _in_words(model)
@@ -388,6 +411,10 @@ class Fit:
     relaxation: int = 0  # terms of each hysteretic spring
     interior_mass: bool = False  # whether the specimen's mass sat between the springs
     budget: Budget | None = None
+    # Mean and standard deviation of what was known of parameters before, SI
+    priors: dict[str, tuple[float, float]] = field(default_factory=dict)
+    # Samples of a Markov chain, (walkers, steps) by parameter, SI; empty if none was made
+    draws: dict[str, Array] = field(default_factory=dict)
 
     @property
     def springs(self) -> dict[str, Spring]:
@@ -440,6 +467,12 @@ class Fit:
         return None if moved is None else moved / self.measurement.specimen.height
 
     @property
+    def loop(self) -> Loop | None:
+        """The loop measured and fitted; over time where no strain was measured."""
+        c, test = self.curves, self.measurement
+        return loop_of(test, c.stress_along, c.stress)
+
+    @property
     def snapping(self) -> dict[str, Snapping]:
         """How each microscale spring snapped, where that is known; see `snapping_of`."""
         stress = self.curves.measured_stress if self.drive == "stress" else self.curves.stress
@@ -457,6 +490,7 @@ class Fit:
             "budget": self.budget and self.budget.contributions,
             "ladder": self.ladder and asdict(self.ladder),
             "by_cycle": self.by_cycle,
+            "priors": self.priors,
         }
         content = {
             "schema": SCHEMA,
@@ -469,16 +503,15 @@ class Fit:
                 "last_cycle": test.last_cycle,
                 "cycles": len(test.cycles),
                 "start_strain": test.start_strain,
+                "origins": test.origins,
                 "rate": loading_rate(test),
                 "notes": test.notes,
             },
+            "specimen": asdict(test.specimen),
             **{name: getattr(self, name) for name in (*asked, "loss", "warnings", "notes")},
             **model.options,
             "model": model.words,
-            "checklist": [
-                {name: getattr(check, name) for name in ("question", "answer", "sentence")}
-                for check in self.checklist
-            ],
+            "checklist": [asdict(check) for check in self.checklist],
             "parameters": {name: asdict(one) for name, one in self.parameters.items()},
             "derived": self._derived(),
             **{name: getattr(self, name) for name in ("visited", "misfit", "weights")},
@@ -491,7 +524,33 @@ class Fit:
             **{name: one for name, one in optional.items() if one},
         }
         made: dict[str, Any] = plain(content)
-        return made
+        columns = self.columns
+        fields = {name: encode(vars(self)[name], columns) for name in KEPT}
+        rest = {name: one for name, one in fields.items() if one != made.get(name)}
+        length = max((column.size for column in columns.values()), default=0)
+        return made | {"load": {"samples": length, **rest}}
+
+    @property
+    def columns(self) -> dict[str, Array]:
+        """The columns of curves.csv: what is measured and fitted, SI, one value per sample."""
+        c, test = self.curves, self.measurement
+        columns: dict[str, Array | None] = {
+            "time (s)": c.time,
+            "measured stress (Pa)": c.measured_stress,
+            "fitted stress (Pa)": c.stress,
+            "measured displacement (m)": c.measured_displacement,
+            "fitted displacement (m)": c.displacement,
+            "stress along measured displacement (Pa)": c.stress_along,
+            "measured deceleration (m/s^2)": test.acceleration,
+        }
+        for node, (measured, fitted) in c.interior.items():
+            columns[f"measured {interior_channel(node)} (m)"] = measured
+            columns[f"fitted {interior_channel(node)} (m)"] = fitted
+        for channel, found in test.outliers.items():
+            columns[f"outliers of {channel} left out"] = found.left_out.astype(int)
+        for channel, taken in test.sampled.items():
+            columns[f"{channel} is measured"] = taken.astype(int)
+        return {name: column for name, column in columns.items() if column is not None}
 
     def _derived(self) -> dict[str, dict[str, Any]]:
         """Return derived points of the springs, and how far they snapped."""
@@ -506,6 +565,11 @@ class Fit:
             if points:
                 found[name] = points
         return found
+
+
+# What fit.json and curves.csv keep of a fit; its insight is all derivatives of the curves, and
+# samples have a file of their own.
+KEPT = tuple(name for name in Fit.__dataclass_fields__ if name not in ("insight", "draws"))
 
 
 def plain(value: Any) -> Any:

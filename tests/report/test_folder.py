@@ -20,15 +20,15 @@ from foamfit.errors import InputError
 from foamfit.report.folder import check_target, load_result
 
 FILES = {
-    "fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf",
+    "fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf", "table.tex",
 }  # fmt: skip
 KEYS = {
     "schema", "foamfit", "test", "data_sha256", "model", "drive", "interior_mass", "seed",
     "status", "warnings",
     "notes", "checklist", "data",
     "parameters", "relaxation", "stiffening", "mullins", "derived", "visited", "misfit", "weights",
-    "statistics", "energy",
-    "runtime_s", "stopped", "loss", "noise", "outliers",
+    "specimen", "statistics", "energy",
+    "runtime_s", "stopped", "loss", "noise", "outliers", "load",
 }  # fmt: skip
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib import rc_context
+from matplotlib.figure import Figure
 
 import foamfit as ff
 from conftest import AREA, HEIGHT
@@ -13,7 +14,8 @@ from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.report.figures import STYLE, image, laid_out
-from foamfit.report.studies.joint import joint_page, joint_text, plot_joint
+from foamfit.report.studies.joint import joint_page, joint_text, plot_compared, plot_joint
+from foamfit.study.joint import JointResult
 from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import Alternative, fit_jointly
 from foamfit.study.joint_result import Alone, JointData
@@ -71,17 +73,17 @@ def found(tmp_path_factory) -> JointData:
 
 
 def test_the_page_needs_nothing_else_and_escapes_names(found):
-    page = joint_page(found, b"\x89PNG")
+    page = joint_page(found, *2 * [b"\x89PNG"])
     assert not re.search(r'(src|href)="(?!data:|[^"]*report\.html)', page)
     assert "<i>third</i>" not in page
     assert "a &amp; b" in page
     assert "it holds &lt;nothing&gt;." in page
     assert 'href="%3Ci%3Ethird%3C/i%3E/report.html"' in page
-    assert "report.html" not in joint_page(found, b"\x89PNG", linked=False)
+    assert "report.html" not in joint_page(found, *2 * [b"\x89PNG"], linked=False)
 
 
 def test_the_page_has_every_parameter_and_test(found):
-    page = joint_page(found, b"\x89PNG")
+    page = joint_page(found, *2 * [b"\x89PNG"])
     for name, one in found.parameters.items():
         assert (f"<code>{name}</code>" in page) == (one.kind != "fixed")
     body = page.split('<table class="sortable">')[1]
@@ -95,7 +97,7 @@ def test_the_page_has_every_parameter_and_test(found):
 
 
 def test_the_page_tells_the_noise_of_each_test_beside_its_share_of_chi2(found):
-    page = joint_page(found, b"\x89PNG")
+    page = joint_page(found, *2 * [b"\x89PNG"])
     body = page.split('<table class="sortable">')[1]
     heads = re.findall(r"<th><button>(.*?)</button>", body)
     at = heads.index("noise loop (Pa)")
@@ -106,44 +108,60 @@ def test_the_page_tells_the_noise_of_each_test_beside_its_share_of_chi2(found):
     level = {"sigma": 250.0, "given": False, "time": 2.5, "scale": 1e3, "range": 1e5}
     one, *others = found.noise
     vars(found)["noise"] = ({"stress_strain": level}, *others)
-    told = joint_page(found, b"\x89PNG")
+    told = joint_page(found, *2 * [b"\x89PNG"])
     vars(found)["noise"] = (one, *others)
     assert "250.0<i" in told
     assert "estimated, correlated over 2.5 samples, counted as 1000" in told
 
 
 def test_ranges_are_told_where_there_are_some(found):
-    assert "<th>range</th>" not in joint_page(found, b"\x89PNG")
+    assert "<th>range</th>" not in joint_page(found, *2 * [b"\x89PNG"])
     k0 = replace(found.parameters["s1_k0"], range=(5.2e5, 5.8e5))
     ranged = replace(found, parameters={**found.parameters, "s1_k0": k0})
-    page = joint_page(ranged, b"\x89PNG")
+    page = joint_page(ranged, *2 * [b"\x89PNG"])
     assert "<th>range</th>" in page
     assert ">520 to 580 kPa<" in page
     assert "where the value would lie (95 %)" in page
     assert "520.0 to 580.0 kPa" in joint_text(ranged)
 
 
-def test_the_picture_has_a_loop_for_each_test_and_a_panel_for_what_differs(found):
+def test_the_picture_has_a_loop_for_each_test_and_a_panel_for_each_law_of_rate(found):
     figure = plot_joint(found)
     titles = [ax.get_title() for part in figure.subfigs for ax in part.axes]
-    assert [title for title in titles if title.endswith("/s")] == [
-        "first, 0.01/s", "second, 0.1/s", "<i>third</i>, 1/s",
+    assert titles[:4] == [
+        "first, 0.01/s", "second, 0.1/s", "<i>third</i>, 1/s", "sigma_plus (kPa): log rate",
     ]  # fmt: skip
-    assert titles[3:6] == [
-        "kc (kPa): scatter", "sigma_plus (kPa): log rate", "spread_plus: own",
-    ]  # fmt: skip
-    panel = figure.subfigs[1].axes[1]
+    panel = figure.subfigs[1].axes[0]
     assert panel.get_xscale() == "log"
     law = panel.lines[0].get_ydata()
     assert law[-1] / law[0] == pytest.approx((1 + 0.05 * 2.303) / (1 - 0.05 * 2.303), rel=0.02)
-    texts = "\n".join(text.get_text() for text in figure.subfigs[1].axes[3].texts)
-    assert "shared by all tests\nk0\neps_star\nsigma_minus\nspread_minus" in texts
     assert image(figure, "png", 50).startswith(b"\x89PNG")
 
 
-def test_tests_at_one_rate_stand_in_their_order(found):
-    figure = plot_joint(replace(found, rates=(0.1, 0.1, 0.1)))
-    assert figure.subfigs[1].axes[0].get_xlabel() == "test"
+def test_parameters_stand_side_by_side(found):
+    figure = plot_compared(found)
+    panels = {ax.get_label(): ax for ax in figure.axes if ax.axison}
+    assert list(panels) == [name for name in found.parameters if name in KINDS]
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == [
+        "first, 0.01/s", "second, 0.1/s", "<i>third</i>, 1/s",
+    ]  # fmt: skip
+    key = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert {"determined", "95 % interval", "common", "spread between specimens"} <= set(key)
+    points = next(line for line in panels["s1_kc"].lines if line.get_label() == "determined")
+    kc = [found.parameters["s1_kc"].tests[test].value / 1e3 for test in found.tests]
+    assert points.get_xdata().tolist() == kc
+    assert points.get_ydata().tolist() == [0, 1, 2]
+    low, high = panels["s1_k0"].get_xlim()
+    assert low < found.parameters["s1_k0"].value / 1e3 < high
+    lost = {
+        t: replace(one, value=1e9, state="not determined", ci95=None) if t == "second" else one
+        for t, one in found.parameters["s1_kc"].tests.items()
+    }
+    kc = replace(found.parameters["s1_kc"], tests=lost)
+    figure = plot_compared(replace(found, parameters={"s1_kc": kc}), width="one")
+    assert figure.get_figwidth() == 3.25
+    assert figure.axes[0].get_xlim()[1] < 1e3
+    assert "beyond the panel" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_twins_whose_rates_differ_a_little_stand_in_their_order(found):
@@ -153,13 +171,15 @@ def test_twins_whose_rates_differ_a_little_stand_in_their_order(found):
         n: p if p.tests is None else replace(p, tests=dict(zip(names, p.tests.values())))  # noqa: B905
         for n, p in parameters.items()
     }
+    shown = JointResult(**vars(replace(found, parameters=own)))
+    assert repr(shown).startswith("a & b: microscale · 3 tests together · status warnings")
+    assert "a &amp; b" in shown._repr_html_()
+    assert len(shown.plot(Figure().subplots()).lines) == 6
     twins = replace(found, parameters=own, tests=names, rates=(0.231, 0.224, 0.239))
-    top, bottom = plot_joint(twins).subfigs
-    panel = bottom.axes[0]
-    assert panel.get_xlabel() == "test"
-    assert panel.get_xscale() == "linear"
-    assert [label.get_text() for label in panel.get_xticklabels()] == ["10", "11", "9"]
+    (top,) = plot_joint(twins).subfigs
     assert [ax.get_title() for ax in top.axes] == list(names)
+    labels = plot_compared(twins).axes[0].get_yticklabels()
+    assert [label.get_text() for label in labels] == list(names)
 
 
 def test_rates_within_a_decade_have_labels_that_do_not_overlap(found):

@@ -27,7 +27,14 @@ import foamfit as ff
 from conftest import HEIGHT, synthetic_impact, without_pictures
 from foamfit.cli import batch as command
 from foamfit.cli import main
-from foamfit.report.studies.batch import MOST_ON_PAGE, Row, row_of, table_rows, write_page
+from foamfit.report.studies.batch import (
+    MOST_ON_PAGE,
+    Row,
+    row_of,
+    table_rows,
+    write_comparison,
+    write_page,
+)
 from foamfit.study import batch as module
 from foamfit.study import batch_work, processes
 from foamfit.study.batch_work import work
@@ -126,9 +133,9 @@ def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
     alone = ff.fit(ff.read_test("tests/b.csv", "foam.toml"), **QUICK)
     frame = frames[2].set_index("test")
     assert frame.loc["b", "s1_k0"] == alone.params["s1_k0"].value
-    assert names("out2") == ["a", "b", "bad", "c", "summary.csv", "summary.html"]
+    assert names("out2") == ["a", "b", "bad", "c", "summary.csv", "summary.html", "summary.tex"]
     assert names("out2/a") == [
-        "batch.json", "curves.csv", "fit.json", "parameters.csv",
+        "batch.json", "curves.csv", "fit.json", "parameters.csv", "table.tex",
     ]  # fmt: skip
     assert frame.loc["bad", "status"] == "refused"
     assert frame.loc["bad", "error"].startswith("tests/bad.csv: ")
@@ -181,7 +188,9 @@ def test_a_cycle_is_a_row_and_its_folder_is_in_that_of_the_test(here, monkeypatc
     assert list(frame.index[:3]) == ["a/cycle-1", "a/cycle-2", "a/cycle-3"]
     assert list(frame["status"][:3]) == ["warnings", "ok", "refused"]
     assert frame.loc["a/cycle-3", "error"] == "it is cut"
-    assert {"batch.json", "cycle-1", "cycle-2", "cycles.csv", "cycles.json"} == set(names("out/a"))
+    assert {"batch.json", "cycle-1", "cycle-2", "cycles.csv", "cycles.json", "table.tex"} == set(
+        names("out/a")
+    )
     page = Path("out/summary.html").read_text(encoding="utf-8")
     assert f"{len(frame) // 3} tests, {len(frame)} cycles: " in page
     before = stamps("out")
@@ -361,7 +370,7 @@ def test_the_pages_of_a_long_batch_take_a_fiftieth_of_its_time(here, tried, monk
     """A page takes longer with every test: the next one waits the longer."""
     clock, saved = [0.0], list[float]()
 
-    def save(made):
+    def save(made, *, whole=False):
         saved.append(clock[0])
         clock[0] += 1.0  # s
 
@@ -429,7 +438,12 @@ def test_memory_errors_and_other_versions_are_not_the_fault_of_a_test(here, monk
     monkeypatch.setattr(batch_work, "fit", lambda *_, **__: (_ for _ in ()).throw(MemoryError()))
     frame = again().set_index("test")
     assert "its fit was lost (MemoryError" in frame.loc["a", "error"]
-    assert names("out") == ["bad", "summary.csv", "summary.html"]  # so that it is tried again
+    assert names("out") == [
+        "bad",
+        "summary.csv",
+        "summary.html",
+        "summary.tex",
+    ]  # so that it is tried again
 
 
 @pytest.mark.parametrize(
@@ -650,6 +664,19 @@ def rows_of(count):
             f"test-{i:04d}", f"data/test-{i:04d}.csv", status, None, base.misfit, 1.0, given,
         )  # fmt: skip
     yield Row("<b>", "<b>.csv", "refused", "no <height> & no width")
+
+
+def test_parameters_of_all_tests_are_drawn_side_by_side(tmp_path):
+    rows = list(rows_of(5))
+    png = write_comparison(rows, tmp_path, "a batch", width="one", pictures=True)
+    assert names(tmp_path) == ["summary.pdf", "summary.png", "summary.tex"]
+    assert png == (tmp_path / "summary.png").read_bytes()
+    text = (tmp_path / "summary.tex").read_text(encoding="utf-8")
+    assert [line.split(" & ")[0] for line in text.splitlines() if line.startswith("test")] == [
+        "test-0000", "test-0001", "test-0003", "test-0004",
+    ]  # fmt: skip
+    write_page(rows, tmp_path, "a batch", png)
+    assert "data:image/png" in (tmp_path / "summary.html").read_text(encoding="utf-8")
 
 
 def test_the_page_of_a_thousand_tests_is_small_and_needs_nothing_else(tmp_path):

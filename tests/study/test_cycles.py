@@ -43,7 +43,7 @@ def test_each_cycle_is_fitted_from_its_own_contact(found):
 def test_a_cycle_that_is_not_there_is_a_row_with_its_sentence(found):
     assert list(found.refused) == [7]
     assert "cycle 7 cannot be taken: the file has cycles 1 to 3" in found.refused[7]
-    row = found.table.loc[7]
+    row = found.by_cycle.loc[7]
     assert row["status"] == "refused"
     assert row["error"] == found.refused[7]
     assert np.isnan(row["s1_k0"])
@@ -90,7 +90,7 @@ def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path,
     names = {path.name for path in folder.iterdir()}
     assert names == {
         "cycle-1", "cycle-2", "cycle-3",
-        "cycles.csv", "cycles.json", "cycles.pdf", "cycles.png",
+        "cycles.csv", "cycles.json", "cycles.pdf", "cycles.png", "table.tex",
     }  # fmt: skip
     assert json.loads((folder / "cycle-2" / "fit.json").read_text())["data"]["cycle"] == 2
     with (folder / "cycles.csv").open(newline="") as file:
@@ -218,10 +218,10 @@ def test_three_cycles_of_a_shoe_foam_share_all_but_snap_through_and_relaxation(t
     options = {"model": "microscale", "relaxation": 1, "intervals": "local"}
     found = ff.fit_cycles(path, toml, cycles=(1, 2, 4), **options)
     assert found.recorded == (1, 2, 3, 4, 5, 6)
-    strains = found.table["start_strain"]
+    strains = found.by_cycle["start_strain"]
     assert strains[1] == 0.0
     assert 0.005 < strains[2] < strains[4] < 0.03
-    assert all(off < 0.0065 for off in found.table["misfit_stress_strain"])
+    assert all(off < 0.0065 for off in found.by_cycle["misfit_stress_strain"])
     fits = list(found.results.values())
     problems = [Options(relaxation=1).problem(r.measurement, r.model, r.params) for r in fits]
     group = Group(tuple(problems), tuple(p.vector() for p in problems))

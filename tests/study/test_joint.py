@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from click.testing import CliRunner
 from scipy import stats
@@ -117,6 +118,19 @@ def test_linked_values_are_one_value_bit_for_bit(found, tmp_path, monkeypatch):
         mine = content["parameters"]["s1_kc"]["tests"][test]["value"]
         assert single["parameters"]["s1_kc"]["value"] == mine
         assert "Fitted together with 2 other tests (a family)" in single["notes"][0]
+    read = ff.load(tmp_path / "out")
+    assert read.to_json_dict() == content
+    assert read.parameters.keys() == found.parameters.keys()
+    assert read.parameters["s1_kc"] == found.parameters["s1_kc"]
+    pd.testing.assert_frame_equal(read.table(), found.table())
+    assert read.results["t1"].parameters["s1_k0"].value == value
+    for one, other in zip(read.loops, found.loops, strict=True):
+        assert one.name == other.name
+        np.testing.assert_array_equal(one.along, other.along)
+        np.testing.assert_allclose(one.fitted, other.fitted)
+    table = read.table().loc["t1"]
+    assert table.loc["s1_kc", "value"] == found.parameters["s1_kc"].tests["t1"].value
+    assert read_source(read).parameters == read_source(found).parameters
 
 
 def test_joint_json_says_everything(found):

@@ -4,7 +4,7 @@ Heavy modules are imported inside the commands that need them. A newcomer reads 
 exit codes and errors, `options` what several commands share.
 """
 
-from foamfit.cli import batch, check, compare, fit, init, joint, page, predict, simulate  # noqa: F401
+from foamfit.cli import batch, card, check, compare, fit, init, joint, page, predict, simulate  # noqa: F401
 from foamfit.cli.group import main
 
 __all__ = ["main"]

@@ -23,8 +23,8 @@ from foamfit.terminal import say
 def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> int:
     """Fit the tests of STUDY.toml together: shared, own, scattering, rate-dependent parameters.
 
-    Writes joint.json, joint.html, joint.png and joint.pdf, and a result folder for each test. Exit
-    codes are those of foamfit fit; a test that cannot be read is left out with a warning.
+    Writes joint.json, joint.html, pictures, table.tex and a result folder for each test. Exit codes
+    are those of foamfit fit; a test that cannot be read is left out with a warning.
 
     \b
     STUDY.toml, for example:

@@ -147,7 +147,8 @@ def read_test(
     spreads |= settings.uncertainties
     test = replace(test, name=settings.name, path=path, data_sha256=sha256, uncertainties=spreads)
     noise = replace(settings.noise, estimated=test.noise.estimated)
-    return with_noise(replace(test, noise=noise, notes=(*notes, *test.notes)))
+    test = replace(test, noise=noise, priors=settings.priors)
+    return with_noise(replace(test, notes=(*notes, *test.notes)))
 
 
 def read_history(path: Path, channel: str) -> tuple[Array, Array]:

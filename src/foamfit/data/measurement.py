@@ -304,6 +304,8 @@ class Measurement:
         Standard deviations that the TOML states: "height", "height_1", … (m), "area" (m²),
         "specimen_mass", "striker_mass" (kg), "velocity" (m/s), "delay" (s) of a motion with its own
         clock, and of scales, as a share: "stress_scale", "displacement_scale", ….
+    priors : dict of str to str
+        What the TOML says of parameters before the fit, like "5.5 ± 0.1 MPa".
     standstills
         First and last time, s (or sample), of each stretch in which the gauge stood still.
     """
@@ -336,6 +338,7 @@ class Measurement:
     block: int = 1
     uncertainties: dict[str, float] = field(default_factory=dict)
     standstills: tuple[tuple[float, float], ...] = ()
+    priors: dict[str, str] = field(default_factory=dict)
 
     @property
     def rows(self) -> RowCount:

@@ -127,16 +127,17 @@ def estimated_noise(values: Array, what: str = "samples") -> NoiseLevel:
 def noise_before_contact(
     whole: dict[str, Array], n: int, curves: dict[str, Array], block: int
 ) -> dict[str, NoiseLevel]:
-    """Noise of channels from their `n` samples before contact, about their line, if so many.
+    """Noise of channels from their `n` samples before contact, about a line or a cubic, if so many.
 
     The `curves` during contact are means of `block` samples; where the noise that they show
     contradicts, it is the answer.
     """
-    found, x = dict[str, NoiseLevel](), np.arange(n, dtype=np.float64)
+    found = dict[str, NoiseLevel]()
     for name, values in ((c, v[:n]) for c, v in whole.items() if n >= MIN_REST):
-        off = values - np.polyval(np.polyfit(x, values, 1), x)
-        sigma, phi = float(np.sqrt(off @ off / (n - 2))), lag_one(off)
-        time = correlation_time(phi) if 2 / np.sqrt(n) < phi < 1 else 1.0
+        (sigma, time), bent = (_noise_about(values, degree) for degree in (1, 3))
+        # A machine that speeds up before contact: its bend is no correlated noise (BIC).
+        if sigma > bent[0] * n ** (2.0 * bent[1] / n):
+            sigma, time = bent
         how = f"estimated from {n} samples before contact"
         level = averaged(NoiseLevel(sigma, False, how, time), block)
         during = estimated_noise(curves[name])
@@ -146,6 +147,15 @@ def noise_before_contact(
             word = "quieter" if level.sigma < during.sigma else "less quiet"
             found[name] = replace(during, how=f"{during.how}, the {n} before contact being {word}")
     return found
+
+
+def _noise_about(values: Array, degree: int) -> tuple[float, float]:
+    """Noise of samples about a polynomial: standard deviation and correlation time in samples."""
+    n, x = values.size, np.linspace(-1.0, 1.0, values.size)
+    off = values - np.polyval(np.polyfit(x, values, degree), x)
+    phi = lag_one(off)
+    time = correlation_time(phi) if 2 / np.sqrt(n) < phi < 1 else 1.0
+    return float(np.sqrt(off @ off / (n - degree - 1))), time
 
 
 class Level(NamedTuple):

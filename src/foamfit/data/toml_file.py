@@ -7,7 +7,8 @@ compression). [data] ``duplicates`` is "average" (neighbouring rows with one tim
 sample) or "refuse", ``sheet`` that of a workbook. A quantity may have a standard deviation, "1.75 ±
 0.01 m/s"; `Measurement.uncertainties` says of which it is used.
 [motion] names a ``file`` that has the motion by a clock of its own, relative to the TOML, the
-``delay`` of that clock, and in [motion.columns] its columns.
+``delay`` of that clock, and in [motion.columns] its columns. [priors] names parameters of the model
+and what is known of them before the fit, "5.5 ± 0.1 MPa".
 """
 
 from __future__ import annotations
@@ -112,6 +113,7 @@ class Settings:
     sheet: str | None = None
     uncertainties: dict[str, float] = field(default_factory=dict)
     motion: Motion | None = None
+    priors: dict[str, str] = field(default_factory=dict)
 
 
 def toml_beside(test: Path) -> Path:
@@ -165,7 +167,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     the key that is wrong or missing.
     """
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
-    check_keys(f"{path}:", document, ["name", "columns", "motion", *_SECTIONS])
+    check_keys(f"{path}:", document, ["name", "columns", "motion", "priors", *_SECTIONS])
     values: dict[str, dict[str, Any]] = {}
     spreads: dict[str, float] = {}
     for section, keys in _SECTIONS.items():
@@ -191,8 +193,20 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         columns=_columns(path, document.get("columns", {}), channels),
         uncertainties=spreads,
         motion=_motion(path, document["motion"], spreads) if "motion" in document else None,
+        priors=_priors(path, document.get("priors", {})),
         **values["data"],
     )
+
+
+def _priors(path: Path, table: Any) -> dict[str, str]:
+    """Texts by parameter; the model, which is not known here, says which there are."""
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: priors must be a table, [priors].")
+    for key, value in table.items():
+        if not isinstance(value, str):
+            told = f'{path}: [priors] {key} = {value!r} must be a text like "5.5 ± 0.1 MPa"'
+            raise InputError(f"{told}.")
+    return table
 
 
 def is_range(cycles: Any) -> bool:

@@ -41,10 +41,12 @@ def covered(seen: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:
-    """Parameters whose branch was never reached, and that branch."""
-    seen = visited(problem, simulated)
+    """Parameters whose branch was never reached, and that branch; not those that have a prior."""
+    seen, known = visited(problem, simulated), {one.name for one in problem.objective.priors}
     out = {}
     for name in problem.model.names:
+        if name in known:
+            continue
         spring = split_name(name)[0]
         branch = problem.model.param(name).branch if spring >= 0 else ""
         if branch and branch not in covered(seen[f"s{spring + 1}"]):

@@ -14,13 +14,15 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.fitting.box import Space
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.search import Tracker, descend, has_several, rank
+from foamfit.fitting.search import MISSING, Tracker, descend, has_several, rank
 from foamfit.springs.exchange import exchanges
 from foamfit.springs.laws.record import Law
 from foamfit.springs.parameters import NUISANCE, relaxation_names, split_name
 
-# Minima whose springs exchange properties at most, and descents for each.
+# Minima whose springs exchange properties at most, and descents for each that is not the best.
 EXCHANGES, EXCHANGED = 8, 16
+# Share of the best cost, if that misses more than noise, by which an end may be worse and lead on.
+DETOUR = 0.5
 # Ends of the search whose cost is above the best by less than so many variances of the noise are
 # settled anew, at most so many; points of the box closer than the last are one minimum.
 NEAR, MINIMA, SAME = 40.0, 24, 0.02
@@ -71,7 +73,7 @@ def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
 
     Which of two springs in series owns which branch shows in few samples: the loop of the chain
     hardly changes where they exchange it, so each such exchange has a minimum of its own. Each
-    minimum that other noise could have made the best is exchanged in turn. Returned are the costs
+    minimum that may lead to the best one is exchanged in turn. Returned are the costs
     of the ends, as by `search`.
     """
     if tracker.best_values is None or not has_several(space.model):
@@ -79,14 +81,16 @@ def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
     objective, costs = tracker.objective, list[tuple[float, int]]()
     met, open_ends = [], [(tracker.best_cost, tracker.best_values)]
     for _ in range(EXCHANGES):
-        open_ends = [end for end in open_ends if end[0] <= tracker.best_cost + _near(objective)]
+        open_ends = [end for end in open_ends if _leads_on(end[0], tracker)]
         if not open_ends:
             break
         at = min(range(len(open_ends)), key=lambda i: open_ends[i][0])
-        values = in_order(space, objective, open_ends.pop(at)[1])
+        cost, values = open_ends.pop(at)
+        values = in_order(space, objective, values)
         met.append(space.encode(values))
         points = [space.encode(other) for other in exchanges(space.model, values)]
-        for _, point in rank(tracker, space, points)[:EXCHANGED]:
+        most = len(points) if cost <= tracker.best_cost else EXCHANGED
+        for _, point in rank(tracker, space, points)[:most]:
             cost, end = descend(tracker, space, point, 60)
             values = in_order(space, objective, space.decode(end))
             costs.append((cost, 1))
@@ -127,6 +131,13 @@ def settle_ends(tracker: Tracker, space: Space) -> None:
 def _near(objective: Objective) -> float:
     """Rise of the cost that other noise could make up for, with a wide margin."""
     return NEAR * objective.floor / objective.n_data
+
+
+def _leads_on(cost: float, tracker: Tracker) -> bool:
+    """Whether exchanges from an end of this cost may lead to a better minimum than the best."""
+    best, floor = tracker.best_cost, tracker.objective.floor
+    misses = best > MISSING * floor  # the true springs, if there are any, are not yet found
+    return cost <= best + max(_near(tracker.objective), DETOUR * best if misses else 0.0)
 
 
 def _among(points: list[Array], point: Array) -> bool:

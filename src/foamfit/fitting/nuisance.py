@@ -36,7 +36,7 @@ LARGEST_CONTACT, LARGEST_SHIFT, LARGEST_ZERO = 0.15, 0.1, 0.5
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a nuisance parameter before the fit: a normal distribution, SI."""
+    """What is known of a parameter before the fit: a normal distribution, SI."""
 
     name: str
     mean: float

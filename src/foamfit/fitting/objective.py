@@ -95,6 +95,7 @@ class Objective:
     # The covariance that a driving motion's own uncertainty gives the residual; see `weigh_motion`.
     weighing: Weighing | None = None
     loss: str = "linear"  # One of `LOSSES`
+    given: tuple[nuisances.Prior, ...] = ()  # Priors of parameters of the springs
     followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is known already
     evaluations: int = field(default=0, init=False)  # Sets of parameters that were simulated
     failures: int = field(default=0, init=False)  # Those of them that could not be
@@ -227,9 +228,9 @@ class Objective:
             span = float(np.ptp(self.measurement.displacement))
             self._steps["displacement_zero"] = STEP_OF_ZERO * span
         known = nuisances.priors_of(self.measurement, self.drive)
-        self.priors = tuple(known[name] for name in self.nuisance if name in known)
-        count, places = len(self.model.names), {n: i for i, n in enumerate(self.nuisance)}
-        self._prior_places = np.array([count + places[one.name] for one in self.priors], np.int64)
+        self.priors = (*self.given, *(known[name] for name in self.nuisance if name in known))
+        names = (*self.model.names, *self.nuisance)
+        self._prior_places = np.array([names.index(one.name) for one in self.priors], np.int64)
 
     def _check_weights(self) -> None:
         for name, weight in self.weights.items():
@@ -578,11 +579,9 @@ class Objective:
         return self.compare(curves, values)
 
     def off_priors(self, values: Array) -> Array:
-        """How far nuisance parameters are off their priors, in standard deviations."""
-        there = values[self._prior_places]
-        return np.array(
-            [(v - one.mean) / one.sigma for v, one in zip(there, self.priors, strict=True)]
-        )
+        """How far parameters are off their priors, in standard deviations."""
+        pairs = zip(values[self._prior_places], self.priors, strict=True)
+        return np.array([(value - one.mean) / one.sigma for value, one in pairs])
 
     def compare(self, curves: Simulated, values: Array) -> Array:
         """Residuals of simulated curves before the loss gives way to large ones; see `residual`."""

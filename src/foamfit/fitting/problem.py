@@ -12,7 +12,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
-from foamfit.data.units import LARGEST
+from foamfit.data.units import LARGEST, parse_uncertain
 from foamfit.errors import InputError
 from foamfit.fitting import nuisance
 from foamfit.fitting.box import Scales, Space, others
@@ -20,7 +20,7 @@ from foamfit.fitting.curves import check_interior, choose_drive, default_weights
 from foamfit.fitting.objective import Objective
 from foamfit.springs.laws.record import ADMISSIBLE, Between, Param
 from foamfit.springs.model import Model, with_options
-from foamfit.springs.parameters import NUISANCE, any_param, split_name
+from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 
 
 def make_params(
@@ -334,6 +334,34 @@ def _check_held(params: lmfit.Parameters) -> None:
             raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
 
 
+def _prior(name: str, value: object, model: Model) -> nuisance.Prior:
+    """Read a prior of a parameter of the springs: mean and standard deviation, or a text."""
+    where = f"priors: {name}"
+    if name in NUISANCE:
+        raise InputError(f"{where} is none of the springs; give its ± in the TOML where it has one")
+    if name not in model.names:
+        raise InputError(
+            f"{where} is not one of the model {model.name}; its parameters are "
+            f"{', '.join(model.names)}"
+        )
+    unit = unit_of(name)
+    example = "5.5 ± 0.1 MPa" if unit == "Pa" else f"0.2 ± 0.01 {unit}".rstrip()
+    if isinstance(value, str):
+        mean, sigma = parse_uncertain(value, unit or "", where, example, zero=True)
+    else:
+        try:
+            mean, sigma = map(float, value)  # type: ignore[call-overload]
+        except (TypeError, ValueError):
+            mean, sigma = math.nan, None
+    if sigma is None or not (math.isfinite(mean) and 0.0 < sigma < math.inf):
+        told = f"({unit or 'a number'}, {unit or 'a number'})"
+        raise InputError(
+            f"{where} = {value!r} must be a mean and a positive standard deviation {told}, or a "
+            f'text like "{example}"'
+        )
+    return nuisance.Prior(name, mean, sigma)
+
+
 def make_problem(
     measurement: Measurement,
     model_name: str,
@@ -345,6 +373,7 @@ def make_problem(
     time_shift: bool = False,
     loss: str = "linear",
     relaxation: int = 0,
+    priors: Mapping[str, object] | None = None,
 ) -> Problem:
     """Make a problem ready; see `foamfit.fit` for the arguments.
 
@@ -364,6 +393,7 @@ def make_problem(
     objective = Objective(
         measurement, model, drive, chosen,
         interior_mass=interior_mass, time_shift=time_shift, loss=loss,
+        given=tuple(_prior(name, value, model) for name, value in (priors or {}).items()),
     )  # fmt: skip
     measurement = objective.measurement  # with the noise of each channel
     wanted = make_params(measurement, model, drive, time_shift=time_shift)
@@ -386,6 +416,10 @@ def make_problem(
             wanted[name].set(min=low, max=high)
     _counted_from(wanted, measurement.origins, -1.0)
     _check_held(wanted)
+    for name in (one.name for one in objective.given):
+        if not wanted[name].vary:
+            why = f"follows from {wanted[name].expr}" if wanted[name].expr else "is held fixed"
+            raise InputError(f"priors: {name} {why}; let it vary, or leave its prior out")
     if not any(parameter.vary for parameter in wanted.values()):
         raise InputError("no parameter varies; let at least one vary")
     return Problem(measurement, model, objective, wanted, Scales.of(measurement), notes)

@@ -7,7 +7,7 @@ loop (stress along the measured motion, closed form, cheap), then the curves of 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -35,6 +35,9 @@ NOISY = 0.005  # noise of a motion, over its range, that is much
 AROUND = 200  # points about the best one among which another search begins
 # Share of the box that counts as its edge, and where inside a descent begins again.
 EDGE, INSIDE = 0.02, (0.35, 0.5, 0.65)
+# Change of the logarithm of a parameter that leads out of a wrong minimum, and the cost over the
+# noise floor, which has a margin, from which on it is tried.
+APART, MISSING = 1.2, 0.8
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
 PROMISING = 100.0
 # Factors by which the stiffness that an interior mass vibrates on is changed, and their inverses.
@@ -201,7 +204,8 @@ def search(
             tracker.ends.append(space.decode(end))
             out.append((cost, counts.get(id(point), 1)))
         edges = _off_edges(tracker, space)
-        out += [(cost, 1) for cost in edges]
+        apart = _descended(tracker, space, _apart(tracker, space))
+        out += [(cost, 1) for cost in edges + apart]
         least = IN_SERIES if several else max(attempts // 2, 2 if edges else 1)
         if attempt + 1 == attempts or _settled(tracker, out, attempt, least):
             break
@@ -235,7 +239,7 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
     """
     low, high = space.box
     best = space.encode(tracker.best_values) if tracker.best_values is not None else low
-    span, costs = high - low, []
+    span = high - low
     edges = (best - low < EDGE * span) | (high - best < EDGE * span)
     edges |= len(space.model.kinds) > 1 and tracker.best_cost > tracker.objective.floor
     starts = []
@@ -246,11 +250,33 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
             starts.append(start)
     if tracker.best_cost > tracker.objective.floor:
         starts += _neighbours(space, space.decode(best))
+    return _descended(tracker, space, starts)
+
+
+def _descended(tracker: Tracker, space: Space, starts: Iterable[Array]) -> list[float]:
+    """Descend from each start; the costs of the ends, which the tracker keeps."""
+    costs = []
     for start in starts:
         cost, end = descend(tracker, space, start, 60)
         tracker.ends.append(space.decode(end))
         costs.append(cost)
     return costs
+
+
+def _apart(tracker: Tracker, space: Space) -> Iterator[Array]:
+    """Points with one positive parameter of the best changed by a factor, larger and smaller.
+
+    All descents may end in one wrong minimum: none is made where only noise is left.
+    """
+    if tracker.best_values is None or tracker.best_cost < MISSING * tracker.objective.floor:
+        return
+    (low, high), best = space.box, space.encode(tracker.best_values)
+    for at, one in enumerate(space.coordinates):
+        for step in (APART, -APART) if one.is_logarithmic else ():
+            if low[at] < best[at] + step < high[at]:
+                start = best.copy()
+                start[at] += step
+                yield start
 
 
 def _neighbours(space: Space, values: Array) -> Iterator[Array]:

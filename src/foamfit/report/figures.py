@@ -84,10 +84,9 @@ def abreast(width: float, panels: int, least: float = 2.1) -> int:
     return max(1, min(panels, int(width / least)))
 
 
-def title_lines(width: str, wide: float, *parts: str) -> list[str]:
-    """Break the parts of a title into lines for a figure of `wide` inches; none if untitled."""
-    parts = parts if is_titled(width) else ()
-    return [line for part in parts for line in wrapped(part, 0, int(16 * wide))]
+def title_lines(wide: float, *parts: str, titled: bool = True) -> list[str]:
+    """Break the parts of a title into lines for a figure of `wide` inches; none if not `titled`."""
+    return [line for part in parts if titled for line in wrapped(part, 0, int(16 * wide))]
 
 
 @contextmanager
@@ -110,6 +109,19 @@ def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[
             if x.size > MOST_POINTS:
                 kept = _seen(x, y)
                 line.set_data(x[kept], y[kept])
+
+
+@contextmanager
+def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
+    """Give axes of the user's, or those of a new pyplot figure in the style of all figures."""
+    if ax is not None:
+        yield ax
+        return
+    import matplotlib
+    from matplotlib import pyplot
+
+    with matplotlib.rc_context(STYLE):
+        yield pyplot.subplots(figsize=(4.5, 3.2), layout="constrained")[1]
 
 
 def _seen(x: Array, y: Array) -> NDArray[np.intp]:
@@ -232,13 +244,13 @@ def draw_estimates(
     return [p.value / factor for _, p in points], ends[:, 1:].ravel().tolist()
 
 
-def limit(ax: Axes, values: Sequence[float], ends: Sequence[float]) -> None:
-    """Let wide intervals run out of a panel rather than flatten the values."""
+def limits(values: Sequence[float], ends: Sequence[float]) -> tuple[float, float]:
+    """Return limits of an axis out of which wide intervals run rather than flatten the values."""
     low, high = min(values), max(values)
     room = max(1.5 * (high - low), 0.1 * max(abs(low), abs(high)), 1e-12)
     bottom, top = max(min([low, *ends]), low - room), min(max([high, *ends]), high + room)
     edge = 0.08 * max(top - bottom, room)
-    ax.set_ylim(bottom - edge, top + 2.0 * edge)
+    return bottom - edge, top + 2.0 * edge
 
 
 def say_nothing_there(ax: Axes, told: str = "no curve to compare") -> None:

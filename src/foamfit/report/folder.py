@@ -13,23 +13,29 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from foamfit.arrays import Array
-from foamfit.data.measurement import Measurement, interior_channel
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, reason, replacing
 from foamfit.report.figures import TWO
 from foamfit.report.page import render_report
 from foamfit.report.result_figures import Mapped, draw_all
-from foamfit.results import SCHEMA, Curves, Fit, Intervals, ParameterEstimate, plain
+from foamfit.report.samples import FILE as SAMPLES
+from foamfit.report.samples import write_samples
+from foamfit.report.tables import parameters_tex
+from foamfit.results import SCHEMA, Fit, Intervals, ParameterEstimate, plain
 
 # All that `save_result` may write, and what `studies` write beside the folders of cycles and tests.
 # Older versions wrote tables of what was plotted: their folders are replaced as well.
 RESULT_FILES = {
     *("fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png"),
     *("fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "budget.csv", "report.html"),
+    *("table.tex", SAMPLES),
 }
-CYCLES_FILES = {*("cycles.json", "cycles.csv", "cycles.png", "cycles.pdf", "cycles-plotted.csv")}
-JOINT_FILES = {"joint.json", "joint.html", "joint.png", "joint.pdf", "joint.csv"}
+CYCLES_FILES = {"cycles.json", "cycles.csv", "cycles.png", "cycles-plotted.csv", "table.tex"}
+JOINT_FILES = {"joint.json", "joint.html", "joint.png", "joint.csv", "table.tex"}
+CYCLES_FILES |= {"cycles.pdf"}
+JOINT_FILES |= {"joint.pdf", "parameters.png", "parameters.pdf"}
 BATCH_FILES = {"summary.csv", "summary.html", "batch.json"}
+BATCH_FILES |= {"summary.tex", "summary.png", "summary.pdf"}
 PREDICTION_FILES = {"prediction.json", "prediction.csv", "prediction.png", "prediction.pdf"}
 # One of these is in every result.
 MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json", "prediction.json")
@@ -216,9 +222,12 @@ def write_result(
     figures = draw_all(result, width, mapped) if pages else ()  # which begins to draw
     write_json(folder / "fit.json", result.to_json_dict())
     write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
-    write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement))
+    write_text(folder / "table.tex", parameters_tex(result.parameters))
+    write_table(folder / "curves.csv", _curve_rows(result.columns))
     if result.intervals is not None and result.intervals.profiles:
         write_table(folder / "profiles.csv", _profile_rows(result.intervals))
+    if result.draws:
+        write_samples(folder / SAMPLES, result.draws)
     if pages and result.budget is not None and result.budget.telling:
         write_table(folder / "budget.csv", result.budget.rows())
     if result.ladder is not None:
@@ -228,14 +237,24 @@ def write_result(
         for form, content in () if images is None else images.files():
             (folder / f"{name}.{form}").write_bytes(content)
     if pages:
-        page = render_report(result, drawn)
-        (folder / "report.html").write_text(page, encoding="utf-8", errors="replace")
+        write_text(folder / "report.html", render_report(result, drawn))
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write plain types as JSON; a non-UTF-8 name keeps its bytes as a JSON escape."""
-    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write an object as JSON; a non-UTF-8 name keeps its bytes as a JSON escape.
+
+    What `load` needs, which nobody reads, is one line at the end.
+    """
+    form: Any = {"ensure_ascii": False, "allow_nan": False}
+    text = json.dumps({k: v for k, v in content.items() if k != "load"}, indent=2, **form)
+    if "load" in content:
+        text = f'{text[:-2]},\n  "load": {json.dumps(content["load"], **form)}\n}}'
     path.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+
+
+def write_text(path: Path, content: str) -> None:
+    """Write a text; letters of a non-UTF-8 name are replaced."""
+    path.write_text(content, encoding="utf-8", errors="replace")
 
 
 def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
@@ -260,23 +279,7 @@ def _profile_rows(intervals: Intervals) -> Iterator[Iterable[object]]:
             yield [profile.name, value, rise, profile.cut, profile.complete]
 
 
-def _curve_rows(curves: Curves, measurement: Measurement) -> Iterator[Iterable[object]]:
-    columns: dict[str, Array | None] = {
-        "time (s)": curves.time,
-        "measured stress (Pa)": curves.measured_stress,
-        "fitted stress (Pa)": curves.stress,
-        "measured displacement (m)": curves.measured_displacement,
-        "fitted displacement (m)": curves.displacement,
-        "stress along measured displacement (Pa)": curves.stress_along,
-    }
-    for node, (measured, fitted) in curves.interior.items():
-        columns[f"measured {interior_channel(node)} (m)"] = measured
-        columns[f"fitted {interior_channel(node)} (m)"] = fitted
-    for channel, found in measurement.outliers.items():
-        columns[f"outliers of {channel} left out"] = found.left_out.astype(int)
-    for channel, taken in measurement.sampled.items():
-        columns[f"{channel} is measured"] = taken.astype(int)
-    there = {name: column for name, column in columns.items() if column is not None}
-    yield there.keys()
+def _curve_rows(columns: Mapping[str, Array]) -> Iterator[Iterable[object]]:
+    yield columns.keys()
     # Python floats are written with as many digits as they have, numpy's with their type's name.
-    yield from zip(*(column.tolist() for column in there.values()), strict=True)
+    yield from zip(*(column.tolist() for column in columns.values()), strict=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
+from foamfit.errors import InputError
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, VERMILION
 from foamfit.report.readable import readable_unit
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.results import Fit
+    from foamfit.results import Fit, Loop
     from foamfit.solve.simulation import Response
 
 # Points at which a spring changes between two branches, in either order.
@@ -38,6 +39,7 @@ BESIDE = {"c": (7.0, -3.0), "e": (4.0, -7.0), "snap-back": (7.0, -6.0)}
 LIGHT = {"a": (0.9, (-4.0, 3.0)), "c": (0.5, (5.0, -4.0))}
 MARKERS = 60  # markers on a measured curve; more would blot
 PALE = "#A6CEE3"
+MOST_NAMED = 12  # loops that a legend names
 STOOD = "#F2DC6B"  # where the gauge stood still
 # Dashes and marks of interior masses, from the base up, for readers without colour.
 DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)))
@@ -63,16 +65,51 @@ def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -
     panels = _panels(result)
     with _panelled(panels, width, known=is_known(result)) as (figure, axes, sizes):
         for ax, panel, size in zip(axes, panels, sizes, strict=False):
-            _mark_outliers(ax, panel, result)
-            _shade_standstills(ax, panel, result)
-            labels = _Labels(ax, panel, size)
-            if panel.is_loop:
-                _draw_law(labels, result)
-            _mark_switches(labels, panel, result)
-            if panel.is_loop:
-                _name_branches(labels, panel, result)
+            _annotate(ax, panel, result, size)
         _head(figure, result, titled=figures.is_titled(width))
     return figures.save(figure, path)
+
+
+def draw_panel(result: Fit, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
+    """Draw one panel of `plot_fit` into axes, or into those of a new figure; returns them.
+
+    `what` is "stress-strain", "stress-time" or "displacement-time".
+    """
+    panels = {panel.key.replace("_", "-"): panel for panel in _panels(result)}
+    if what not in panels:
+        raise InputError(f"what = {what!r} is not admissible; this fit has {', '.join(panels)}")
+    with figures.axes_or_new(ax) as ax:
+        _draw(ax, panels[what])
+        wide, high = (72.0 * side / ax.figure.dpi for side in ax.bbox.size)
+        _annotate(ax, panels[what], result, (wide, high))
+        ax.legend(loc="best", fontsize="small")
+    return ax
+
+
+def draw_loops(loops: Iterable[Loop], ax: Axes | None = None) -> Axes:
+    """Draw the loops of several tests into axes, or into those of a new figure; returns them.
+
+    Measured curves are grey and wide, fitted ones thin and coloured from light to dark; of many the
+    key names the first and the last.
+    """
+    import matplotlib
+
+    shown = list(loops)
+    factor, unit = readable_unit(max((_size(one.measured) for one in shown), default=0.0), "Pa")
+    colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, max(len(shown), 1)))
+    with figures.axes_or_new(ax) as ax:
+        for place, (one, colour) in enumerate(zip(shown, colours, strict=False)):
+            ax.plot(one.along, one.measured / factor, color="0.75", lw=2.0, label="_measured")
+            if one.fitted is not None:
+                named = len(shown) <= MOST_NAMED or place in (0, len(shown) - 1)
+                label = one.name if named else f"_{one.name}"
+                ax.plot(one.along, one.fitted / factor, color=colour, lw=0.9, label=label)
+        ax.set(xlabel=shown[0].label if shown else "strain", ylabel=f"stress ({unit})")
+        if shown:
+            ax.legend(
+                loc="best", fontsize="small", title="fitted; measured grey", title_fontsize="small"
+            )
+    return ax
 
 
 def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
@@ -140,6 +177,18 @@ def origin_word(result: Fit) -> str | None:
     text = " ".join((result.measurement.name, *result.measurement.notes)).lower()
     match = re.search(r"\b(reconstruct|synthetic)", text)
     return match and {"reconstruct": "reconstruction"}.get(match[1], match[1])
+
+
+def _annotate(ax: Axes, panel: _Panel, result: Fit, size: tuple[float, float]) -> None:
+    """Write into a panel of about a size (points) all but its curves."""
+    _mark_outliers(ax, panel, result)
+    _shade_standstills(ax, panel, result)
+    labels = _Labels(ax, panel, size)
+    if panel.is_loop:
+        _draw_law(labels, result)
+    _mark_switches(labels, panel, result)
+    if panel.is_loop:
+        _name_branches(labels, panel, result)
 
 
 # ------------------------------------------------------------------------------- the panels

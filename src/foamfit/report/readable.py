@@ -86,15 +86,15 @@ class Readable:
         return self.state != "fixed" and (self.state != "determined" or ";" in self.why)
 
 
-def readable(name: str, p: ParameterEstimate) -> Readable:
-    """Return a parameter in readable form.
+def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = None) -> Readable:
+    """Return a parameter in readable form, in a given unit (factor and name) or a suitable one.
 
     It is shown with the digits that its standard error leaves (two of the error), or with four.
     """
     size = p.value or p.stderr or 0.0
     if name in LABELS:  # its value may be far below its error
         size = max(abs(p.value), p.stderr or 0.0)
-    factor, unit = readable_unit(size, p.unit)
+    factor, unit = given or readable_unit(size, p.unit)
     value = p.value / factor
     shown, stderr, interval, span = number(value), "", "", ""
     if math.isfinite(value) and p.stderr is not None and 0 < p.stderr < math.inf:
@@ -144,6 +144,14 @@ def symbol(name: str) -> tuple[str, str]:
     stem, index = any_param(short).symbol
     term = short.removeprefix(family(short))  # of relaxation
     return stem, ",".join(filter(None, (index, term, str(spring + 1))))
+
+
+def own_symbol(name: str, springs: int = 1) -> tuple[str, str]:
+    """Return the symbol of a parameter, without the spring where there is only one."""
+    stem, index = symbol(name)
+    if springs == 1 and split_name(name)[0] >= 0:
+        index = index.rpartition(",")[0]
+    return stem, index
 
 
 def _rounded(value: float, stderr: float) -> tuple[str, str, int]:

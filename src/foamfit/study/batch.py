@@ -98,14 +98,18 @@ class Batch:
             found += self.rows.get(name) or (Row(name, str(path), tables.OPEN, again),)
         return found
 
-    def save(self) -> None:
-        """Write summary.csv and summary.html."""
+    def save(self, *, whole: bool = False) -> None:
+        """Write summary.csv and summary.html; as a `whole` also parameters side by side."""
         rows = self.summary
         tables.write_summary(rows, self.out)
         options = self.recipe.options
         model = with_options(self.recipe.model, **{o: bool(options.get(o)) for o in laws.OPTIONS})
         law = law_in_words(model, options.get("relaxation", 0))
-        tables.write_page(rows, self.out, f"{self.out.resolve().name}: {law}")
+        title, picture = f"{self.out.resolve().name}: {law}", None
+        if whole:
+            pictures, width = self.recipe.pages, self.recipe.width
+            picture = tables.write_comparison(rows, self.out, title, width=width, pictures=pictures)
+        tables.write_page(rows, self.out, title, picture)
 
 
 def batch(
@@ -342,7 +346,7 @@ class _Run:
             with without_ctrl_c(), suppress(InputError):
                 self.batch.save()
             raise
-        self.batch.save()
+        self.batch.save(whole=True)
 
     def _is_cold(self) -> bool:
         """Whether the first fit compiles what the others need too."""

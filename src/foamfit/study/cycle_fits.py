@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from foamfit.results import Fit, plain
 from foamfit.springs.parameters import NUISANCE, springs_first
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 SCHEMA = 1
 CURVES = ("stress_time", "displacement_time", "stress_strain")
@@ -91,14 +88,6 @@ class FittedCycles:
                 p, none = one.parameters.get(name), (None, None)
                 cells += (p.value, p.stderr, *(p.ci95 or none), p.state) if p else [None] * 5
             yield [plain(cell) for cell in cells]
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """The rows of cycles.csv, indexed by the cycle."""
-        import pandas as pd
-
-        head, *rows = self.rows()
-        return pd.DataFrame(rows, columns=[str(name) for name in head]).set_index("cycle")
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of cycles.json, in plain types."""

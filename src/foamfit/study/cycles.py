@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import lmfit
 
@@ -15,16 +15,49 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.search import what_stopped
 from foamfit.one_model import Keywords, Options, Progress
 from foamfit.report.figures import TWO, inches
+from foamfit.report.plots import draw_loops
+from foamfit.report.shown import cycles_shown
 from foamfit.report.studies.cycles import save_cycles
+from foamfit.report.tables import frame, stacked
 from foamfit.results import Fit
 from foamfit.study.cycle_fits import FittedCycles
 from foamfit.trust.intervals import Announce
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
 
 Params = Callable[[Measurement], lmfit.Parameters | None]
 
 
 class CycleFits(FittedCycles):
     """Fits of the cycles of one record, as `FittedCycles`; `save` writes them."""
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the loops of all cycles, measured and fitted, into axes or a new figure."""
+        found = ((n, one.loop) for n, one in sorted(self.results.items()))
+        loops = (loop._replace(name=f"cycle {n}") for n, loop in found if loop is not None)
+        return draw_loops(loops, ax)
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each cycle and parameter, SI; `to_latex` of it compiles."""
+        results = sorted(self.results.items())
+        return stacked({n: frame(one.parameters) for n, one in results}, "cycle")
+
+    @property
+    def by_cycle(self) -> pd.DataFrame:
+        """Return the rows of cycles.csv, indexed by the cycle."""
+        import pandas as pd
+
+        head, *rows = self.rows()
+        return pd.DataFrame(rows, columns=[str(name) for name in head]).set_index("cycle")
+
+    def __repr__(self) -> str:
+        """Return model, misfits and parameters of the cycles."""
+        return cycles_shown(self)
+
+    def _repr_html_(self) -> str:
+        return cycles_shown(self, html=True)
 
     def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
         """Write ``cycle-<n>/``, cycles.csv, cycles.png and cycles.json whole; returns the folder.

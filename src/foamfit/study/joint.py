@@ -23,6 +23,7 @@ from foamfit.fitting.search import Tracker, descend
 from foamfit.one_model import Options, Progress, identify, weigh_motion
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import check_target, try_target
+from foamfit.report.shown import JointViews
 from foamfit.report.studies.joint import save_joint
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
@@ -51,7 +52,7 @@ ONE_FOR_ALL = 2
 SAME_RATE = 0.02
 
 
-class JointResult(JointData):
+class JointResult(JointViews, JointData):
     """Everything that a joint fit found, and how it is written; its fields are `JointData`'s."""
 
     def save(
@@ -62,11 +63,12 @@ class JointResult(JointData):
         report: bool = True,
         figure_width: str = TWO,
     ) -> Path:
-        """Write joint.json, joint.html, joint.png and a result folder per test; returns the folder.
+        """Write joint.json, its page, pictures and table.tex, and a result folder per test.
 
         An older result there is replaced as a whole, at the end. The folders of the tests are made
         by `jobs` processes (by default one for each core), without `report` with tables alone.
-        Figures are "one" or "two" columns wide, or as wide as a length ("85 mm").
+        Figures are "one" or "two" columns wide, or as wide as a length ("85 mm"). Returns the
+        folder.
         """
         inches(figure_width)  # refuses what is no width
         check_target(folder)
@@ -171,6 +173,11 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
         tell(0.1 * i / len(pairs), "reading")
         try:
             test = read_test(path, specimen, study.cycle, cycles=study.cycles)
+            if test.priors:
+                raise InputError(
+                    f"{path}: [priors] are those of one test, and a joint fit takes none; leave "
+                    "them out of its TOML"
+                )
             options.problem(test, study.model)
             found.append((name, path, test))
         except (InputError, SimulationError) as error:

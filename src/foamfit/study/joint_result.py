@@ -16,7 +16,7 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
-from foamfit.results import SCHEMA, Fit, ParameterEstimate, plain
+from foamfit.results import SCHEMA, Fit, Loop, ParameterEstimate, loop_of, plain
 from foamfit.springs.model import Model
 from foamfit.study.joint_fit import Alternative, JointFit
 from foamfit.study.shared import bic
@@ -74,6 +74,16 @@ class JointParameter:
     # What the error of the law leaves open of it (`joint_fit.ranges_of`); None where all is noise.
     range: tuple[float, float] | None = None
     b_range: tuple[float, float] | None = None
+
+    def estimate(self, test: str | None = None) -> ParameterEstimate:
+        """The common value, or that of a test, as the parameter of a fit."""
+        if test is None or self.tests is None:
+            told, span = (self.state or "", self.why or ""), self.range
+            return ParameterEstimate(
+                self.value, self.stderr, self.ci95, self.unit, True, *told, range=span
+            )
+        at = self.tests[test]
+        return ParameterEstimate(at.value, at.stderr, at.ci95, self.unit, True, at.state, at.why)
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return its part of joint.json."""
@@ -153,6 +163,29 @@ class JointData:
     warnings: tuple[str, ...] = ()
     sentences: tuple[str, ...] = ()
     runtime_s: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Name of the study."""
+        return self.study.name
+
+    @property
+    def model(self) -> str:
+        """The model as `--model` takes it."""
+        return self.study.model
+
+    @cached_property
+    def loops(self) -> tuple[Loop, ...]:
+        """The loop of each test, measured and fitted."""
+        out = list[Loop]()
+        for name, problem, values in zip(
+            self.tests, self.problems, self.fit.found.values, strict=True
+        ):
+            curves = problem.objective.simulate(values, everything=True).curves
+            fitted = curves.get("stress_strain"), curves.get("stress_time")
+            if (loop := loop_of(problem.measurement, *fitted)) is not None:
+                out.append(loop._replace(name=name))
+        return tuple(out)
 
     @property
     def problems(self) -> tuple[Problem, ...]:

@@ -28,7 +28,14 @@ from foamfit.text import engineering, listed, percent
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import make_budget
-from foamfit.trust.checklist import Findings, make_checklist, may_vanish, status_of, warnings_of
+from foamfit.trust.checklist import (
+    POOR,
+    Findings,
+    make_checklist,
+    may_vanish,
+    status_of,
+    warnings_of,
+)
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
 from foamfit.trust.sentences import say
@@ -91,8 +98,10 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         relaxation=problem.model.relaxation,
         interior_mass=objective.interior_mass,
         noise=noise_of(best, best.errors if best.names else ()),
-        intervals=intervals,
+        intervals=replace(intervals, draws={}),
         budget=budget,
+        priors={one.name: (one.mean, one.sigma) for one in objective.given},
+        draws={n: one + measurement.origins.get(n, 0.0) for n, one in intervals.draws.items()},
     )
 
 
@@ -137,6 +146,11 @@ def _noise_notes(objective: Objective) -> Iterator[str]:
 def _notes(best: BestPoint) -> Iterator[str]:
     """What was left out of the model, and what it would change."""
     yield from _inner_loops(best)
+    for one in best.problem.objective.given:
+        found, unit = float(best.values[best.index[one.name]]), unit_of(one.name)
+        told = [engineering(v, unit) if unit else f"{v:.4g}" for v in (one.mean, one.sigma)]
+        away = abs(found - one.mean) / one.sigma
+        yield say("note", "prior", name=one.name, mean=told[0], sigma=told[1], off=away)
     test, simulated, objective = best.problem.measurement, best.simulated, best.problem.objective
     single = len(best.problem.model.kinds) == 1
     off = [
@@ -205,13 +219,15 @@ def _estimates(
 ) -> dict[str, ParameterEstimate]:
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
     problem, out = best.problem, {}
+    objective = problem.objective
+    missed = max((objective.off(best.simulated, c) or 0.0, c) for c in objective.counted)
     for name, value in zip(problem.names, best.values.tolist(), strict=True):
         if problem.is_exact(name):
             continue
         parameter = problem.params[name]
         if name in best.names:
             assert insight is not None
-            one = _varied(best, name, insight, intervals)
+            one = _followed(_varied(best, name, insight, intervals), missed)
         else:
             vary, spring = bool(parameter.vary), split_name(name)[0] + 1
             state, key = ("not determined", "unreached") if vary else ("fixed", "held")
@@ -221,6 +237,15 @@ def _estimates(
         parameter.stderr = one.stderr
         out[name] = one.counted_from(-problem.measurement.origins.get(name, 0.0))
     return out
+
+
+def _followed(one: ParameterEstimate, missed: tuple[float, str]) -> ParameterEstimate:
+    """Call nothing determined that belongs to curves which the model does not follow."""
+    off, curve = missed
+    if off <= POOR or one.state != "determined":
+        return one
+    told = say("why", "poor", off=off, curve=curve.replace("_", "-"), why=one.why)
+    return replace(one, state="weak", why=told)
 
 
 def _varied(

@@ -32,8 +32,8 @@ REFITS, ENOUGH_DRAWS, MOST_DRAWS = 9, 40, 100_000
 # Evaluations of a refit, and its slopes.
 EVALUATIONS, SLOPES = 6.0, 0.6
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
-# noise makes that much difference in three tests of a thousand.
-HARDLY_WORSE = 1.5
+# noise makes that much difference in one test of ten thousand, but minima and parameters are many.
+HARDLY_WORSE = 2.0
 Announce = Callable[[str], None]
 Minima = Sequence[tuple[Array, Array]]  # points at which descents ended, and their residuals
 
@@ -242,7 +242,9 @@ def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker, announce: Announ
     lost = ", ".join(name for name in best.names if name not in best.known)
     note = say("interval", "lost", told=note, names=lost) if lost else note
     fine = chain.converged and chain.stopped is None
-    return _percentiles(best, chain.samples, "MCMC", note, fine)
+    made = _percentiles(best, chain.samples, "MCMC", note, fine)
+    columns = chain.samples.reshape(-1, chain.walkers, len(best.names)).T  # (k, walkers, steps)
+    return replace(made, draws=dict(zip(best.names, columns, strict=True)))
 
 
 def _percentiles(best: BestPoint, drawn: Array, method: str, note: str, fine: bool) -> Intervals:

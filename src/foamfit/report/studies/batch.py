@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import csv
 import math
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,11 +16,16 @@ from urllib.parse import quote
 
 import numpy as np
 
-from foamfit.files import csv_bytes, write_file
+from foamfit.errors import InputError
+from foamfit.files import csv_bytes, read_whole, write_file
+from foamfit.report.figures import image
 from foamfit.report.readable import readable_unit, symbol
 from foamfit.report.render import page, words
-from foamfit.results import Fit, plain
-from foamfit.springs.parameters import springs_first
+from foamfit.report.studies.parameters import DPI as SUMMARY_DPI
+from foamfit.report.studies.parameters import Compared, plot_parameters
+from foamfit.report.tables import by_test, by_test_tex
+from foamfit.results import Fit, ParameterEstimate, plain
+from foamfit.springs.parameters import NUISANCE, springs_first
 from foamfit.text import counted, listed
 
 if TYPE_CHECKING:
@@ -105,9 +113,24 @@ def table_rows(rows: Sequence[Row]) -> Iterator[list[Any]]:
 
 def table(rows: Sequence[Row]) -> pd.DataFrame:
     """The rows of summary.csv as pandas reads them."""
+    return _frame(*table_rows(rows))
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Return the table in a summary.csv; InputError if it is none."""
+    try:
+        text = read_whole(path).decode()
+        rows = [[cell or None for cell in row] for row in csv.reader(text.splitlines(True))]
+        return _frame(
+            *([cell and re.sub("^'(?=[=+@-])", "", cell) for cell in row] for row in rows)
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} is no summary of a batch: {error}") from None
+
+
+def _frame(head: list[Any], *cells: list[Any]) -> pd.DataFrame:
     import pandas as pd
 
-    head, *cells = table_rows(rows)
     frame = pd.DataFrame(cells, columns=head)
     words = ("test", "file", "status", "error", *(n for n in head if n.endswith("_state")))
     return frame.astype({name: float for name in head if name not in words})
@@ -158,8 +181,57 @@ def _parameter_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
 # ------------------------------------------------------------------------------- the page
 
 
-def write_page(rows: Sequence[Row], folder: Path, title: str) -> None:
-    """Write summary.html whole: one file that needs nothing else."""
+def write_comparison(
+    rows: Sequence[Row], folder: Path, title: str, *, width: str, pictures: bool
+) -> bytes | None:
+    """Write summary.tex, and summary.png and .pdf if wanted: the parameters of all tests.
+
+    Returns the picture of the page, two columns wide.
+    """
+    fitted = [row for row in rows if row.has_fit]
+    tests = [row.test for row in fitted]
+    found = {name: [_estimate(row, name) for row in fitted] for name in names_of(rows)}
+    found = {n: each for n, each in found.items() if n not in NUISANCE and _varied(each)}
+    text = by_test_tex("Test", by_test(tests, found))
+    write_file(folder / "summary.tex", text.encode("utf-8", "replace"))
+    if not (pictures and found):
+        return None
+    springs = 2 if any(name.startswith("s2_") for name in found) else 1
+    compared = [
+        Compared(name, {t: p for t, p in zip(tests, each, strict=True) if p is not None}, springs)
+        for name, each in found.items()
+    ]
+    figure = plot_parameters(f"{title} · {counts_in_words(rows)}", tests, compared, width=width)
+    png = image(figure, "png", SUMMARY_DPI)
+    write_file(folder / "summary.png", png)
+    write_file(folder / "summary.pdf", image(figure, "pdf"))
+    return png
+
+
+def _varied(each: Sequence[ParameterEstimate | None]) -> bool:
+    return any(one is not None and one.state != "fixed" for one in each)
+
+
+def _estimate(row: Row, name: str) -> ParameterEstimate | None:
+    """Return a parameter of a test; None if the test does not have it."""
+    value, stderr, low, high, state, unit, *span = row.parameters.get(name, [None] * 6)
+    if value is None:
+        return None
+    ends = None if low is None or high is None else (low, high)
+    return ParameterEstimate(
+        value,
+        stderr,
+        ends,
+        unit,
+        state != "fixed",
+        state,
+        "",
+        range=(span[0], span[1]) if span else None,
+    )
+
+
+def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | None = None) -> None:
+    """Write summary.html whole, with a picture (PNG): one file that needs nothing else."""
     shown = rows
     if len(rows) > MOST_ON_PAGE:  # tests without a fit are always shown
         first = {id(row) for row in rows[:MOST_ON_PAGE]}
@@ -178,6 +250,7 @@ def write_page(rows: Sequence[Row], folder: Path, title: str) -> None:
         columns=columns,
         cells=[[_cell(row, column) for column in columns] for row in shown],
         misfits={curve: told for curve, told in _MISFITS.items() if curve in measured},
+        picture=picture and base64.b64encode(picture).decode("ascii"),
     )
     write_file(folder / "summary.html", text.encode("utf-8", "replace"))
 

@@ -9,9 +9,11 @@ import numpy as np
 
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, TWO
-from foamfit.report.folder import save_whole, write_json, write_result, write_table
+from foamfit.report.folder import save_whole, write_json, write_result, write_table, write_text
 from foamfit.report.readable import own_name, readable_unit
 from foamfit.report.render import words
+from foamfit.report.shown import cycles_by_test
+from foamfit.report.tables import by_test_tex
 from foamfit.text import percent
 
 if TYPE_CHECKING:
@@ -56,6 +58,7 @@ def write_cycles(
         write_result(result, inner, pages=pages, width=width, mapped=mapped)
     write_table(folder / "cycles.csv", found.rows())
     write_json(folder / "cycles.json", found.to_json_dict())
+    write_text(folder / "table.tex", by_test_tex("Cycle", cycles_by_test(found)))
     if pages:
         figures.write_both(plot_cycles(found, width=width), folder / "cycles", DPI)
 
@@ -82,7 +85,8 @@ def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
     panels, wide = 3 + len(varied), figures.inches(width)
     columns = max(figures.abreast(wide, COLUMNS, LEAST), 2)
     rows = 2 + max(0, -(-(panels - 2 * (columns - 2)) // columns))
-    lines = figures.title_lines(width, wide, f"{found.test} · {found.model}")
+    told = f"{found.test} · {found.model}"
+    lines = figures.title_lines(wide, told, titled=figures.is_titled(width))
     with figures.drawing(wide, rows * PANEL[1] + 0.13 * len(lines) + 0.4, lines) as figure:
         grid = figure.add_gridspec(rows, columns)
         _loops(figure.add_subplot(grid[:2, :2]), found)
@@ -154,4 +158,4 @@ def _parameter(ax: Axes, found: FittedCycles, name: str) -> None:
     factor, unit = readable_unit(max(abs(p.value) for _, p in points), points[0][1].unit)
     ax.set_title(own_name(name, found.model) + (f" ({unit})" if unit else ""))
     values, ends = figures.draw_estimates(ax, points, factor)
-    figures.limit(ax, values, ends)
+    ax.set_ylim(figures.limits(values, ends))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from importlib.metadata import version
-from os.path import commonprefix
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +13,13 @@ import numpy as np
 from foamfit.fitting.links import RATES, law_values
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, TWO, VERMILION, image
-from foamfit.report.folder import save_whole, write_json, write_result
-from foamfit.report.readable import Readable, in_unit, own_name, readable, readable_unit, symbol
+from foamfit.report.folder import save_whole, write_json, write_result, write_text
+from foamfit.report.readable import in_unit, own_name, readable, readable_unit, symbol
 from foamfit.report.render import page, words
-from foamfit.results import ParameterEstimate, law_in_words
+from foamfit.report.shown import Joint
+from foamfit.report.studies.parameters import Compared, plot_parameters
+from foamfit.report.tables import parameters_tex
+from foamfit.results import law_in_words
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import percent
 from foamfit.trust.covariance import RULE
@@ -26,7 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.arrays import Array
     from foamfit.study.joint_result import JointData, JointParameter, TestFit
 
 CURVES = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
@@ -34,10 +35,9 @@ DPI = 180  # of the picture
 MOST_ROWS = 60  # of the table of tests on the terminal
 # Columns of the picture, and inches of a loop and of a parameter.
 LOOPS, LOOP, COLUMNS, PANEL = 6, (1.25, 1.15), 3, (2.5, 1.6)
-LEAST_LOOP, LEAST_PANEL, LEAST_TABLE = 1.05, 1.55, 2.1  # in
+LEAST_LOOP, LEAST_PANEL, ROOMY = 1.05, 1.55, 2.1  # in
 MEASURED = "0.65"  # wide and light below what is fitted, which is darker in grey too
 MOST_LOOPS = 48
-MOST_NAMES = 12  # of tests that stand at an axis
 # Tests are ordered by rate from this ratio of the largest to the smallest rate on, even if no
 # parameter follows a law of rate; rates of nominally equal tests differ by some percent.
 SEVERAL_RATES = 1.5
@@ -70,15 +70,19 @@ def save_joint(
             failed.append(error)
 
     def show(fresh: Path) -> None:
+        write_text(fresh / "table.tex", joint_tex(found))
         folders = [fresh / name for name in found.tests]
         # Where other processes make the folders, the picture of all is drawn beside them.
         n = len(folders)
         made = each(_write_test, found.test_fits(), folders, [reports] * n, [width] * n)
-        png = figures.write_both(plot_joint(found, width=width), fresh / "joint", DPI)
+        pictures = [
+            figures.write_both(draw(found, width=width), fresh / name, DPI)
+            for name, draw in (("joint", plot_joint), ("parameters", plot_compared))
+        ]
         if width != TWO:  # the page is as wide as two columns
-            png = image(plot_joint(found), "png", DPI)
-        text = joint_page(found, png, linked=reports)
-        (fresh / "joint.html").write_text(text, encoding="utf-8", errors="replace")
+            pictures = [image(draw(found), "png", DPI) for draw in (plot_joint, plot_compared)]
+        text = joint_page(found, *pictures, linked=reports)
+        write_text(fresh / "joint.html", text)
         for _ in made:
             pass
 
@@ -88,6 +92,22 @@ def save_joint(
             f"{failed[0]!r}; {Path(folder) / 'joint.json'} is written, but not all reports"
         ) from failed[0]
     return Path(folder)
+
+
+def joint_tex(found: Joint) -> str:
+    """Return table.tex: a row for each parameter of the springs."""
+    shown = _of_springs(found)
+    return parameters_tex(
+        {name: one.estimate() for name, one in shown.items()},
+        kinds={name: one.kind for name, one in shown.items()},
+        between={name: between(one) for name, one in shown.items()},
+    )
+
+
+def _of_springs(found: Joint) -> dict[str, JointParameter]:
+    """Parameters of the springs but for those that are held at zero."""
+    every = found.parameters.items()
+    return {n: p for n, p in every if n not in NUISANCE and (p.kind != "fixed" or p.value)}
 
 
 def _write_test(one: TestFit, folder: Path, reports: bool, width: str) -> None:
@@ -111,8 +131,8 @@ def joint_text(found: JointData) -> str:
     )
 
 
-def joint_page(found: JointData, picture: bytes, *, linked: bool = True) -> str:
-    """Return the page; `picture` is a PNG, `linked` says whether each test has a report."""
+def joint_page(found: JointData, loops: bytes, compared: bytes, *, linked: bool = True) -> str:
+    """Return the page with two pictures (PNG); `linked` says whether each test has a report."""
     each = []
     for name, one in found.parameters.items():
         if one.tests and one.kind != "fixed":
@@ -127,11 +147,11 @@ def joint_page(found: JointData, picture: bytes, *, linked: bool = True) -> str:
         found=found,
         law=law_in_words(found.study.model, found.study.relaxation),
         version=version("foamfit"),
-        picture=base64.b64encode(picture).decode("ascii"),
+        loops=base64.b64encode(loops).decode("ascii"),
+        compared=base64.b64encode(compared).decode("ascii"),
         parameters=[
-            (one, _readable(name, one), between(one))
-            for name, one in found.parameters.items()
-            if name not in NUISANCE and (one.kind != "fixed" or one.value)
+            (one, readable(name, one.estimate()), between(one))
+            for name, one in _of_springs(found).items()
         ],
         rule=RULE,
         ranged=any(one.range for one in found.parameters.values()),
@@ -142,13 +162,6 @@ def joint_page(found: JointData, picture: bytes, *, linked: bool = True) -> str:
         each=each,
         linked=linked,
     )
-
-
-def _readable(name: str, one: JointParameter) -> Readable:
-    shared = ("value", "stderr", "ci95", "unit", "range")
-    given: dict[str, Any] = {key: getattr(one, key) for key in shared}
-    state, why = one.state or "", one.why or ""
-    return readable(name, ParameterEstimate(**given, vary=True, state=state, why=why))
 
 
 def _evidence(found: JointData) -> dict[str, list[Any]]:
@@ -205,39 +218,57 @@ def _test_rows(found: JointData) -> list[list[str]]:
 
 
 def plot_joint(found: JointData, *, width: str = TWO) -> Figure:
-    """Draw the loop of each test and every parameter by test, or by rate where there are several.
+    """Draw the loop of each test, and each parameter that follows a law of rate against the rate.
 
-    Bars are 95 % intervals; a hollow mark is a test that does not determine the parameter well. The
-    line is what the tests have in common: a value, a law of rate, a common value with its spread
-    between specimens. `width` is "one" or "two" columns, or a length such as "85 mm".
+    Bars are 95 % intervals of the tests. `width` is "one" or "two" columns, or a length such as
+    "85 mm".
     """
-    shown = _shown(found)
-    own = {n: one for n, one in found.parameters.items() if one.kind not in ("fixed", "shared")}
-    names = [name for name in own if name not in NUISANCE]
-    shared = [n for n, one in found.parameters.items() if one.kind == "shared"]
-    panels, wide = len(names) + bool(shared), figures.inches(width)
+    shown, wide = _shown(found), figures.inches(width)
+    names = [n for n, one in found.parameters.items() if one.kind in RATES and n not in NUISANCE]
     across = figures.abreast(wide, min(LOOPS, max(len(shown), COLUMNS)), LEAST_LOOP)
     columns = figures.abreast(wide, COLUMNS, LEAST_PANEL)
-    rows, low = -(-len(shown) // across), -(-panels // columns)
+    rows, low = -(-len(shown) // across), -(-len(names) // columns)
     heights = [rows * LOOP[1], low * PANEL[1]]
     more = f"; {len(shown)} of {len(found.tests)} drawn" if len(shown) < len(found.tests) else ""
-    told = f"{found.study.name} · {found.study.model} · {len(found.tests)} tests together{more}"
-    lines = figures.title_lines(width, wide, told)
+    told = f"{found.name} · {found.model} · {len(found.tests)} tests together{more}"
+    lines = figures.title_lines(wide, told, titled=figures.is_titled(width))
     with figures.drawing(wide, sum(heights) + 0.6 + 0.13 * len(lines), lines) as figure:
-        top, bottom = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
+        parts = [height for height in heights if height]
+        top, *bottom = figure.subfigures(len(parts), 1, height_ratios=parts, squeeze=False)[:, 0]
         most = int(72.0 * wide / across / 4.2)  # letters of a name
         loops = top.subplots(rows, across, squeeze=False).ravel().tolist()
         _draw_loops(loops, found, shown, most)
-        axes = bottom.subplots(low, columns, squeeze=False).ravel().tolist()
-        narrow = wide / columns < LEAST_TABLE
-        for ax, name in zip(axes, names, strict=False):
-            _parameter(ax, found, name, parted=narrow)
-        for ax in axes[len(names) :]:
-            ax.set_axis_off()
-        if shared:
-            _list(axes[len(names)], found, shared, stacked=narrow)
-        figures.legend_below(figure, figures.key_of([*loops, *axes]))
+        for part in bottom:
+            axes = part.subplots(low, columns, squeeze=False).ravel().tolist()
+            for ax, name in zip(axes, names, strict=False):
+                _law_of_rate(ax, found, name, parted=wide / columns < ROOMY)
+            for ax in axes[len(names) :]:
+                ax.set_axis_off()
+            loops += axes
+        figures.legend_below(figure, figures.key_of(loops))
     return figure
+
+
+def plot_compared(found: JointData, *, width: str = TWO) -> Figure:
+    """Draw the parameters of all tests side by side, the tests by rate where they have several."""
+    rates = dict(zip(found.tests, found.rates, strict=True)) if by_rate(found) else {}
+    tests = sorted(found.tests, key=lambda test: rates.get(test) or 0.0)
+    names = {t: f"{t}, {rates[t]:.2g}/s" if rates.get(t) else t for t in tests}
+    springs = len(found.model.split("+"))
+    compared = [
+        Compared(
+            name,
+            {names[t]: one.estimate(t) for t in tests if one.tests and t in one.tests},
+            springs,
+            one.kind,
+            one.estimate() if one.kind in ("shared", "scatter") else None,
+            one.scatter,
+        )
+        for name, one in _of_springs(found).items()
+        if one.kind != "fixed"
+    ]
+    title = f"{found.name} · {found.model} · {len(tests)} tests together"
+    return plot_parameters(title, list(names.values()), compared, width=width)
 
 
 def _shown(found: JointData) -> list[int]:
@@ -250,29 +281,24 @@ def _shown(found: JointData) -> list[int]:
 
 def _draw_loops(axes: list[Axes], found: JointData, shown: list[int], most: int) -> None:
     """Draw the loop of each test that is shown; names have so many letters at most."""
-    tests = found.measurements
-    top = max(float(np.max(t.stress)) for t in tests if t.stress is not None)
-    factor, unit = readable_unit(top, "Pa")
+    loops = {one.name: one for one in found.loops}
+    tops = (float(np.max(one.measured)) for one in loops.values())
+    factor, unit = readable_unit(max(tops, default=0.0), "Pa")
     for ax, t in zip(axes, shown, strict=False):
-        problem, test = found.problems[t], tests[t]
-        curves = problem.objective.simulate(found.fit.found.values[t], everything=True).curves
-        along, fitted, label = test.time, curves.get("stress_time"), "time (s)"
-        if test.displacement is not None and "stress_strain" in curves:
-            along, label = test.displacement / test.specimen.height, "strain"
-            fitted = curves["stress_strain"]
-        if along is None or test.stress is None:
+        if (one := loops.get(found.tests[t])) is None:
             continue
-        some = slice(None, None, max(along.size // POINTS, 1))
-        ax.plot(along[some], test.stress[some] / factor, color=MEASURED, lw=1.5, label="_measured")
-        if fitted is not None:
-            ax.plot(along[some], fitted[some] / factor, color=BLUE, lw=0.7, label="_fitted")
-        ax.set_label(found.tests[t])
+        some = slice(None, None, max(one.along.size // POINTS, 1))
+        x = one.along[some]
+        ax.plot(x, one.measured[some] / factor, color=MEASURED, lw=1.5, label="_measured")
+        if one.fitted is not None:
+            ax.plot(x, one.fitted[some] / factor, color=BLUE, lw=0.7, label="_fitted")
+        ax.set_label(one.name)
         rate = found.rates[t] if by_rate(found) else None
-        told = found.tests[t] if rate is None else f"{found.tests[t]}, {rate:.2g}/s"
+        told = one.name if rate is None else f"{one.name}, {rate:.2g}/s"
         ax.set_title(told if len(told) <= most else f"…{told[-most + 1 :]}", fontsize=6)
         ax.tick_params(labelsize=5.5, length=2, pad=1.5)
         ax.locator_params(nbins=3)
-        ax.set_xlabel(label, fontsize=6, labelpad=1, visible=t == shown[0])
+        ax.set_xlabel(one.label, fontsize=6, labelpad=1, visible=t == shown[0])
         ax.set_ylabel(f"stress ({unit})", fontsize=6, labelpad=1, visible=t == shown[0])
     for ax in axes[len(shown) :]:
         ax.set_axis_off()
@@ -288,87 +314,27 @@ def by_rate(found: JointData) -> bool:
     return len(rates) == len(found.rates) and max(rates) > SEVERAL_RATES * min(rates)
 
 
-def _marks(tests: Sequence[str]) -> list[str]:
-    """Short labels of the tests: the part in which their names differ, else numbers."""
-    ways = (list(tests), [name[::-1] for name in tests])
-    before, after = (len(commonprefix(way).rstrip("0123456789")) for way in ways)  # noqa: RUF071
-    marks = [name[before : len(name) - after] for name in tests]
-    short = all(0 < len(mark) <= 4 for mark in marks)
-    return marks if short else [str(t) for t in range(1, len(tests) + 1)]
-
-
-def _parameter(ax: Axes, found: JointData, name: str, *, parted: bool) -> None:
-    """One parameter by test, or by rate; its title in two lines if `parted`."""
-    one = found.parameters[name]
-    rated = by_rate(found)
+def _law_of_rate(ax: Axes, found: JointData, name: str, *, parted: bool) -> None:
+    """One parameter by rate, with its law; its title in two lines if `parted`."""
+    one, x = found.parameters[name], np.array(found.rates, dtype=float)
     factor, unit = readable_unit(abs(one.value), one.unit)
-    x = np.array(found.rates, dtype=float) if rated else np.arange(1.0, len(found.tests) + 1)
-    told = f"{own_name(name, found.study.model)}{f' ({unit})' if unit else ''}:"
+    told = f"{own_name(name, found.model)}{f' ({unit})' if unit else ''}:"
     ax.set_title(f"{told}\n{one.kind}" if parted else f"{told} {one.kind}")
     ax.set_label(f"{told} {one.kind}")
     tests = one.tests or {}
     points = [(at, tests[test]) for at, test in zip(x, found.tests, strict=True) if test in tests]
-    points = [(at, value) for at, value in points if value.state != "fixed"]
-    size = 0.0 if one.kind in RATES else 3.5 if len(found.tests) < 60 else 1.5
-    values, ends = figures.draw_estimates(ax, points, factor, size)
-    if rated:
-        ax.set_xscale("log")
-        ax.set_xlabel("strain rate (1/s)", labelpad=1)
-        if np.nanmax(x) < 10.0 * np.nanmin(x):  # no two powers of ten, and minor labels overlap
-            ticks = np.geomspace(np.nanmin(x), np.nanmax(x), 3)
-            ax.set_xticks(ticks, [f"{tick:.2g}" for tick in ticks])
-            ax.minorticks_off()
-    else:
-        ax.set_xlabel("test", labelpad=1)
-        if len(x) <= MOST_NAMES:
-            ax.set_xticks(x, _marks(found.tests))
-    _common(ax, found, name, x, factor)
-    if values and one.kind not in RATES:
-        figures.limit(ax, values, ends)
-
-
-def _common(ax: Axes, found: JointData, name: str, x: Array, factor: float) -> None:
-    """What the tests have in common: line and 95 % band, spread between specimens dashed."""
-    one = found.parameters[name]
-    if one.kind == "own":
-        return
-    span, told, y = np.array([np.nanmin(x), np.nanmax(x)]), "", 0.97
-    line: dict[str, Any] = {"color": VERMILION, "linewidth": 1.0}
-    if one.kind in RATES and one.b is not None and found.rate0 is not None:
-        span = np.geomspace(span[0], span[1], 50)
-        values = law_values(one.kind, one.value, one.b, np.log(span / found.rate0))
-        ax.plot(span, values / factor, label="_law of rate", **line)
-        told, y = between(one), 0.05 if one.b > 0.0 else 0.97
-    else:
-        ax.plot(span, [one.value / factor] * 2, label="_in common", zorder=0, **line)
-        if one.ci95 is not None:
-            low, high = (end / factor for end in one.ci95)
-            band: dict[str, Any] = {"color": VERMILION, "alpha": 0.18, "linewidth": 0, "zorder": 0}
-            ax.fill_between(span, low, high, label="_95 % interval in common", **band)
-        line |= {"linewidth": 0.7, "zorder": 0, "label": "_spread between specimens"}
-        for sign in (-1.0, 1.0) if one.scatter else ():
-            edge = one.value * np.exp(sign * (one.scatter or 0.0)) / factor
-            ax.plot(span, [edge] * 2, "--", **line)
-        told = f"spread {percent(one.scatter)}" if one.scatter else ""
-    side: Any = {"ha": "right", "va": "top" if y > 0.5 else "bottom", "fontsize": 6.5}
-    ax.text(0.98, y, told, transform=ax.transAxes, **side)
-
-
-def _list(ax: Axes, found: JointData, names: list[str], *, stacked: bool) -> None:
-    """Write the values that all tests share, side by side or `stacked` below their names."""
-    lines = [["shared by all tests", "", ""]]
-    for name in names:
-        one = found.parameters[name]
-        widths = [ends[1] - ends[0] for ends in (one.ci95, one.range) if ends is not None]
-        half = 0.5 * max(widths, default=0.0)  # which decides its state
-        error = f"±{percent(half / abs(one.value))}" if half and one.value else ""
-        error += f" {one.state or ''}" if one.state != "determined" else ""
-        value = in_unit((one.value,), one.unit)
-        if stacked:
-            lines += [[own_name(name, found.study.model), "", ""], [f"   {value} {error}", "", ""]]
-        else:
-            lines.append([own_name(name, found.study.model), value, error])
-    size = min(7.0, 90.0 / len(lines))
-    for column, x in ((0, 0.0), (1, 0.42), (2, 0.78)):
-        told = "\n".join(line[column] for line in lines)
-        ax.text(x, 1.0, told, transform=ax.transAxes, va="top", fontsize=size, linespacing=1.5)
+    figures.draw_estimates(ax, points, factor, 0.0)
+    ax.set_xscale("log")
+    ax.set_xlabel("strain rate (1/s)", labelpad=1)
+    low, high = np.nanmin(x), np.nanmax(x)
+    if high < 10.0 * low:  # no two powers of ten, and minor labels overlap
+        ticks = np.geomspace(low, high, 3)
+        ax.set_xticks(ticks, [f"{tick:.2g}" for tick in ticks])
+        ax.minorticks_off()
+    if one.b is not None and found.rate0 is not None:
+        rates = np.geomspace(low, high, 50)
+        values = law_values(one.kind, one.value, one.b, np.log(rates / found.rate0))
+        ax.plot(rates, values / factor, label="_law of rate", color=VERMILION, linewidth=1.0)
+        y = 0.05 if one.b > 0.0 else 0.97
+        side: Any = {"ha": "right", "va": "top" if y > 0.5 else "bottom", "fontsize": 6.5}
+        ax.text(0.98, y, between(one), transform=ax.transAxes, **side)

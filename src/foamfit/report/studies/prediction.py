@@ -113,10 +113,10 @@ def plot_prediction(found: PredictedTest, *, width: str = TWO) -> Figure:
     bands = -(-(1 + len(curves)) // across)  # each a row of panels with a lower one beneath
     inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in curves)
     lines = figures.title_lines(
-        width,
         wide,
         f"{found.measurement.name}, predicted from {found.source}; {_rates(found)}",
         f"inside the 95 % band: {inside}",
+        titled=figures.is_titled(width),
     )
     tall = bands * 1.7 * PANEL[1] + 0.4 + 0.15 * max(len(lines) - 2, 0)
     with figures.drawing(wide, tall, lines) as figure:

@@ -1,0 +1,202 @@
+"""Do the intervals hold where springs remember, on records of three cycles?
+
+A synthetic foam is a row of discrete micro-springs (model.md, section 8), each with a flag "has
+snapped once", and one relaxation term; a machine comes from before contact, with zeros of its own,
+and presses it three times without leaving it. Nothing of this comes from foamfit: the stress at a
+strain is found by bisection over the row. Each record goes the way of a user: a CSV with noise on
+force and motion, `foamfit.read_test` with `cycles=(1, 3)`, `foamfit.fit` with stiffening and the
+Mullins effect. It counts the 95 % intervals that hold the truth, and the determined values that lie
+further outside than their interval is wide ("far").
+
+    python experiments/recovery/cycles.py --tests 50 --raw rows.csv     # resumable; 15 s a test
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rig import draw_microscale
+from rigs import JOB, Row, run, sentence, share
+from scipy.optimize import minimize_scalar
+from scipy.special import ndtri
+from truth import Array
+
+import foamfit as ff
+
+MICRO_SPRINGS, STEPS, CYCLE = 4000, 2000, 4.0  # springs; steps of a leg; s of a cycle
+HEIGHT, AREA = 10e-3, 4.5e-5  # m, m²
+ROWS, NOISE = 1200, 1e-3  # samples; noise of each channel over its range
+LEAST = 0.02  # share of the peak stress at which the machine turns back
+DEEPEST, BACK = 0.82, 0.3  # largest strain; what is left of it where it turns back, at most
+
+
+@dataclass
+class Ensemble:
+    """Micro-springs in a row at one stress, with what each remembers."""
+
+    values: dict[str, float]
+
+    def __post_init__(self) -> None:
+        """Begin unloaded; ranks are those of equal shares."""
+        v, ranks = self.values, ndtri((np.arange(MICRO_SPRINGS) + 0.5) / MICRO_SPRINGS)
+        self.first = v["sigma_plus"] * np.exp(v["spread_plus"] * ranks)
+        self.back = v["sigma_minus"] * np.exp(v["spread_minus"] * ranks)
+        self.snapped = np.zeros(MICRO_SPRINGS, bool)
+        self.ever = self.snapped.copy()
+        self.stress = 0.0
+
+    def after(self, stress: float) -> Array:
+        """Which micro-springs are snapped once the stress has come here."""
+        through = np.where(self.ever, self.first * math.exp(-self.values["weakening"]), self.first)
+        if stress >= self.stress:
+            return self.snapped | (stress >= through)
+        return self.snapped & (stress >= np.minimum(self.back, through))
+
+    def strain(self, stress: float, snapped: Array) -> float:
+        """Mean strain of the row."""
+        v, n = self.values, self.values["stiffening"]
+        soft = v["k0"] * math.exp(-v["softening"])
+        virgin, worn = (1.0 - (1.0 + n * stress / k) ** (-1.0 / n) for k in (v["k0"], soft))
+        compressed = v["eps_star"] + stress / (v["kc"] + stress)
+        p, ever = float(snapped.mean()), float((self.ever | snapped).mean())
+        return (1.0 - ever) * virgin + (ever - p) * worn + p * compressed
+
+    def press(self, strain: float) -> float:
+        """Bring the row to a strain; returns its stress."""
+        rising = strain > self.strain(self.stress, self.snapped)
+        low, high = (self.stress, 20.0 * self.first[-1]) if rising else (0.0, self.stress)
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            above = self.strain(middle, self.after(middle)) > strain
+            low, high = (low, middle) if above else (middle, high)
+        self.snapped = self.after(high)
+        self.stress, self.ever = high, self.ever | self.snapped
+        return high
+
+
+def draw(rng: np.random.Generator) -> tuple[dict[str, float], float]:
+    """Draw a foam, and the stress of its largest compression."""
+    names = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
+    while True:
+        spring, most = draw_microscale(rng)
+        values = {name: getattr(spring, name) for name in names}
+        values["stiffening"] = 10.0 ** rng.uniform(0.0, 1.2)
+        values["softening"], values["weakening"] = rng.uniform(0.3, 1.0), rng.uniform(0.1, 0.5)
+        values["g1"], values["tau1"] = (
+            rng.uniform(0.1, 0.8),
+            CYCLE * 10.0 ** rng.uniform(-2.0, -0.7),
+        )
+        soft, n = values["k0"] * math.exp(-values["softening"]), values["stiffening"]
+
+        def lead(log: float, soft: float = soft, n: float = n, kc: float = values["kc"]) -> float:
+            s = math.exp(log)
+            return s / (kc + s) - 1.0 + (1.0 + n * s / soft) ** (-1.0 / n)
+
+        bounds = (math.log(1e-4 * soft), math.log(1e4 * soft))
+        least = -min(minimize_scalar(lead, bounds=bounds, method="bounded").fun, 0.0)
+        values["eps_star"] = least + rng.uniform(0.02, 0.2)
+        row = Ensemble(values)
+        top = row.strain(most, row.after(most))
+        if top < DEEPEST:
+            return values, top
+
+
+def pressed(values: dict[str, float], top: float) -> tuple[list[float], list[float]]:
+    """Press a foam three times, to `top` and a little further each; its strains and stresses."""
+    row, g, tau = Ensemble(values), values["g1"], values["tau1"]
+    step = 0.5 * CYCLE / STEPS
+    fade, gain = math.exp(-step / tau), g * tau / step * (1.0 - math.exp(-step / tau))
+    strains, stresses, relaxing, peak = [0.0], [0.0], 0.0, 0.0
+    for leg in range(6):
+        ups = leg % 2 == 0
+        goal = top * (1.0 + 0.02 * (leg // 2)) if ups else 0.0
+        rate = (goal - strains[-1]) / STEPS if ups else -top / STEPS
+        for _ in range(STEPS):
+            before = row.stress
+            strains.append(strains[-1] + rate)
+            relaxing = relaxing * fade + gain * (row.press(strains[-1]) - before)
+            stresses.append(row.stress + relaxing)
+            peak = max(peak, stresses[-1])
+            if not ups and stresses[-1] < LEAST * peak:
+                break
+    return strains, stresses
+
+
+def record(seed: int) -> tuple[dict[str, float], pd.DataFrame]:
+    """Make the true parameters and the noisy record of one test."""
+    rng = np.random.default_rng([seed, 11])
+    values, top = draw(rng)
+    strains, stresses = pressed(values, top)
+    while strains[-1] > BACK * top:
+        values, top = draw(rng)
+        strains, stresses = pressed(values, top)
+    step = 0.5 * CYCLE / STEPS
+    own = np.linspace(0, len(strains) - 1, ROWS)
+    at = np.arange(len(strains))
+    early = int(rng.uniform(30, 120))  # rows before contact, at the speed of the first leg
+    own = np.concatenate([own[1] * np.arange(-early, 0) + 0.3 * own[1], own])
+    strain = np.interp(own, at, strains) + np.minimum(own, 0.0) * strains[1]
+    clean = [strain * HEIGHT, np.interp(own, at, stresses) * AREA]
+    w, force = (c + NOISE * np.ptp(c) * rng.standard_normal(own.size) for c in clean)
+    w, force = w + rng.uniform(-3.0, 3.0) * HEIGHT, force + 0.02 * rng.normal() * np.ptp(force)
+    columns = {"time (s)": own * step + 5.0, "displacement (mm)": 1e3 * w, "force (N)": force}
+    return {f"s1_{name}": value for name, value in values.items()}, pd.DataFrame(columns)
+
+
+def run_test(family: str, name: str, seed: int) -> list[Row]:
+    """Make, write, read and fit one test: a row for each parameter, or one for the failure."""
+    about: Row = {"family": family, "class": name, "test": seed}
+    truth, table = record(seed)
+    began = time.perf_counter()
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "test.csv"
+            table.to_csv(path, index=False, float_format="%.9g")
+            specimen = f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n'
+            path.with_suffix(".toml").write_text(specimen, encoding="utf-8")
+            test = ff.read_test(path, cycles=(1, 3))
+        result = ff.fit(test, model="microscale", relaxation=1, stiffening=True, mullins=True)
+    except Exception as error:
+        return [about | {"error": sentence(error)}]
+    about |= {"rows": ROWS, "status": result.status, "seconds": time.perf_counter() - began}
+    rows = []
+    for parameter, true in truth.items():
+        found = result.parameters[parameter]
+        low, high = map(float, found.ci95 or (np.nan, np.nan))
+        outside = max(low - true, true - high)
+        far = found.state == "determined" and bool(outside > high - low)
+        own = {"parameter": parameter, "truth": true, "value": found.value, "state": found.state}
+        ends = {"low": low, "high": high, "stderr": found.stderr}
+        rows.append(about | own | ends | {"holds": bool(outside <= 0.0), "far": far})
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tests", type=int, default=50)
+    parser.add_argument("--first-seed", type=int, default=1)
+    parser.add_argument("--raw", type=Path, help="rows of all tests; resumed")
+    parser.add_argument("--jobs", type=int, default=1)
+    options = parser.parse_args()
+    seeds = range(options.first_seed, options.first_seed + options.tests)
+    rows = run(run_test, [("memory", "three cycles", s) for s in seeds], options.raw, options.jobs)
+    given = rows[rows["low"].notna()]
+    for name, group in [*given.groupby("parameter", sort=False), ("all", given)]:
+        holds, low, high = share(group["holds"])
+        told = f"{holds:.1f} % ({low:.1f} to {high:.1f}) of {len(group)}, far {group['far'].sum()}"
+        print(f"{name:16} {told}")
+    print("states:", rows["state"].value_counts().to_dict())
+    print("status:", rows.drop_duplicates(JOB)["status"].value_counts().to_dict())
+    for row in rows[rows["error"].notna()].itertuples():
+        print(f"test {row.test}: {row.error}")
+
+
+if __name__ == "__main__":
+    main()

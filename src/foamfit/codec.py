@@ -1,0 +1,118 @@
+"""Results as plain types and back: by the fields and types of their dataclasses.
+
+An array that is a column of a table beside the JSON is a reference to it, `{"column": name}`.
+"""
+
+from __future__ import annotations
+
+import math
+import types
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import PurePath
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.springs.spring import Spring
+
+Columns = Mapping[str, Array]
+_PARAMETER = ("value", "vary", "min", "max", "stderr", "expr")
+_NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+
+
+def encode(value: Any, columns: Columns) -> Any:
+    """Return a value in the types of JSON; a number that is not finite is its name."""
+    if hasattr(value, "valuesdict"):  # lmfit's parameters, whose own writer pickles functions
+        every = {
+            name: {key: getattr(one, key) for key in _PARAMETER} for name, one in value.items()
+        }
+        return encode(every, columns)
+    if isinstance(value, Mapping):
+        return {str(key): encode(item, columns) for key, item in value.items()}
+    if isinstance(value, Spring):
+        relaxation = [list(term) for term in value.relaxation]
+        return {"kind": value.law.kind, "values": list(value.values), "relaxation": relaxation}
+    if is_dataclass(value):
+        return {one.name: encode(getattr(value, one.name), columns) for one in fields(value)}
+    if isinstance(value, np.ndarray):
+        same = (name for name, one in columns.items() if np.array_equal(one, value, equal_nan=True))
+        name = next(same, None)
+        return encode(value.tolist(), columns) if name is None else {"column": name}
+    if isinstance(value, np.generic | PurePath):
+        return encode(value.item() if isinstance(value, np.generic) else str(value), columns)
+    if isinstance(value, list | tuple):
+        return [encode(item, columns) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def decode(hint: Any, value: Any, columns: Columns) -> Any:
+    """Return what `encode` has made of a value of a type; `build` says what is raised."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        arms = [arm for arm in inner if arm is not type(None)]
+        hint = arms[0] if len(arms) == 1 else Any
+        return None if value is None else decode(hint, value, columns)
+    if origin is np.ndarray:  # NDArray[kind]: its last argument is dtype[kind]
+        given = columns[value["column"]] if isinstance(value, Mapping) else _finite_or_not(value)
+        return np.array(given, dtype=get_args(inner[-1])[0])
+    if origin is tuple:
+        each = (inner[0],) * len(value) if inner[-1] is Ellipsis else inner
+        return tuple(decode(one, item, columns) for one, item in zip(each, value, strict=True))
+    if origin in (dict, Mapping):
+        name, kind = inner
+        return {name(key): decode(kind, item, columns) for key, item in value.items()}
+    if hint is float:
+        return math.nan if value is None else float(value)
+    if isinstance(hint, type) and issubclass(hint, PurePath):
+        return hint(value)
+    if hint is Spring:
+        from foamfit.springs import laws
+
+        pairs = [(g, tau) for g, tau in value["relaxation"]]
+        return laws.law(value["kind"]).make(value["values"], pairs)
+    if hasattr(hint, "valuesdict"):
+        return _parameters(hint(), _finite_or_not(value))
+    if is_dataclass(hint):
+        assert isinstance(hint, type)
+        return build(hint, value, columns)
+    return _finite_or_not(value) if hint is Any else value
+
+
+def build(made: type, content: Mapping[str, Any], columns: Columns, **names: Any) -> Any:
+    """Make a dataclass of its encoded fields; one that has a default may be missing.
+
+    `names` are those in its annotations that its module imports for typing alone.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError, AttributeError
+        If a field is missing, or is not what the dataclass says.
+    """
+    hints = get_type_hints(made, localns=names)
+    given = {}
+    for one in fields(made):
+        missing = one.default is MISSING and one.default_factory is MISSING
+        if missing or one.name in content:
+            given[one.name] = decode(hints[one.name], content[one.name], columns)
+    return made(**given)
+
+
+def _parameters(params: Any, content: Mapping[str, Any]) -> Any:
+    for name, one in content.items():
+        params.add(name, **{key: one[key] for key in ("value", "vary", "min", "max")})
+        params[name].stderr = one["stderr"]
+    for name, one in content.items():
+        if one["expr"] is not None:
+            params[name].expr = one["expr"]
+    return params
+
+
+def _finite_or_not(value: Any) -> Any:
+    """Return plain types with numbers in place of their names."""
+    if isinstance(value, Mapping):
+        return {key: _finite_or_not(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite_or_not(item) for item in value]
+    return _NOT_FINITE.get(value, value) if isinstance(value, str) else value

@@ -1,0 +1,147 @@
+"""Results as Python and notebooks show them: a few lines of text, or one line and a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+from foamfit.report.plots import draw_loops
+from foamfit.report.readable import Readable, readable, readable_unit
+from foamfit.report.render import environment
+from foamfit.report.summary import misfits
+from foamfit.report.tables import by_test, frame, stacked
+from foamfit.results import Fit, Loop
+from foamfit.springs.parameters import NUISANCE
+from foamfit.text import counted, percent, wrapped
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
+    from foamfit.study.cycle_fits import FittedCycles
+    from foamfit.study.joint_result import JointParameter
+
+
+def fit_shown(result: Fit, *, html: bool = False) -> str:
+    """Return status, model, misfit and parameters of a fit."""
+    off = ((name, one) for name, one in misfits(result).items() if one is not None)
+    told = ", ".join(f"{name} {percent(one)}" for name, one in off)
+    line = f"{result.law}, {result.drive} drive · status {result.status} · misfit: {told or '–'}"
+    rows = [readable(name, p) for name, p in result.parameters.items()]
+    return _shown(
+        result.measurement.name, line, [one for one in rows if one.state != "fixed"], html
+    )
+
+
+def cycles_shown(found: FittedCycles, *, html: bool = False) -> str:
+    """Return how many cycles were fitted, their misfits, and the parameters by cycle."""
+    line = f"{found.model} · {len(found.results)} of {counted(len(found.recorded), 'cycle')} fitted"
+    each = (one.misfit.get("stress_strain") for one in found.results.values())
+    if known := [off for off in each if off is not None]:
+        line += f" · misfit {percent(min(known))} to {percent(max(known))}"
+    if html:
+        head = {"first": "cycle", **cycles_by_test(found)}
+        return _render("shown", title=found.test, line=line, rows=[], by_test=head)
+    rows = [
+        Readable(name, ("", ""), f"{low.value} to {high.value}", "", "", low.unit, "", "")
+        for name, (low, high) in _spans(found)
+    ]
+    return _shown(found.test, line, rows, html)
+
+
+def cycles_by_test(found: FittedCycles) -> dict[str, Any]:
+    """Return head and rows of a table with a row for each cycle."""
+    numbers = sorted(found.results)
+    estimates = {n: [found.results[i].parameters.get(n) for i in numbers] for n in found.varied}
+    return by_test([str(number) for number in numbers], estimates)
+
+
+def _spans(found: FittedCycles) -> Iterator[tuple[str, tuple[Readable, Readable]]]:
+    """Smallest and largest value of each parameter over the cycles, in one unit."""
+    for name in found.varied:
+        each = [one.parameters[name] for one in found.results.values() if name in one.parameters]
+        ends = min(each, key=lambda one: one.value), max(each, key=lambda one: one.value)
+        unit = readable_unit(abs(ends[1].value), ends[1].unit)
+        yield name, (readable(name, ends[0], unit), readable(name, ends[1], unit))
+
+
+def _shown(title: str, line: str, rows: Sequence[Readable], html: bool) -> str:
+    if html:
+        return _render("shown", title=title, line=line, rows=rows, by_test=None)
+    marks = {"weak": " (weak)", "not determined": " (not determined)"}
+    told = (f"{p.label} {p.with_unit(p.with_error)}{marks.get(p.state, '')}" for p in rows)
+    return "\n".join([*wrapped(f"{title}: {line}", 2), *wrapped(", ".join(told), 2)])
+
+
+def _render(name: str, **values: Any) -> str:
+    return environment().get_template(f"{name}.html").render(**values)
+
+
+class Joint(Protocol):
+    """A joint fit, made or read back."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def model(self) -> str:
+        """Its model."""
+
+    @property
+    def status(self) -> str:
+        """Its status."""
+
+    @property
+    def tests(self) -> tuple[str, ...]:
+        """Names of its tests."""
+
+    @property
+    def parameters(self) -> Mapping[str, JointParameter]:
+        """Its parameters."""
+
+    @property
+    def loops(self) -> tuple[Loop, ...]:
+        """The loops of its tests."""
+
+
+class JointViews:
+    """What Python and notebooks show of a joint fit."""
+
+    def plot(self: Joint, ax: Axes | None = None) -> Axes:
+        """Draw the loops of all tests, measured and fitted, into axes or a new figure."""
+        return draw_loops(self.loops, ax)
+
+    def table(self: Joint) -> pd.DataFrame:
+        """Return a row for each parameter ("" for what is common) and test, SI.
+
+        `kind`, `scatter` and `b` are as in joint.json. The LaTeX of its `to_latex` compiles.
+        """
+        common = {n: p for n, p in self.parameters.items() if p.kind != "own"}
+        more = ("kind", "scatter", "b")
+        columns = {key: {n: getattr(p, key) for n, p in common.items()} for key in more}
+        frames = {"": frame(common, **columns)}
+        for test in self.tests:
+            own = {n: p for n, p in self.parameters.items() if p.tests and test in p.tests}
+            kinds = {name: p.kind for name, p in own.items()}
+            each = {name: p.estimate(test) for name, p in own.items()}
+            frames[test] = frame(each, kind=kinds, scatter={}, b={})
+        return stacked(frames, "test")
+
+    def __repr__(self: Joint) -> str:
+        """Return name, model, status and the common values."""
+        return joint_shown(self)
+
+    def _repr_html_(self: Joint) -> str:
+        return joint_shown(self, html=True)
+
+
+def joint_shown(found: Joint, *, html: bool = False) -> str:
+    """Return model, tests, status and the common values of a joint fit."""
+    line = f"{found.model} · {counted(len(found.tests), 'test')} together · status {found.status}"
+    rows = [
+        readable(name, p.estimate())
+        for name, p in found.parameters.items()
+        if p.kind != "fixed" and name not in NUISANCE
+    ]
+    return _shown(found.name, line, rows, html)

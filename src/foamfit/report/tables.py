@@ -1,0 +1,171 @@
+"""Tables of parameters for a paper: LaTeX with booktabs, and pandas."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from foamfit.report.readable import own_symbol, readable, readable_unit
+from foamfit.report.render import environment
+from foamfit.results import ParameterEstimate
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_NAMES = (
+    r"\alpha \beta \gamma \delta \varepsilon \zeta \eta \theta \kappa \lambda \mu \nu \xi \pi "
+    r"\rho \sigma \tau \phi \chi \psi \omega \Gamma \Delta \Theta \Lambda \Xi \Pi \Sigma \Phi "
+    r"\Psi \Omega \mu "
+)
+_GREEK = zip("αβγδεζηθκλμνξπρστφχψωΓΔΘΛΞΠΣΦΨΩµ", re.findall(r"\S+ ", _NAMES), strict=True)
+_MATH = dict(_GREEK) | {
+    "−": "-", "·": r"\cdot ", "±": r"\pm ", "²": "^2", "³": "^3", "₀": "_0", "₊": "_+", "₋": "_-",
+}  # fmt: skip
+_TEXT = {letter: f"${name.strip()}$" for letter, name in _MATH.items()}
+_TEXT |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
+_TEXT |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+_TEXT |= {"–": "--", "…": r"\dots{}"} | {letter: f"${letter}$" for letter in "<>|"}
+_TEXT |= {letter: f"{{{letter}}}" for letter in "[]*"}  # at the start of a row they are options
+_LAST_LETTER = "ſ"  # that pdfLaTeX sets without further packages
+
+
+def escaped(told: object) -> str:
+    """Return a text as LaTeX sets it; "?" stands for a letter that its fonts lack."""
+    letters = (c if c.isprintable() else " " for c in str(told))
+    return "".join(_TEXT.get(c, c if c <= _LAST_LETTER else "?") for c in letters)
+
+
+def formula(pair: tuple[str, str]) -> str:
+    """Return a symbol and its index as LaTeX: `$k_{0,1}$`."""
+    stem, index = pair
+    if len(stem) > 2:  # the name of a parameter that has no symbol
+        return rf"$\mathrm{{{escaped(stem)}}}$"
+    stem = "".join(_MATH.get(c, c) for c in stem).strip()
+    index = "".join(_MATH.get(c, c) for c in index).strip()
+    return f"${stem}_{{{re.sub(r'[a-z]{2,}', roman, index)}}}$" if index else f"${stem}$"
+
+
+def roman(word: re.Match[str]) -> str:
+    """Return a word in a formula, upright."""
+    return rf"\mathrm{{{word[0]}}}"
+
+
+def numbers(told: str) -> str:
+    """Return "5.50 ± 0.01" or "1 to 2" as LaTeX."""
+    told = re.sub(r"e([-+]?)0*(\d+)", r"\\times 10^{\1\2}", told.replace("−", "-")).replace(
+        "{+", "{"
+    )
+    told = re.sub(r"(\S+) ± (\S+times \S+)", r"\1 \\pm (\2)", told)
+    return " to ".join(f"${one.replace('±', chr(92) + 'pm')}$" for one in told.split(" to ") if one)
+
+
+def parameters_tex(parameters: Mapping[str, ParameterEstimate], **more: Any) -> str:
+    """Return table.tex of a fit: a row for each parameter that is not held at zero.
+
+    `more` may hold `kinds` and `between` of a joint fit, by the name of the parameter.
+    """
+    shown = {n: p for n, p in parameters.items() if p.state != "fixed" or p.value}
+    rows = list(zip(_symbols(shown), itertools.starmap(readable, shown.items()), strict=True))
+    return _tex("parameters", rows=rows, **({"kinds": {}, "between": {}} | more))
+
+
+def by_test(
+    tests: Sequence[str], parameters: Mapping[str, Sequence[ParameterEstimate | None]]
+) -> dict[str, Any]:
+    """Return heads and rows of a table: a row for each test, for each parameter a column."""
+    heads, cells = [], []
+    for own, (name, each) in zip(_symbols(parameters), parameters.items(), strict=True):
+        factor, unit = unit_of_all(each)
+        heads.append((own, unit))
+        cells.append([one and readable(name, one, (factor, unit)) for one in each])
+    return {"heads": heads, "rows": list(zip(tests, *cells, strict=True))}
+
+
+def by_test_tex(first: str, table: Mapping[str, Any]) -> str:
+    """Return a table of `by_test` as LaTeX; `first` is the head of its first column."""
+    return _tex("by_test", first=first, **table)
+
+
+def _symbols(names: Iterable[str]) -> list[tuple[str, str]]:
+    """Return the symbols of parameters, without the spring where there is only one."""
+    names = list(names)
+    springs = 1 + any(name.startswith("s2_") for name in names)
+    return [own_symbol(name, springs) for name in names]
+
+
+def unit_of_all(each: Iterable[ParameterEstimate | None]) -> tuple[float, str]:
+    """Return factor and name of the unit in which the values of several tests read well."""
+    there = [one for one in each if one is not None and np.isfinite(one.value)]
+    known = [one for one in there if one.state != "not determined"] or there
+    size = float(np.median([abs(one.value) for one in known])) if known else 0.0
+    return readable_unit(size, there[0].unit if there else "")
+
+
+def _tex(name: str, **values: Any) -> str:
+    values |= {"version": version("foamfit"), "tex": escaped, "formula": formula}
+    return environment().get_template(f"{name}.tex").render(numbers=numbers, **values)
+
+
+def frame(parameters: Mapping[str, Any], **more: Mapping[str, Any]) -> pd.DataFrame:
+    """Return a row for each parameter, SI; `more` are further columns by the name of parameters."""
+    made: pd.DataFrame = _frame_type()(_rows(parameters, more))
+    return made.set_index("parameter")
+
+
+def _rows(parameters: Mapping[str, Any], more: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    for own, (name, p) in zip(_symbols(parameters), parameters.items(), strict=True):
+        ends = (*(p.ci95 or (None, None)), *(getattr(p, "range", None) or (None, None)))
+        spans = zip(("ci95_low", "ci95_high", "range_low", "range_high"), ends, strict=True)
+        row = {"parameter": name, "symbol": formula(own), "value": p.value}
+        row |= {"stderr": p.stderr, **dict(spans), "systematic": getattr(p, "systematic", None)}
+        numbers = {key: _number(one) for key, one in row.items()}
+        others = {key: _number(values.get(name)) for key, values in more.items()}
+        yield numbers | others | {"unit": getattr(p, "unit", ""), "state": p.state}
+
+
+def _number(value: object) -> object:
+    return np.nan if value is None else value
+
+
+def stacked(frames: Mapping[Any, pd.DataFrame], name: str) -> pd.DataFrame:
+    """Return tables of several tests below each other."""
+    import pandas as pd
+
+    made: pd.DataFrame = _frame_type()(pd.concat(frames, names=[name]))
+    return made
+
+
+@functools.cache
+def _frame_type() -> Any:
+    import pandas as pd
+
+    class Table(pd.DataFrame):
+        """A table whose LaTeX compiles: names are escaped, symbols are formulas."""
+
+        @property
+        def _constructor(self) -> Any:
+            return Table
+
+        def to_latex(self, *args: Any, **options: Any) -> Any:
+            """Return the table as LaTeX with booktabs; arguments as those of pandas."""
+            texts = self.columns.difference(["symbol"])
+            plain = pd.DataFrame(self).assign(
+                **{name: self[name].map(_cell) for name in texts if self[name].dtype.kind in "OT"}
+            )
+            plain = plain.rename(index=_cell, columns=_cell).rename_axis(
+                index=[escaped(one or "") for one in plain.index.names]
+            )
+            chosen: Any = {"multirow": False, "na_rep": "--"} | options
+            return plain.to_latex(*args, **chosen)
+
+    return Table
+
+
+def _cell(value: object) -> object:
+    return escaped(value) if isinstance(value, str) else value

@@ -1,0 +1,172 @@
+"""A result folder read back: what `foamfit.load` returns."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import lmfit
+import numpy as np
+
+from foamfit.api import FitResult
+from foamfit.arrays import Array
+from foamfit.codec import build, decode
+from foamfit.errors import InputError
+from foamfit.files import read_whole, reason
+from foamfit.report.folder import load_result
+from foamfit.report.samples import FILE as SAMPLES
+from foamfit.report.samples import read_samples
+from foamfit.report.shown import JointViews
+from foamfit.report.studies.batch import read_table
+from foamfit.results import KEPT, Loop
+from foamfit.study.cycles import CycleFits
+from foamfit.study.joint_result import JointParameter
+from foamfit.trust.identifiability import Insight
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def load(folder: str | Path) -> FitResult | SavedJoint | CycleFits | pd.DataFrame:
+    """Return what was saved in a result folder.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The folder of a fit, of a joint fit, of cycles or of a batch.
+
+    Returns
+    -------
+    FitResult, SavedJoint, CycleFits or pandas.DataFrame
+        The same as was saved; of a batch its summary, as `foamfit.batch` returns it. A fit has no
+        `insight`, so that a report that is saved anew has no section on the information.
+
+    Raises
+    ------
+    InputError
+        If there is no result of this version's format, or a file of it is damaged.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise InputError(f"{folder} is no folder; name a result folder that foamfit has written")
+    if (place / "joint.json").is_file():
+        return _joint(place)
+    if (place / "cycles.json").is_file():
+        return _cycles(place)
+    if (place / "summary.csv").is_file():
+        return read_table(place / "summary.csv")
+    return _fit(place)
+
+
+def _fit(folder: Path) -> FitResult:
+    """Read fit.json and curves.csv."""
+    content = load_result(folder)
+    if not isinstance(content.get("load"), Mapping):
+        raise InputError(
+            f"{folder / 'fit.json'} is of foamfit {content.get('foamfit')}, which did not keep all "
+            "that load needs; fit the test again"
+        )
+    kept = content | content["load"]
+    columns = _columns(folder / "curves.csv", kept.get("samples"))
+    try:
+        given = {name: kept[name] for name in KEPT if name in kept}
+        result: FitResult = build(FitResult, given, columns, lmfit=lmfit, Insight=Insight)
+        result.draws.update(read_samples(folder / SAMPLES))
+        return result
+    except KeyError as error:
+        why = f"{error} is missing"
+    except (TypeError, ValueError, AttributeError) as error:
+        why = str(error)
+    raise InputError(f"{folder}: fit.json and curves.csv cannot be read back: {why}")
+
+
+def _columns(path: Path, samples: object) -> dict[str, Array]:
+    """Read curves.csv, which must have so many rows."""
+    try:
+        head, *lines = read_whole(path).decode(errors="replace").splitlines() or [""]
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {reason(error)}") from None
+    if len(lines) != samples:
+        raise InputError(f"{path} is damaged: it has {len(lines)} rows of {samples}")
+    names = next(csv.reader([head]), [])
+    try:
+        values = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.empty((0, len(names)))
+        return dict(zip(names, values.T, strict=True))
+    except ValueError as error:
+        raise InputError(f"{path} is damaged: {str(error).partition(';')[0]}") from None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SavedJoint(JointViews):
+    """A joint fit read back.
+
+    Attributes
+    ----------
+    name, model, status, warnings, sentences
+        As joint.json has them.
+    tests : tuple of str
+        Names of the tests.
+    rates, rate0
+        Mean strain rate on loading of each, and of the median test, 1/s; None where unknown.
+    parameters : dict of str to JointParameter
+        SI; values by test are in `tests` of each.
+    results : dict of str to FitResult
+        The result of each test at the joint fit.
+    content : dict
+        All of joint.json.
+    """
+
+    name: str
+    model: str
+    status: str
+    warnings: tuple[str, ...]
+    sentences: tuple[str, ...]
+    tests: tuple[str, ...]
+    rates: tuple[float | None, ...]
+    rate0: float | None
+    parameters: dict[str, JointParameter]
+    results: dict[str, FitResult]
+    content: dict[str, Any]
+
+    @property
+    def loops(self) -> tuple[Loop, ...]:
+        """The loop of each test, measured and fitted."""
+        found = ((name, one.loop) for name, one in self.results.items())
+        return tuple(loop._replace(name=name) for name, loop in found if loop is not None)
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content of joint.json."""
+        return self.content
+
+
+def _joint(folder: Path) -> SavedJoint:
+    """Read joint.json and the folders of its tests."""
+    content = load_result(folder / "joint.json")
+    try:
+        tests = content["tests"]
+        given = content | {
+            "tests": list(tests),
+            "rates": [one["rate"] for one in tests.values()],
+            "content": content,
+            "results": {},
+        }
+        made: SavedJoint = build(SavedJoint, given, {})
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{folder / 'joint.json'} is damaged: {error!r}") from None
+    made.results.update({name: _fit(folder / name) for name in made.tests})
+    return made
+
+
+def _cycles(folder: Path) -> CycleFits:
+    """Read cycles.json and the folders of its cycles."""
+    content = load_result(folder / "cycles.json")
+    try:
+        names = content["fitted"]
+        refused = decode(dict[int, str], content["refused"], {})
+        given = content["test"], content["model"], tuple(content["recorded"])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{folder / 'cycles.json'} is damaged: {error!r}") from None
+    return CycleFits(*given, {n: _fit(folder / f"cycle-{n}") for n in names}, refused)

@@ -1,0 +1,81 @@
+"""What is known of a parameter before the fit counts as one residual."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+import foamfit as ff
+from conftest import synthetic_impact
+
+OPTIONS = {"model": "bistable", "starts": 2, "intervals": "local"}
+
+
+@pytest.fixture(scope="module")
+def impact() -> ff.Measurement:
+    return synthetic_impact(samples=201)[1]
+
+
+def test_a_prior_draws_the_value_and_narrows_the_interval(impact: ff.Measurement) -> None:
+    alone = ff.fit(impact, **OPTIONS).parameters["s1_k0"]
+    sigma = 0.5 * alone.stderr
+    mean = alone.value + 3.0 * sigma
+    result = ff.fit(impact, priors={"s1_k0": (mean, sigma)}, **OPTIONS)
+    found = result.parameters["s1_k0"]
+    weight = (sigma / alone.stderr) ** -2
+    # as independent normal distributions combine, as far as the residual is linear
+    assert found.value == pytest.approx((alone.value + weight * mean) / (1.0 + weight), rel=0.02)
+    assert found.stderr == pytest.approx(math.hypot(1 / sigma, 1 / alone.stderr) ** -1, rel=0.05)
+    assert result.to_json_dict()["priors"] == {"s1_k0": [mean, sigma]}
+    assert any(note.startswith("Prior of s1_k0: ") for note in result.notes)
+    free = ff.fit(impact, priors={"s1_k0": f"{mean / 1e6} ± 1e9 MPa"}, **OPTIONS)
+    assert free.parameters["s1_k0"].value == pytest.approx(alone.value, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("s1_k", (1.0, 2.0), "s1_k is not one of the model bistable"),
+        ("s1_k0", (5e6, -1e5), "positive standard deviation"),
+        ("s1_k0", "5 MPa", "positive standard deviation"),
+        ("s1_k0", "5 ± -1 MPa", "must not be negative"),
+        ("s1_k0", "5.5 ± 0.1 mm", "of another kind"),
+        ("s1_k0", 5e6, "positive standard deviation"),
+        ("site_eta", "1 ± 0.1 Pa s", "is held fixed"),
+        ("velocity", "2 ± 0.1 m/s", "its ± in the TOML"),
+    ],
+)
+def test_a_wrong_prior_is_refused_in_one_sentence(impact, name, value, words) -> None:
+    with pytest.raises(ff.InputError, match=words) as caught:
+        ff.fit(impact, priors={name: value}, **OPTIONS)
+    assert "\n" not in str(caught.value)
+
+
+def test_priors_belong_to_one_model(impact: ff.Measurement) -> None:
+    with pytest.raises(ff.InputError, match="priors belong to one model"):
+        ff.fit(impact, model="auto", priors={"s1_k0": (1.0, 1.0)})
+    with pytest.raises(ff.InputError, match="priors must be a mapping"):
+        ff.fit(impact, priors=[1.0], **OPTIONS)
+
+
+def test_the_toml_may_have_priors(impact: ff.Measurement, tmp_path: Path) -> None:
+    rows = zip(impact.time, impact.stress, impact.displacement, strict=True)
+    lines = ["time (s),stress (Pa),displacement (m)", *(f"{t},{s},{u}" for t, s, u in rows)]
+    toml = (
+        '[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n'
+        '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n[priors]\ns1_k0 = '
+    )
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.csv").write_text("\n".join(lines))
+        (tmp_path / f"{name}.toml").write_text(toml + '"4 ± 0.001 MPa"\n')
+    result = ff.fit(ff.read_test(tmp_path / "a.csv"), **OPTIONS)
+    assert result.parameters["s1_k0"].value == pytest.approx(4e6, rel=2e-3)
+    study = tmp_path / "study.toml"
+    study.write_text('name = "x"\ntests = ["*.csv"]\nmodel = "bistable"\n')
+    with pytest.raises(ff.InputError, match="a joint fit takes none"):
+        ff.joint(study, jobs=1)
+    (tmp_path / "a.toml").write_text(toml + "4e6\n")
+    with pytest.raises(ff.InputError, match=r"\[priors\] s1_k0 = 4000000.0 must be a text"):
+        ff.read_test(tmp_path / "a.csv")

@@ -1,0 +1,413 @@
+"""A material card: its curves, its unloading, its text as others read it, and what it loses."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import fabricated
+import foamfit as ff
+from conftest import DATA, needs_data, thinned
+from foamfit.cards import replay
+from foamfit.cards.card import FORMATS, UNITS
+from foamfit.cards.curves import Curves
+from foamfit.cli import main
+
+HEIGHT, AREA, MASS = 10e-3, 5e-5, 1.1e-4  # 220 kg/m³
+LAW: dict[str, float] = {
+    "k0": 4.4e5, "kc": 4.9e5, "eps_star": 0.29, "sigma_plus": 1.06e5, "spread_plus": 0.44,
+    "sigma_minus": 7.9e4, "spread_minus": 0.7, "eta": 20.0, "g1": 0.3, "tau1": 0.25,
+}  # fmt: skip
+TOP, NOISE = 0.6, 300.0
+# Pa, 1/s and kg/m³ of one unit of stress, strain rate and density.
+SI = {"kg-mm-ms": (1e9, 1e3, 1e9), "t-mm-s": (1e6, 1.0, 1e12), "SI": (1.0, 1.0, 1.0)}
+
+
+def write_fit(
+    folder: Path, rate: float, b: float = 0.0, top: float = TOP, **changed: Any
+) -> dict[str, Any]:
+    """Write the folder of a fit to a triangular test: the law itself, and noise; its fit.json.
+
+    The snap stresses go with the rate to the power b.
+    """
+    values = LAW | {name: LAW[name] * rate**b for name in ("sigma_plus", "sigma_minus")}
+    *own, g, tau = values.values()
+    spring = ff.MicroscaleSpring(*own, relaxation=[(g, tau)])
+    time = np.linspace(0.0, 2.0 * top / rate, 401)
+    strain = rate * np.minimum(time, time[-1] - time)
+    drive = ff.DisplacementDrive(strain * HEIGHT)
+    fitted = ff.simulate(ff.Chain([spring], [HEIGHT], AREA), drive, time).base_stress
+    measured = fitted + NOISE * np.random.default_rng(0).standard_normal(time.size)
+    content: dict[str, Any] = {
+        "schema": 1, "foamfit": "", "test": "a foam", "model": "microscale", "relaxation": 1,
+        "drive": "displacement", "status": "ok", "data": {"rate": rate},
+        "specimen": {"height": HEIGHT, "area": AREA, "mass": MASS, "heights": None},
+        "misfit": {"stress_strain": float(np.std(fitted - measured) / np.ptp(measured))},
+        "parameters": {f"s1_{name}": {"value": one, "vary": True} for name, one in values.items()},
+    }  # fmt: skip
+    content |= changed
+    folder.mkdir(parents=True)
+    (folder / "fit.json").write_text(json.dumps(content))
+    np.savetxt(
+        folder / "curves.csv", np.transpose([time, measured, fitted, strain * HEIGHT]), comments="",
+        delimiter=",", header="time (s),measured stress (Pa),"
+        "stress along measured displacement (Pa),measured displacement (m)",
+    )  # fmt: skip
+    return content
+
+
+@pytest.fixture(scope="module")
+def fit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("fits") / "foam"
+    write_fit(folder, 0.25)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def joint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three tests whose snap stresses follow a law of rate."""
+    folder, b = tmp_path_factory.mktemp("joint") / "study", 0.08
+    rates = {"slow": 0.01, "middle": 1.0, "fast": 100.0}
+    tests = {name: write_fit(folder / name, rate, b) for name, rate in rates.items()}
+    parameters = {
+        f"s1_{name}": {"kind": "power rate", "value": value, "b": b}
+        if name.startswith("sigma")
+        else {"kind": "shared", "value": value}
+        for name, value in LAW.items()
+    }
+    content = {name: tests["middle"][name] for name in ("schema", "foamfit", "model", "drive")}
+    content |= {"name": "rates", "relaxation": 1, "status": "ok", "rate0": 1.0}
+    content |= {"parameters": parameters}
+    content["tests"] = {
+        name: {"rate": rate, "drive": "displacement", "misfit": tests[name]["misfit"]}
+        for name, rate in rates.items()
+    }
+    (folder / "joint.json").write_text(json.dumps(content))
+    return folder
+
+
+# ------------------------------------------------------------------------------- curves
+
+
+def test_loading_curves_are_those_of_the_law_and_fit_for_a_solver(joint: Path) -> None:
+    card = ff.card(joint, format="csv", rates=(0.001, 0.01, 1, 10, 100, 1e4))
+    curves = card.curves
+    assert curves.measured_to == pytest.approx(TOP)
+    assert np.all(curves.stress[:, 0] == 0.0)
+    assert curves.strain[0] == 0.0
+    assert np.all(np.diff(curves.strain) > 0.0)
+    assert np.all(np.diff(curves.stress) > 0.0)
+    assert np.all(np.diff(curves.stress, axis=0) >= 0.0)  # none crosses
+    assert curves.strain[-1] > 0.85
+    np.testing.assert_array_equal(curves.stress[0], curves.stress[1])  # clamped
+    np.testing.assert_array_equal(curves.stress[-1], curves.stress[-2])
+    assert sum("outside the fitted rates" in one for one in card.warnings) == 2
+    # At a rate between the fitted ones: simulated here, and read between the points of the card.
+    sigma = [LAW[name] * 10.0**0.08 for name in ("sigma_plus", "sigma_minus")]
+    values = LAW | dict(zip(("sigma_plus", "sigma_minus"), sigma, strict=True))
+    *own, g, tau = values.values()
+    chain = ff.Chain([ff.MicroscaleSpring(*own, relaxation=[(g, tau)])], [1.0], 1.0)
+    strain = np.linspace(0.0, 0.85, 3001)
+    law = ff.simulate(chain, ff.DisplacementDrive(strain), strain / 10.0).base_stress
+    read = np.interp(strain, curves.strain, curves.stress[3])
+    beyond = strain > 0.01  # where the jump of the dashpot is spread
+    assert np.abs(read - law)[beyond].max() < 2e-3 * curves.stress[3].max()
+
+
+def test_a_curve_ends_where_the_foam_is_solid(tmp_path: Path) -> None:
+    elastic = {
+        f"s1_{n}": {"value": v, "vary": True} for n, v in (LAW | {"sigma_plus": 1e9}).items()
+    }
+    write_fit(tmp_path / "elastic", 0.25, top=0.3, parameters=elastic)
+    curves = ff.card(tmp_path / "elastic", format="mat083").curves
+    assert curves.strain[curves.measured - 1] == curves.measured_to == 0.3
+    assert 9.5 < curves.stress.max() / curves.stress[0, curves.measured - 1] <= 10.0
+    assert curves.strain[-1] < 0.9
+
+
+# ------------------------------------------------------------------------------- unloading
+
+
+def replayed(style: str, strain: np.ndarray, unloading: replay.Unloading) -> np.ndarray:
+    """A card of one curve, σ = ε² MPa, along a strain in steps of a second."""
+    x = np.linspace(0.0, 1.0, 4001)
+    curves = Curves(np.array([1e-3]), x, 1e6 * x[None] ** 2, 1.0)
+    first = strain >= np.maximum.accumulate(strain)
+    motion = replay.Motion(strain, np.gradient(strain), first)
+    return replay.REPLAYS[style](curves, motion)(unloading)
+
+
+def test_unloading_follows_the_formula_of_the_solvers() -> None:
+    hu, shape, expon = unloading = replay.Unloading(0.1, 1.7, 0.6)
+    down, up = np.linspace(0.8, 0.2, 61), np.linspace(0.2, 0.9, 71)[1:]
+    strain = np.concatenate([np.linspace(0.0, 0.8, 81), down[1:], up])
+    # W goes with ε³.
+    share = 1.0 - (1.0 - hu) * (1.0 - (down / 0.8) ** (3.0 * shape)) ** expon
+    dyna = replayed("mat083", strain, unloading)
+    np.testing.assert_allclose(dyna[80:141], 1e6 * share * down**2, rtol=1e-4)
+    np.testing.assert_allclose(dyna[141:200], dyna[139:80:-1], rtol=1e-6)  # and back
+    np.testing.assert_allclose(dyna[201:], 1e6 * strain[201:] ** 2, rtol=1e-4)
+    radioss = replayed("law90", strain, unloading)
+    np.testing.assert_allclose(radioss[81:140], dyna[81:140], rtol=2e-3)
+    np.testing.assert_allclose(radioss[142:], 1e6 * strain[142:] ** 2, rtol=1e-4)  # jumps
+
+
+@pytest.mark.parametrize("style", FORMATS)
+def test_the_unloading_of_a_card_is_found_again(style: str) -> None:
+    strain = np.concatenate([np.linspace(0.0, 1.0, 101), np.linspace(1.0, 0.0, 101)[1:]])
+    true = replay.Unloading(0.15, 2.3, 1.0 if style == "mat057" else 0.7)
+    target = replayed(style, strain, true)
+    found = replay.fit_unloading(
+        [lambda one: replayed(style, strain, one)], [target], expon=style != "mat057"
+    )
+    np.testing.assert_allclose(found, true, rtol=1e-3)
+
+
+def test_what_the_card_loses_is_said(fit: Path, joint: Path) -> None:
+    """On the law's own record the fit leaves the noise, three parameters more, two more again."""
+    losses = {}
+    for style in FORMATS:
+        card = ff.card(fit, format=style)
+        assert card.misfit["fit"] == pytest.approx(NOISE / np.ptp(card.records[0].stress), rel=0.1)
+        assert 0.0 < card.unloading.HU <= 1.0
+        losses[style] = card.misfit["card"]
+        one = card.records[0]
+        rms = np.sqrt(np.mean((one.card - one.stress) ** 2)) / np.ptp(one.stress)
+        assert losses[style] == pytest.approx(rms)
+    assert card.misfit["fit"] < losses["mat083"] < losses["mat057"] < 0.05
+    assert ff.card(fit, format="mat057").unloading.EXPON == 1.0
+    many = {style: ff.card(joint, format=style) for style in FORMATS}
+    assert many["mat083"].misfit["card"] < 0.04
+    assert len(many["mat057"].curves.rates) == 1
+    assert any("no strain rate" in one for one in many["mat057"].warnings)
+
+
+@needs_data
+def test_on_real_foam_three_parameters_lose_little_and_two_more(tmp_path: Path) -> None:
+    toml = tmp_path / "foam.toml"
+    toml.write_text('[specimen]\nheight = "10.53 mm"\ndiameter = "7.63 mm"\n')
+    file = thinned(DATA / "shoe-foam" / "turbo-comp-1_cycle1.csv", tmp_path, 4)
+    fit = ff.fit(ff.read_test(file, toml), model="microscale", relaxation=1, starts=3)
+    three, two = (ff.card(fit, format=style) for style in ("mat083", "mat057"))
+    assert fit.misfit["stress_strain"] < 0.007
+    assert three.misfit["card"] < 0.012
+    assert 1.2 * three.misfit["card"] < two.misfit["card"] < 0.02
+    # The loss is at the turn, where the foam relaxes and a card does not.
+    one = three.records[0]
+    off = (one.card - one.stress)[one.strain < one.strain.max() - 0.01]
+    assert np.sqrt(np.mean(off**2)) / np.ptp(one.stress) < 0.009
+
+
+# ------------------------------------------------------------------------------- texts
+
+
+def fixed(line: str, width: int = 10) -> list[str]:
+    return [line[i : i + width].strip() for i in range(0, len(line), width)]
+
+
+def dyna_blocks(text: str) -> Iterator[tuple[str, list[str]]]:
+    """Keywords of an LS-DYNA deck with their data lines."""
+    lines = [line for line in text.splitlines() if not line.startswith("$")]
+    starts = [i for i, line in enumerate(lines) if line.startswith("*")]
+    for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
+        yield lines[start], lines[start + 1 : end]
+
+
+def points(lines: list[str]) -> np.ndarray:
+    return np.array([[float(cell) for cell in fixed(line, 20)] for line in lines]).T
+
+
+@pytest.mark.parametrize("units", UNITS)
+def test_ls_dyna_reads_the_card(joint: Path, units: str) -> None:
+    card = ff.card(joint, format="mat083", units=units, rates=(0.02, 3, 80))
+    pa, per_second, dense = SI[units]
+    assert all(len(line) <= 80 for line in card.text.splitlines())
+    assert card.text.isascii()
+    assert "\n\n" not in card.text
+    blocks = list(dyna_blocks(card.text))
+    names = [name for name, _ in blocks]
+    assert names == ["*KEYWORD", "*MAT_083", "*DEFINE_TABLE", *["*DEFINE_CURVE"] * 3, "*END"]
+    first, second, third, fourth, fifth = map(fixed, blocks[1][1])
+    mid, ro, e, kcon, tc, _, _, tbid = first  # MID RO E KCON TC FAIL DAMP TBID
+    assert (int(mid), float(tc)) == (1, 1e20)
+    assert float(ro) * dense == pytest.approx(MASS / (AREA * HEIGHT), rel=1e-3)
+    slopes = np.diff(card.curves.stress) / np.diff(card.curves.strain)
+    assert float(e) * pa == pytest.approx(slopes[:, : card.curves.measured - 1].max(), rel=1e-3)
+    assert float(kcon) * pa == pytest.approx(slopes.max(), rel=1e-3)
+    # BVFLAG SFLAG RFLAG TFLAG PVID SRAF REF HU; …; C3 … MAXR SHAPE; EXPON RIULD
+    assert [float(cell) for cell in second[:7]] == [0, 1, 0, 0, 0, 0, 0]
+    read = [float(cell) for cell in (second[7], fourth[7], fifth[0])]
+    np.testing.assert_allclose(read, card.unloading, rtol=1e-5)
+    assert not any(float(cell) for cell in (*third, *fourth[:7], fifth[1]))
+    table, *rates = blocks[2][1]
+    assert fixed(table)[0] == tbid
+    np.testing.assert_allclose([float(one) * per_second for one in rates], [0.02, 3, 80], rtol=1e-6)
+    ids = set()
+    for (_, (head, *lines)), stress in zip(blocks[3:6], card.curves.stress, strict=True):
+        ids.add(fixed(head)[0])
+        strain, read_stress = points(lines)
+        np.testing.assert_allclose(strain, card.curves.strain, rtol=1e-6)
+        np.testing.assert_allclose(read_stress * pa, stress, rtol=1e-6)
+    assert len({tbid, *ids}) == 4
+    assert card.text.count("extrapolated from here on") == 3
+
+
+def test_the_other_solvers_read_their_cards(joint: Path) -> None:
+    rates = (0.02, 3, 80)
+    single = ff.card(joint, format="mat057", rates=rates)
+    blocks = list(dyna_blocks(single.text))
+    first, second = map(fixed, blocks[1][1])  # MID RO E LCID TC HU BETA DAMP; SHAPE … KCON REF
+    assert (blocks[1][0], first[3], first[6]) == ("*MAT_057", "1001", "0.0")
+    read = [float(first[5]), float(second[0])]
+    np.testing.assert_allclose(read, single.unloading[:2], rtol=1e-5)
+    np.testing.assert_allclose(
+        points(blocks[2][1][1:])[1] * 1e9, single.curves.stress[0], rtol=1e-6
+    )
+
+    card = ff.card(joint, format="law90", rates=rates, units="t-mm-s")
+    lines = [line for line in card.text.splitlines() if not line.startswith("#")]
+    assert lines[2].split() == ["Mg", "mm", "s"]
+    at = lines.index("/MAT/LAW90/1/1")
+    head = lines[at + 4]  # NL Ismooth Fcut Shape Hys Alpha
+    assert fixed(head[:20]) == ["4", "1"]
+    _, shape, hu, alpha = (float(cell) for cell in fixed(head[20:], 20))
+    np.testing.assert_allclose([hu, shape, alpha], card.unloading, rtol=1e-6)
+    rows = [(int(row[:10]), float(row[10:30])) for row in lines[at + 5 : at + 9]]
+    assert [row[0] for row in rows] == [1001, 1002, 1003, 1003]  # clamped beyond the last
+    assert rows[3][1] > 1e3 * rows[2][1]
+    functions = [i for i, line in enumerate(lines) if line.startswith("/FUNCT/")]
+    stress = points(lines[functions[1] + 2 : functions[2]])[1]
+    np.testing.assert_allclose(stress * 1e6, card.curves.stress[1], rtol=1e-6)
+
+    card = ff.card(joint, format="abaqus", rates=(0.02, 3, 100, 1e4), units="SI")
+    body = card.text.partition("DIRECTION=COMPRESSION\n")[2].splitlines()
+    data = np.array([[float(x) for x in row.split(",")] for row in body if row[:2] != "**"])
+    stress, _, rate = data.T
+    assert np.all(np.diff(rate) >= 0.0)
+    assert list(np.unique(rate)) == [-0.02, 0.02, 3.0, 100.0]  # the clamped curve is left out
+    parts = [data[rate == one] for one in np.unique(rate)]
+    for part in parts:
+        assert np.all(np.diff(part[:, :2], axis=0) > 0.0)
+    for below, above in pairwise(parts):
+        assert np.all(below[1:, 0] < above[1:, 0])  # none meets another
+    np.testing.assert_allclose(parts[1][:, 0], card.curves.stress[0], rtol=1e-6)
+
+
+def test_a_reader_of_others_reads_the_ls_dyna_cards(joint: Path) -> None:
+    core = pytest.importorskip(
+        "ansys.dyna.core", reason="the reader is missing: pip install 'foamfit[cards]'"
+    )
+    for style in ("mat083", "mat057"):
+        card = ff.card(joint, format=style)
+        deck = core.Deck()
+        deck.loads(card.text)
+        assert not deck.string_keywords
+        material, *more = deck.keywords
+        assert material.ro * 1e9 == pytest.approx(MASS / (AREA * HEIGHT), rel=1e-3)
+        assert (material.hu, material.shape) == pytest.approx(card.unloading[:2], rel=1e-5)
+        curves = [one for one in more if one.subkeyword == "CURVE"]
+        assert len(curves) == len(card.curves.rates)
+        for one, stress in zip(curves, card.curves.stress, strict=True):
+            np.testing.assert_allclose(one.curves["o1"] * 1e9, stress, rtol=1e-6)
+        if style == "mat083":
+            assert material.expon == pytest.approx(card.unloading.EXPON, rel=1e-5)
+            assert more[0].tbid == material.tbid
+            np.testing.assert_allclose(np.array(more[0].points.data) * 1e3, card.curves.rates)
+        else:
+            assert curves[0].lcid == material.lcid
+
+
+def test_an_unknown_density_is_no_number(tmp_path: Path) -> None:
+    write_fit(tmp_path / "foam", 0.25, specimen={"height": HEIGHT, "area": AREA, "mass": None})
+    for style in ("mat083", "mat057", "law90", "abaqus"):
+        card = ff.card(tmp_path / "foam", format=style)
+        assert any("density" in one for one in card.warnings)
+        assert "DENSITY MISSING" in card.text
+        assert FORMATS[style][2] in card.text
+
+
+# ------------------------------------------------------------------------------- files, refusals
+
+
+def run(*args: object) -> Any:
+    return CliRunner().invoke(main, ["card", *map(str, args)])
+
+
+def test_the_command_writes_card_numbers_and_picture(
+    fit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = run(fit, "--format", "mat083", "--rates", "0.25,10")
+    assert done.exit_code == 0, done.output
+    assert "cards/a-foam-mat083.k" in done.output
+    names = ["a-foam-mat083.k", *(f"a-foam-mat083.k.{one}" for one in ("json", "pdf", "png"))]
+    assert sorted(path.name for path in Path("cards").iterdir()) == names
+    told = json.loads(Path("cards", names[1]).read_text())
+    assert list(told) == ["format", "misfit", "parameters", "curves", "warnings"]
+    assert list(told["parameters"]) == ["HU", "SHAPE", "EXPON"]
+    assert list(told["curves"][0]) == ["rate", "strain", "stress", "measured_to"]
+    assert "10 1/s lies outside the fitted rates" in told["warnings"][0]
+    assert f"{100 * told['misfit']['card']:.2g} %" in done.output
+    rows = np.genfromtxt(
+        ff.card(fit, format="csv", units="SI").text.splitlines()[1:], delimiter=","
+    )
+    np.testing.assert_allclose(rows[:, 2], told["curves"][0]["stress"])
+    assert np.all(rows[:, 3] == (rows[:, 1] > TOP))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["--format", "mat084"], "format = 'mat084' is unknown"),
+        (["--format", "mat083", "--units", "inch"], "units = 'inch' is unknown"),
+        (["--format", "mat083", "--rates", "1,-2"], "rates = 1,-2 must be positive"),
+        (["--format", "mat083", "--rates", "fast"], "rates = fast must be positive"),
+        (["--format", "mat083", "--rates", "inf"], "rates = inf must be positive"),
+        (["--format", "csv", "--out", "no/such/card.csv"], "there is no folder"),
+        ([], "--format"),
+    ],
+)
+def test_a_wrong_call_is_one_sentence_and_writes_nothing(
+    fit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: list[str], words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = run(fit, *given)
+    assert done.exit_code == 1
+    assert words in done.output
+    assert done.output.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_result_without_a_card_is_refused(tmp_path: Path, fit: Path) -> None:
+    linear = {"s1_k0": {"value": 1e6, "vary": True}}
+    write_fit(tmp_path / "linear", 0.25, model="linear", relaxation=0, parameters=linear)
+    write_fit(tmp_path / "older", 0.25, specimen=None)
+    for result, words in (
+        (tmp_path / "linear", "has no hysteretic spring"),
+        (tmp_path / "older", "has no height of the specimen"),
+        (tmp_path / "nothing", "is not a result folder"),
+    ):
+        done = run(result, "--format", "mat083", "--out", tmp_path / "card.k")
+        assert (done.exit_code, done.output.count("\n")) == (1, 1)
+        assert words in done.output
+    done = run(fit, "--format", "csv", "--out", fit / "card.csv")
+    assert done.exit_code == 1
+    assert "lies in a result" in done.output
+    assert not list(tmp_path.glob("card*"))
+    with pytest.raises(ff.InputError, match="rates"):
+        ff.card(fit, format="csv", rates=0.0)
+
+
+def test_a_result_in_memory_gives_the_card_of_its_folder(tmp_path: Path) -> None:
+    made = fabricated.microscale_result()
+    made.save(tmp_path / "fit", report=False)
+    first, second = (ff.card(one, format="mat083") for one in (made, tmp_path / "fit"))
+    assert first.text == second.text
+    assert first.to_json_dict() == second.to_json_dict()
