@@ -109,6 +109,13 @@ def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(result_folder, "render_report", lambda *_, **__: "")
 
 
+def few_bytes(figure: object, place: Path, *_: object) -> bytes:
+    """Write what stands for a PNG and a PDF of a study."""
+    for suffix in (".png", ".pdf"):
+        place.with_suffix(suffix).write_bytes(b"\x89PNG")
+    return b"\x89PNG"
+
+
 @functools.cache
 def synthetic_impact(
     velocity: float = 2.0, noise: float = 0.01, seed: int = 0, eta: float = 0.0, samples: int = 401

@@ -233,5 +233,7 @@ def microscale_result(**changed: Any) -> FitResult:
 def no_figures() -> dict[str, Images | None]:
     """What stands for the figures of a report, of which drawing takes longest."""
     few = b"\x89PNG" + bytes(20)
-    there = {"fit": Images(few, 250, b"%PDF"), "shown": Images(few, 250)}
-    return there | {"residuals": Images(few, 250), "information": None, "profiles": None}
+    there = {"fit": Images(few, 250, b"%PDF")} | dict.fromkeys(
+        ("shown", "narrow", "residuals"), Images(few, 250)
+    )
+    return there | dict.fromkeys(("information", "snapping", "profiles"))

@@ -223,7 +223,7 @@ def test_the_terminal_is_one_screen_and_verbose_says_the_rest(
     monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: found)
     monkeypatch.setattr("foamfit.report.folder.save_result", lambda *_, **__: None)
     short = accepted("fit", RECONSTRUCTION).stdout
-    assert len(short.splitlines()) <= 30
+    assert len(short.splitlines()) <= 24
     assert "rows: 601 read, 601 used" in short
     assert "warning: s1_kh_minus is not determined" in short
     assert "note: Noise of stress" not in short

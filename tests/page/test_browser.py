@@ -150,6 +150,13 @@ def choose(page, *files):
     page.get_by_label("Drop a CSV").set_input_files(given)
 
 
+def press(button):
+    """Click after scrolling: in the same frame the click goes to the report that stood there."""
+    button.scroll_into_view_if_needed()
+    button.page.wait_for_timeout(300)
+    button.click()
+
+
 def load(page):
     choose(page, (TEST.name, TEST.read_text()), ("any.toml", TEST.with_suffix(".toml").read_text()))
     page.get_by_label("s1_k0", exact=True).wait_for()
@@ -169,8 +176,10 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     toml = TEST.with_suffix(".toml").read_text()
     toml = re.sub(r'name = ".*"', f"name = {json.dumps(name)}", toml)
     drop(page, (TEST.name, TEST.read_text()), ("t.toml", toml))
+    page.get_by_text("What is understood").click()
     api.expect(page.get_by_text(name).first).to_be_visible()
     assert page.title() == "foamfit"
+    page.get_by_text("What is understood").click()  # folds it again
     # The good test; a wrong quantity is marked.
     load(page)
     height = page.get_by_label("Specimen height")
@@ -209,7 +218,7 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     api.expect(report.get_by_text("s1_kc").first).to_be_visible(timeout=LATER)
     # Saved is what the command writes.
     with page.expect_download() as saved:
-        page.get_by_text("Save the result folder").click()
+        press(page.get_by_text("Save the result folder"))
     archive = zipfile.ZipFile(saved.value.path())
     assert {"fit.json", "report.html", "fit.png", "curves.csv", "test.toml"} <= {
         *archive.namelist()
@@ -246,7 +255,7 @@ def test_firefox_drops_fits_turns_and_saves(playwright, served, tmp_path):
         page.get_by_role("button", name="Fit", exact=True).click()
         report = page.frame_locator("iframe")
         api.expect(report.get_by_text("s1_kc").first).to_be_visible(timeout=LATER)
-        page.get_by_text("Save the report").click()
+        press(page.get_by_text("Save the report"))
         saved, end = tmp_path / "report.html", time.monotonic() + 20.0
         while not saved.is_file() or "</html>" not in saved.read_text():  # no event tells it
             assert time.monotonic() < end
@@ -273,6 +282,8 @@ def test_two_windows_do_not_mix(window, served):
     other.goto(served.address)
     load(window)
     other.get_by_label("Drop a CSV").wait_for()
+    for page in (window, other):
+        page.get_by_text("What is understood").click()  # opens it
     api.expect(other.get_by_text("There is no test yet.")).to_be_visible()
     api.expect(other.get_by_label("Specimen height")).to_have_value("")
     other.get_by_label("reconstruction").select_option("foam-1: model-1-2.0mps-reconstruction")

@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 import foamfit as ff
-from conftest import EXPERIMENTS, synthetic_impact, synthetic_loop, without_pictures
+from conftest import EXPERIMENTS, few_bytes, synthetic_impact, synthetic_loop, without_pictures
 from cycled import write_record
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Specimen
@@ -183,7 +183,7 @@ def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkey
     assert desk.command == f"foamfit fit synthetic.csv {' '.join(asked)}"
     assert "2 of 3 cycles fitted" in desk.told
     without_pictures(monkeypatch)
-    monkeypatch.setattr(cycles_report, "image", lambda *_: b"")
+    monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
     told = CliRunner().invoke(main, ["fit", str(record), *asked, "--json", f"--out={tmp_path}/r"])
     command = json.loads(told.stdout)["cycles"]
@@ -390,5 +390,9 @@ def test_ticks_say_what_a_fit_holds_and_varies():
     curves._moved(SimpleNamespace(data={"held": {"s1_k0": False, "site_eta": False}}))
     assert (set(curves.chosen()[0]), curves.chosen()[1]) == ({"s1_eta"}, ["site_eta"])
     # A chain holds its dashpots and varies the striker's by itself: the ticks say nothing else.
+    curves.found = {"s2_kc": {"ci95": [80e6, 85e6], "range": None}}
     curves.show(Turning(ff.read_test(TEST), "linear+bistable"))
+    bars = {r["name"]: r["interval"] for r in curves.sliders.rows if "interval" in r}
+    assert bars == {"s2_kc": [80.0, 85.0]}  # MPa, as its slider
+    assert not any("range" in row for row in curves.sliders.rows)
     assert curves.chosen() == ({}, [])

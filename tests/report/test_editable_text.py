@@ -50,7 +50,8 @@ def letters(pdf: bytes) -> set[str]:
             for line in re.findall(rb"<\w+> (?:<\w+> )?\[?(<[\w<> ]+>)", body):
                 for code in re.findall(rb"<(\w+)>", line):
                     found.add(bytes.fromhex(code.decode()).decode("utf-16-be"))
-            for first, last, code in re.findall(rb"<(\w+)> <(\w+)> <(\w+)>", body):
+            ranges = re.sub(rb"\[[^]]*\]", b"", body)  # those whose codes are not listed
+            for first, last, code in re.findall(rb"<(\w+)> <(\w+)> <(\w+)>", ranges):
                 span = int(last, 16) - int(first, 16)
                 found |= {chr(int(code, 16) + i) for i in range(span + 1)}
     return found

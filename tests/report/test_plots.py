@@ -18,6 +18,7 @@ from foamfit.errors import InputError
 from foamfit.report.figures import MOST_POINTS, STYLE, drawing, image, laid_out
 from foamfit.report.plots import origin_word, plot_fit, plot_residuals, plot_response
 from foamfit.report.readable import readable_unit
+from foamfit.report.snapping_plots import plot_snapping
 from foamfit.results import Switch
 
 
@@ -159,7 +160,8 @@ def test_a_panel_without_curves_is_left_out(missing: list[str], panels: list[str
 def test_the_loop_of_a_displacement_drive_without_time() -> None:
     result = with_curves(fabricated.result(drive="displacement"), time=None, displacement=None)
     switches = tuple(replace(s, time=None) for s in result.switches)
-    (loop,) = plot_fit(replace(result, switches=switches)).axes
+    loop, residual = plot_fit(replace(result, switches=switches)).axes
+    assert residual.get_xlabel() == "strain (–)"
     assert line(loop, "fitted") is not None
     assert {"a", "d", "c", "e", "A1"} <= set(texts(loop))
 
@@ -281,11 +283,27 @@ def test_readable_unit(size: float, unit: str, expected: tuple[float, str]) -> N
     assert readable_unit(size, unit) == expected
 
 
+def test_a_prescribed_motion_is_not_drawn_and_residuals_stand_below_large_curves() -> None:
+    result = fabricated.microscale_result()
+    figure = plot_fit(result, width="two, untitled")
+    loop, stress_time, *below = figure.axes
+    assert [ax.get_xlabel() for ax in figure.axes] == ["", "", "strain (–)", "time (s)"]
+    c = result.curves
+    off = 100 * (c.stress - c.measured_stress) / np.ptp(c.measured_stress)
+    for above, strip in zip((loop, stress_time), below, strict=True):
+        np.testing.assert_allclose(strip.lines[1].get_ydata(), off)
+        assert strip.get_xlim() == above.get_xlim()
+    with laid_out(figure):
+        sizes = [ax.get_position().size for ax in figure.axes]
+    assert np.prod(sizes[0]) > 1.3 * np.prod(sizes[1]) > 2.0 * np.prod(sizes[2])
+    assert figure.get_suptitle() == ""
+    assert "shoe foam" in plot_fit(result).get_suptitle()
+
+
 def test_a_microscale_loop_has_its_branches_and_medians() -> None:
     result = fabricated.microscale_result()
-    stress_time, displacement_time, loop = plot_fit(result).axes
+    loop, stress_time, _, _ = plot_fit(result).axes
     assert texts(stress_time) == ["σ₊", "σ₋"]
-    assert texts(displacement_time) == []  # nothing is simulated there
     assert texts(loop) == ["a", "c", "σ₊", "σ₋", "snap-through", "held", "snap-back"]
     marks = [line.get_xydata() for line in loop.lines if line.get_color() == "black"]
     for (strain, stress), median, up in zip(
@@ -304,7 +322,7 @@ def test_a_microscale_loop_that_does_not_reach_branch_c_is_drawn() -> None:
     far = replace(fabricated.MICRO, eps_star=0.9, relaxation=())
     chain = fabricated.Chain(springs=[far], heights=[fabricated.HEIGHT], area=fabricated.AREA)
     result = fabricated.microscale_result(chain=chain, relaxation=0)
-    loop = plot_fit(result).axes[-1]
+    loop = plot_fit(result).axes[0]
     assert "a" in texts(loop)
     assert "c" not in texts(loop)
 
@@ -318,7 +336,7 @@ def test_names_of_branches_stay_in_their_panel(k0: float) -> None:
     stress = np.asarray(spring.stress(strain))
     figure = plot_fit(with_curves(result, stress=stress, stress_along=stress))
     image(figure, "png", 100)
-    loop = figure.axes[-1]
+    loop = figure.axes[0]
     (name,) = (text for text in loop.texts if text.get_text() == "snap-through")
     assert name.get_window_extent().x0 >= loop.get_window_extent().x0
 
@@ -341,3 +359,19 @@ def test_a_long_line_is_drawn_through_what_can_be_seen() -> None:
         assert {3.0, -2.0} <= set(kept[:, 1])
     thin, whole = (imread(io.BytesIO(png))[..., :3] for png in pictures)
     assert np.mean(np.abs(thin - whole) > 0.1) < 0.002
+
+
+def test_the_fraction_snapped_is_drawn_over_time_and_in_pictures_of_the_foam() -> None:
+    result = fabricated.microscale_result()
+    figure = plot_snapping(result)
+    assert figure is not None
+    strip, below = figure.axes
+    fraction = result.snapping["s1"].fraction
+    np.testing.assert_allclose(line(below, "snapped").get_ydata(), 100 * fraction)
+    np.testing.assert_allclose(
+        line(below, "ever snapped").get_ydata(), 100 * np.maximum.accumulate(fraction)
+    )
+    whole, shaded = strip.patches[6:8]  # of the fourth of seven pictures, at the turn
+    assert whole.get_height() == pytest.approx(0.4, abs=0.004)  # of its height, at a strain of 60 %
+    assert shaded.get_height() / whole.get_height() == pytest.approx(fraction.max(), 0.01)
+    assert plot_snapping(fabricated.result()) is None

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 import foamfit as ff
-from conftest import DATA, EXPERIMENTS, needs_data, thinned, without_pictures
+from conftest import DATA, EXPERIMENTS, few_bytes, needs_data, thinned, without_pictures
 from cycled import FRESH, ONSETS, SETS, write_record
 from foamfit.cli import main
 from foamfit.report.studies import cycles as cycles_report
@@ -83,13 +83,14 @@ def test_ctrl_c_keeps_what_was_found(record, monkeypatch, at):
 def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
-    monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
+    monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
     folder = tmp_path / "out"
     found.results[1].save(folder)  # of a fit of one cycle
     found.save(folder)
     names = {path.name for path in folder.iterdir()}
     assert names == {
-        "cycle-1", "cycle-2", "cycle-3", "cycles.csv", "cycles.json", "cycles.png", "table.tex",
+        "cycle-1", "cycle-2", "cycle-3",
+        "cycles.csv", "cycles.json", "cycles.pdf", "cycles.png", "table.tex",
     }  # fmt: skip
     assert json.loads((folder / "cycle-2" / "fit.json").read_text())["data"]["cycle"] == 2
     with (folder / "cycles.csv").open(newline="") as file:
@@ -110,7 +111,7 @@ def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path,
 def test_what_foamfit_did_not_write_is_not_replaced(found, tmp_path, monkeypatch, place):
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
-    monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
+    monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
     found.save(tmp_path / "out")
     (tmp_path / "out" / place).write_text("mine")
     with pytest.raises(ff.InputError, match="did not write"):
@@ -170,7 +171,7 @@ def test_one_cycle_is_fitted_as_any_test(record, tmp_path, monkeypatch):
 def test_all_cycles_are_fitted_in_turn(record, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
-    monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
+    monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
     words = ("fit", record, "--cycle", "all", "--starts", 2, "--out", tmp_path / "out")
     result = run(*words, "--fix", "s1_kc=20e6")
     assert result.exit_code == 0
@@ -182,7 +183,7 @@ def test_all_cycles_are_fitted_in_turn(record, tmp_path, monkeypatch):
 def test_json_holds_every_cycle(record, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
-    monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
+    monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
     words = ("--starts", 1, "--json", "--out", tmp_path / "out")
     result = run("fit", record, "--cycle", "1,2", *words)
     assert result.exit_code == 0

@@ -623,7 +623,7 @@ def test_the_command_prints_json_and_nothing_else(tmp_path, monkeypatch, record,
 
 
 def pictures_of_a_few_bytes(monkeypatch):
-    monkeypatch.setattr(prediction_report, "image", lambda *_: b"\x89PNG" + bytes(20))
+    monkeypatch.setattr(prediction_report.figures, "image", lambda *_: b"\x89PNG" + bytes(20))
 
 
 def test_the_command_replaces_predictions_and_nothing_else(tmp_path, monkeypatch, record, result):
@@ -646,7 +646,7 @@ def test_a_prediction_that_cannot_be_drawn_leaves_nothing(tmp_path, monkeypatch)
     def fails(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(prediction_report, "image", fails)
+    monkeypatch.setattr(prediction_report.figures, "image", fails)
     found = ff.predict(InMemory(fit_content()), loop(seed=0), draws=DRAWS)
     with pytest.raises(InputError, match="No space left on device"):
         found.save(tmp_path / "out")

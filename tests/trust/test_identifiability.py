@@ -421,7 +421,7 @@ def test_the_picture_shows_every_parameter() -> None:
 def test_the_report_shows_them_too() -> None:
     result = concluded()
     page = render_report(result)
-    assert page.count("data:image/png;base64,") == 3
+    assert page.count("data:image/png;base64,") == 4  # the fit for a screen and for a phone
     for words in (
         "Checklist",
         "What the test determines",

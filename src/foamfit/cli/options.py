@@ -92,7 +92,8 @@ MORE = tuple(option(f"--{name}", freed.told) for name, freed in OPTIONS.items())
 PLOT = option("--plot", "Also draw a PNG, PDF or SVG.", FILE)
 WIDTH = option(
     "--figure-width",
-    'Width of figures: one column (3.25 in), two (7 in), or a length as "85 mm".',
+    'Width of figures: one column (3.25 in), two (7 in), or a length as "85 mm"; "two, untitled" '
+    "leaves titles out.",
     default="two",
     metavar="one|two|LENGTH",
     callback=_width,

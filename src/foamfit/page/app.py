@@ -19,7 +19,7 @@ import panel as pn
 
 from foamfit.errors import InputError, SimulationError
 from foamfit.page.curves import Curves, grid, misfits_text
-from foamfit.page.desk import BUSY, LARGEST, QUANTITIES, Checked, Desk
+from foamfit.page.desk import BUSY, FIRST, LARGEST, QUANTITIES, Checked, Desk
 from foamfit.page.fields import RELAXATIONS, Field
 from foamfit.page.first_use import FirstUse
 from foamfit.page.turning import Turning
@@ -78,10 +78,17 @@ class Window:
         self._outputs()
         self._inputs(address)
         self.template = pn.Template((TEMPLATES / "page.html").read_text(encoding="utf-8"))
-        test_parts = [self.upload, self.chosen, *self.quantities.values()]
+        first, others = (
+            [field for name, field in self.quantities.items() if (name in FIRST) == shown]
+            for shown in (True, False)
+        )
+        asked = grid(first, 8.0)
+        asked.visible = True
         result_parts = [self.saves, self.ending, self.report_of]
         parts = {
-            "test": [*test_parts, self.rest, self.check, self.problem],
+            "test": [self.upload, self.chosen, asked],
+            "specimen": [*others, self.rest],
+            "check": [self.check, self.problem],
             "model": [self.options[name].widget for name in SHOWN],
             "more": [self.options[name].widget for name in FOLDED],
             "run": [self.run, self.stop, self.progress],
@@ -240,7 +247,7 @@ class Window:
         self._filling = True  # one check after all of them
         if self.desk.worker is None:  # what is shown of a fit is of another test
             self._hide_result("There is no fit yet.")
-            self.curves.held, self.cycle.value = {}, ""
+            self.curves.held, self.curves.found, self.cycle.value = {}, {}, ""
         if found is not None or self.desk.replaced:
             quantities, self.rest.value = found or ({}, "")
             for name, field in self.quantities.items():
@@ -355,6 +362,7 @@ class Window:
             return
         self.run.disabled, self.stop.visible, self.stop.disabled = True, True, False
         self._hide_result("A fit is running.")
+        self.curves.found = {}
         for field in (*self.fields, self.chosen, self.check):  # nothing of the test may change
             field.disabled = True
         self._poll.start()
@@ -443,6 +451,7 @@ class Window:
             return
         self.report.object = piece("report", self._report())
         fit = load_result(self.desk.fits[cycle])
+        self.curves.found = fit["parameters"]
         values = {name: one["value"] for name, one in fit["parameters"].items()}
         place = {name: fit[name] for name in ("relaxation", "drive")}
         model = Model.of_result(fit).name

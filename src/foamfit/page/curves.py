@@ -51,6 +51,7 @@ class Curves:
     def __init__(self, turning: Turning | None = None) -> None:
         self.turning: Turning | None = None
         self.held: dict[str, bool] = {}  # by parameter: whether the user's tick holds it in a fit
+        self.found: dict[str, Any] = {}  # parameters of the fit, as in fit.json
         self._rows: dict[str, Row] = {}
         self._scales: dict[str, tuple[float, float]] = {}
         self._measured = {name: ColumnDataSource({"x": [], "y": []}) for name in PANELS}
@@ -63,7 +64,9 @@ class Curves:
         self.sliders.on_msg(lambda event: pn.state.execute(partial(self._moved, event), True))
         wide: dict[str, Any] = {"sizing_mode": "stretch_width"}
         legend = pn.pane.HTML(piece("legend", GREY, VERMILION), margin=0, **wide)
-        self._panels = grid([pn.pane.Bokeh(one, **wide) for one in self._figures.values()], 14.5)
+        loop_first = sorted(PANELS, key=lambda name: name != "stress_strain")
+        self._panes = {n: pn.pane.Bokeh(self._figures[n], **wide) for n in loop_first}
+        self._panels = grid([*self._panes.values()], 14.5)
         self._panels.insert(0, legend)  # a figure's own would be redrawn each time
         self.view = pn.Column(self._panels, self.sliders, margin=0, **wide)
         if turning is not None:
@@ -75,9 +78,16 @@ class Curves:
         self._rows = {row.name: row for row in turning.rows}
         self._show_measured()
         self.sliders.rows = [
-            vars(row) | {"held": self.held.get(row.name, row.held)} for row in turning.rows
+            vars(row) | {"held": self.held.get(row.name, row.held)} | self._spans(row)
+            for row in turning.rows
         ]
         self._draw({})
+
+    def _spans(self, row: Row) -> dict[str, list[float]]:
+        """Return interval and range of the fit, where there are any, in the unit of a slider."""
+        fit = self.found.get(row.name, {})
+        given = {"interval": fit.get("ci95"), "range": fit.get("range")}
+        return {name: [end / row.factor for end in ends] for name, ends in given.items() if ends}
 
     def put(self, values: Mapping[str, float]) -> None:
         """Draw the springs at other values (SI), and move the sliders there."""
@@ -139,7 +149,9 @@ class Curves:
         assert self.turning is not None
         for name, made in self._figures.items():
             there = self.turning.measured.get(name)
-            made.visible = there is not None
+            if name == "displacement_time" and self.turning.drive == "displacement":
+                there = None  # the input
+            self._panes[name].visible = there is not None
             if there is None:
                 continue
             (x_name, x_si), (y_name, y_si) = AXES[name]

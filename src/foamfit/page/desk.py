@@ -46,6 +46,8 @@ QUANTITIES = {
     "[striker] mass": ("Striker mass (optional)", "7 g"),
     "[striker] velocity": ("Striker velocity (optional)", "1.75 m/s"),
 }
+# Those that are shown; the others are folded.
+FIRST = ("[specimen] height", "[specimen] diameter", "[striker] mass", "[striker] velocity")
 
 
 @dataclass(frozen=True)

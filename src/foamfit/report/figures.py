@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -51,6 +51,7 @@ DPI = 250  # of a PNG
 TWO = "two"
 COLUMNS = {"one": 3.25, TWO: 7.0}
 NARROWEST, WIDEST = 2.5, 20.0
+UNTITLED = "untitled"  # after a width and a comma: no title
 # Lines with more points are drawn through the first, last and extreme samples of this many
 # stretches, which looks the same in print.
 MOST_POINTS, STRETCHES = 3000, 500
@@ -58,6 +59,7 @@ MOST_POINTS, STRETCHES = 3000, 500
 
 def inches(width: str) -> float:
     """Return the width of a figure that "one" or "two" columns or a length ("85 mm") name."""
+    width = width.rpartition(",")[0] if not is_titled(width) else width
     if (known := COLUMNS.get(width.strip().lower())) is not None:
         return known
     from foamfit.data.units import parse_quantity
@@ -72,14 +74,19 @@ def inches(width: str) -> float:
     return wide
 
 
+def is_titled(width: str) -> bool:
+    """Whether a figure of such a width has a title: all but "two, untitled" and its like."""
+    return width.rpartition(",")[2].strip().lower() != UNTITLED
+
+
 def abreast(width: float, panels: int, least: float = 2.1) -> int:
     """Return how many panels of at least `least` inches fit side by side."""
     return max(1, min(panels, int(width / least)))
 
 
-def title_lines(width: float, *parts: str) -> list[str]:
-    """Break the parts of a title into lines for a figure of a width in inches."""
-    return [line for part in parts for line in wrapped(part, 0, int(16 * width))]
+def title_lines(wide: float, *parts: str, titled: bool = True) -> list[str]:
+    """Break the parts of a title into lines for a figure of `wide` inches; none if not `titled`."""
+    return [line for part in parts if titled for line in wrapped(part, 0, int(16 * wide))]
 
 
 @contextmanager
@@ -126,6 +133,17 @@ def _seen(x: Array, y: Array) -> NDArray[np.intp]:
         for start, stop in pairwise(ends):
             kept.append(start + np.array([low[start:stop].argmin(), high[start:stop].argmax()]))
     return np.unique(np.concatenate(kept))
+
+
+def key_of(axes: Iterable[Axes]) -> dict[str, Any]:
+    """Return what is drawn by its label, less the "_" that keeps it off other legends."""
+    found: dict[str, Any] = {}
+    for artist in (one for ax in axes for one in (*ax.lines, *ax.collections, *ax.patches)):
+        label = str(artist.get_label())
+        empty = hasattr(artist, "get_xdata") and not len(artist.get_xdata())
+        if label.startswith("_") and not label.startswith("_child") and not empty:
+            found.setdefault(label[1:], artist)
+    return found
 
 
 def legend_below(figure: Figure, entries: dict[str, Any]) -> int:
@@ -247,6 +265,15 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
         case ("png" | "pdf" | "svg") as form:
             return form
     raise InputError(f"a figure is saved as .png, .pdf or .svg, not {Path(path).name!r}")
+
+
+def write_both(figure: Figure, place: Path, dpi: int = DPI) -> bytes:
+    """Write a figure as PNG and, for print, as PDF; returns the PNG. `place` has no suffix."""
+    with laid_out(figure, dpi):
+        png = image(figure, "png", dpi)
+        place.with_suffix(".png").write_bytes(png)
+        place.with_suffix(".pdf").write_bytes(image(figure, "pdf"))
+    return png
 
 
 def save(figure: Figure, path: str | Path | None) -> Figure:

@@ -32,7 +32,8 @@ RESULT_FILES = {
 }
 CYCLES_FILES = {"cycles.json", "cycles.csv", "cycles.png", "cycles-plotted.csv", "table.tex"}
 JOINT_FILES = {"joint.json", "joint.html", "joint.png", "joint.csv", "table.tex"}
-JOINT_FILES |= {"parameters.png", "parameters.pdf"}
+CYCLES_FILES |= {"cycles.pdf"}
+JOINT_FILES |= {"joint.pdf", "parameters.png", "parameters.pdf"}
 BATCH_FILES = {"summary.csv", "summary.html", "batch.json"}
 BATCH_FILES |= {"summary.tex", "summary.png", "summary.pdf"}
 PREDICTION_FILES = {"prediction.json", "prediction.csv", "prediction.png", "prediction.pdf"}

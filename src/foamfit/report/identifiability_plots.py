@@ -30,7 +30,7 @@ def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
     """
     profiles = result.intervals.profiles if result.intervals is not None else ()
     rows = max(-(-len(profiles) // 4), 1)
-    with figures.drawing(7.0, 0.35 + 1.55 * rows) as figure:
+    with figures.drawing(7.0, 0.55 + 1.55 * rows) as figure:
         axes = figure.subplots(rows, 4, squeeze=False, sharey=True).ravel()
         for ax in axes[len(profiles) :]:
             ax.set_axis_off()
@@ -40,6 +40,7 @@ def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
             ax.set_label(profile.name)
         if not profiles:
             figures.say_nothing_there(axes[0])
+        figures.legend_below(figure, figures.key_of(axes))
     return figures.save(figure, path)
 
 
@@ -47,18 +48,20 @@ def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> No
     """One profile, its cut, its interval, and the parabola of the standard error."""
     factor, unit = readable_unit(float(np.max(np.abs(profile.values))), estimate.unit)
     top = 2.0 * profile.cut
+    best = float(profile.values[np.argmin(profile.rises)])  # from the zero of the profile
     x = profile.values / factor
-    ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)), label="_95 % cut")
+    ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)), label="_95 % threshold")
     ax.axvspan(*(end / factor for end in profile.ci95), color="0.92", lw=0, label="_95 % interval")
     fine = np.linspace(x.min(), x.max(), 200)
     if estimate.stderr:
-        parabola = ((fine * factor - estimate.value) / estimate.stderr) ** 2
+        parabola = ((fine * factor - best) / estimate.stderr) ** 2
         below = np.where(parabola <= top, parabola, np.nan)
         ax.plot(fine, below, color=GREY, lw=0.8, ls="--", label="_local covariance")
-    root = np.sign(profile.values - estimate.value) * np.sqrt(np.maximum(profile.rises, 0.0))
-    ax.plot(fine, np.interp(fine, x, root) ** 2, color=BLUE, lw=1.1, label="_profile, between")
-    ax.plot(x, profile.rises, "o", color=BLUE, ms=2.2, label="_profile")
-    ax.plot(estimate.value / factor, 0.0, "o", color=VERMILION, ms=3.5, label="_best fit")
+    root = np.sign(profile.values - best) * np.sqrt(np.maximum(profile.rises, 0.0))
+    style: Any = {"color": BLUE, "lw": 1.1, "label": "_lowest cost, all others refitted"}
+    ax.plot(fine, np.interp(fine, x, root) ** 2, **style)
+    ax.plot(x, profile.rises, "o", color=BLUE, ms=2.2)
+    ax.plot(best / factor, 0.0, "o", color=VERMILION, ms=3.5, label="_best fit")
     ax.set_ylim(-0.04 * top, top)
     ax.locator_params(axis="x", nbins=4)
     name = f"{profile.name} ({unit})" if unit else profile.name
@@ -109,9 +112,11 @@ def _draw_information(
         place = float(np.mean(at)), 0.0
         name = curve.replace("_", "-")
         left.annotate(name, place, (0, beneath), color=_color(curve), **style)
+    # Points that a cell is wide: two digits need 15.
+    cell = 72.0 * (0.5 * width if width >= SIDE_BY_SIDE else width - 0.85) / k
     matrix = insight.correlation if correlation is None else correlation
     below = np.where(np.tri(k, dtype=bool), matrix, np.nan)
-    _cells(right, below, "RdBu_r", (-1.4, 1.4), "{:.2f}")
+    _cells(right, below, "RdBu_r", (-1.4, 1.4), "{:.2f}" if cell >= 15.0 else "{:.1f}")
     right.set_title("correlation of the estimates", loc="left", fontsize=7.5, pad=4)
     right.set_xticks(range(k), insight.names, rotation=90)
     beside = width >= SIDE_BY_SIDE  # then the names stand on the left
@@ -123,10 +128,13 @@ def _cells(ax: Axes, values: Array, colors: str, limits: tuple[float, float], fo
     ax.imshow(values, cmap=colors, vmin=limits[0], vmax=limits[1], aspect="auto")
     for (i, j), value in np.ndenumerate(values):
         if np.isfinite(value):
-            shown = form.format(value).replace("-", "−").replace("0.", ".")
-            shown = {"−.00": "0", ".00": "0", "1.00": "1", "−0": "0", "0": ""}.get(shown, shown)
+            tenths = (
+                np.trunc(10.000001 * value) / 10.0 if form == "{:.1f}" else value
+            )  # .97 is no 1
+            shown = form.format(tenths).replace("-", "−").replace("0.", ".")
+            shown = "1" if shown.startswith("1.") else shown if shown.strip("−.0") else ""
             color = "white" if abs(value) > 0.6 * limits[1] else "black"
-            text = ax.text(j, i, shown, ha="center", va="center", fontsize=5.5, color=color)
+            text = ax.text(j, i, shown, ha="center", va="center", fontsize=6, color=color)
             text.set_in_layout(False)  # inside its cell; measuring is slow
     ax.tick_params(length=0, labelsize=6.5)
     ax.spines[:].set_visible(False)

@@ -16,6 +16,7 @@ from foamfit.report.summary import (
     LADDER,
     conclusions,
     cycle_rows,
+    determined,
     ladder_cells,
     misfits,
 )
@@ -37,6 +38,7 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
         version=version("foamfit"),
         origin=origin_word(result),
         conclusions=conclusions(result),
+        determined=determined(result),
         misfits=misfits(result),
         cycles=cycle_rows(result),
         statistics=plain["statistics"],

@@ -48,21 +48,25 @@ MARKS = ("^", "v", "D", "p")
 # and below it, and what title and legend take.
 HEIGHT, STACKED, BESIDE_IT, BELOW_IT, AROUND = 133.0, 112.0, 31.0, 26.0, 39.0
 MOST_WIDE = {0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}  # in, by the number of panels
+# Of a known motion: height of the loop, how many times as wide it is as others, and the height of a
+# residual below, points.
+LOOP, WIDER, STRIP = 165.0, 1.45, 40.0
 
 
 def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -> Figure:
     """Draw stress-time, displacement-time and stress-strain, measured and fitted.
 
-    A panel of which the fit has no curve is left out. `width` is "one" or "two" columns, or a
-    length such as "85 mm"; panels for which it has no room side by side stand one above the other,
-    and a figure of fewer panels is no wider than these need. Saved at `path`, if one is given, in
-    the format of its suffix.
+    A panel of which the fit has no curve is left out. Where the motion is prescribed, the loop is
+    large, the input is not drawn, and below each curve is its residual. `width` is "one" or "two"
+    columns, or a length such as "85 mm", and with ", untitled" behind it there is no title; panels
+    for which it has no room side by side stand one above the other, and a figure of fewer panels is
+    no wider than these need. Saved at `path`, if one is given, in the format of its suffix.
     """
     panels = _panels(result)
-    with _panelled(panels, width) as (figure, axes, size):
-        for ax, panel in zip(axes, panels, strict=False):
+    with _panelled(panels, width, known=is_known(result)) as (figure, axes, sizes):
+        for ax, panel, size in zip(axes, panels, sizes, strict=False):
             _annotate(ax, panel, result, size)
-        _head(figure, result)
+        _head(figure, result, titled=figures.is_titled(width))
     return figures.save(figure, path)
 
 
@@ -238,21 +242,28 @@ def _panels(result: Fit) -> list[_Panel]:
         _measured(strain, c.measured_stress, motion),
         _fitted(None if moved is None else moved / height, pushed),
     ]
-    if strain is not None and c.stress_along is not None:
+    if strain is not None and c.stress_along is not None and not is_known(result):
         # Wide and pale below the others, with which it coincides where the fit is good.
         pale = {"color": PALE, "lw": 3.2, "zorder": 2}
         loop.append(_Line(strain, c.stress_along, "springs along measured strain", pale))
     pushing = [_measured(c.time, c.measured_stress), _fitted(c.time, c.stress)]
-    panels = (
+    panels = [
         ("stress_time", "time", "s", "stress", "Pa", pushing),
         ("displacement_time", "time", "s", "displacement", "m", moving),
         ("stress_strain", "strain", "–", "stress", "Pa", loop),
-    )
+    ]
+    if is_known(result):
+        panels = [panels[2], panels[0]]
     made = (
         _Panel(key, x, x_unit, y, y_unit, [line for line in lines if line])
         for key, x, x_unit, y, y_unit, lines in panels
     )
     return [panel for panel in made if panel.lines]
+
+
+def is_known(result: Fit) -> bool:
+    """Whether the motion is the input and nothing else of it is compared."""
+    return result.drive == "displacement" and not result.curves.interior
 
 
 def _measured(
@@ -282,23 +293,35 @@ def _fitted(x: Array | None, y: Array | None, node: int = 0) -> _Line | None:
 
 @contextmanager
 def _panelled(
-    panels: list[_Panel], width: str
-) -> Iterator[tuple[Figure, list[Axes], tuple[float, float]]]:
-    """Give a figure with its panels drawn, their axes, and about how large one is, in points."""
-    wide = min(figures.inches(width), MOST_WIDE[len(panels)])
-    across = figures.abreast(wide, max(len(panels), 1))
-    rows = -(-max(len(panels), 1) // across)
-    size = 72.0 * wide / across - BESIDE_IT, HEIGHT if rows == 1 else STACKED
-    with figures.drawing(wide, (rows * (size[1] + BELOW_IT) + AROUND) / 72.0) as figure:
-        axes = figure.subplots(rows, across, squeeze=False).ravel().tolist()
-        for ax in axes[len(panels) :]:
+    panels: list[_Panel], width: str, *, known: bool = False
+) -> Iterator[tuple[Figure, list[Axes], list[tuple[float, float]]]]:
+    """Give a figure with its panels drawn, their axes, and about how large each is, in points.
+
+    With `known` the first is the largest, and below each is its residual.
+    """
+    count = max(len(panels), 1)
+    wide = min(figures.inches(width), MOST_WIDE[3 if known and count > 1 else len(panels)])
+    across = figures.abreast(wide, count)
+    rows, every = -(-count // across), 2 if known else 1
+    parts = [WIDER if known else 1.0, *[1.0] * (across - 1)]
+    spans = [72.0 * wide * part / sum(parts) - BESIDE_IT for part in parts]
+    tall = LOOP if known and across > 1 else HEIGHT if rows == 1 else STACKED
+    heights = [tall, STRIP][:every] * rows
+    height = (sum(heights) + rows * BELOW_IT + AROUND) / 72.0
+    with figures.drawing(wide, height) as figure:
+        ratios = {"width_ratios": parts, "height_ratios": heights}
+        grid = figure.subplots(every * rows, across, squeeze=False, gridspec_kw=ratios)
+        axes, below = grid[::every].ravel().tolist(), grid[1::every].ravel().tolist()
+        for ax in [*axes[len(panels) :], *below[len(panels) :]]:
             ax.set_axis_off()
         if not panels:
             figures.say_nothing_there(axes[0])
         for ax, panel in zip(axes, panels, strict=False):
             ax.set_label(panel.key.replace("_", "-"))
             _draw(ax, panel)
-        yield figure, axes, size
+        for ax, strip, panel in zip(axes, below, panels, strict=False) if known else ():
+            _draw_residual(ax, strip, panel)
+        yield figure, axes, [(spans[i % across], tall) for i in range(count)]
         figure.align_ylabels()
 
 
@@ -314,6 +337,24 @@ def _draw(ax: Axes, panel: _Panel) -> None:
         ax.plot(x, y, label=line.label, **style)
     ax.set(xlabel=x_label, ylabel=y_label)
     ax.margins(0.05, 0.11)
+
+
+def _draw_residual(ax: Axes, strip: Axes, panel: _Panel) -> None:
+    """Draw fitted minus measured below a panel, in percent of the measured range."""
+    ends = {line.kind: line for line in panel.lines}
+    if len(ends) < 2:
+        strip.set_axis_off()
+        return
+    measured, fitted = ends["measured"].y, ends["fitted"].y
+    strip.axhline(0.0, color=GREY, lw=0.6)
+    off = 100.0 * (fitted - measured) / (float(np.ptp(measured)) or 1.0)
+    style: Any = {"color": VERMILION, "lw": 0.7, "label": "_fitted − measured"}
+    strip.plot(ends["measured"].x / panel.scale()[0], off, **style)
+    strip.set(xlabel=ax.get_xlabel(), label=f"{ax.get_label()}, residual")
+    strip.set_ylabel("residual\n(% of range)", fontsize=7)
+    strip.sharex(ax)
+    ax.set_xlabel("")
+    ax.tick_params(labelbottom=False)
 
 
 def _evenly(x: Array, y: Array, n: int) -> NDArray[np.intp]:
@@ -533,7 +574,7 @@ def _switch_samples(result: Fit, loop: _Line) -> list[int]:
     return samples[1:]
 
 
-def _head(figure: Figure, result: Fit) -> None:
+def _head(figure: Figure, result: Fit, *, titled: bool) -> None:
     """Write the title above all panels and the legend below them, and make room for both."""
     name = printable(" ".join(result.measurement.name.split()))
     name = name if len(name) <= 60 else name[:59] + "…"
@@ -544,12 +585,13 @@ def _head(figure: Figure, result: Fit) -> None:
     title = "\u00a0· ".join([name, result.law, f"{result.drive} drive", *more])
     title = textwrap.fill(title, int(12 * figure.get_figwidth()))
     # A name may hold a dollar sign: it is no formula.
-    figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, parse_math=False)
+    if titled:
+        figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, parse_math=False)
     entries: dict[str, Any] = {}
     for ax in figure.axes:
         entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
     lines = figures.legend_below(figure, entries)
-    extra = 11.0 * max(lines - 1, 0) + 11.0 * title.count("\n")
+    extra = 11.0 * max(lines - 1, 0) + (11.0 * title.count("\n") if titled else -13.0)
     figure.set_figheight(figure.get_figheight() + extra / 72.0)
 
 

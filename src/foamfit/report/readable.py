@@ -24,9 +24,9 @@ SYMBOLS = {
 # Names of nuisance parameters in reports.
 LABELS = {
     "contact_time": "contact time t₀",
-    "displacement_zero": "zero of the motion w₀",
-    "stress_zero": "zero of the stress σ₀",
-    "acceleration_zero": "zero of the acceleration a₀",
+    "displacement_zero": "motion zero w₀",
+    "stress_zero": "stress zero σ₀",
+    "acceleration_zero": "acceleration zero a₀",
     "velocity": "velocity v₀",
     "striker_mass": "striker mass m",
     "time_shift": "time shift Δt",

@@ -7,19 +7,20 @@ from dataclasses import dataclass, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from foamfit.report.figures import DPI, TWO, image, inches, laid_out
+from foamfit.report.figures import DPI, TWO, UNTITLED, image, laid_out
 from foamfit.report.identifiability_plots import plot_insight, plot_profiles
-from foamfit.report.plots import plot_fit, plot_residuals
+from foamfit.report.plots import is_known, plot_fit, plot_residuals
+from foamfit.report.snapping_plots import plot_snapping
 from foamfit.results import Fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Mapped = Callable[..., Iterable[Any]]  # as the built-in `map`
-COARSE = 160  # dots per inch of a figure that is only on the page, to save time
-# In the order in which they are begun: what takes longest first. "shown" is the fit on the page,
-# two columns wide as all others there.
-_NAMES = ("fit", "shown", "information", "residuals", "profiles")
+SHOWN, COARSE = 200, 160  # dots per inch of figures that are only on the page, to save time
+# In the order in which they are begun: what takes longest first. "shown" and "narrow" are the fit
+# on the page, which has its title in the text, on a screen and on a phone.
+_NAMES = ("fit", "shown", "narrow", "information", "residuals", "snapping", "profiles")
 
 
 @dataclass(frozen=True)
@@ -44,27 +45,18 @@ def draw_all(
     A `map` of an executor draws them in its processes: it begins at once, and what is given is
     waited for when it is asked for. `width` is that of "fit" (`foamfit.report.plots.plot_fit`).
     """
-    again = inches(width) != inches(TWO)
-    names = [name for name in _NAMES if again or name != "shown"]
     drawn: dict[str, Any] = {field.name: getattr(result, field.name) for field in fields(Fit)}
     # No figure needs them, and unpickling them would import lmfit, the slowest import.
     drawn["params"] = None
-    images = mapped(partial(_draw, Fit(**drawn), width), names)  # begins before it is asked for
-
-    def given() -> Iterator[tuple[str, Images | None]]:
-        for name, one in zip(names, images, strict=True):
-            yield name, one
-            if name == "fit" and not again:
-                yield "shown", Images(one.png, one.dpi)
-
-    return given()
+    images = mapped(partial(_draw, Fit(**drawn), width), _NAMES)  # begins before it is asked for
+    return zip(_NAMES, images, strict=True)
 
 
 def _draw(result: Fit, width: str, name: str) -> Images | None:
     figure = _figure(result, width, name)
     if figure is None:
         return None
-    dpi = COARSE if name == "information" else DPI
+    dpi = DPI if name == "fit" else COARSE if name == "information" else SHOWN
     with laid_out(figure, dpi):
         pdf = image(figure, "pdf") if name == "fit" else None
         png = image(figure, "png", dpi)
@@ -73,11 +65,14 @@ def _draw(result: Fit, width: str, name: str) -> Images | None:
 
 def _figure(result: Fit, width: str, name: str) -> Figure | None:
     """Draw one of the figures, if the result has it."""
-    if name == "residuals":
-        return plot_residuals(result)
+    if name == "residuals":  # those of a known motion are below its curves
+        return None if is_known(result) else plot_residuals(result)
     if name == "information":
         matrix = None if result.correlation is None else result.correlation.matrix
         return None if result.insight is None else plot_insight(result.insight, matrix)
     if name == "profiles":
         return plot_profiles(result) if result.intervals and result.intervals.profiles else None
-    return plot_fit(result, width=width if name == "fit" else TWO)
+    if name == "snapping":
+        return plot_snapping(result)
+    columns = {"fit": width, "shown": f"{TWO}, {UNTITLED}", "narrow": f"one, {UNTITLED}"}
+    return plot_fit(result, width=columns[name])

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
-from foamfit.data.measurement import ASKED, interior_channel
-from foamfit.report.readable import readable
+from foamfit.data.measurement import interior_channel
+from foamfit.report.readable import Readable, readable
 from foamfit.report.render import sentences, words
 from foamfit.results import STATED, Fit, Ladder, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import counted, percent, wrapped
+from foamfit.text import aligned, counted, percent, wrapped
 
 CURVES = {
     "stress_time": "stress-time",
@@ -20,39 +21,90 @@ CURVES = {
 ANSWERS = {True: "yes", False: "no", None: "–"}
 LADDER = ["", "model", "with", "misfit %", "pred. %", "gain %", "rank", "AICc", "BIC"]
 LADDER += ["p", "n.d.", "s"]
-# Lines on the terminal for warnings, and for rows that are not used.
-WARNING_LINES, ROW_LINES = 4, 2
+# The screen of a fit, of which two lines say where the result is; lines kept for its warnings.
+LINES, COLUMNS, WARNING_LINES = 22, 80, 3
 LONGEST = 180  # characters of the reasons for a state; longer ones are left to the report
 
 
 def summary_text(result: Fit, *, verbose: bool = False) -> str:
-    """Return what the command prints after a fit: one screen, at most 100 columns wide.
+    """Return what the command prints after a fit: one screen of 80 columns and 24 lines.
 
-    `verbose` adds what else is only in the report: the ladder, the reasons of each state, the
-    checklist, the notes and all warnings.
+    Parameters that are not determined, and those of the record, stand in a line where the table has
+    no room for them; warnings are cut. `verbose` prints all of that, and what else is only in the
+    report: the ladder, the reasons of each state, the checklist and the notes.
     """
+    ladder, measured = result.ladder, result.measurement
     rows = [readable(name, p) for name, p in result.parameters.items()]
-    columns = {"parameter": "label", "value ± stderr": "with_error", "unit": "unit"}
-    columns |= {"95 % interval": "interval"}
-    columns |= {"range": "range"} if any(row.range for row in rows) else {}
-    columns |= {"state": "state"}
+    given: dict[str, Any] = {
+        "result": result,
+        "m": measured,
+        "ladder": ladder,
+        "shown": [(name, percent(off)) for name, off in _compared(result).items()],
+        "fixed": [f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed"],
+        "determined": determined(result),
+        "unknown": _unknown({n: p for n, p in result.parameters.items() if n not in NUISANCE}),
+    }
+    *lines, following = _screen(result, rows, given, verbose=verbose)
+    if verbose:
+        ladder_rows = [] if ladder is None else [LADDER, *ladder_cells(ladder)]
+        more = {"cycles": cycle_rows(result), "ladder_rows": ladder_rows, "rows": rows}
+        more |= {"conclusions": conclusions(result), "answers": ANSWERS}
+        lines.append("\n" + words("summary", **more, **given) + "\n")
+    return "\n".join([*lines, following])
+
+
+def _screen(
+    result: Fit, rows: list[Readable], given: dict[str, Any], *, verbose: bool
+) -> Iterator[str]:
+    """Give the lines of one screen: as much as it has room for, all with `verbose`."""
+    head = words("short", part="head", **given).split("\n")
+    head = [line for one in head for line in wrapped(one, 2, COLUMNS)[:2]]
+    states = [w for check in result.checklist if check.key == "determined" for w in check.warnings]
+    warnings = [one for one in result.warnings if verbose or one not in states]
     varied = [row for row in rows if row.state != "fixed"]
-    return words(
-        "summary",
-        cycles=cycle_rows(result),
-        result=result,
-        m=result.measurement,
-        ladder=result.ladder,
-        ladder_rows=[] if result.ladder is None else [LADDER, *ladder_cells(result.ladder)],
-        shown=[(name, percent(off)) for name, off in _compared(result).items()],
-        rows=rows,
-        table=[[*columns], *([getattr(row, one) for one in columns.values()] for row in varied)],
-        fixed=[f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed"],
-        conclusions=conclusions(result),
-        answers=ANSWERS,
-        verbose=verbose,
-        short=[*_rows(result), *_short_warnings(result)],
-    )
+    sure = [row for row in varied if row.state != "not determined"]
+    springs = [row for row in sure if row.name not in NUISANCE]
+    lines, kept = 10**6 if verbose else LINES, min(len(warnings), WARNING_LINES)
+    stages = [(varied, True), (varied, False), (sure, False), (springs, False)]
+    for shown, whole in stages:
+        left = [row for row in varied if row not in shown and row.name in NUISANCE]
+        record = [f"{row.label} {row.with_unit(row.with_error)}" for row in left]
+        foot = words("short", part="foot", whole=whole, of_record=record, **given).split("\n")
+        room = lines - len(head) - len(foot) - (len(shown) + 2 if shown else 0)
+        if room >= kept:
+            break
+    yield from head
+    if shown:
+        yield from ("", *aligned(_table(shown, short=not verbose)))
+    for line in foot[:-1]:
+        yield from wrapped(line) if verbose else [_cut(line)]
+    yield from _fitting(warnings, max(room, min(kept, 1)))
+    yield foot[-1]
+
+
+def _table(rows: list[Readable], *, short: bool) -> list[list[str]]:
+    """Table of parameters, its head first; in `short` the range takes the place of the error."""
+    ranged = any(row.range for row in rows)
+    value = {"value": "value"} if short and ranged else {"value ± stderr": "with_error"}
+    columns = {"parameter": "label"} | value | {"unit": "unit", "95 % interval": "interval"}
+    columns |= ({"range": "range"} if ranged else {}) | {"state": "state"}
+    return [[*columns], *([getattr(row, one) for one in columns.values()] for row in rows)]
+
+
+def _cut(line: str) -> str:
+    return line if len(line) <= COLUMNS else f"{line[: COLUMNS - 2].rstrip()} …"
+
+
+def _fitting(warnings: list[str], room: int) -> list[str]:
+    """Return the lines of warnings for which there is room: the last are cut, then left out."""
+    told = [wrapped(f"warning: {warning}", 2, COLUMNS) for warning in warnings]
+    for i in reversed(range(len(told))):
+        if sum(map(len, told)) > room:
+            told[i] = [_cut(f"warning: {warnings[i]}")]
+    if len(told) > room:
+        more = counted(len(told) - room + 1, "more warning")
+        told[room - 1 :] = [[f"and {more}: see the report, or --verbose"]]
+    return [line for lines in told for line in lines]
 
 
 def misfits(result: Fit) -> dict[str, float | None]:
@@ -99,6 +151,13 @@ def conclusions(result: Fit) -> tuple[str, ...]:
         several=len(result.chain.springs) > 1,
         lost=[name for name, p in springs.items() if p.state == "not determined"],
     )
+
+
+def determined(result: Fit) -> str:
+    """Say how many of the springs' parameters are determined, "" if none is varied."""
+    varied = [p for name, p in result.parameters.items() if p.vary and name not in NUISANCE]
+    found = sum(p.state == "determined" for p in varied)
+    return f"{found} of {len(varied)} determined" if varied else ""
 
 
 def _unknown(parameters: dict[str, ParameterEstimate]) -> dict[str, dict[str, list[str]]]:
@@ -149,36 +208,6 @@ def cycle_rows(result: Fit) -> list[list[str]]:
         for number, one in found.items()
     ]
     return [head, *rows]
-
-
-def _rows(result: Fit) -> list[str]:
-    """Say how many rows are used and, if there is room, why the others are not."""
-    rows = result.measurement.rows
-    reasons = ", ".join(f"{item.rows} ({item.why})" for item in rows.dropped)
-    unused = f"; not used: {reasons}" if reasons else ""
-    lines = wrapped(f"rows: {rows.rows} read, {rows.used} used{unused}")
-    if len(lines) > ROW_LINES:
-        lines = wrapped(f"rows: {rows.sentences()[0]} See the report for the others.")
-    return lines
-
-
-def _short_warnings(result: Fit) -> Iterator[str]:
-    """Give all warnings about the input, and as many others as fit, except those on states."""
-    said = [w for check in result.checklist if check.key == "determined" for w in check.warnings]
-    warnings = [warning for warning in result.warnings if warning not in said]
-    asked = [warning for warning in warnings if warning.startswith(ASKED)]
-    for warning in asked:
-        yield from wrapped(f"warning: {warning}")
-    warnings, given = warnings[len(asked) :], 0
-    for i, warning in enumerate(warnings):
-        lines = wrapped(f"warning: {warning}")
-        if i and given + len(lines) > WARNING_LINES:
-            yield f"and {counted(len(warnings) - i, 'more warning')}: see the report, or --verbose"
-            return
-        if len(lines) > WARNING_LINES:
-            lines = [*lines[: WARNING_LINES - 1], "  … (see the report, or --verbose)"]
-        yield from lines
-        given += len(lines)
 
 
 def ladder_cells(ladder: Ladder) -> Iterator[list[str]]:

@@ -4,7 +4,10 @@ export function render({ model, el }) {
   list.className = "list";
   const told = document.createElement("p");
   told.setAttribute("role", "status");
-  el.append(told, list);
+  const key = document.createElement("p");
+  key.className = "key";
+  key.innerHTML = '<i class="interval"></i> 95 % interval of the fit <i class="range"></i> its range';
+  el.append(told, list, key);
   let inputs = {}, waiting = {}, busy = false;
   const STEPS = 1000;
   const digits = (value) => Number(value.toPrecision(5));
@@ -34,11 +37,12 @@ export function render({ model, el }) {
   function build() {
     list.replaceChildren();
     [inputs, waiting, busy] = [{}, {}, false];
+    key.hidden = !model.rows.some((row) => row.interval || row.range);
     for (const row of model.rows) {
       const line = document.createElement("div");
       line.className = "row";
       const label = document.createElement("label");
-      const slider = document.createElement("input");
+      const slider = document.createElement("input"), track = document.createElement("div");
       const number = document.createElement("input");
       const unit = document.createElement("span");
       label.textContent = row.name;
@@ -66,6 +70,17 @@ export function render({ model, el }) {
         show({ [row.name]: value });
         move(row.name, value);
       });
+      // The range of the fit below its interval.
+      track.className = "track";
+      track.append(slider);
+      for (const kind of ["range", "interval"]) {
+        if (!row[kind]) continue;
+        const bar = document.createElement("i"), [from, to] = row[kind].map((end) => place(row, end));
+        bar.className = kind;
+        Object.assign(bar.style, { left: `${from / STEPS * 100}%`, width: `${(to - from) / STEPS * 100}%` });
+        track.append(bar);
+        track.title += `${kind} ${row[kind].map(digits).join(" to ")} ${row.unit}  `;
+      }
       inputs[row.name] = { row, slider, number };
       // Whether a fit holds it where it stands.
       const held = document.createElement("label"), box = document.createElement("input");
@@ -74,7 +89,7 @@ export function render({ model, el }) {
       box.setAttribute("aria-label", `${row.name} fixed in the fit`);
       box.addEventListener("change", () => model.send_msg({ held: { [row.name]: box.checked } }));
       held.append(box, "fixed");
-      line.append(label, slider, number, unit, held);
+      line.append(label, track, number, unit, held);
       list.append(line);
     }
     show(Object.fromEntries(model.rows.map((row) => [row.name, row.value])));

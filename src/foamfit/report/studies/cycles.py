@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, TWO, image
+from foamfit.report.figures import BLUE, TWO
 from foamfit.report.folder import save_whole, write_json, write_result, write_table, write_text
 from foamfit.report.readable import own_name, readable_unit
 from foamfit.report.render import words
@@ -60,8 +60,7 @@ def write_cycles(
     write_json(folder / "cycles.json", found.to_json_dict())
     write_text(folder / "table.tex", by_test_tex("Cycle", cycles_by_test(found)))
     if pages:
-        figure = plot_cycles(found, width=width)
-        (folder / "cycles.png").write_bytes(image(figure, "png", DPI))
+        figures.write_both(plot_cycles(found, width=width), folder / "cycles", DPI)
 
 
 def cycles_text(found: FittedCycles) -> str:
@@ -86,9 +85,9 @@ def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
     panels, wide = 3 + len(varied), figures.inches(width)
     columns = max(figures.abreast(wide, COLUMNS, LEAST), 2)
     rows = 2 + max(0, -(-(panels - 2 * (columns - 2)) // columns))
-    told = "points: each cycle alone with 95 % interval, hollow if weak or not determined"
-    lines = figures.title_lines(wide, f"{found.test} · {found.model}", told)
-    with figures.drawing(wide, rows * PANEL[1] + 0.13 * len(lines) + 0.1, lines) as figure:
+    told = f"{found.test} · {found.model}"
+    lines = figures.title_lines(wide, told, titled=figures.is_titled(width))
+    with figures.drawing(wide, rows * PANEL[1] + 0.13 * len(lines) + 0.4, lines) as figure:
         grid = figure.add_gridspec(rows, columns)
         _loops(figure.add_subplot(grid[:2, :2]), found)
         places = [(i, j) for i in range(rows) for j in range(columns) if i > 1 or j > 1]
@@ -117,6 +116,7 @@ def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
                 ax.set_xscale("log")
             elif len(numbers) <= 8:
                 ax.set_xticks(numbers)
+        figures.legend_below(figure, figures.key_of(figure.axes))
     return figure
 
 
@@ -144,10 +144,9 @@ def _loops(ax: Axes, found: FittedCycles) -> None:
             label = f"cycle {number}"
             ax.plot(strain, measured / 1e3, color=colour, linewidth=0.9, label=label)
         if fitted is not None and number in (shown[0], shown[-1]):
-            label = f"_cycle {number}, fitted"
+            label = "_fitted, first and last cycle"
             ax.plot(strain, fitted / 1e3, ":", color="black", linewidth=0.8, label=label)
     ax.set(xlabel="strain from the first contact", ylabel="stress (kPa)")
-    ax.set_title("measured; first and last fitted (dotted)")
     if shown:
         ax.legend(loc="upper left", fontsize=6.5, handlelength=1.2, labelspacing=0.25)
 

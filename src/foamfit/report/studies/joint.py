@@ -75,13 +75,10 @@ def save_joint(
         # Where other processes make the folders, the picture of all is drawn beside them.
         n = len(folders)
         made = each(_write_test, found.test_fits(), folders, [reports] * n, [width] * n)
-        figure = plot_joint(found, width=width)
-        png = image(figure, "png", DPI)
-        (fresh / "joint.png").write_bytes(png)
-        compared = plot_compared(found, width=width)
-        pictures = [png, image(compared, "png", DPI)]
-        (fresh / "parameters.png").write_bytes(pictures[1])
-        (fresh / "parameters.pdf").write_bytes(image(compared, "pdf"))
+        pictures = [
+            figures.write_both(draw(found, width=width), fresh / name, DPI)
+            for name, draw in (("joint", plot_joint), ("parameters", plot_compared))
+        ]
         if width != TWO:  # the page is as wide as two columns
             pictures = [image(draw(found), "png", DPI) for draw in (plot_joint, plot_compared)]
         text = joint_page(found, *pictures, linked=reports)
@@ -233,13 +230,9 @@ def plot_joint(found: JointData, *, width: str = TWO) -> Figure:
     rows, low = -(-len(shown) // across), -(-len(names) // columns)
     heights = [rows * LOOP[1], low * PANEL[1]]
     more = f"; {len(shown)} of {len(found.tests)} drawn" if len(shown) < len(found.tests) else ""
-    below = "; below: laws of rate, 95 % intervals by test" if names else ""
-    lines = figures.title_lines(
-        wide,
-        f"{found.name} · {found.model} · {len(found.tests)} tests together",
-        f"loops: measured grey and wide, fitted blue and thin{more}{below}",
-    )
-    with figures.drawing(wide, sum(heights) + 0.2 + 0.13 * len(lines), lines) as figure:
+    told = f"{found.name} · {found.model} · {len(found.tests)} tests together{more}"
+    lines = figures.title_lines(wide, told, titled=figures.is_titled(width))
+    with figures.drawing(wide, sum(heights) + 0.6 + 0.13 * len(lines), lines) as figure:
         parts = [height for height in heights if height]
         top, *bottom = figure.subfigures(len(parts), 1, height_ratios=parts, squeeze=False)[:, 0]
         most = int(72.0 * wide / across / 4.2)  # letters of a name
@@ -251,6 +244,8 @@ def plot_joint(found: JointData, *, width: str = TWO) -> Figure:
                 _law_of_rate(ax, found, name, parted=wide / columns < ROOMY)
             for ax in axes[len(names) :]:
                 ax.set_axis_off()
+            loops += axes
+        figures.legend_below(figure, figures.key_of(loops))
     return figure
 
 

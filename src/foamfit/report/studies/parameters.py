@@ -66,7 +66,7 @@ def plot_parameters(
     rows = -(-max(len(compared), 1) // across)
     across = -(-max(len(compared), 1) // rows)  # rows of equal length
     tall = min(max(ROW * count, 0.5), max(TALLEST / rows, 0.1 * count if named else 1.5)) + 0.55
-    lines = figures.title_lines(wide, title)
+    lines = figures.title_lines(wide, title, titled=figures.is_titled(width))
     with figures.drawing(wide, rows * tall + 0.16 * len(lines) + 0.3, lines) as figure:
         axes = figure.subplots(rows, across, sharey=True, squeeze=False)
         for ax in axes.ravel()[len(compared) :]:

@@ -10,7 +10,7 @@ import numpy as np
 from foamfit.errors import InputError
 from foamfit.report import figures
 from foamfit.report import folder as results
-from foamfit.report.figures import BLUE, INSIDE, TWO, VERMILION, image
+from foamfit.report.figures import BLUE, INSIDE, TWO, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import words
 from foamfit.text import percent
@@ -54,10 +54,7 @@ def save_prediction(
         results.write_table(fresh / "prediction.csv", found.rows())
         if not report:
             return
-        figure = plot_prediction(found, width=width)
-        with figures.laid_out(figure):
-            (fresh / "prediction.png").write_bytes(image(figure, "png"))
-            (fresh / "prediction.pdf").write_bytes(image(figure, "pdf"))
+        figures.write_both(plot_prediction(found, width=width), fresh / "prediction")
 
     check_replaceable(folder)
     return results.save_whole(folder, write)
@@ -119,6 +116,7 @@ def plot_prediction(found: PredictedTest, *, width: str = TWO) -> Figure:
         wide,
         f"{found.measurement.name}, predicted from {found.source}; {_rates(found)}",
         f"inside the 95 % band: {inside}",
+        titled=figures.is_titled(width),
     )
     tall = bands * 1.7 * PANEL[1] + 0.4 + 0.15 * max(len(lines) - 2, 0)
     with figures.drawing(wide, tall, lines) as figure:

@@ -1,0 +1,76 @@
+"""How a foam of micro-springs deforms: the fraction snapped over time, and a strip of pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from foamfit.data.cycles import cycles_of
+from foamfit.report import figures
+from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION
+from foamfit.report.readable import readable_unit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from foamfit.arrays import Array
+    from foamfit.results import Fit
+
+INSTANTS = 7
+SNAPPED, STANDING = "#7FB2D9", "#E6EEF4"  # shades of a spring
+
+
+def plot_snapping(result: Fit, path: str | Path | None = None) -> Figure | None:
+    """Draw the fraction of micro-springs snapped over time, and the chain at a few instants.
+
+    The instants are even along the motion, within the first cycle of several. None if no fraction
+    is known. Saved at `path`, if one is given.
+    """
+    snapping, time, strain = result.snapping, result.curves.time, result.strain
+    if not snapping or time is None or strain is None:
+        return None
+    first = next(iter(cycles_of(result.measurement).values()), slice(None))
+    along = np.cumsum(np.abs(np.diff(strain[first], prepend=strain[0])))
+    at = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], INSTANTS))).tolist()
+    with figures.drawing(7.0, 3.0) as figure:
+        above, below = figure.subplots(2, 1, height_ratios=[1.0, 1.2])
+        _draw_strip(above, result, strain, at)
+        factor, unit = readable_unit(float(time[-1]), "s")
+        for (name, one), colour in zip(snapping.items(), (BLUE, VERMILION, *INSIDE), strict=False):
+            of = f" of {name}" if len(result.chain.springs) > 1 else ""
+            style = {"color": colour, "lw": 1.0}
+            below.plot(time / factor, 100.0 * one.fraction, label=f"snapped{of}", **style)
+            below.plot(time / factor, 100.0 * one.ever, "--", label=f"ever snapped{of}", **style)
+        for number, sample in enumerate(at, start=1):
+            below.axvline(time[sample] / factor, color=GREY, lw=0.5, ls=":", zorder=0)
+            below.annotate(f"{number}", (time[sample] / factor, 104.0), ha="center", fontsize=7)
+        below.set(xlabel=f"time ({unit})", ylabel="micro-springs (%)", ylim=(0.0, 115.0))
+        handles, labels = below.get_legend_handles_labels()
+        figures.legend_below(figure, dict(zip(labels, handles, strict=True)))
+    return figures.save(figure, path)
+
+
+def _draw_strip(ax: Axes, result: Fit, overall: Array, at: list[int]) -> None:
+    """Draw the chain at some samples, each spring shaded from below by its fraction snapped."""
+    chain, snapping = result.chain, result.snapping
+    strains = [overall]
+    if len(chain.springs) > 1:  # all in equilibrium, else no fraction is known
+        stress = next(iter(snapping.values())).stress
+        strains = [np.asarray(spring.strain(stress)) for spring in chain.springs]
+    total = sum(chain.heights)
+    for number, sample in enumerate(at, start=1):
+        floor = 0.0
+        for i, (strain, height) in enumerate(zip(strains, chain.heights, strict=True), start=1):
+            tall = height / total * (1.0 - float(strain[sample]))
+            share = float(snapping[f"s{i}"].fraction[sample]) if f"s{i}" in snapping else 0.0
+            ax.bar(number, tall, 0.5, floor, color=STANDING, edgecolor=GREY, lw=0.6)
+            ax.bar(number, share * tall, 0.5, floor, color=SNAPPED)
+            floor += tall
+        told = f"{number}: {100 * float(overall[sample]):.0f} %"
+        ax.annotate(told, (number, floor), (0, 3), textcoords="offset points", ha="center")
+    ax.set(ylim=(0.0, 1.25), xlim=(0.4, len(at) + 0.6))
+    ax.set_title("shaded: the fraction snapped; written: the strain", loc="left", fontsize=7.5)
+    ax.set_axis_off()
