@@ -500,7 +500,8 @@ class Objective:
         values = values if self._own is None else values[..., self._own]
         if self._fine == 1:
             return values
-        return np.asarray(values.reshape(*values.shape[:-1], -1, self._fine).mean(axis=-1))
+        parts = [values[..., i :: self._fine] for i in range(self._fine)]  # faster than .mean()
+        return np.asarray(sum(parts[1:], parts[0]) / self._fine)
 
     def _averaged(self, motion: Motion, contact: float) -> Motion:
         """A run on the clock of the samples."""

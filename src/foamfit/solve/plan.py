@@ -279,7 +279,8 @@ class Plan(NamedTuple):
                 _on_one_plateau(rows, branches, directions) if moved else _NOTHING[:0],
             )
         eta = rows[0, kernels.ETA]
-        if moved and len(heights) == 1 and stress.size > 1 and (eta > 0.0 or slopes is not None):
+        damped = eta > 0.0 or np.isin(directions[:, 1], (OWN_ETA, OWN_HEIGHT)).any()
+        if moved and len(heights) == 1 and stress.size > 1 and damped:
             rate = np.gradient(strain[0], self.time)
             stress = stress + eta * rate
             for p, (_, what) in enumerate(directions):

@@ -337,7 +337,8 @@ def _draw(population: Population, problem: Problem, point: Array, draws: int, se
     What lies beyond the limits of a fit of the test is moved there, as a fit does: to draw it again
     would leave one side of all other parameters out. What was aligned stays as it is at the point.
     """
-    rng, objective, tried = np.random.default_rng([seed, 1]), problem.objective, 0
+    rng, other = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
+    objective, tried = problem.objective, 0
     values, curves = list[Array](), list[dict[str, Array]]()
     params = [problem.params[name] for name in problem.model.names]
     common = point[: len(params)]
@@ -345,7 +346,8 @@ def _draw(population: Population, problem: Problem, point: Array, draws: int, se
     high = np.maximum([one.max for one in params], common)
     while len(values) < draws and tried < TRIES * draws:
         tried += 1
-        one = np.clip(population.draw(rng), low, high)
+        uncertain = population.root @ other.standard_normal(len(params))
+        one = np.clip(population.draw(rng) + uncertain, low, high)
         try:
             simulated = objective.simulate(np.append(one, point[one.size :]))
         except SimulationError:
@@ -417,12 +419,14 @@ def _curve(
     if drawn is not None:
         ends = np.quantile([curves[name] for curves in drawn.curves], (*BAND, 0.5), axis=0)
         low, high, middle = ends
-        parts["scatter"] = 0.5 * (high - low)
+        both = 0.5 * (high - low)
+        parts["scatter"] = np.sqrt(np.maximum(both**2 - parts["parameters"] ** 2, 0.0))
     sigma, span = objective.noise(name).sigma, float(np.ptp(predicted))
     parts["noise"] = np.full(n, NORMAL * sigma)
     missed = source.law_error(channel, sigma / float(np.ptp(objective.measured[name])))
     parts["law_error"] = missed * span * np.sqrt(_grown(problem.measurement, source))
-    more = sum(parts[part] ** 2 for part in parts.keys() - {"scatter"})
+    within = {"scatter"} if drawn is None else {"scatter", "parameters"}  # of the draws
+    more = sum(parts[part] ** 2 for part in parts.keys() - within)
     kept = np.zeros(n, dtype=bool)
     kept[objective.kept(name)] = True
     return PredictedCurve(
@@ -454,9 +458,10 @@ def _parameters(
     population: Population, point: Array, drawn: _Drawn | None
 ) -> dict[str, PredictedParameter]:
     """Each parameter at the test and its 95 % interval, within its limits."""
-    low, high = (point, point) if drawn is None else np.quantile(drawn.values, BAND, axis=0)
-    more = (population.quantile * np.sqrt(np.maximum(np.diag(population.covariance), 0.0))) ** 2
-    ends = point - np.sqrt((point - low) ** 2 + more), point + np.sqrt((high - point) ** 2 + more)
+    half = population.quantile * np.sqrt(np.maximum(np.diag(population.covariance), 0.0))
+    ends = (point - half, point + half)
+    if drawn is not None:
+        ends = tuple(np.quantile(drawn.values, BAND, axis=0))
     out = {}
     for name, value, *pair in zip(population.names, point, *ends, strict=True):
         limits = population.limits[name]

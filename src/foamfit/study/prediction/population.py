@@ -106,13 +106,19 @@ class Population:
         return tuple(free), matrix - spread.T @ told
 
     def _error(self, name: str) -> float:
-        """Standard error of an uncertain quantity, SI; by its range where it has none."""
+        """Standard error of an uncertain quantity, SI; by its range where it has none.
+
+        In a joint result those of few tests are larger by what their intervals are.
+        """
         one = self.source.parameters[name.removesuffix(":b")]
-        error = one.b_stderr if name.endswith(":b") else one.error
+        given = (one.b_stderr, one.b_ci95) if name.endswith(":b") else (one.error, one.ci95)
+        error, ends = given
         if error is None:
             assert one.span is not None
             return self._flat(name, one.span)
-        return error
+        if ends is None or not self.source.joint:
+            return error
+        return max(error, 0.5 * (ends[1] - ends[0]) / NORMAL)
 
     def _flat(self, name: str, span: Pair) -> float:
         """Standard deviation of a flat distribution, of the logarithm where that is positive."""
@@ -135,6 +141,11 @@ class Population:
         return slopes @ matrix @ slopes.T
 
     @cached_property
+    def root(self) -> Array:
+        """Matrix square root of `covariance`."""
+        return _root(self.covariance)
+
+    @cached_property
     def quantile(self) -> float:
         """Half of a 95 % interval over a standard error, as the intervals have it in the middle.
 
@@ -144,7 +155,7 @@ class Population:
         ratios = [
             0.5 * (one.ci95[1] - one.ci95[0]) / one.stderr
             for one in map(self.source.parameters.__getitem__, self._uncertain)
-            if one.ci95 is not None and one.stderr is not None
+            if one.ci95 is not None and one.stderr is not None and not self.source.joint
         ]
         return max(NORMAL, float(np.median(ratios))) if ratios else NORMAL
 
@@ -349,7 +360,7 @@ def _places(
 
 
 def _root(correlation: Array) -> Array:
-    """Matrix square root of a correlation, its negative eigenvalues set to zero."""
+    """Matrix square root of a correlation or covariance, its negative eigenvalues set to zero."""
     power, axes = np.linalg.eigh(correlation)
     return np.asarray(axes * np.sqrt(np.maximum(power, 0.0)))
 
