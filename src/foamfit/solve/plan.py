@@ -131,6 +131,12 @@ class Plan(NamedTuple):
     memory: bool = False
     unit: float = 1.0
 
+    @property
+    def moves_one(self) -> bool:
+        """Whether a known motion drives one spring with memory, which has a derivative by it."""
+        closed = self.solver == CLOSED_FORM and self.top == scenes.MOTION
+        return closed and self.memory and self.mass.size == 1
+
     def run(
         self,
         rows: Array,
