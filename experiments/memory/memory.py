@@ -195,6 +195,12 @@ def coverage(table: pd.DataFrame, *, chosen: bool | None = None) -> str:
     )
 
 
+def seconds(table: pd.DataFrame) -> str:
+    """Say how long the fits of cycles 1 to 3 took."""
+    own = table[table["what"] == HISTORY]["seconds"].dropna()
+    return f"{own.min():.0f} to {own.max():.0f} s, {own.mean():.0f} s in the mean,"
+
+
 def values_table(values: pd.DataFrame) -> str:
     """Mean and scatter between the specimens of each parameter, from cycles 1 to 3."""
     own = values[values["what"] == HISTORY]
@@ -219,7 +225,7 @@ def main(fresh: bool) -> None:
     page = (HERE / "page.template.md").read_text(encoding="utf-8")
     text = page.format(
         source=real_foams.SOURCE, summary=summary(table), specimens=per_specimen(table),
-        values=values_table(values), inside=coverage(table), verified=coverage(table, chosen=False),
+        values=values_table(values), inside=coverage(table), verified=coverage(table, chosen=False), seconds=seconds(table),
     )  # fmt: skip
     (HERE / "README.md").write_text(text, encoding="utf-8")
 
