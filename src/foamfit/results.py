@@ -94,10 +94,15 @@ class Loop(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Correlation:
-    """Correlation matrix of the identified parameters, in the order of `names`."""
+    """Correlation matrix of the identified parameters, in the order of `names`.
+
+    `stderr` are the local standard errors, SI, also of those that the test does not determine; NaN
+    where the data fix only a combination.
+    """
 
     names: tuple[str, ...]
     matrix: Array
+    stderr: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -211,3 +211,35 @@ def test_relaxation_terms_come_back_in_the_order_of_their_times():
             params["s1_g1"].set(value=0.1, vary=False)
         else:
             np.testing.assert_array_equal(ordered, [0.1, 1.0, 0.2, 0.05])
+
+
+@pytest.mark.parametrize("terms", [0, 2])
+@pytest.mark.parametrize("mullins", [False, True])
+def test_the_derivative_by_the_zero_of_a_driving_motion_is_that_of_differences(terms, mullins):
+    """Along loops between which contact is lost: the motion stops at no strain."""
+    time = np.linspace(0.0, 8.0, 401)
+    strain = 0.35 * (0.5 - 0.5 * np.cos(np.pi * time)) + 0.05 * np.sin(1.3 * time) + 0.06
+    test = Measurement(
+        "driven", None, "0" * 64, time, 1e5 * strain, strain * HEIGHT, Specimen(HEIGHT, AREA),
+        noise=Noise(1e3, 1e-9), motion="measured",
+    )  # fmt: skip
+    problem = Options(relaxation=terms, mullins=mullins).problem(test, "microscale", None)
+    values = problem.vector()
+    for name, value in zip(problem.model.names, OF_SPRING[:7], strict=False):
+        values[problem.index[name]] = value
+    for i in range(terms):
+        values[problem.index[f"s1_g{i + 1}"]], values[problem.index[f"s1_tau{i + 1}"]] = 0.5, 3.0**i
+    place = problem.index["displacement_zero"]
+    values[place] = 0.07 * HEIGHT
+    names = ("s1_k0", "displacement_zero")
+    step = 1e-6 * HEIGHT
+    sides = []
+    for side in (-1.0, 1.0):
+        there = values.copy()
+        there[place] += side * step
+        sides.append(problem.objective.simulate(there).curves["stress_strain"])
+    places = np.array([problem.index[name] for name in names])
+    slopes = problem.objective.simulate(values, places=places).slopes
+    found, wanted = slopes["stress_strain"][1], (sides[1] - sides[0]) / (2.0 * step)
+    assert (strain < 0.07).any()
+    assert np.linalg.norm(found - wanted) < 1e-3 * np.linalg.norm(wanted)

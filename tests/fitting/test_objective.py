@@ -410,7 +410,7 @@ def of_two_loops() -> SystemError:
 def test_ctrl_c_in_a_compiled_loop_is_ctrl_c(monkeypatch, lost):
     """Where it comes as a loop hands over its result, Python makes a SystemError of it."""
 
-    def interrupted(*_):
+    def interrupted(*_, **__):
         raise SystemError("returned a result with an exception set") from lost
 
     problem = Options().problem(synthetic_impact()[1], "bistable")

@@ -119,14 +119,15 @@ def test_independent_errors_of_a_ratio_add_in_squares_and_the_text_says_so() -> 
 @pytest.mark.parametrize("rho", [-0.8, 0.5, 0.99])
 def test_the_correlation_enters_the_error_of_a_ratio(rho: float) -> None:
     names = ("s1_kc", "s1_k0")
-    correlation = Correlation(names, np.array([[1.0, rho], [rho, 1.0]]))
+    correlation = Correlation(names, np.array([[1.0, rho], [rho, 1.0]]), np.array([5.0, 7.0]))
     result = published_fit(correlation=correlation)
     comparison = compare([result])
     expected = 15 * 0.01 * math.sqrt(2 - 2 * rho)
     assert row(only(comparison), "k_c/k0").stderr == pytest.approx(expected)
     assert "no correlation" not in comparison_text(comparison)
     content = json.loads(json.dumps(result.to_json_dict()))
-    assert content["correlation"] == {"names": list(names), "matrix": [[1.0, rho], [rho, 1.0]]}
+    matrix, stderr = [[1.0, rho], [rho, 1.0]], [5.0, 7.0]
+    assert content["correlation"] == {"names": list(names), "matrix": matrix, "stderr": stderr}
     assert compare([content]) == comparison
 
 

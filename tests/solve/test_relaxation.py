@@ -277,7 +277,7 @@ def test_moments_of_short_and_long_steps_meet() -> None:
     row = chain(flat).arrays.rows[0].copy()
     for x in (1e-12, 1e-3, 0.9999, 1.0001, 3.0, 50.0, 1e4):
         eps, t = np.array([0.0, 1e-9]), np.array([0.0, x])
-        got = relaxed_along(row, eps, t, 1e-6, True)
+        got = relaxed_along(row, eps, t, 1e-6, True, np.zeros((2, 2)))
         want = 1.0 * (1.0 - math.expm1(-x) / x) if x > 0 else 2.0
         assert got[0][1] == pytest.approx(want, rel=1e-8)
         by_tau = -math.exp(-x) - math.expm1(-x) / x

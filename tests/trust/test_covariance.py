@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from foamfit.trust.best_point import growth
 from foamfit.trust.covariance import Block, Uncertainty, covariance, half_width, state
 from foamfit.trust.residuals.noise_process import NoiseProcess, autocorrelation_time
 
@@ -130,3 +131,23 @@ def test_parameters_that_no_curve_follows_have_no_covariance():
     found = Uncertainty((block,), np.ones(2)).covariance
     assert np.isnan(found.matrix).all()
     assert np.isnan(found.inflation).all()
+
+
+def test_the_growth_to_a_further_cycle_is_that_of_predicted_repetitions():
+    """Three cycles in which the law is off independently, and a fourth like the third; 400 times.
+
+    Some directions are told by one cycle alone, so that fit and prediction differ much.
+    """
+    rng, rows = np.random.default_rng(0), np.arange(80, 120)
+    jacobian = rng.standard_normal((120, 12))
+    jacobian[:80, :6] *= 0.1
+    fitted, told, predicted = 0.0, 0.0, 0.0
+    for _ in range(400):
+        y, further = rng.standard_normal(120), rng.standard_normal(40)
+        best = np.linalg.lstsq(jacobian, y, rcond=None)[0]
+        residual = y - jacobian @ best
+        square = float(residual[rows] @ residual[rows])
+        fitted, told = fitted + square, told + square * (1.0 + growth(jacobian, residual, rows))
+        predicted += float(np.sum((further - jacobian[rows] @ best) ** 2))
+    assert told == pytest.approx(predicted, rel=0.1)
+    assert predicted > 1.3 * fitted

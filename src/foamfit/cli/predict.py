@@ -30,7 +30,7 @@ from foamfit.cli.options import Output
 )
 @options.option(
     "--draws",
-    "Draws of the parameters for the band.",
+    "Draws of specimens for the band.",
     click.IntRange(40, 100_000),
     default=400,
     metavar="N",

@@ -133,12 +133,15 @@ def driving_stress(stress: Array, model: Model) -> Array:
     return np.maximum(smooth, 0.0) if "unilateral" in model.kinds else smooth
 
 
-def driving_motion(measurement: Measurement, time: Array) -> SmoothMotion | None:
+def driving_motion(
+    measurement: Measurement, time: Array, *, always: bool = False
+) -> SmoothMotion | None:
     """The measured motion without its noise; None where its samples say all, or are not there.
 
     An exact motion that turns sharply between samples went further than they say. Where a noisy one
     leaves the samples more than their noise the machine's motion is not that smooth: the samples
-    themselves are the better motion. `time` (n,) is that of the samples, s.
+    themselves are the better motion, unless it is to be smooth `always`. `time` (n,) is that of the
+    samples, s.
     """
     values, level = measurement.displacement, measurement.noise.of("displacement")
     if values is None or level is None:
@@ -154,7 +157,7 @@ def driving_motion(measurement: Measurement, time: Array) -> SmoothMotion | None
         apart = np.abs(time[:, None] - found.turns).min(axis=1) > 0.75 * gap
         counts = apart if counts is None else counts & apart
         found = follow(time, values, level, counts)
-    return found if found.sigma <= FOLLOWED * level.sigma else None
+    return found if always or found.sigma <= FOLLOWED * level.sigma else None
 
 
 def later(time: Array, curves: Array, late: float) -> Array:

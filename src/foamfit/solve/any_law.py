@@ -224,6 +224,11 @@ class AnyLawPlan(NamedTuple):
     drag: float
 
     @property
+    def moves_one(self) -> bool:
+        """See `solve.plan.Plan`: there is no derivative by a motion."""
+        return False
+
+    @property
     def solver(self) -> str:
         """The least solver that the scene needs, as `Response.solver` says it."""
         return "second order" if self.speed > 0.0 else "first order"

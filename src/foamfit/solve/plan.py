@@ -131,6 +131,12 @@ class Plan(NamedTuple):
     memory: bool = False
     unit: float = 1.0
 
+    @property
+    def moves_one(self) -> bool:
+        """Whether a known motion drives one spring with memory, which has a derivative by it."""
+        closed = self.solver == CLOSED_FORM and self.top == scenes.MOTION
+        return closed and self.memory and self.mass.size == 1
+
     def run(
         self,
         rows: Array,
@@ -279,7 +285,8 @@ class Plan(NamedTuple):
                 _on_one_plateau(rows, branches, directions) if moved else _NOTHING[:0],
             )
         eta = rows[0, kernels.ETA]
-        if moved and len(heights) == 1 and stress.size > 1 and (eta > 0.0 or slopes is not None):
+        damped = eta > 0.0 or np.isin(directions[:, 1], (OWN_ETA, OWN_HEIGHT)).any()
+        if moved and len(heights) == 1 and stress.size > 1 and damped:
             rate = np.gradient(strain[0], self.time)
             stress = stress + eta * rate
             for p, (_, what) in enumerate(directions):

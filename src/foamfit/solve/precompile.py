@@ -98,7 +98,7 @@ def _memory(relaxed: bool) -> None:
     assert rows is not None
     row, at = rows[0], np.zeros(2)
     if relaxed:
-        relaxation.relaxed_along(row, at, np.arange(2.0), 1e-6, False)
+        relaxation.relaxed_along(row, at, np.arange(2.0), 1e-6, False, np.zeros((2, 2)))
         return
     micro.stress_tangents_along(row, at, *micro.stress_along(row, at))
     micro.strain_along(row, at)

@@ -37,7 +37,7 @@ from foamfit.springs.kernels import (
 )
 from foamfit.springs.law import MICROSCALE
 from foamfit.springs.laws import followed
-from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
+from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 from foamfit.springs.ranks import (
     BRANCH,
     CARRIED,
@@ -105,13 +105,17 @@ def _switch(row: Row, state: Array, up: bool) -> None:
 
 
 @inner
-def _tangents(row: Row, state: Array, d_ranks: Array, out: Array) -> None:
-    """Fill the derivatives of the stress at a strain; see `microscale_kernels.tangents`."""
+def _tangents(row: Row, state: Array, seed: Array, d_ranks: Array, out: Array) -> None:
+    """Fill the derivatives of the stress at a strain; see `microscale_kernels.tangents`.
+
+    In place of that by the logarithm of the strain ε stands that by what moves ε by seed · (1, ε).
+    """
     branch, eps = int(state[BRANCH]), state[EPS]
+    moved = seed[0] + seed[1] * eps
     if row[KIND] == MICROSCALE:
         rank = micro.rank_now(row, state)
         ever = micro.ever_now(state, rank)
-        micro.tangents(row, branch, rank, ever, state[SIGMA], eps, d_ranks, out)
+        micro.tangents(row, branch, rank, ever, state[SIGMA], moved, d_ranks, out)
         return
     slope = slope_on(row, branch, eps)
     curved, _, x0, _ = branch_shape(row, branch)
@@ -120,7 +124,7 @@ def _tangents(row: Row, state: Array, d_ranks: Array, out: Array) -> None:
     for own in range(OF_STRAIN):
         dk, dx0, ds0 = branch_derivative(row, branch, own)
         out[own] = factor * dk - slope * dx0 + ds0
-    out[OF_STRAIN] = slope * eps
+    out[OF_STRAIN] = slope * moved
 
 
 @inner
@@ -278,23 +282,26 @@ def _try_nodes(
 
 @inlined
 def _derive(
-    row: Row, state: Array, nodes: Array, d_ranks: Array, d_nodes: Array, first: float, last: float
-) -> None:
+    row: Row, state: Array, seed: Array, nodes: Array, d_ranks: Array, d_nodes: Array,
+    first: float, last: float,
+) -> None:  # fmt: skip
     """Fill the derivatives of the stress at the nodes of a step between two strains."""
     for c in range(d_nodes.shape[1]):
         d_nodes[0, c] = d_nodes[3, c]
     here = state[SIGMA], state[EPS]
     for i in range(1, 4):
         state[EPS], state[SIGMA] = first + NODES[i] * (last - first), nodes[i]
-        _tangents(row, state, d_ranks, d_nodes[i])
+        _tangents(row, state, seed, d_ranks, d_nodes[i])
     state[SIGMA], state[EPS] = here
 
 
 @inlined
-def _derive_end(row: Row, state: Array, d_ranks: Array, d_nodes: Array, wanted: bool) -> None:
+def _derive_end(
+    row: Row, state: Array, seed: Array, d_ranks: Array, d_nodes: Array, wanted: bool
+) -> None:
     """Fill the derivatives of the stress where the spring is now, if they are wanted."""
     if wanted:
-        _tangents(row, state, d_ranks, d_nodes[3])
+        _tangents(row, state, seed, d_ranks, d_nodes[3])
 
 
 @inlined
@@ -347,7 +354,7 @@ def _of_bump(table: Array) -> float:
 
 @compiled
 def relaxed_along(
-    row: Row, eps: Array, t: Array, rtol: float, derive: bool
+    row: Row, eps: Array, t: Array, rtol: float, derive: bool, seeds: Array
 ) -> tuple[Array, Branches, Array, Array, Array]:
     """Stress of a spring and of its relaxation terms along a history of its strain.
 
@@ -361,6 +368,9 @@ def relaxed_along(
         Wanted error over the largest stress.
     derive : bool
         Whether to fill the derivatives too.
+    seeds : (n, 2) array
+        On the way to each sample the last but one of them is by what moves the strain ε by
+        seed · (1, ε): (0, 1) is the logarithm of the strain.
 
     Returns
     -------
@@ -395,7 +405,7 @@ def relaxed_along(
             if start:  # from rest to the first sample in no time
                 _settle(row, state, end)
                 done, entered = until, True
-            _derive_end(row, state, d_ranks, d_nodes, derive and entered)
+            _derive_end(row, state, seeds[j], d_ranks, d_nodes, derive and entered)
             entered = False
             pace = until - done
             at, first = done, state[EPS]
@@ -424,7 +434,7 @@ def relaxed_along(
                 if not short:
                     plain = CHECKED if sloped and error <= PLAIN * rtol * largest else 0
                 if derive:
-                    _derive(row, state, nodes, d_ranks, d_nodes, origin, goal)
+                    _derive(row, state, seeds[j], nodes, d_ranks, d_nodes, origin, goal)
                 _relax(row, h, table, nodes, d_nodes, kept)
                 done = until if last else done + pace
                 pace *= 2.0
@@ -437,7 +447,7 @@ def relaxed_along(
                 continue
             if state[EPS] != end:  # so near the end of a branch that no time is left
                 _settle(row, state, end)
-                _derive_end(row, state, d_ranks, d_nodes, derive)
+                _derive_end(row, state, seeds[j], d_ranks, d_nodes, derive)
             break
         if start:
             kept.y[:] = -state[SIGMA]
@@ -445,6 +455,19 @@ def relaxed_along(
         sigma[j] = _sum_up(row, state[SIGMA], d_nodes[3], kept, by[:, j], by_g[:, j], by_tau[:, j])
         branches[j] = int(state[BRANCH])
     return sigma, branches, by, by_g, by_tau
+
+
+def _seeds(eps: Array, *, moved: bool) -> Array:
+    """Seeds of the derivative by the logarithm of the strain, or by all strains in contact."""
+    seeds = np.zeros((eps.size, 2))
+    if not moved:
+        seeds[:, 1] = 1.0
+        return seeds
+    touched = (eps > 0.0).astype(float)
+    seeds[:, 0] = touched
+    for j in np.flatnonzero(np.diff(touched)) + 1:  # it comes or goes on the way there
+        seeds[j] = 0.0, 1.0 / (eps[j] - eps[j - 1]) * (touched[j] - touched[j - 1])
+    return seeds
 
 
 def stress_along(
@@ -472,17 +495,20 @@ def stress_along(
     """
     own = directions[:, 1]
     terms = row[N_COLUMNS::2]
-    out = np.zeros((len(own), eps.size))
+    out, seeds = np.zeros((len(own), eps.size)), _seeds(eps, moved=bool((own == MOVED).any()))
     if row[KIND] == MICROSCALE and not terms.any() and not (own >= OWN_RELAXATION).any():
         stress, ranks, branches = micro.stress_along(row, eps)
         if len(own) == 0:
             return stress, branches, out
-        by, _ = micro.stress_tangents_along(row, eps, stress, ranks, branches)
+        moved = seeds[:, 0] + seeds[:, 1] * eps
+        by, _ = micro.stress_tangents_along(row, moved, stress, ranks, branches)
         by_g = by_tau = by[:0]
     else:
-        stress, branches, by, by_g, by_tau = relaxed_along(row, eps, t, rtol, len(own) > 0)
+        stress, branches, by, by_g, by_tau = relaxed_along(row, eps, t, rtol, len(own) > 0, seeds)
     for p, what in enumerate(own):
-        if what < OWN_ETA:
+        if what == MOVED:
+            out[p] = by[OF_STRAIN] / height
+        elif what < OWN_ETA:
             out[p] = by[what]
         elif what == OWN_HEIGHT:
             out[p] = by[OF_STRAIN] / -height

@@ -17,6 +17,8 @@ from foamfit.springs.laws.record import COMMON, ETA, Param
 # on: the strength g_k of term k = 1, 2, … is OWN_RELAXATION + 2 (k-1), its time τ_k the number
 # after it.
 OWN_ETA, OWN_HEIGHT, DRAG, OWN_RELAXATION = 20, 21, 22, 23
+# By the displacement of all samples of a known motion that are in contact; of one spring alone.
+MOVED = -1
 
 # What a record does not say exactly of an impact, and its unit: unknowns beside the springs.
 NUISANCE = {

@@ -11,19 +11,20 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.csv_file import read_test
+from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
 from foamfit.data.noise import with_noise
 from foamfit.data.rate import loading_rate
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.curves import check_drive, check_time_shift, choose_drive
+from foamfit.fitting.curves import check_drive, check_time_shift, choose_drive, driving_motion
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, descend
 from foamfit.report import render
 from foamfit.report.figures import TWO, inches
 from foamfit.report.studies.prediction import save_prediction
 from foamfit.springs.parameters import unit_of
-from foamfit.study.prediction.identified import HasContent, Source, read_source
-from foamfit.study.prediction.population import NORMAL, Population
+from foamfit.study.prediction.identified import NORMAL, HasContent, Source, read_source
+from foamfit.study.prediction.population import Population
 from foamfit.study.prediction.predicted import (
     PARTS,
     PredictedCurve,
@@ -32,7 +33,7 @@ from foamfit.study.prediction.predicted import (
 )
 from foamfit.text import engineering
 
-# Draws of the parameters; fewer say nothing of the ends of a 95 % band.
+# Draws of specimens; fewer say nothing of the ends of a 95 % band.
 DRAWS, FEWEST = 400, 40
 # By how much the rate of a test may lie outside the fitted ones, as a factor.
 RATE_FACTOR = 1.25
@@ -72,9 +73,10 @@ def predict(
     Height, area, mass and velocity are those of the test, and so is the rate at which laws of rate
     are evaluated. What its record does not say exactly, such as the contact time and zeros of an
     impact, is fitted to it (`PredictedTest.aligned`). The 95 % band has these parts: what the
-    result leaves uncertain of the parameters, their scatter between specimens (of a joint result),
-    the noise of the test, that of a motion that drives, and what the law has missed of the fitted
-    tests beyond their noise. The first two are drawn and simulated exactly.
+    result leaves uncertain of the parameters, to first order; their scatter between specimens (of a
+    joint result), drawn and simulated; the noise of the test and that of a motion that drives; and
+    what the law has missed of the fitted tests beyond their noise, which grows with each cycle
+    after the last of a fitted history (`foamfit.trust.best_point.cycle_growth`).
 
     Parameters
     ----------
@@ -88,7 +90,7 @@ def predict(
     extrapolate : bool
         Whether the rate of the test may lie outside the fitted rates by more than `RATE_FACTOR`.
     draws, seed
-        Draws of the parameters for each part; same seed, same numbers.
+        Draws of specimens; same seed, same numbers.
 
     Returns
     -------
@@ -116,19 +118,28 @@ def predict(
         )
     problem = _problem(source, measurement, drive)
     objective = problem.objective
-    population = Population(source, problem.model.names, problem.measurement.specimen, rate)
-    springs = _point(population, problem)
+    limits = {name: (one.min, one.max) for name, one in problem.params.items()}
+    population = Population(source, problem.model.names, problem.measurement.specimen, rate, limits)
+    springs, aligning = _point(population, problem), _before(problem, source)
     try:
-        point, aligned = _aligned(problem, springs, population.scattering)
+        point, aligned = _aligned(aligning, springs, population.scattering)
         simulated = objective.simulate(point, everything=True)
     except SimulationError as error:
         raise SimulationError(
             f"{measurement.name} cannot be predicted from {source.where}: {error}"
         ) from None
-    drawn = _draw(population, problem, point, draws, seed)
-    moved = _by_motion(problem, point)
+    drawn = _draw(population, problem, point, draws, seed) if population.scattering else None
+    known = {"parameters": _by_parameters(population, aligning, point, tuple(aligned))}
+    known |= {"motion": _by_motion(problem, point)}
     curves = {
-        name: _curve(problem, name, simulated.curves[name], drawn, source, moved.get(name))
+        name: _curve(
+            problem,
+            name,
+            simulated.curves[name],
+            drawn,
+            source,
+            {part: sides[name] for part, sides in known.items() if name in sides},
+        )
         for name in objective.counted
     }
     changing, count = population.scattering, population.fewest if population.scattering else 0
@@ -144,7 +155,7 @@ def predict(
         scattering=changing,
         held=population.held,
         untold=[one.channel for one in curves.values() if one.channel not in source.misses],
-        drawn=min((len(one.values) for one in drawn.values()), default=draws),
+        drawn=draws if drawn is None else len(drawn.values),
         draws=draws,
     )
     sentences = render.sentences(
@@ -171,8 +182,8 @@ def predict(
         rate=rate,
         fitted_rates=source.rates,
         extrapolated=bool(outside),
-        draws=min((len(one.values) for one in drawn.values()), default=0),
-        redrawn=sum(one.redrawn for one in set(drawn.values())),
+        draws=0 if drawn is None else len(drawn.values),
+        redrawn=0 if drawn is None else drawn.redrawn,
         held=population.held,
         sentences=sentences,
         warnings=warnings,
@@ -214,7 +225,7 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
             check_time_shift(measurement, chosen)
         except InputError:  # it was that of another record
             late = False
-    return make_problem(
+    problem = make_problem(
         measurement,
         source.model.name,
         chosen,
@@ -224,6 +235,33 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
         time_shift=late,
         relaxation=source.model.relaxation,
     )
+    objective = problem.objective
+    if (
+        source.sha256 != measurement.data_sha256
+        or source.smoothed is None
+        or chosen != "displacement"
+    ):
+        return problem
+    # More or other cycles of the record that was fitted: its motion is what it was then.
+    motion = driving_motion(objective.measurement, objective.time, always=source.smoothed)
+    followed = (motion if source.smoothed else None,)
+    return replace(problem, objective=replace(objective, followed=followed))
+
+
+def _before(problem: Problem, source: Source) -> Problem:
+    """The problem without the cycles that come after the last fitted one, if others are left."""
+    objective, test, last = problem.objective, problem.measurement, source.last_cycle
+    ends = [part.stop for number, part in cycles_of(test).items() if last and number <= last]
+    if not ends or ends[-1] == objective.time.size:
+        return problem
+    before = np.arange(objective.time.size) < ends[-1]
+    sampled = {
+        channel: before & test.sampled.get(channel, True)
+        for channel in map(objective.channel, objective.counted)
+    }
+    test = replace(test, sampled=test.sampled | sampled)
+    followed = (objective.motion,)
+    return replace(problem, objective=replace(objective, measurement=test, followed=followed))
 
 
 def _point(population: Population, problem: Problem) -> Array:
@@ -245,7 +283,8 @@ def _aligned(
 ) -> tuple[Array, dict[str, float]]:
     """The springs and what of the record fits them best, and that in the numbers of its file.
 
-    Parameters that change from specimen to specimen are fitted with it and then given up: held, a
+    Of a history that goes on after the cycles that were fitted, only those tell it. Parameters that
+    change from specimen to specimen are fitted with it and then given up: held, a
     stiffer specimen would be taken for one that is touched earlier.
     Raises SimulationError if the springs cannot be simulated.
     """
@@ -285,44 +324,21 @@ def _admissible(problem: Problem, values: Array) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """Draws of the parameters and their curves."""
+    """Draws of specimens and their curves."""
 
     values: list[Array]
     curves: list[dict[str, Array]]
     redrawn: int
 
 
-def _draw(
-    population: Population, problem: Problem, point: Array, draws: int, seed: int
-) -> dict[str, _Drawn]:
-    """Draws of each of the first two parts, and of both together, about a point."""
-    wanted = {"parameters": population.uncertain, "scatter": bool(population.scattering)}
-    out = {
-        part: _simulate(population, problem, point, draws, [seed, i], {part})
-        for i, (part, there) in enumerate(wanted.items())
-        if there
-    }
-    if len(out) == 2:
-        out["both"] = _simulate(population, problem, point, draws, [seed, 2], set(wanted))
-    elif out:
-        out["both"] = next(iter(out.values()))
-    return out
-
-
-def _simulate(
-    population: Population,
-    problem: Problem,
-    point: Array,
-    draws: int,
-    seed: list[int],
-    parts: set[str],
-) -> _Drawn:
+def _draw(population: Population, problem: Problem, point: Array, draws: int, seed: int) -> _Drawn:
     """Draw and simulate until there are so many; what is not admissible is drawn again.
 
     What lies beyond the limits of a fit of the test is moved there, as a fit does: to draw it again
     would leave one side of all other parameters out. What was aligned stays as it is at the point.
     """
-    rng, objective, tried = np.random.default_rng(seed), problem.objective, 0
+    rng, other = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
+    objective, tried = problem.objective, 0
     values, curves = list[Array](), list[dict[str, Array]]()
     params = [problem.params[name] for name in problem.model.names]
     common = point[: len(params)]
@@ -330,8 +346,8 @@ def _simulate(
     high = np.maximum([one.max for one in params], common)
     while len(values) < draws and tried < TRIES * draws:
         tried += 1
-        drawn = population.draw(rng, open_="parameters" in parts, scatter="scatter" in parts)
-        one = np.clip(drawn, low, high)
+        uncertain = population.root @ other.standard_normal(len(params))
+        one = np.clip(population.draw(rng) + uncertain, low, high)
         try:
             simulated = objective.simulate(np.append(one, point[one.size :]))
         except SimulationError:
@@ -340,22 +356,50 @@ def _simulate(
         curves.append({name: simulated.curves[name] for name in objective.counted})
     if len(values) < FEWEST:
         raise SimulationError(
-            f"{population.source.where}: only {len(values)} of {tried} sets of parameters drawn "
-            "from its uncertainty can be simulated; hold or share what it leaves undetermined"
+            f"{population.source.where}: only {len(values)} of {tried} specimens drawn from its "
+            "scatter can be simulated; hold or share what it leaves undetermined"
         )
     return _Drawn(values, curves, tried - len(values))
 
 
+def _by_parameters(
+    population: Population, aligning: Problem, point: Array, aligned: tuple[str, ...]
+) -> dict[str, Array]:
+    """Half of the 95 % band (n,), SI, by what the result leaves uncertain, to first order.
+
+    What is aligned to the record would follow the parameters, by the samples of `aligning`.
+    """
+    objective, covariance = aligning.objective, population.covariance
+    own = np.flatnonzero(np.diag(covariance) > 0.0)
+    places = np.append(own, [aligning.index[name] for name in aligned]).astype(np.int64)
+    slopes = objective.simulate(point, places=places).slopes
+    if not own.size or slopes is None:
+        return {}
+    jacobian, out = objective.jacobian(point, places), dict[str, Array]()
+    follow = np.linalg.lstsq(jacobian[:, own.size :], jacobian[:, : own.size], rcond=None)[0]
+    for name in objective.counted:
+        moved = slopes[name][: own.size] - follow.T @ slopes[name][own.size :]
+        variance = np.einsum("in,ij,jn->n", moved, covariance[np.ix_(own, own)], moved)
+        out[name] = population.quantile * np.sqrt(np.maximum(variance, 0.0))
+    return out
+
+
 def _by_motion(problem: Problem, point: Array) -> dict[str, Array]:
-    """Standard deviation of each curve (n,), SI, by what stays uncertain of a driving motion."""
+    """Half of the 95 % band (n,), SI, by what stays uncertain of a driving motion.
+
+    That is no more than the noise of a sample, wherever there is one.
+    """
     objective, out = problem.objective, dict[str, Array]()
-    changes = objective.by_motion(point)
-    if changes is None:
+    changes, level = objective.by_motion(point), objective.measurement.noise.of("displacement")
+    if changes is None or objective.motion is None or level is None:
         return out
+    apart = np.linalg.norm(objective.motion.modes(objective.time), axis=1)
+    share = np.minimum(1.0, level.sigma / np.maximum(apart, 1e-300))
     parts = np.split(np.linalg.norm(changes, axis=1), np.cumsum(objective.sizes)[:-1])
     samples = np.arange(objective.time.size)
     for name, part in zip(objective.counted, parts, strict=True):
-        out[name] = np.interp(samples, objective.kept(name), part / objective.factor(name))
+        size = np.interp(samples, objective.kept(name), part / objective.factor(name))
+        out[name] = NORMAL * share * size
     return out
 
 
@@ -363,28 +407,26 @@ def _curve(
     problem: Problem,
     name: str,
     predicted: Array,
-    drawn: dict[str, _Drawn],
+    drawn: _Drawn | None,
     source: Source,
-    by_motion: Array | None,
+    known: dict[str, Array],
 ) -> PredictedCurve:
     """One curve with its band: quantiles of the draws, all other parts added in quadrature."""
     objective = problem.objective
     channel, n = objective.channel(name), predicted.size
-    parts = {part: np.zeros(n) for part in PARTS if part != "motion" or by_motion is not None}
-    if by_motion is not None:
-        parts["motion"] = NORMAL * by_motion
-    ends = {
-        part: np.quantile([curves[name] for curves in one.curves], [BAND[0], 0.5, BAND[1]], axis=0)
-        for part, one in drawn.items()
-    }
-    for part in ends.keys() & parts.keys():
-        parts[part] = 0.5 * (ends[part][2] - ends[part][0])
+    parts = {part: np.zeros(n) for part in PARTS if part != "motion"} | known
+    low = middle = high = predicted
+    if drawn is not None:
+        ends = np.quantile([curves[name] for curves in drawn.curves], (*BAND, 0.5), axis=0)
+        low, high, middle = ends
+        both = 0.5 * (high - low)
+        parts["scatter"] = np.sqrt(np.maximum(both**2 - parts["parameters"] ** 2, 0.0))
     sigma, span = objective.noise(name).sigma, float(np.ptp(predicted))
     parts["noise"] = np.full(n, NORMAL * sigma)
     missed = source.law_error(channel, sigma / float(np.ptp(objective.measured[name])))
-    parts["law_error"] = np.full(n, NORMAL * missed * span)
-    low, middle, high = ends.get("both", np.tile(predicted, (3, 1)))
-    more = sum(parts[part] ** 2 for part in parts.keys() - {"parameters", "scatter"})
+    parts["law_error"] = missed * span * np.sqrt(_grown(problem.measurement, source))
+    within = {"scatter"} if drawn is None else {"scatter", "parameters"}  # of the draws
+    more = sum(parts[part] ** 2 for part in parts.keys() - within)
     kept = np.zeros(n, dtype=bool)
     kept[objective.kept(name)] = True
     return PredictedCurve(
@@ -394,20 +436,36 @@ def _curve(
         predicted=predicted,
         lo=middle - np.sqrt((middle - low) ** 2 + more),
         hi=middle + np.sqrt((high - middle) ** 2 + more),
-        parts=parts,
+        parts={part: parts[part] for part in PARTS if part in parts},
         kept=kept,
     )
 
 
+def _grown(measurement: Measurement, source: Source) -> Array:
+    """Mean square of the law's error over that of the fitted cycles, (n,).
+
+    After the last fitted cycle it grows by the same amount with each, as a random walk does.
+    """
+    assert measurement.stress is not None
+    grown = np.ones(measurement.stress.size)
+    last = source.last_cycle or math.inf
+    for number, part in cycles_of(measurement).items():
+        grown[part] += source.growth * max(number - last, 0.0)
+    return grown
+
+
 def _parameters(
-    population: Population, point: Array, drawn: dict[str, _Drawn]
+    population: Population, point: Array, drawn: _Drawn | None
 ) -> dict[str, PredictedParameter]:
-    """Each parameter at the test, and where 95 % of the draws lie."""
-    both = np.array(drawn["both"].values) if drawn else point[None]
-    low, high = np.quantile(both, BAND, axis=0)
-    return {
-        name: PredictedParameter(
-            population.source.parameters[name].kind, float(point[i]), float(low[i]), float(high[i])
-        )
-        for i, name in enumerate(population.names)
-    }
+    """Each parameter at the test and its 95 % interval, within its limits."""
+    half = population.quantile * np.sqrt(np.maximum(np.diag(population.covariance), 0.0))
+    ends = (point - half, point + half)
+    if drawn is not None:
+        ends = tuple(np.quantile(drawn.values, BAND, axis=0))
+    out = {}
+    for name, value, *pair in zip(population.names, point, *ends, strict=True):
+        limits = population.limits[name]
+        lo, hi = (float(np.clip(end, min(limits[0], value), max(limits[1], value))) for end in pair)
+        kind = population.source.parameters[name].kind
+        out[name] = PredictedParameter(kind, float(value), lo, hi)
+    return out

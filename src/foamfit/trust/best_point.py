@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
+from foamfit.data.cycles import cycles_of
 from foamfit.fitting.branches import unreached
 from foamfit.fitting.losses import influence, soften
 from foamfit.fitting.objective import Simulated
@@ -20,7 +21,10 @@ from foamfit.fitting.problem import Problem
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Block, Covariance, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
-from foamfit.trust.residuals.noise_process import noise_processes, parts
+from foamfit.trust.residuals.noise_process import basis_of, noise_processes, parts
+
+# Share of the residuals along a direction that a cycle takes at most, so that it is not all.
+MOST_TAKEN = 0.99
 
 
 def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:
@@ -188,3 +192,26 @@ class BestPoint:
     def rises(self, residual: Array) -> Array:
         """Rise of the cost at another point, from its softened residual, as χ² of each, (k,)."""
         return np.asarray((float(residual @ residual) - self.cost) / self.spread.inflation)
+
+
+def cycle_growth(best: BestPoint) -> float | None:
+    """`growth` from the last fitted cycle to the next; None where there are not several cycles."""
+    objective, spans = best.problem.objective, cycles_of(best.problem.measurement)
+    if len(spans) < 2 or not best.names:
+        return None
+    last = spans[max(spans)]
+    kept = np.concatenate([objective.kept(name) for name in objective.counted])
+    return growth(*best.weighted, np.flatnonzero((kept >= last.start) & (kept < last.stop)))
+
+
+def growth(jacobian: Array, residual: Array, rows: NDArray[np.intp]) -> float:
+    """Mean square of what a law misses of a new cycle over that of a fitted one, less one.
+
+    The fitted cycle has the samples `rows` and the part H of the hat matrix. Errors that differ
+    from cycle to cycle leave residuals r of covariance I - H in it, and of I + H in a new one like
+    it: r'(I + H)(I - H)⁻¹r there for r'r here. (To leave the fitted cycle out would tell more,
+    (I - H)⁻¹r, as one cycle fewer is fitted then.)
+    """
+    onto, share, _ = np.linalg.svd(basis_of(jacobian)[rows], full_matrices=False)
+    hat, left = np.minimum(share**2, MOST_TAKEN), residual[rows]
+    return float(2.0 * hat / (1.0 - hat) @ (onto.T @ left) ** 2 / max(left @ left, 1e-300))

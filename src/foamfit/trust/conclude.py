@@ -26,7 +26,7 @@ from foamfit.springs import laws
 from foamfit.springs.parameters import any_param, split_name, unit_of
 from foamfit.text import engineering, listed, percent
 from foamfit.trust import covariance
-from foamfit.trust.best_point import BestPoint
+from foamfit.trust.best_point import BestPoint, cycle_growth
 from foamfit.trust.budget import make_budget
 from foamfit.trust.checklist import (
     POOR,
@@ -49,13 +49,14 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
     problem, objective, simulated = best.problem, best.problem.objective, best.simulated
     measurement, specimen = problem.measurement, problem.measurement.specimen
     intervals = Intervals() if intervals is None else intervals
-    insight = None
+    insight = correlation = None
     if best.names:  # one standard deviation of what is left of each curve, its correlation counted
         left = {
             name: math.sqrt(max(process.variance * process.tau, 1e-300)) / objective.factor(name)
             for name, process in zip(objective.counted, best.spread.noise, strict=True)
         }
-        insight = look(best, left)
+        insight, spread = look(best, left), best.spread
+        correlation = Correlation(best.names, spread.correlation, spread.stderr)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals))
     balance, misfit = audit(measurement), objective.misfit(simulated)
     checklist = make_checklist(Findings(best, estimates, misfit, record, balance, intervals))
@@ -89,7 +90,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
             },
         ),
         switches=_switches(best),
-        correlation=Correlation(best.names, best.spread.correlation) if best.names else None,
+        correlation=correlation,
         notes=(*problem.notes, *_notes(best), *_noise_notes(objective), *intervals.notes),
         checklist=checklist,
         insight=insight,
@@ -110,11 +111,13 @@ def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[st
 
     `errors` are those of the counted curves, or none if nothing varies. `law_error` is the RMS of
     the law's error beside the noise, SI, None if there is none; `law_error_evidence` is by how much
-    the Bayesian information criterion favours it.
+    the Bayesian information criterion favours it. `motion_smoothed` tells whether the driving
+    motion was followed without its noise. 95 % of the residuals are below `residual_q95`, SI.
     """
     objective, found = best.problem.objective, {}
     known = dict(zip(objective.counted, errors, strict=True)) if errors else {}
     for name, rms in objective.rms(best.residual).items():
+        off = best.simulated.curves[name] - objective.measured[name]
         level, error = objective.noise(name), known.get(name)
         found[name] = asdict(level) | {
             "scale": objective.scale[name],
@@ -122,6 +125,8 @@ def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[st
             "law_error": error.law / objective.factor(name) if error and error.found else None,
             "law_error_evidence": error.evidence if error else None,
             "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
+            "motion_smoothed": objective.drive == "displacement" and objective.motion is not None,
+            "residual_q95": float(np.quantile(np.abs(off[objective.kept(name)]), 0.95)),
         }
     return found
 
@@ -349,6 +354,7 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
         "n_starts": record.starts,
         "n_descents": len(record.costs),
         "n_agreeing": record.agreeing,
+        "cycle_growth": cycle_growth(best),
     }
 
 

@@ -86,6 +86,8 @@ class Refit:
             box[:, hold[0]] = hold[1]
 
         def residual(scaled: Array) -> Array:
+            if scaled is begin:
+                return np.asarray(root * first)
             return np.asarray(root * self.tracker.residual(self.point(scaled, box), self.shift))
 
         def jacobian(scaled: Array) -> Array:
@@ -95,11 +97,12 @@ class Refit:
                 return slopes * sizes
             return self._jacobian(problem.objective.differences(point) - self.shift, slopes)
 
-        scaled = np.clip(start[self.best.places], *box) / sizes
-        if self.residual(self.point(scaled, box)) is None:
+        begin = np.clip(start[self.best.places], *box) / sizes
+        first = self.residual(self.point(begin, box))
+        if first is None:
             return None
         limits = box[0] / sizes, box[1] / sizes
         end = descend(
-            residual, jacobian, scaled, limits, iterations, least=self.enough, damping=1e-6
+            residual, jacobian, begin, limits, iterations, least=self.enough, damping=1e-6
         )
         return replace(end, point=self.point(end.point, box))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -193,6 +194,7 @@ def _ranks_below(stress: ArrayLike, middle: float, spread: float) -> Array:
     return np.asarray(ndtr(scores), dtype=float)
 
 
+@lru_cache(maxsize=256)
 def _least_star(k0: float, kc: float, stiffening: float = 1.0, softening: float = 0.0) -> float:
     """Least ε_*: with it branch c lies at or beyond branch a, softened too, at every stress."""
     return most_beyond(k0 * math.exp(-softening), kc, stiffening)[0]

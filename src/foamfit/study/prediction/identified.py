@@ -22,6 +22,7 @@ from foamfit.report.folder import load_result
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name
 
+NORMAL = 1.959964  # half of the 95 % interval of a normal distribution over its standard deviation
 KINDS = ("shared", "own", "scatter", *RATES, "fixed")
 Pair = tuple[float, float]
 # Curves that a drive gives, but which it does not count: see `fitting.curves.default_weights`.
@@ -49,6 +50,7 @@ class Identified:
     kind: str
     value: float
     stderr: float | None = None
+    local: float | None = None  # As `stderr`, also where the test does not determine it
     ci95: Pair | None = None
     range: Pair | None = None
     state: str | None = None
@@ -60,16 +62,25 @@ class Identified:
     rates: tuple[float | None, ...] = ()  # of these tests, 1/s
 
     @property
+    def error(self) -> float | None:
+        """Its standard error, that of the local covariance where it is not determined."""
+        return self.stderr or self.local
+
+    @property
     def span(self) -> Pair | None:
         """Where it may lie if it has no standard error."""
         return self.range or self.ci95
 
 
 class Miss(NamedTuple):
-    """Misfit (RMS) of a curve of a fitted test and its noise, both over the measured range."""
+    """Misfit (RMS) of a curve of a fitted test and its noise, both over the measured range.
+
+    `most` is what 95 % of the residuals are below.
+    """
 
     misfit: float
     noise: float | None
+    most: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,16 +105,23 @@ class Source:
     # Correlation between specimens of own and scattering parameters, as far as the result has it.
     changing: tuple[str, ...] = ()
     together: Array = field(default_factory=lambda: np.empty((0, 0)))
+    sha256: str | None = None  # Of the record, where it is that of one test
+    smoothed: bool | None = None  # Whether the driving motion was followed without its noise
+    # Of several cycles fitted as one history: the last, and `Fit.growth`.
+    last_cycle: float | None = None
+    growth: float = 0.0
 
     def law_error(self, channel: str, noise: float) -> float:
-        """RMS of what the law missed of the fitted tests beyond their noise, over the range.
+        """Half of the 95 % band by what the law missed of the fitted tests beyond their noise.
 
-        `noise` (over the range) is taken for tests whose noise the result does not tell.
+        Over the range. `noise` (over the range) is taken for tests whose noise the result does not
+        tell. Residuals that are mostly small and sometimes large count by their quantile.
         """
-        squares = [
-            max(miss.misfit**2 - (noise if miss.noise is None else miss.noise) ** 2, 0.0)
-            for miss in self.misses.get(channel, ())
-        ]
+        squares = []
+        for miss in self.misses.get(channel, ()):
+            known = noise if miss.noise is None else miss.noise
+            missed = max(NORMAL * miss.misfit, miss.most)
+            squares.append(max(missed**2 - (NORMAL * known) ** 2, 0.0))
         return math.sqrt(sum(squares) / len(squares)) if squares else 0.0
 
 
@@ -221,6 +239,7 @@ def _source(given: _Item) -> Source:
         given, *(("covariance", "matrix") if joint else ("correlation", "matrix")), parameters
     )
     changing, together = _correlation(given, "specimens", "correlation", parameters)
+    noise = given.items("noise") if content.get("noise") else {}
     return Source(
         name=str(content.get("name" if joint else "test") or where),
         where=where,
@@ -238,6 +257,10 @@ def _source(given: _Item) -> Source:
         time_shift=TIME_SHIFT in content["parameters"],
         changing=changing,
         together=together,
+        sha256=content.get("data_sha256"),
+        smoothed=next((one.get("motion_smoothed") for one in noise.values()), None),
+        last_cycle=given.item("data").item("last_cycle").maybe,
+        growth=given.item("statistics").item("cycle_growth").maybe or 0.0,
     )
 
 
@@ -245,8 +268,10 @@ def _parameters(
     given: _Item, model: Model, joint: bool, rates: Mapping[str, float | None]
 ) -> dict[str, Identified]:
     """The parameters of the springs: nuisance parameters are those of one record."""
+    told = given.item("correlation")
+    errors = dict(zip(told.get("names") or (), told.get("stderr") or (), strict=False))
     found = {
-        name: _parameter(item, joint, rates)
+        name: _parameter(item, _Item(errors.get(name), item.where).error, joint, rates)
         for name, item in given.items("parameters").items()
         if name not in NUISANCE
     }
@@ -260,7 +285,9 @@ def _parameters(
     return {name: Identified("fixed", 0.0) for name in model.names} | found
 
 
-def _parameter(item: _Item, joint: bool, rates: Mapping[str, float | None]) -> Identified:
+def _parameter(
+    item: _Item, local: float | None, joint: bool, rates: Mapping[str, float | None]
+) -> Identified:
     """One parameter of fit.json or joint.json; `rates` are those of the tests."""
     if not isinstance(item.content, Mapping):
         raise InputError(f"{item.where} is {item.content!r}; it must be an object with a value")
@@ -277,6 +304,7 @@ def _parameter(item: _Item, joint: bool, rates: Mapping[str, float | None]) -> I
         kind,
         item.item("value").number,
         item.item("stderr").error,
+        local,
         item.item("ci95").pair,
         item.item("range").pair,
         item.get("state"),
@@ -327,9 +355,10 @@ def _misses(tests: list[_Item]) -> dict[str, tuple[Miss, ...]]:
         for curve, misfit in misfits.items():
             if misfit.content is None or curve in _UNCOUNTED.get(str(test.get("drive")), ()):
                 continue
-            noise, share = test.item("noise").item(curve), None
+            noise, share, most = test.item("noise").item(curve), None, 0.0
             if noise.get("range"):
                 share = noise.item("sigma").number / noise.item("range").number
+                most = (noise.item("residual_q95").maybe or 0.0) / noise.item("range").number
             channel = "stress" if curve.startswith("stress") else curve.removesuffix("_time")
-            found.setdefault(channel, []).append(Miss(misfit.number, share))
+            found.setdefault(channel, []).append(Miss(misfit.number, share, most))
     return {channel: tuple(each) for channel, each in found.items()}

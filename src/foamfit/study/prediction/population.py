@@ -1,19 +1,18 @@
-"""Draws of the parameters of a test that was not fitted, from what a result says of them.
+"""Parameters of a test that was not fitted, from what a result says of them.
 
-Two things are drawn: what the result leaves uncertain (its standard errors and their correlation),
-and what changes from specimen to specimen (parameters that scatter or are own).
+What the result leaves uncertain of them is a covariance; what changes from specimen to specimen
+(parameters that scatter or are own) is drawn.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Specimen
@@ -21,26 +20,26 @@ from foamfit.errors import InputError
 from foamfit.fitting.box import is_logarithmic
 from foamfit.fitting.links import RATES, factor
 from foamfit.springs.parameters import split_name
-from foamfit.study.prediction.identified import Identified, Pair, Source
+from foamfit.study.prediction.identified import NORMAL, Identified, Pair, Source
 from foamfit.trust.scatter import correlation
 
 # Own parameters change with the rate if that lowers BIC by so much, over so many tests or more, of
 # which the logarithms of the rate spread by more than this.
 EVIDENCE, FEWEST_OF_TREND, SAME_RATE = 2.0, 5, 0.05
-NORMAL = 1.959964  # half of the 95 % interval of a normal distribution over its standard deviation
 
 
 @dataclass(frozen=True, eq=False)
 class Population:
     """The parameters of one test, in the order of `names` (SI), as a result predicts them.
 
-    `rate` (1/s) is that of the test, None where it is not known.
+    `rate` (1/s) is that of the test, None where it is not known; `limits` are those of a fit of it.
     """
 
     source: Source
     names: tuple[str, ...]
     specimen: Specimen
     rate: float | None
+    limits: Mapping[str, Pair] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse a law of rate where there is no rate."""
@@ -68,17 +67,18 @@ class Population:
         return tuple(
             name
             for name in self._uncertain
-            if parameters[name].stderr is None and parameters[name].span is None
+            if parameters[name].error is None and parameters[name].span is None
         )
 
     # ------------------------------------------------------------------ what the result leaves open
 
     @cached_property
     def _open(self) -> tuple[tuple[str, ...], Array]:
-        """Uncertain quantities, and the root of their correlation given those that are held.
+        """Uncertain quantities and their covariance given those that are held.
 
         What a result leaves undetermined is correlated with other parameters: where it stays at its
-        value, these have the spread that is left to them then.
+        value, these have the spread that is left to them then. Of each parameter no less is known
+        than that it lies between its limits.
         """
         free = [name for name in self._uncertain if name not in self.held]
         free += [f"{name}:b" for name, one in self._known.items() if one.b_stderr]
@@ -92,30 +92,72 @@ class Population:
         matrix[np.ix_(there, there)] = inner
         mine, places = _places(free, self.scattering)  # means of what scatters
         matrix[np.ix_(mine, mine)] = self._correlation[np.ix_(places, places)]
-        return tuple(free), _root(matrix)
+        errors = np.array([self._error(name) for name in free])
+        matrix = matrix * np.outer(errors, errors)
+        flat = {
+            i: self._flat(name, self.limits[name])
+            for i, name in enumerate(free)
+            if name in self.limits
+        }
+        bound = [i for i, spread in flat.items() if math.isfinite(spread)]
+        prior = [flat[i] ** 2 for i in bound]
+        spread = matrix[bound]
+        told = np.linalg.lstsq(spread[:, bound] + np.diag(prior), spread, rcond=None)[0]
+        return tuple(free), matrix - spread.T @ told
 
-    @property
-    def uncertain(self) -> bool:
-        """Whether the result leaves anything uncertain."""
-        return bool(self._open[0])
+    def _error(self, name: str) -> float:
+        """Standard error of an uncertain quantity, SI; by its range where it has none.
 
-    def _placed(self, name: str, z: float) -> float:
-        """Value of an uncertain quantity at a standard normal z."""
+        In a joint result those of few tests are larger by what their intervals are.
+        """
         one = self.source.parameters[name.removesuffix(":b")]
-        if name.endswith(":b"):
-            assert one.b_stderr is not None
-            return one.b + z * one.b_stderr * _wider(one.b_ci95, one.b_stderr)
-        positive = is_logarithmic(split_name(name)[1]) or one.kind in ("scatter", *RATES)
-        if one.stderr is None:
+        given = (one.b_stderr, one.b_ci95) if name.endswith(":b") else (one.error, one.ci95)
+        error, ends = given
+        if error is None:
             assert one.span is not None
-            low, high = one.span
-            if positive and low > 0.0:
-                return low * math.exp(math.log(high / low) * float(ndtr(z)))
-            return low + (high - low) * float(ndtr(z))
-        stderr = one.stderr * _wider(one.ci95, one.stderr)
-        if positive and one.value > 0.0:  # log-normal of the same coefficient of variation
-            return one.value * math.exp(z * math.sqrt(math.log1p((stderr / one.value) ** 2)))
-        return one.value + z * stderr
+            return self._flat(name, one.span)
+        if ends is None or not self.source.joint:
+            return error
+        return max(error, 0.5 * (ends[1] - ends[0]) / NORMAL)
+
+    def _flat(self, name: str, span: Pair) -> float:
+        """Standard deviation of a flat distribution, of the logarithm where that is positive."""
+        low, high = span
+        one = self.source.parameters[name]
+        if low > 0.0 and (is_logarithmic(split_name(name)[1]) or one.kind in ("scatter", *RATES)):
+            return abs(one.value) * math.log(high / low) / math.sqrt(12.0)
+        return (high - low) / math.sqrt(12.0)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """What the result leaves uncertain of the parameters, SI, (p, p), to first order."""
+        free, matrix = self._open
+        slopes = np.zeros((len(self.names), len(free)))
+        for column, name in zip(slopes.T, free, strict=True):
+            one = self.source.parameters[name.removesuffix(":b")]
+            at, step = one.b if name.endswith(":b") else one.value, 1e-4 * self._error(name)
+            sides = [self._vector(self._means, {name: at + side * step}) for side in (-1.0, 1.0)]
+            column[:] = (sides[1] - sides[0]) / (2.0 * step)
+        return slopes @ matrix @ slopes.T
+
+    @cached_property
+    def root(self) -> Array:
+        """Matrix square root of `covariance`."""
+        return _root(self.covariance)
+
+    @cached_property
+    def quantile(self) -> float:
+        """Half of a 95 % interval over a standard error, as the intervals have it in the middle.
+
+        Few degrees of freedom widen it. That a limit or a curved valley of the cost changes one of
+        them does not: along a valley the others follow.
+        """
+        ratios = [
+            0.5 * (one.ci95[1] - one.ci95[0]) / one.stderr
+            for one in map(self.source.parameters.__getitem__, self._uncertain)
+            if one.ci95 is not None and one.stderr is not None and not self.source.joint
+        ]
+        return max(NORMAL, float(np.median(ratios))) if ratios else NORMAL
 
     # ------------------------------------------------------------------ from specimen to specimen
 
@@ -187,11 +229,15 @@ class Population:
     # ------------------------------------------------------------------ values of one test
 
     @property
+    def _means(self) -> dict[str, float]:
+        """Own parameters that have a trend: the median over the tests is that of no rate."""
+        pairs = zip(self.trends.items(), self._own.mean, strict=True)
+        return {name: float(mean) for (name, slope), mean in pairs if slope}
+
+    @property
     def point(self) -> Array:
         """The common values, at the rate of the test."""
-        pairs = zip(self.trends.items(), self._own.mean, strict=True)
-        # Where there is a trend, the median over the tests is that of no rate.
-        return self._vector({name: mean for (name, slope), mean in pairs if slope})
+        return self._vector(self._means)
 
     def nearest(self, admissible: Callable[[Array], bool]) -> Array | None:
         """Values with the own parameters of the admissible test nearest to their means."""
@@ -205,27 +251,22 @@ class Population:
                 return found
         return None
 
-    def draw(self, rng: np.random.Generator, *, open_: bool, scatter: bool) -> Array:
-        """Draw what the result leaves open, the scatter between specimens, or both.
+    def draw(self, rng: np.random.Generator) -> Array:
+        """Draw the scatter between specimens.
 
         Parameters change together from specimen to specimen. Their spreads are known from n tests:
         the deviates are Student's t with n - 1 degrees of freedom.
         """
         values, own = dict[str, float](), dict[str, float]()
-        if open_:
-            free, root = self._open
-            pairs = zip(free, (root @ rng.standard_normal(len(free))).tolist(), strict=True)
-            values = {name: self._placed(name, z) for name, z in pairs}
-        if scatter:
-            freedom = max(self.fewest - 1 - bool(self._own.slopes.any()), 1)
-            tail = math.sqrt(freedom / rng.chisquare(freedom))
-            drawn = tail * (self._changed @ rng.standard_normal(len(self.scattering)))
-            for name, z in zip(self.scattering, drawn.tolist(), strict=True):
-                one = self.source.parameters[name]
-                if one.kind == "scatter":
-                    values[name] = values.get(name, one.value) * _exp(one.scatter * z)
-                else:
-                    own[name] = self._own.at(name, z)
+        freedom = max(self.fewest - 1 - bool(self._own.slopes.any()), 1)
+        tail = math.sqrt(freedom / rng.chisquare(freedom))
+        drawn = tail * (self._changed @ rng.standard_normal(len(self.scattering)))
+        for name, z in zip(self.scattering, drawn.tolist(), strict=True):
+            one = self.source.parameters[name]
+            if one.kind == "scatter":
+                values[name] = one.value * _exp(one.scatter * z)
+            else:
+                own[name] = self._own.at(name, z)
         return self._vector(own, values)
 
     def _vector(self, own: dict[str, float], drawn: dict[str, float] | None = None) -> Array:
@@ -318,17 +359,8 @@ def _places(
     return there, places
 
 
-def _wider(ci95: Pair | None, stderr: float) -> float:
-    """How much wider a 95 % interval is than that of a normal distribution with this error.
-
-    Few degrees of freedom widen it, and a cost that is no parabola; a limit that cuts it does not
-    make it narrower.
-    """
-    return 1.0 if ci95 is None else max(1.0, 0.5 * (ci95[1] - ci95[0]) / (NORMAL * stderr))
-
-
 def _root(correlation: Array) -> Array:
-    """Matrix square root of a correlation, its negative eigenvalues set to zero."""
+    """Matrix square root of a correlation or covariance, its negative eigenvalues set to zero."""
     power, axes = np.linalg.eigh(correlation)
     return np.asarray(axes * np.sqrt(np.maximum(power, 0.0)))
 

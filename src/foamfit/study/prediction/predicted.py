@@ -65,7 +65,7 @@ class PredictedCurve:
 
 @dataclass(frozen=True)
 class PredictedParameter:
-    """A parameter as it is for the test: its value, and where 95 % of the draws lie."""
+    """A parameter as it is for the test: its value, and its 95 % interval."""
 
     kind: str  # As in joint.json; "shared" or "fixed" where the result is of one test
     value: float
@@ -94,7 +94,7 @@ class PredictedTest:
     extrapolated : bool
         Whether the rate lies outside the fitted ones.
     draws, redrawn : int
-        Draws of the parameters, and those more that were not admissible and were drawn again.
+        Draws of specimens, and those more that were not admissible and were drawn again.
     held : tuple of str
         Parameters that the result leaves undetermined and that were held at their values.
     aligned : dict of str to float
