@@ -225,7 +225,8 @@ def main(fresh: bool) -> None:
     page = (HERE / "page.template.md").read_text(encoding="utf-8")
     text = page.format(
         source=real_foams.SOURCE, summary=summary(table), specimens=per_specimen(table),
-        values=values_table(values), inside=coverage(table), verified=coverage(table, chosen=False), seconds=seconds(table),
+        values=values_table(values), inside=coverage(table), seconds=seconds(table),
+        verified=coverage(table, chosen=False),
     )  # fmt: skip
     (HERE / "README.md").write_text(text, encoding="utf-8")
 

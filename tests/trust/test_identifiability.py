@@ -280,7 +280,7 @@ def test_each_question_is_answered_no_by_what_deserves_it(key: str) -> None:
     assert result.status == ("failed" if key == "followed" else "warnings")
     assert result.warnings
     told = result.to_json_dict()["checklist"]
-    assert all(set(item) == {"question", "answer", "sentence"} for item in told)
+    assert all({"question", "answer", "sentence"} <= set(item) for item in told)
     assert sum(item["answer"] is False for item in told) >= 1
 
 

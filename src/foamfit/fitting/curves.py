@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from numbers import Real
+
 import numpy as np
 from scipy.linalg import lstsq
 from scipy.ndimage import convolve1d
@@ -22,6 +25,8 @@ DRIVES = ("impact", "stress", "displacement")
 # Noise of a motion, over its range, that counts as none; most that a smooth motion may leave of the
 # samples, over their noise.
 EXACT, FOLLOWED = 1e-6, 1.5
+# Gaps between samples by which the first may lie after contact, for it to be simulated from there.
+LATEST = 50.0
 
 
 def choose_drive(measurement: Measurement) -> str:
@@ -82,6 +87,17 @@ def check_interior(measurement: Measurement, springs: int) -> None:
             "the 'displacement' column; take a model of more springs, or rename or leave out that "
             "column"
         )
+
+
+def checked_weights(weights: Mapping[str, float], curves: Sequence[str]) -> dict[str, float]:
+    """Weights of all curves; those that are not given are zero."""
+    for name, weight in weights.items():
+        if name not in curves or not isinstance(weight, Real) or not 0 <= weight < np.inf:
+            raise InputError(
+                f"weights: '{name}' = {weight} is not admissible; give {', '.join(curves)} a "
+                "weight of zero or more"
+            )
+    return dict.fromkeys(curves, 0.0) | dict(weights)
 
 
 def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> dict[str, float]:
@@ -158,6 +174,31 @@ def driving_motion(
         counts = apart if counts is None else counts & apart
         found = follow(time, values, level, counts)
     return found if always or found.sigma <= FOLLOWED * level.sigma else None
+
+
+def moved_at(instants: Array, time: Array, values: Array, motion: SmoothMotion | None) -> Array:
+    """A measured motion (m) at some instants, straight on before its first sample."""
+    if motion is not None:
+        return motion.at(instants)
+    before = np.minimum(instants - time[0], 0.0) / (time[1] - time[0])
+    return np.asarray(np.interp(instants, time, values) + before * (values[1] - values[0]))
+
+
+def driven_instants(measurement: Measurement, clock: Array, motion: SmoothMotion | None) -> Array:
+    """Instants to simulate: those of the samples, turns between them, and the contact.
+
+    How far a motion goes where it turns is what springs remember. Where the first sample lies a
+    little after the contact the springs start there without strain: what they carry at the first
+    sample relaxes already.
+    """
+    more = [] if motion is None else motion.turns.tolist()
+    values = measurement.displacement
+    if values is not None and measurement.contact != "file" and not measurement.start_strain:
+        time = clock if measurement.time is None else measurement.time
+        (at, then), (first, second) = clock[:2], moved_at(clock[:2], time, values, motion)
+        late = first / (second - first) if second > first else -1.0
+        more += [at - late * (then - at)] if 0.0 < late < LATEST else []
+    return np.union1d(clock, more) if more else clock
 
 
 def later(time: Array, curves: Array, late: float) -> Array:

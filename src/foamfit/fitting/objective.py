@@ -11,7 +11,6 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +27,14 @@ from foamfit.fitting.curves import (
     MOTION_CURVES,
     check_drive,
     check_time_shift,
+    checked_weights,
+    driven_instants,
     driving_motion,
     driving_stress,
     instants,
     interior_curves,
     later,
+    moved_at,
 )
 from foamfit.fitting.losses import LOSSES, Weighing, soften, softness
 from foamfit.solve.plan import AnyPlan, Motion
@@ -53,8 +55,6 @@ MAX_STEPS = 20_000  # a trial that needs more is too stiff to be worth waiting f
 RTOL_OF_ANY_LAW = 1e-5  # of a registered law, whose halved steps cost more
 # Standard deviation of normal residuals over the median of their sizes.
 NORMAL = 1.4826
-# Gaps between samples by which the first may lie after contact, for it to be simulated from there.
-LATEST = 50.0
 # Most instants that are simulated for each sample that averages rows of the file.
 FINEST = 8
 # Steps of differences: of the velocity and the mass, relative, of times over the instants' gap, and
@@ -119,19 +119,19 @@ class Objective:
         self.interior = interior_curves(self.measurement, len(self.model.kinds))
         self.accelerated = self.drive == "impact" and self.measurement.acceleration is not None
         self.curves = (*CURVES, *((ACCELERATION,) if self.accelerated else ()), *self.interior)
-        self._check_weights()
+        self.weights = checked_weights(self.weights, self.curves)
         self._dashpots = np.array([name.endswith("eta") for name in self.model.names])
         self._dashpots[-1] = False  # the onsite damper is none of a spring
         time = self.measurement.time
         self.time = np.arange(self._stress.size, dtype=float) if time is None else time
         self._fine = min(self.measurement.block, FINEST) if self.drive != "stress" else 1
         self._clock, self._own = instants(self.time, self._fine), None
-        if self._driven and (more := [*self._turns(), *self._contact()]):
-            own, self._clock = self._clock, np.union1d(self._clock, more)
-            self._own = np.searchsorted(self._clock, own)
-        self._absent = {"stress": ["stress_time"], "displacement": ["displacement_time"]}.get(
-            self.drive, []
-        ) + (["stress_time"] if time is None else [])
+        if self._driven:
+            own = self._clock
+            self._clock = driven_instants(self.measurement, own, self.motion)
+            self._own = np.searchsorted(self._clock, own) if self._clock.size > own.size else None
+        driving = {"stress": ["stress_time"], "displacement": ["displacement_time"]}
+        self._absent = driving.get(self.drive, []) + ["stress_time"] * (time is None)
         loading = self._loading()
         self._plans = {damped: self._scene(loading, damped=damped) for damped in (False, True)}
         self.measured = self._measured()
@@ -151,41 +151,14 @@ class Objective:
 
     @cached_property
     def motion(self) -> SmoothMotion | None:
-        """The measured motion without its noise; None where it is exact, or is not there.
-
-        Where it leaves the samples more than their noise the machine's motion is not that smooth:
-        the samples themselves are the better motion.
-        """
+        """The measured motion without its noise, or None; see `driving_motion`."""
         return self.followed[0] if self.followed else driving_motion(self.measurement, self.time)
-
-    def _turns(self) -> Array:
-        """Instants between samples at which a motion turns: how far it goes is remembered."""
-        return np.empty(0) if self.motion is None else self.motion.turns
-
-    def _contact(self) -> list[float]:
-        """Instant of contact, where the first sample lies a little after it.
-
-        The springs start there without strain: what they carry at the first sample relaxes already.
-        """
-        if self.measurement.contact == "file" or self.measurement.start_strain:
-            return []
-        (at, then), (first, second) = self._clock[:2], self._motion_at(self._clock[:2])
-        late = first / (second - first) if second > first else -1.0
-        return [float(at - late * (then - at))] if 0.0 < late < LATEST else []
-
-    def _motion_at(self, times: Array) -> Array:
-        """The measured motion at some times, m; it goes straight on before its first sample."""
-        values = self.measurement.displacement
-        assert values is not None
-        if self.motion is not None:
-            return self.motion.at(times)
-        before = np.minimum(times - self.time[0], 0.0) / (self.time[1] - self.time[0])
-        return np.interp(times, self.time, values) + before * (values[1] - values[0])
 
     @cached_property
     def _moved(self) -> Array:
         """The measured motion at the instants that are simulated, m."""
-        return self._motion_at(self._clock)
+        assert self.measurement.displacement is not None
+        return moved_at(self._clock, self.time, self.measurement.displacement, self.motion)
 
     @cached_property
     def _along(self) -> dict[bool, AnyPlan]:
@@ -253,16 +226,6 @@ class Objective:
         self.priors = (*self.given, *(known[name] for name in self.nuisance if name in known))
         names = (*self.model.names, *self.nuisance)
         self._prior_places = np.array([names.index(one.name) for one in self.priors], np.int64)
-
-    def _check_weights(self) -> None:
-        for name, weight in self.weights.items():
-            number = isinstance(weight, Real)
-            if name not in self.curves or not number or not 0 <= weight < np.inf:
-                raise InputError(
-                    f"weights: '{name}' = {weight} is not admissible; give "
-                    f"{', '.join(self.curves)} a weight of zero or more"
-                )
-        self.weights = dict.fromkeys(self.curves, 0.0) | self.weights
 
     @property
     def _stress(self) -> Array:

@@ -484,8 +484,8 @@ def plan(
         inside = np.flatnonzero(chain.arrays.masses[:-1] > 0.0)
         ends = np.append(inside + 1, ends)
         masses = np.append(chain.arrays.masses[inside] / chain.area, masses)
-    relaxing |= any(g > 0.0 for spring in chain.springs for g, _ in spring.relaxation)
-    memory = relaxing or any(spring.law.remembers for spring in chain.springs)
+    relaxing |= chain.relaxes
+    memory = relaxing or chain.remembers
     alone = top == scenes.MOTION and len(chain.springs) == 1
     damped = dashpots or chain.arrays.damped or top == scenes.VISCOUS
     if len(ends) > 1 or above > 0.0:

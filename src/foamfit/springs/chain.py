@@ -128,15 +128,25 @@ class Chain:
         """Overall height H = Σ h_i, m."""
         return math.fsum(self.heights)
 
-    @property
+    @cached_property
     def kinds(self) -> tuple[str, ...]:
         """The law of each spring."""
         return tuple(spring.law.kind for spring in self.springs)
 
-    @property
+    @cached_property
     def is_registered(self) -> bool:
         """Whether a spring follows a registered law, not one of the paper's."""
         return any(laws.is_registered(kind) for kind in self.kinds)
+
+    @cached_property
+    def relaxes(self) -> bool:
+        """Whether a spring has a relaxation term that is not zero."""
+        return any(g > 0.0 for spring in self.springs for g, _ in spring.relaxation)
+
+    @cached_property
+    def remembers(self) -> bool:
+        """Whether a spring keeps more than its branch, apart from relaxation."""
+        return any(spring.law.remembers for spring in self.springs)
 
     @cached_property
     def relaxation(self) -> tuple[int, ...]:

@@ -337,4 +337,5 @@ def _law_of_rate(ax: Axes, found: JointData, name: str, *, parted: bool) -> None
         ax.plot(rates, values / factor, label="_law of rate", color=VERMILION, linewidth=1.0)
         y = 0.05 if one.b > 0.0 else 0.97
         side: Any = {"ha": "right", "va": "top" if y > 0.5 else "bottom", "fontsize": 6.5}
-        ax.text(0.98, y, between(one), transform=ax.transAxes, **side)
+        told = between(one).partition(" (")[0] if parted else between(one)
+        ax.text(0.98, y, told, transform=ax.transAxes, **side)
