@@ -695,7 +695,7 @@ def loop_file(tmp_path, monkeypatch):
 
 
 def test_the_command_writes_to_auto(loop_file, tmp_path):
-    done = run("fit", loop_file, "--model", "auto", "--starts", 4)
+    done = run("fit", loop_file, "--model", "auto", "--starts", 4, "--verbose")
     assert done.exit_code == 0, done.output
     assert "chosen of 1 model tried: bistable: its residuals are random" in done.stdout
     assert "no richer model was tried" in done.stdout

@@ -205,3 +205,10 @@ def test_a_loaded_result_is_compared_and_predicts_as_the_first(tmp_path: Path) -
     one.save(tmp_path / "x", report=False)
     assert json.dumps(ff.load(tmp_path / "x").to_json_dict()) == json.dumps(one.to_json_dict())
     assert read_source(ff.load(tmp_path / "x")).parameters == read_source(one).parameters
+
+
+def test_a_measurement_shows_what_it_holds_without_its_samples():
+    shown = repr(odd().measurement)
+    assert shown.startswith("Measurement ")
+    assert "rows of stress" in shown
+    assert len(shown) < 300

@@ -119,6 +119,10 @@ class Card:
         back = unloading_curve(self.curves, self.unloading)
         return np.array([-rates[0], *rates[kept]]), np.vstack([back, loading])
 
+    def __repr__(self) -> str:
+        """Tell what the card is and what it loses."""
+        return self.summary()
+
     def summary(self) -> str:
         """What the command prints of it."""
         return _words("terminal", card=self)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
+from foamfit.text import engineering
 
 MIN_ROWS = 10  # samples of a test
 
@@ -339,6 +340,12 @@ class Measurement:
     uncertainties: dict[str, float] = field(default_factory=dict)
     standstills: tuple[tuple[float, float], ...] = ()
     priors: dict[str, str] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Tell what it holds, without its samples."""
+        height, area = engineering(self.specimen.height, "m"), f"{self.specimen.area:.4g} m²"
+        held = f"{self.rows.used} rows of {', '.join(self.channels())}"
+        return f"Measurement {self.name!r}: {held}; height {height}, area {area}"
 
     @property
     def rows(self) -> RowCount:

@@ -322,20 +322,16 @@ def simulate(
     check_scene(chain, drive)
     if not 1e-14 <= as_number(rtol, "rtol") <= 1e-1:
         raise InputError(f"rtol = {rtol:g} is not admissible: it must be between 1e-14 and 0.1")
-    directions = NO_DIRECTIONS
+    directions, dashpots, relaxing = NO_DIRECTIONS, False, False
     if sensitivities:
         wanted = [direction(chain.kinds, name, chain.relaxation) for name in sensitivities]
         longer = any(what == OWN_HEIGHT for _, what in wanted)
         if longer and chain.site_damping > 0.0:  # the onsite damper acts over the whole height
             wanted.append((-1, DRAG))
         directions = np.array(wanted)
-    scene = plan(
-        chain,
-        drive,
-        t,
-        dashpots=any(name.endswith("_eta") for name in sensitivities),
-        relaxing=any(what >= OWN_RELAXATION for _, what in directions),
-    )
+        dashpots = any(name.endswith("_eta") for name in sensitivities)
+        relaxing = any(what >= OWN_RELAXATION for _, what in directions)
+    scene = plan(chain, drive, t, dashpots=dashpots, relaxing=relaxing)
     rows, heights = chain.arrays.rows, chain.arrays.heights
     if isinstance(scene, AnyLawPlan):
         motion = scene.run(rows, heights, rtol, directions=directions)

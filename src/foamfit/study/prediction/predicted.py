@@ -123,6 +123,10 @@ class PredictedTest:
     warnings: tuple[str, ...]
     aligned: dict[str, float] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """Tell how well it meets the record."""
+        return "\n  ".join((f"{self.measurement.name} predicted from {self.source}", *self.sentences))
+
     @property
     def law(self) -> str:
         """The model and its relaxation in words."""
