@@ -1,9 +1,7 @@
-"""Make the pictures of the page and of each notebook: notebooks/pictures/*.png.
+"""Photograph the page and its sliders: `python notebooks/make_pictures.py`.
 
-    python notebooks/make_pictures.py
-
-Those of the page and of its sliders are made by a browser, where one is installed. The tests are
-reconstructions, simulated from published parameters, not measurements.
+A browser is needed. The test is a reconstruction, simulated from published parameters, not a
+measurement.
 """
 
 from __future__ import annotations
@@ -14,48 +12,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import foamfit as ff
-from foamfit.api import FitResult
-from foamfit.report.comparison import compare, plot_comparison
-from foamfit.report.plots import plot_fit
-
 HERE = Path(__file__).parent
 PICTURES = HERE / "pictures"
-TESTS = HERE.parent / "experiments" / "foam-1"
-CASES = {"model-2": "bistable", "model-3": "linear+bistable"}
-DPI = 160
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # Width and height of a window of which the upper part is seen.
 WINDOW = {"width": 1200, "height": 760}
-
-
-def read(case: str) -> ff.Measurement:
-    """Read the reconstruction of a model of foam-1 at 2.0 m/s."""
-    return ff.read_test(TESTS / f"{case}-2.0mps-reconstruction.csv")
-
-
-def fit_with_site_damper(case: str) -> FitResult:
-    """Fit a reconstruction with the paper's one damper, that of the striker."""
-    test, model = read(case), CASES[case]
-    params = ff.make_params(test, model)
-    for parameter in params.values():
-        if parameter.name.endswith("_eta"):
-            parameter.set(value=0.0, vary=parameter.name == "site_eta")
-    return ff.fit(test, model=model, params=params, seed=0)
-
-
-def main() -> None:
-    """Make the pictures."""
-    PICTURES.mkdir(exist_ok=True)
-    test = read("model-2")
-    comparison = compare([fit_with_site_damper(case) for case in CASES])
-    for name, figure in (
-        ("fit_a_new_test", plot_fit(ff.fit(test, seed=0))),
-        ("fitted_against_published", plot_comparison(comparison)),
-    ):
-        figure.savefig(PICTURES / f"{name}.png", dpi=DPI)
-        tell(name)
-    photograph_page()
 
 
 def tell(name: str) -> None:
@@ -106,4 +67,4 @@ if __name__ == "__main__":
     from unchanged import keep_unchanged
 
     with keep_unchanged(HERE):
-        main()
+        photograph_page()

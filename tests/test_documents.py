@@ -42,3 +42,7 @@ def test_the_page_on_laws_shows_the_law_of_the_notebook():
     page = (ROOT / "docs" / "own_law.md").read_text(encoding="utf-8")
     shown = re.search(r"```python\n(.*?)```", page, flags=re.DOTALL)[1]
     assert shown == (ROOT / "notebooks" / "bouc_wen.py").read_text(encoding="utf-8")
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900

@@ -38,8 +38,7 @@ def describe(test: Measurement, audit: EnergyAudit, *, exact: bool = True) -> st
         told = ", ".join(f"1 % of the {name} is {effect}" for name, effect in effects.items())
         sentences = [
             f"The TOML states no ± of {listed(effects)}, which therefore count as exact.",
-            f"The ± of the {next(iter(effects))} would probably matter most: {told}. "
-            "With --model check says what each does to the parameters.",
+            f"The ± of the {next(iter(effects))} would probably matter most: {told}.",
         ]
         lines.append(("exact", sentences))
     return labelled(lines)

@@ -23,7 +23,6 @@ from foamfit.report.summary import CURVES
 from foamfit.text import percent
 
 MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a simulated curve, and of a measured one
-ASIDE = {"C1": -22}  # px from a point at the right edge to its name
 NOTHING = np.empty(0), np.empty(0)
 AXES = {  # of each panel: x and y, with the SI units of both
     "stress_time": (("time", "s"), ("stress", "Pa")),
@@ -57,7 +56,7 @@ class Curves:
         self._measured = {name: ColumnDataSource({"x": [], "y": []}) for name in PANELS}
         # One source for all panels makes one message per move.
         self._turned = ColumnDataSource({f"{name}_{axis}": [] for name in PANELS for axis in "xy"})
-        self._points = ColumnDataSource({"x": [], "y": [], "name": [], "aside": []})
+        self._points = ColumnDataSource({"x": [], "y": [], "name": [], "aside": [], "up": []})
         self._figures = {name: self._figure(name) for name in PANELS}
         self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
         # With the lock of the document, which not every message holds.
@@ -139,7 +138,7 @@ class Curves:
             at: dict[str, Any] = {"x": "x", "y": "y", "source": self._points, "level": "overlay"}
             centred = {"text_align": "center", "text_baseline": "middle"}
             made.add_layout(LabelSet(text=value("\u25cf"), **centred, **at))
-            beside = {"x_offset": "aside", "y_offset": -15, "text_font_size": "9pt"}
+            beside = {"x_offset": "aside", "y_offset": "up", "text_font_size": "9pt"}
             made.add_layout(LabelSet(text="name", **beside, **at))
         made.toolbar.logo = None
         made.toolbar.autohide = True
@@ -216,8 +215,10 @@ class Curves:
         x, y = np.array([*drawn.points.values()]).reshape(-1, 2).T
         if len(x) or len(self._points.data["x"]):
             names = [*drawn.points]
-            aside = [ASIDE.get(name, 6) for name in names]
-            self._points.data = {"x": x / fx, "y": y / fy, "name": names, "aside": aside}
+            # In px, A1 and C1 above on the left, A2 and C2 below on the right: beside the curves.
+            beside = [(-8 - 7 * len(name), 2) if name[-1] == "1" else (6, -15) for name in names]
+            aside, up = np.array(beside).reshape(-1, 2).T
+            self._points.data = {"x": x / fx, "y": y / fy, "name": names, "aside": aside, "up": up}
 
 
 def misfits_text(misfit: Mapping[str, float | None]) -> str:

@@ -6,7 +6,7 @@ export function render({ model, el }) {
   told.setAttribute("role", "status");
   const key = document.createElement("p");
   key.className = "key";
-  key.innerHTML = '<i class="interval"></i> 95 % interval of the fit <i class="range"></i> its range';
+  key.innerHTML = '<i class="interval"></i> 95 % interval of the fit <span><i class="range"></i> its range</span>';
   el.append(told, list, key);
   let inputs = {}, waiting = {}, busy = false;
   const STEPS = 1000;
@@ -38,6 +38,7 @@ export function render({ model, el }) {
     list.replaceChildren();
     [inputs, waiting, busy] = [{}, {}, false];
     key.hidden = !model.rows.some((row) => row.interval || row.range);
+    key.lastChild.hidden = !model.rows.some((row) => row.range);
     for (const row of model.rows) {
       const line = document.createElement("div");
       line.className = "row";
@@ -77,7 +78,9 @@ export function render({ model, el }) {
         if (!row[kind]) continue;
         const bar = document.createElement("i"), [from, to] = row[kind].map((end) => place(row, end));
         bar.className = kind;
-        Object.assign(bar.style, { left: `${from / STEPS * 100}%`, width: `${(to - from) / STEPS * 100}%` });
+        // The middle of the thumb goes from half its width, 1rem, to as far from the other end.
+        const along = (part) => `(100% - 1rem) * ${part / STEPS}`;
+        Object.assign(bar.style, { left: `calc(.5rem + ${along(from)})`, width: `calc(${along(to - from)})` });
         track.append(bar);
         track.title += `${kind} ${row[kind].map(digits).join(" to ")} ${row.unit}  `;
       }
