@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import csv
-import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,16 +21,23 @@ from foamfit.report.figures import image
 from foamfit.report.render import page, words
 from foamfit.report.studies.parameters import DPI as SUMMARY_DPI
 from foamfit.report.studies.parameters import Compared, plot_parameters
-from foamfit.report.tables import by_test, by_test_tex, unit_of_all
+from foamfit.report.tables import (
+    by_test,
+    by_test_tex,
+    names_of,
+    unit_of_all,
+    varied,
+    wide_cells,
+    wide_head,
+)
 from foamfit.results import Fit, ParameterEstimate, plain
-from foamfit.springs.parameters import NUISANCE, springs_first
+from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, listed
 
 if TYPE_CHECKING:
     import pandas as pd
 
 CURVES = ("stress_time", "displacement_time", "stress_strain")
-PARTS = ("", "_stderr", "_lo", "_hi", "_state")
 # What a row says of a test without a result.
 REFUSED, OPEN = "refused", "not fitted"
 _STATUS = {
@@ -83,33 +89,15 @@ def row_of(test: str, file: str, result: Fit) -> Row:
 # ------------------------------------------------------------------------------- the table
 
 
-def names_of(rows: Sequence[Row]) -> list[str]:
-    """Names of the parameters of any test, in their order, those of the springs first."""
-    return springs_first(name for row in rows for name in row.parameters)
-
-
 def table_rows(rows: Sequence[Row]) -> Iterator[list[Any]]:
     """Rows of summary.csv, the header first: SI, a row for each test, empty = not there."""
-    names = names_of(rows)
+    names = names_of(row.parameters for row in rows)
     head = ["test", "file", "status", "error", *(f"misfit_{name}" for name in CURVES), "runtime_s"]
-    yield [*head, *(f"{name}{part}" for name in names for part in PARTS)]
+    yield [*head, *wide_head(names)]
     for row in rows:
         cells: list[Any] = [row.test, row.file, row.status, row.error]
         cells += [*(row.misfit.get(name) for name in CURVES), row.runtime_s]
-        for p in map(row.parameters.get, names):
-            known = p and (p.value, p.stderr, *(p.ci95 or (None, None)), p.state)
-            cells += plain(known or (None,) * len(PARTS))
-        yield cells
-
-
-def _varied(rows: Sequence[Row]) -> dict[str, list[ParameterEstimate | None]]:
-    """The parameters that any test varied, of all tests; None where a test has no value."""
-    every = {name: [row.parameters.get(name) for row in rows] for name in names_of(rows)}
-    return {
-        name: [p if p is not None and math.isfinite(p.value) else None for p in each]
-        for name, each in every.items()
-        if any(p is not None and p.state != "fixed" for p in each)
-    }
+        yield cells + wide_cells(names, row.parameters)
 
 
 def table(rows: Sequence[Row]) -> pd.DataFrame:
@@ -168,7 +156,7 @@ def summary_words(rows: Sequence[Row]) -> str:
 def _parameter_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
     """Median and quartiles over the tests of each parameter that any test varied."""
     yield ["parameter", "median", "quartile", "quartile", "determined in", ""]
-    for name, each in _varied(rows).items():
+    for name, each in varied([row.parameters for row in rows]).items():
         known = [p for p in each if p is not None]
         factor, unit = unit_of_all(known)
         middle = np.quantile([p.value / factor for p in known], [0.5, 0.25, 0.75])
@@ -188,7 +176,8 @@ def write_comparison(
     """
     fitted = [row for row in rows if row.has_fit]
     tests = [row.test for row in fitted]
-    found = {n: each for n, each in _varied(fitted).items() if n not in NUISANCE}
+    every = varied([row.parameters for row in fitted])
+    found = {name: each for name, each in every.items() if name not in NUISANCE}
     text = by_test_tex("Test", by_test(tests, found))
     write_file(folder / "summary.tex", text.encode("utf-8", "replace"))
     if not (pictures and found):
@@ -221,7 +210,7 @@ def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | N
         total=len(rows),
         links=[f"{quote(row.test)}/report.html" for row in shown],
         reports=[(folder / row.test / "report.html").is_file() for row in shown],
-        parameters=by_test([row.test for row in shown], _varied(shown)),
+        parameters=by_test([row.test for row in shown], varied([row.parameters for row in shown])),
         misfits={curve: told for curve, told in _MISFITS.items() if curve in measured},
         picture=picture and base64.b64encode(picture).decode("ascii"),
     )
