@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,10 +17,12 @@ from click.testing import CliRunner
 import fabricated
 import foamfit as ff
 from conftest import DATA, needs_data, thinned
+from foamfit.cards import curves as card_curves
 from foamfit.cards import replay
 from foamfit.cards.card import FORMATS, UNITS
-from foamfit.cards.curves import Curves
 from foamfit.cli import main
+from foamfit.data.measurement import Specimen
+from foamfit.results import Curves
 
 HEIGHT, AREA, MASS = 10e-3, 5e-5, 1.1e-4  # 220 kg/m³
 LAW: dict[str, float] = {
@@ -32,35 +36,35 @@ SI = {"kg-mm-ms": (1e9, 1e3, 1e9), "t-mm-s": (1e6, 1.0, 1e12), "SI": (1.0, 1.0, 
 
 def write_fit(
     folder: Path, rate: float, b: float = 0.0, top: float = TOP, **changed: Any
-) -> dict[str, Any]:
-    """Write the folder of a fit to a triangular test: the law itself, and noise; its fit.json.
+) -> ff.FitResult:
+    """Write the folder of a fit to a triangular test: the law itself, and noise.
 
     The snap stresses go with the rate to the power b.
     """
     values = LAW | {name: LAW[name] * rate**b for name in ("sigma_plus", "sigma_minus")}
     *own, g, tau = values.values()
-    spring = ff.MicroscaleSpring(*own, relaxation=[(g, tau)])
+    chain = ff.Chain([ff.MicroscaleSpring(*own, relaxation=[(g, tau)])], [HEIGHT], AREA)
     time = np.linspace(0.0, 2.0 * top / rate, 401)
-    strain = rate * np.minimum(time, time[-1] - time)
-    drive = ff.DisplacementDrive(strain * HEIGHT)
-    fitted = ff.simulate(ff.Chain([spring], [HEIGHT], AREA), drive, time).base_stress
+    moved = rate * np.minimum(time, time[-1] - time) * HEIGHT
+    fitted = ff.simulate(chain, ff.DisplacementDrive(moved), time).base_stress
     measured = fitted + NOISE * np.random.default_rng(0).standard_normal(time.size)
-    content: dict[str, Any] = {
-        "schema": 1, "foamfit": "", "test": "a foam", "model": "microscale", "relaxation": 1,
-        "drive": "displacement", "status": "ok", "data": {"rate": rate},
-        "specimen": {"height": HEIGHT, "area": AREA, "mass": MASS, "heights": None},
+    base = fabricated.microscale_result()
+    given: dict[str, Any] = {
+        "measurement": replace(
+            base.measurement, name="a foam", time=time, stress=measured, displacement=moved,
+            specimen=Specimen(HEIGHT, AREA, MASS),
+        ),
+        "chain": chain,
         "misfit": {"stress_strain": float(np.std(fitted - measured) / np.ptp(measured))},
-        "parameters": {f"s1_{name}": {"value": one, "vary": True} for name, one in values.items()},
+        "curves": Curves(time, measured, moved, fitted, None, fitted),
+        "parameters": {
+            f"s1_{n}": fabricated.estimate(n, v, stderr=None, ci95=None) for n, v in values.items()
+        },
+        "switches": (),
     }  # fmt: skip
-    content |= changed
-    folder.mkdir(parents=True)
-    (folder / "fit.json").write_text(json.dumps(content))
-    np.savetxt(
-        folder / "curves.csv", np.transpose([time, measured, fitted, strain * HEIGHT]), comments="",
-        delimiter=",", header="time (s),measured stress (Pa),"
-        "stress along measured displacement (Pa),measured displacement (m)",
-    )  # fmt: skip
-    return content
+    found = replace(base, **(given | changed))
+    found.save(folder, report=False)
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -77,18 +81,19 @@ def joint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rates = {"slow": 0.01, "middle": 1.0, "fast": 100.0}
     tests = {name: write_fit(folder / name, rate, b) for name, rate in rates.items()}
     parameters = {
-        f"s1_{name}": {"kind": "power rate", "value": value, "b": b}
-        if name.startswith("sigma")
-        else {"kind": "shared", "value": value}
+        f"s1_{name}": {"value": value, "unit": ""}
+        | ({"kind": "power rate", "b": b} if name.startswith("sigma") else {"kind": "shared"})
         for name, value in LAW.items()
     }
-    content = {name: tests["middle"][name] for name in ("schema", "foamfit", "model", "drive")}
-    content |= {"name": "rates", "relaxation": 1, "status": "ok", "rate0": 1.0}
-    content |= {"parameters": parameters}
-    content["tests"] = {
-        name: {"rate": rate, "drive": "displacement", "misfit": tests[name]["misfit"]}
-        for name, rate in rates.items()
-    }
+    content = {
+        "schema": 1, "foamfit": "", "name": "rates", "model": "microscale", "relaxation": 1,
+        "drive": "displacement", "status": "ok", "warnings": [], "sentences": [], "rate0": 1.0,
+        "parameters": parameters,
+        "tests": {
+            name: {"rate": rate, "drive": "displacement", "misfit": tests[name].misfit}
+            for name, rate in rates.items()
+        },
+    }  # fmt: skip
     (folder / "joint.json").write_text(json.dumps(content))
     return folder
 
@@ -122,9 +127,7 @@ def test_loading_curves_are_those_of_the_law_and_fit_for_a_solver(joint: Path) -
 
 
 def test_a_curve_ends_where_the_foam_is_solid(tmp_path: Path) -> None:
-    elastic = {
-        f"s1_{n}": {"value": v, "vary": True} for n, v in (LAW | {"sigma_plus": 1e9}).items()
-    }
+    elastic = {f"s1_{n}": fabricated.estimate(n, v) for n, v in (LAW | {"sigma_plus": 1e9}).items()}
     write_fit(tmp_path / "elastic", 0.25, top=0.3, parameters=elastic)
     curves = ff.card(tmp_path / "elastic", format="mat083").curves
     assert curves.strain[curves.measured - 1] == curves.measured_to == 0.3
@@ -138,7 +141,7 @@ def test_a_curve_ends_where_the_foam_is_solid(tmp_path: Path) -> None:
 def replayed(style: str, strain: np.ndarray, unloading: replay.Unloading) -> np.ndarray:
     """A card of one curve, σ = ε² MPa, along a strain in steps of a second."""
     x = np.linspace(0.0, 1.0, 4001)
-    curves = Curves(np.array([1e-3]), x, 1e6 * x[None] ** 2, 1.0)
+    curves = card_curves.Curves(np.array([1e-3]), x, 1e6 * x[None] ** 2, 1.0)
     first = strain >= np.maximum.accumulate(strain)
     motion = replay.Motion(strain, np.gradient(strain), first)
     return replay.REPLAYS[style](curves, motion)(unloading)
@@ -324,8 +327,10 @@ def test_a_reader_of_others_reads_the_ls_dyna_cards(joint: Path) -> None:
             assert curves[0].lcid == material.lcid
 
 
-def test_an_unknown_density_is_no_number(tmp_path: Path) -> None:
-    write_fit(tmp_path / "foam", 0.25, specimen={"height": HEIGHT, "area": AREA, "mass": None})
+def test_an_unknown_density_is_no_number(tmp_path: Path, fit: Path) -> None:
+    known = ff.load(fit)
+    test = replace(known.measurement, specimen=Specimen(HEIGHT, AREA))
+    replace(known, measurement=test).save(tmp_path / "foam", report=False)
     for style in ("mat083", "mat057", "law90", "abaqus"):
         card = ff.card(tmp_path / "foam", format=style)
         assert any("density" in one for one in card.warnings)
@@ -386,12 +391,15 @@ def test_a_wrong_call_is_one_sentence_and_writes_nothing(
 
 
 def test_a_result_without_a_card_is_refused(tmp_path: Path, fit: Path) -> None:
-    linear = {"s1_k0": {"value": 1e6, "vary": True}}
+    linear = {"s1_k0": fabricated.estimate("s1_k0", 1e6)}
     write_fit(tmp_path / "linear", 0.25, model="linear", relaxation=0, parameters=linear)
-    write_fit(tmp_path / "older", 0.25, specimen=None)
+    shutil.copytree(fit, tmp_path / "older")
+    older = json.loads((fit / "fit.json").read_text())
+    del older["load"]
+    (tmp_path / "older" / "fit.json").write_text(json.dumps(older))
     for result, words in (
         (tmp_path / "linear", "has no hysteretic spring"),
-        (tmp_path / "older", "has no height of the specimen"),
+        (tmp_path / "older", "fit the test again"),
         (tmp_path / "nothing", "is not a result folder"),
     ):
         done = run(result, "--format", "mat083", "--out", tmp_path / "card.k")
@@ -411,3 +419,8 @@ def test_a_result_in_memory_gives_the_card_of_its_folder(tmp_path: Path) -> None
     first, second = (ff.card(one, format="mat083") for one in (made, tmp_path / "fit"))
     assert first.text == second.text
     assert first.to_json_dict() == second.to_json_dict()
+
+
+def test_a_joint_result_read_back_gives_the_card_of_its_folder(joint: Path) -> None:
+    first, second = (ff.card(one, format="mat083") for one in (ff.load(joint), joint))
+    assert first.text == second.text

@@ -243,7 +243,9 @@ def fabricated_rows(place: Path, count: int) -> list[Any]:
     base, rng = row_of("t", "t.csv", result), np.random.default_rng(0)
     rows = []
     for i in range(count):
-        values = {n: [c[0] * rng.normal(1, 0.02), *c[1:]] for n, c in base.parameters.items()}
+        values = {
+            n: replace(p, value=p.value * rng.normal(1, 0.02)) for n, p in base.parameters.items()
+        }
         rows.append(replace(base, test=f"test-{i:05d}", parameters=values))
     return rows
 

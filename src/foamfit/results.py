@@ -531,7 +531,8 @@ class Fit:
         made: dict[str, Any] = plain(content)
         columns = self.columns
         fields = {name: encode(vars(self)[name], columns) for name in KEPT}
-        rest = {name: one for name, one in fields.items() if one != made.get(name)}
+        rest = _without(made, fields)
+        rest["measurement"] = _without(made | made["data"], fields["measurement"])
         length = max((column.size for column in columns.values()), default=0)
         return made | {"load": {"samples": length, **rest}}
 
@@ -575,6 +576,11 @@ class Fit:
 # What fit.json and curves.csv keep of a fit; its insight is all derivatives of the curves, and
 # samples have a file of their own.
 KEPT = tuple(name for name in Fit.__dataclass_fields__ if name not in ("insight", "draws"))
+
+
+def _without(told: Mapping[str, Any], fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields that fit.json does not have elsewhere."""
+    return {name: one for name, one in fields.items() if name not in told or one != told[name]}
 
 
 def plain(value: Any) -> Any:

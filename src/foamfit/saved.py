@@ -72,6 +72,7 @@ def _fit(folder: Path) -> FitResult:
     kept = content | content["load"]
     columns = _columns(folder / "curves.csv", kept.get("samples"))
     try:
+        kept["measurement"] = content | content["data"] | kept["measurement"]
         given = {name: kept[name] for name in KEPT if name in kept}
         result: FitResult = build(FitResult, given, columns, lmfit=lmfit, Insight=Insight)
         result.draws.update(read_samples(folder / SAMPLES))

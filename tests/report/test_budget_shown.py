@@ -16,8 +16,9 @@ from foamfit.data.energy import audit
 from foamfit.report.page import render_report
 from foamfit.report.readable import readable
 from foamfit.report.result_figures import draw_all
-from foamfit.report.studies.batch import names_of, row_of
+from foamfit.report.studies.batch import row_of
 from foamfit.report.summary import conclusions, summary_text
+from foamfit.report.tables import names_of
 from foamfit.results import ParameterEstimate
 
 NUISANCE = {
@@ -70,7 +71,7 @@ def test_conclusions_are_about_the_springs_alone() -> None:
 def test_in_a_batch_they_are_the_last_columns() -> None:
     chain = fabricated.chain_result()
     rows = [row_of("a", "a.csv", with_nuisance()), row_of("b", "b.csv", chain)]
-    names = names_of(rows)
+    names = names_of(row.parameters for row in rows)
     assert names[-len(NUISANCE) :] == list(NUISANCE)
     assert set(names[: -len(NUISANCE)]) == {*fabricated.result().parameters, *chain.parameters}
 

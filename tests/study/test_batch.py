@@ -14,6 +14,7 @@ import threading
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -658,7 +659,10 @@ def rows_of(count):
     rng = np.random.default_rng(0)
     base = row_of("t", "t.csv", fabricated.result())
     for i in range(count):
-        given = {n: [rng.normal(c[0] or 1.0, 1e-2), *c[1:]] for n, c in base.parameters.items()}
+        given = {
+            name: replace(p, value=rng.normal(p.value or 1.0, 1e-2))
+            for name, p in base.parameters.items()
+        }
         status = ("ok", "warnings", "failed")[i % 3]
         yield Row(
             f"test-{i:04d}", f"data/test-{i:04d}.csv", status, None, base.misfit, 1.0, given,
@@ -691,7 +695,7 @@ def test_the_page_of_a_thousand_tests_is_small_and_needs_nothing_else(tmp_path):
 
 
 def test_the_page_has_no_misfit_that_no_test_has(tmp_path):
-    cells = [[float(k), None, 0.5 * k, 1.5 * k, "determined", "Pa"] for k in (1, 2, 40)]
+    cells = [fabricated.estimate("s1_kc", float(k)) for k in (1, 2, 40)]
     rows = [
         Row(f"t{i}", f"t{i}.csv", "ok", None, {"stress_strain": 0.01, "stress_time": None}, 1.0,
             {"s1_kc": cell})
@@ -714,8 +718,9 @@ def test_of_very_many_tests_the_page_shows_some_and_all_that_failed(tmp_path):
 
 
 def test_models_with_other_parameters_leave_cells_empty():
-    one = Row("a", "a.csv", "ok", parameters={"s1_k0": [1.0, 0.1, 0.8, 1.2, "determined", "Pa"]})
-    other = Row("b", "b.csv", "ok", parameters={"s1_kc": [2.0, None, None, None, "weak", "Pa"]})
+    one = Row("a", "a.csv", "ok", parameters={"s1_k0": fabricated.estimate("s1_k0", 1.0)})
+    weak = fabricated.estimate("s1_kc", 2.0, state="weak")
+    other = Row("b", "b.csv", "ok", parameters={"s1_kc": weak})
     head, first, second = table_rows([one, other])
     assert dict(zip(head, first, strict=True))["s1_kc"] is None
     assert dict(zip(head, second, strict=True))["s1_kc_state"] == "weak"
@@ -723,8 +728,10 @@ def test_models_with_other_parameters_leave_cells_empty():
 
 def test_the_page_of_a_batch_shows_the_range_that_a_state_goes_by(tmp_path: Path) -> None:
     """A parameter is not determined by its range, however narrow its interval is."""
-    cell = [2e5, 1e3, 1.98e5, 2.02e5, "not determined", "Pa", 0.4e5, 7.1e5]
+    cell = fabricated.estimate(
+        "s1_kc", 2e5, stderr=1e3, ci95=(1.98e5, 2.02e5), state="not determined", range=(4e4, 7.1e5)
+    )
     rows = [Row(name, f"{name}.csv", "ok", parameters={"s1_kc": cell}) for name in "ab"]
     write_page(rows, tmp_path, "two tests")
     page = (tmp_path / "summary.html").read_text()
-    assert "198 to 202; range 40 to 710" in page
+    assert "198.0 to 202.0; range 40 to 710" in page

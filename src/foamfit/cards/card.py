@@ -106,13 +106,11 @@ class Card:
         return f"{template.render(values).rstrip()}\n"
 
     def _written(self) -> tuple[Array, Array]:
-        """Rates and stresses of the curves in the file: of Abaqus with the unloading curve.
-
-        Abaqus refuses curves that meet; beyond the last rate it takes the last curve.
-        """
+        """Rates and stresses of the curves in the file: of Abaqus with the unloading curve."""
         rates, stress = self.curves.rates, self.curves.stress
         if self.format != "abaqus":
             return rates, stress
+        # Abaqus refuses curves that meet; beyond the last rate it takes the last curve.
         kept = [0, *(1 + np.flatnonzero(np.any(np.diff(stress, axis=0) > 0.0, axis=1)))]
         apart = np.cumprod([[1.0], *[[1.001]] * (len(kept) - 1)], axis=0)
         loading = apart * np.maximum.accumulate(stress[kept] / apart, axis=0)

@@ -110,11 +110,9 @@ def loading_curves(
 
 
 def _points(fine: Array, stress: Array, measured_to: float) -> Array:
-    """Choose the strains of a card: dense where a curve bends, `measured_to` among them.
-
-    What lines between points miss goes with curvature times the square of their distance; it is
-    judged against the stress, at least that at `measured_to` (1).
-    """
+    """Choose the strains of a card: dense where a curve bends, `measured_to` among them."""
+    # What lines between points miss goes with curvature times the square of their distance; it is
+    # judged against the stress, at least that at `measured_to` (1).
     bend = np.abs(np.gradient(np.gradient(stress, fine, axis=1), fine, axis=1))
     density = np.sqrt((bend / np.maximum(stress, 1.0)).max(axis=0))
     density = density / density.mean() + 0.5

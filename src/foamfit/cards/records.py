@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from foamfit.arrays import Array
+from foamfit.data.rate import loading_rate
 from foamfit.errors import InputError
-from foamfit.report.folder import load_result
 from foamfit.results import Fit
+from foamfit.saved import SavedJoint, load
 from foamfit.study.joint_result import JointData
-
-_COLUMNS = (
-    *("time (s)", "measured stress (Pa)", "measured displacement (m)"),
-    *("fitted stress (Pa)", "fitted displacement (m)", "stress along measured displacement (Pa)"),
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,69 +35,48 @@ class Record:
         return float(np.sqrt(np.mean((self.card - self.stress) ** 2)) / np.ptp(self.stress))
 
     @classmethod
-    def of(cls, where: str, content: Mapping[str, Any], columns: Sequence[Array | None]) -> Record:
-        """Make it of the content of fit.json and `_COLUMNS`; `where` is for messages.
-
-        Zeros of the channels that were fitted are taken off.
-        """
+    def of(cls, result: Fit) -> Record:
+        """Make it of a fit; zeros of the channels that were fitted are taken off."""
+        test, c, impact = result.measurement, result.curves, result.drive == "impact"
 
         def zero(channel: str) -> float:
             name = f"{channel}_zero"
-            found = content["parameters"].get(name)
-            return found["value"] - content["data"]["origins"].get(name, 0.0) if found else 0.0
+            found = result.parameters.get(name)
+            return found.value - test.origins.get(name, 0.0) if found else 0.0
 
-        time, stress, displacement, pressed, simulated, along = columns
-        specimen, moved = (
-            content.get("specimen"),
-            simulated if displacement is None else displacement,
-        )
-        if specimen is None or stress is None or moved is None:
-            lack = "height of the specimen" if specimen is None else "measured loop"
-            raise InputError(f"{where} has no {lack}, which a card needs; fit the test again")
-        height, mass, off = specimen["height"], specimen["mass"], content["misfit"]
-        impact = content["drive"] == "impact"
-        fitted = pressed if impact else along
+        measured, specimen = c.measured_displacement, test.specimen
+        moved = c.displacement if measured is None else measured
+        if c.measured_stress is None or moved is None:
+            raise InputError(f"{test.name} has no measured loop, which a card needs")
+        fitted = c.stress if impact else c.stress_along
         strain, motion = (
-            (one - zero("displacement")) / height
-            for one in (moved, simulated if impact and simulated is not None else moved)
+            (one - zero("displacement")) / specimen.height
+            for one in (moved, c.displacement if impact and c.displacement is not None else moved)
         )
-        if time is None:  # the law depends on none
-            time = np.cumsum(np.abs(np.diff(motion, prepend=motion[0])) + 1e-9)
+        # Without a time, the law depends on none.
+        steps = np.abs(np.diff(motion, prepend=motion[0])) + 1e-9
+        mass, volume = specimen.mass, specimen.height * specimen.area
         return cls(
-            rate=content["data"].get("rate"),
-            time=time,
+            rate=loading_rate(test),
+            time=np.cumsum(steps) if c.time is None else c.time,
             strain=strain,
-            stress=stress - zero("stress"),
+            stress=c.measured_stress - zero("stress"),
             motion=motion,
-            fitted=(stress if fitted is None else fitted) - zero("stress"),
-            misfit=off["stress_time" if impact else "stress_strain"],
-            density=None if mass is None else mass / (height * specimen["area"]),
+            fitted=(c.measured_stress if fitted is None else fitted) - zero("stress"),
+            misfit=result.misfit["stress_time" if impact else "stress_strain"],
+            density=None if mass is None else mass / volume,
         )
 
 
 def read_records(result: object) -> list[Record]:
     """Return the records of the fitted tests of a result of `fit` or `joint`, or of its folder."""
+    if isinstance(result, str | Path):
+        path = Path(result)
+        return read_records(load(path if path.is_dir() else path.parent))
     if isinstance(result, JointData):
-        return [record for one in result.test_fits() for record in read_records(one.fit())]
+        return [Record.of(one.fit()) for one in result.test_fits()]
+    if isinstance(result, SavedJoint):
+        return [Record.of(one) for one in result.results.values()]
     if isinstance(result, Fit):
-        c = result.curves
-        measured = (c.time, c.measured_stress, c.measured_displacement)
-        columns = (*measured, c.stress, c.displacement, c.stress_along)
-        return [Record.of(result.measurement.name, result.to_json_dict(), columns)]
-    if not isinstance(result, str | Path):
-        raise InputError(f"a card is made of a result of fit or joint, not of {result!r}")
-    folder = Path(result) if Path(result).is_dir() else Path(result).parent
-    study = folder / "joint.json"
-    names = load_result(study)["tests"] if study.is_file() else [""]
-    return [_read(folder / name) for name in names]
-
-
-def _read(folder: Path) -> Record:
-    """The record of the test in a folder."""
-    path = folder / "curves.csv"
-    try:
-        table = pd.read_csv(path)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
-    columns = [table[name].to_numpy(float) if name in table else None for name in _COLUMNS]
-    return Record.of(str(folder), load_result(folder), columns)
+        return [Record.of(result)]
+    raise InputError(f"a card is made of a result of fit or joint, not of {result!r}")

@@ -12,7 +12,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
-from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, reason, replacing
 from foamfit.report.figures import TWO
@@ -30,13 +29,12 @@ RESULT_FILES = {
     *("fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "budget.csv", "report.html"),
     *("table.tex", SAMPLES),
 }
-CYCLES_FILES = {"cycles.json", "cycles.csv", "cycles.png", "cycles-plotted.csv", "table.tex"}
-JOINT_FILES = {"joint.json", "joint.html", "joint.png", "joint.csv", "table.tex"}
-CYCLES_FILES |= {"cycles.pdf"}
-JOINT_FILES |= {"joint.pdf", "parameters.png", "parameters.pdf"}
-BATCH_FILES = {"summary.csv", "summary.html", "batch.json"}
-BATCH_FILES |= {"summary.tex", "summary.png", "summary.pdf"}
-PREDICTION_FILES = {"prediction.json", "prediction.csv", "prediction.png", "prediction.pdf"}
+CYCLES_FILES = {f"cycles.{kind}" for kind in ("json", "csv", "png", "pdf")}
+CYCLES_FILES |= {"cycles-plotted.csv", "table.tex"}
+JOINT_FILES = {f"joint.{kind}" for kind in ("json", "html", "png", "pdf", "csv")}
+JOINT_FILES |= {"table.tex", "parameters.png", "parameters.pdf"}
+BATCH_FILES = {f"summary.{kind}" for kind in ("csv", "html", "tex", "png", "pdf")} | {"batch.json"}
+PREDICTION_FILES = {f"prediction.{kind}" for kind in ("json", "csv", "png", "pdf")}
 # One of these is in every result.
 MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json", "prediction.json")
 _FILES = RESULT_FILES | CYCLES_FILES | JOINT_FILES | PREDICTION_FILES | {"batch.json"}
@@ -223,7 +221,9 @@ def write_result(
     write_json(folder / "fit.json", result.to_json_dict())
     write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
     write_text(folder / "table.tex", parameters_tex(result.parameters))
-    write_table(folder / "curves.csv", _curve_rows(result.columns))
+    # Python floats are written with as many digits as they have, numpy's with their type's name.
+    samples = zip(*(column.tolist() for column in result.columns.values()), strict=True)
+    write_table(folder / "curves.csv", [result.columns.keys(), *samples])
     if result.intervals is not None and result.intervals.profiles:
         write_table(folder / "profiles.csv", _profile_rows(result.intervals))
     if result.draws:
@@ -277,9 +277,3 @@ def _profile_rows(intervals: Intervals) -> Iterator[Iterable[object]]:
     for profile in intervals.profiles:
         for value, rise in zip(profile.values.tolist(), profile.rises.tolist(), strict=True):
             yield [profile.name, value, rise, profile.cut, profile.complete]
-
-
-def _curve_rows(columns: Mapping[str, Array]) -> Iterator[Iterable[object]]:
-    yield columns.keys()
-    # Python floats are written with as many digits as they have, numpy's with their type's name.
-    yield from zip(*(column.tolist() for column in columns.values()), strict=True)

@@ -537,11 +537,7 @@ def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
 
 
 def _first_visits(result: Fit, fitted: _Line) -> Iterator[tuple[str, int, int]]:
-    """Give each branch of the only spring, and the samples of its first stretch on it.
-
-    A spring leaves its branch wherever a measured motion shakes: a stretch of less than a fiftieth
-    of the largest strain is part of the one before it.
-    """
+    """Give each branch of the only spring, and the samples of its first stretch on it."""
     starts = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
     at_rest = next(iter(result.chain.springs[0].law.branches))
     branches = [switch.source for switch in result.switches[:1]] or [at_rest]
@@ -550,6 +546,7 @@ def _first_visits(result: Fit, fitted: _Line) -> Iterator[tuple[str, int, int]]:
     for branch, start, end in zip(branches, starts, starts[1:], strict=False):
         if end <= start:
             continue
+        # A shaking motion leaves a branch for less than a fiftieth of the largest strain.
         shakes = np.ptp(fitted.x[start : end + 1]) < 0.02 * np.ptp(fitted.x)
         if stretches and (shakes or branch == stretches[-1][0]):
             stretches[-1] = (stretches[-1][0], stretches[-1][1], end)

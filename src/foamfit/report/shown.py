@@ -51,15 +51,13 @@ def cycles_shown(found: FittedCycles, *, html: bool = False) -> str:
 
 def cycles_by_test(found: FittedCycles) -> dict[str, Any]:
     """Return head and rows of a table with a row for each cycle."""
-    numbers = sorted(found.results)
-    estimates = {n: [found.results[i].parameters.get(n) for i in numbers] for n in found.varied}
-    return by_test([str(number) for number in numbers], estimates)
+    return by_test(list(map(str, sorted(found.results))), found.varied)
 
 
 def _spans(found: FittedCycles) -> Iterator[tuple[str, tuple[Readable, Readable]]]:
     """Smallest and largest value of each parameter over the cycles, in one unit."""
-    for name in found.varied:
-        each = [one.parameters[name] for one in found.results.values() if name in one.parameters]
+    for name, every in found.varied.items():
+        each = [one for one in every if one is not None]
         ends = min(each, key=lambda one: one.value), max(each, key=lambda one: one.value)
         unit = readable_unit(abs(ends[1].value), ends[1].unit)
         yield name, (readable(name, ends[0], unit), readable(name, ends[1], unit))

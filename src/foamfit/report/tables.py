@@ -13,7 +13,8 @@ import numpy as np
 
 from foamfit.report.readable import own_symbol, readable, readable_unit
 from foamfit.report.render import environment
-from foamfit.results import ParameterEstimate
+from foamfit.results import ParameterEstimate, plain
+from foamfit.springs.parameters import springs_first
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,6 +34,8 @@ _TEXT |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasci
 _TEXT |= {"–": "--", "…": r"\dots{}"} | {letter: f"${letter}$" for letter in "<>|"}
 _TEXT |= {letter: f"{{{letter}}}" for letter in "[]*"}  # at the start of a row they are options
 _LAST_LETTER = "ſ"  # that pdfLaTeX sets without further packages
+PARTS = ("", "_stderr", "_lo", "_hi", "_state")  # of a parameter, in a row for each test
+Parameters = Mapping[str, ParameterEstimate]
 
 
 def escaped(told: object) -> str:
@@ -65,7 +68,7 @@ def numbers(told: str) -> str:
     return " to ".join(f"${one.replace('±', chr(92) + 'pm')}$" for one in told.split(" to ") if one)
 
 
-def parameters_tex(parameters: Mapping[str, ParameterEstimate], **more: Any) -> str:
+def parameters_tex(parameters: Parameters, **more: Any) -> str:
     """Return table.tex of a fit: a row for each parameter that is not held at zero.
 
     `more` may hold `kinds` and `between` of a joint fit, by the name of the parameter.
@@ -73,6 +76,35 @@ def parameters_tex(parameters: Mapping[str, ParameterEstimate], **more: Any) -> 
     shown = {n: p for n, p in parameters.items() if p.state != "fixed" or p.value}
     rows = list(zip(_symbols(shown), itertools.starmap(readable, shown.items()), strict=True))
     return _tex("parameters", rows=rows, **({"kinds": {}, "between": {}} | more))
+
+
+def names_of(each: Iterable[Parameters]) -> list[str]:
+    """Return the names of the parameters of any test, those of the springs first."""
+    return springs_first(name for one in each for name in one)
+
+
+def varied(each: Sequence[Parameters]) -> dict[str, list[ParameterEstimate | None]]:
+    """Return the parameters that any test varied, of all tests; None where a test has no value."""
+    every = {name: [one.get(name) for one in each] for name in names_of(each)}
+    return {
+        name: [p if p is not None and np.isfinite(p.value) else None for p in there]
+        for name, there in every.items()
+        if any(p is not None and p.vary for p in there)
+    }
+
+
+def wide_head(names: Iterable[str]) -> list[str]:
+    """Return the columns of parameters in a table with a row for each test."""
+    return [f"{name}{part}" for name in names for part in PARTS]
+
+
+def wide_cells(names: Iterable[str], parameters: Parameters) -> list[Any]:
+    """Return the cells of a test below `wide_head`, SI; None where there is nothing."""
+    cells = list[Any]()
+    for p in map(parameters.get, names):
+        known = p and (p.value, p.stderr, *(p.ci95 or (None, None)), p.state)
+        cells += known or (None,) * len(PARTS)
+    return list(plain(cells))
 
 
 def by_test(

@@ -19,6 +19,7 @@ from typing import Any
 import lmfit
 
 from foamfit.api import fit
+from foamfit.codec import build, encode
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.data.toml_file import motion_file
@@ -136,15 +137,9 @@ def stored(folder: Path, wanted: str, recipe: Recipe) -> tuple[Row, ...] | None:
         there = content.get("figure_width", inches(TWO)) if content["pages"] else None
         if recipe.pages and there != inches(recipe.width):
             return None
-        return tuple(Row(**row) for row in content["rows"])
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        RecursionError,
-    ):  # none, or of another version
-        return None
+        return tuple(build(Row, row, {}) for row in content["rows"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None  # none, or of another version
 
 
 def work(task: Task) -> Outcome:
@@ -162,7 +157,7 @@ def work(task: Task) -> Outcome:
             "fingerprint": task.fingerprint,
             "pages": task.recipe.pages,
             "figure_width": inches(task.recipe.width),
-            "rows": [asdict(row) for row in rows],
+            "rows": encode(rows, {}),
         }
 
         def fill(folder: Path) -> None:

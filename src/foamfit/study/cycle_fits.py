@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
-from foamfit.results import Fit, plain
-from foamfit.springs.parameters import NUISANCE, springs_first
+from foamfit.report.tables import names_of, varied, wide_cells, wide_head
+from foamfit.results import Fit, ParameterEstimate, plain
+from foamfit.springs.parameters import NUISANCE
 
 SCHEMA = 1
 CURVES = ("stress_time", "displacement_time", "stress_strain")
@@ -38,56 +39,29 @@ class FittedCycles:
     refused: dict[int, str]
 
     @property
-    def names(self) -> list[str]:
-        """Names of the parameters of any fit, in their order, those of the springs first."""
-        return springs_first(name for one in self.results.values() for name in one.parameters)
-
-    @property
-    def varied(self) -> list[str]:
-        """Names of the parameters of the springs that vary in any fit."""
-        fits = [one.parameters for one in self.results.values()]
-        return [
-            name
-            for name in self.names
-            if name not in NUISANCE and any(name in one and one[name].vary for one in fits)
-        ]
+    def varied(self) -> dict[str, list[ParameterEstimate | None]]:
+        """The parameters of the springs that vary in any fit, by cycle in ascending order."""
+        every = varied([one.parameters for _, one in sorted(self.results.items())])
+        return {name: each for name, each in every.items() if name not in NUISANCE}
 
     def rows(self) -> Iterator[list[object]]:
         """Rows of cycles.csv, the header first: SI, one row for each cycle, empty = not there."""
-        head = [
-            "cycle",
-            "start_strain",
-            "peak_strain",
-            "peak_stress",
-            ENERGY,
-            *(f"misfit_{name}" for name in CURVES),
-            "status",
-            "error",
-        ]
-        parts = "", "_stderr", "_lo", "_hi", "_state"
-        yield [*head, *(f"{name}{part}" for name in self.names for part in parts)]
+        names = names_of(one.parameters for one in self.results.values())
+        head = ["cycle", "start_strain", "peak_strain", "peak_stress", ENERGY]
+        head += [*(f"misfit_{name}" for name in CURVES), "status", "error"]
+        yield [*head, *wide_head(names)]
         for number in sorted({*self.results, *self.refused}):
             one = self.results.get(number)
             if one is None:
-                blank = [None] * (5 * len(self.names))
-                yield [number, *[None] * 7, "refused", self.refused[number], *blank]
+                told = [number, *[None] * 7, "refused", self.refused[number]]
+                yield [*told, *wide_cells(names, {})]
                 continue
             m = one.measurement
             strain = None if m.displacement is None else m.displacement.max() / m.specimen.height
-            cells: list[object] = [
-                number,
-                m.start_strain,
-                strain,
-                None if m.stress is None else m.stress.max(),
-                one.energy.get(ENERGY),
-                *(one.misfit.get(name) for name in CURVES),
-                one.status,
-                None,
-            ]
-            for name in self.names:
-                p, none = one.parameters.get(name), (None, None)
-                cells += (p.value, p.stderr, *(p.ci95 or none), p.state) if p else [None] * 5
-            yield [plain(cell) for cell in cells]
+            stress = None if m.stress is None else m.stress.max()
+            cells = [number, m.start_strain, strain, stress, one.energy.get(ENERGY)]
+            cells += [*map(one.misfit.get, CURVES), one.status, None]
+            yield [*plain(cells), *wide_cells(names, one.parameters)]
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of cycles.json, in plain types."""

@@ -202,10 +202,7 @@ def _too_few(study: Study, count: int, refused: Mapping[str, str]) -> NoReturn:
 
 
 def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters]:
-    """Parameters of each test, varied and held as the study says.
-
-    What is named varies where it does so by itself, and if it does nowhere, then in every test.
-    """
+    """Parameters of each test; what is named varies where it does so by itself, or else in all."""
     model = Model.parse(study.model, study.relaxation)
     every = [make_params(test, model, study.drive) for test in tests]
     for name in (*study.kinds, *study.held):
@@ -284,8 +281,8 @@ def _own_fits(
 ) -> tuple[list[_Test], Group]:
     """Tests that can be fitted, and what a fit of each alone finds.
 
-    A few tests, spread over the rates, are searched as `fit` searches them. The others descend from
-    what these have found, and are searched too where that does not follow them as well.
+    A few, spread over the rates, are searched; the others descend from what these have found, and
+    are searched too where that does not follow them as well.
     """
     order = sorted(range(len(tests)), key=lambda t: (tests[t].rate or 0.0, t))
     places = np.unique(np.linspace(0, len(order) - 1, min(SEARCHED, len(order))).astype(int))
@@ -333,10 +330,7 @@ def _own_fit(
     options: Options,
     near: tuple[Array, ...],
 ) -> tuple[Array, float] | str:
-    """Fit one test from points nearby, or search; returns its vector and χ² per sample.
-
-    Where it cannot be fitted, a sentence that says why.
-    """
+    """Fit one test from points nearby, or search: its vector and χ² per sample, or why not."""
     if not near:
         try:
             found = identify(measurement, model, params, options, lambda *_: None)

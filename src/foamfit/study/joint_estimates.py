@@ -113,11 +113,7 @@ def _judged(
     known: tuple[float, float],
     span: tuple[float, float] | None = None,
 ) -> TestValue:
-    """Judge a value by its standard error and degrees of freedom; see `trust.covariance.RULE`.
-
-    Its scale and limits are those of a test. `span` is its range, if there is one; the state is
-    that of the wider of the two.
-    """
+    """Judge a value by its interval, or by its range if that is wider (`trust.covariance.RULE`)."""
     problem, (stderr, freedom) = fit.found.problems[test], known
     low, high = fit.point.bests[test].limits(name)
     size = float(problem.sizes((name,), fit.found.values[test])[0])

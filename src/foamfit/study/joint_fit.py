@@ -74,8 +74,7 @@ def fit_jointly(
 ) -> JointFit:
     """Fit tests whose parameters are linked as `links` say, and judge the fit.
 
-    Arguments are those of `fitting.together.fit_linked`; `each` maps a function over what is to be
-    done for each test, as `map` does.
+    Arguments are those of `fitting.together.fit_linked`; `each` maps over tests, as `map` does.
     """
     found = fit_linked(problems, links, starts)
     errors = errors_of(found, each)
@@ -95,10 +94,7 @@ def fit_jointly(
 
 
 def _spread(point: JointPoint, name: str) -> tuple[Array, Spread, Array, Array] | None:
-    """What the tests say undrawn (logarithms), their spread, inflations, and the pulls of it.
-
-    None where fewer than two tests say anything.
-    """
+    """What tests say undrawn (logarithms), spread, inflations, pulls; None of fewer than two."""
     found, (matrix, bread) = point.found, point.of_logarithms(name)
     drawn = _logarithms(found, name)
     there = (np.diag(matrix) < SAYS_NOTHING**2) & np.isfinite(drawn)
@@ -325,8 +321,7 @@ def _kinds_of(
 ) -> Iterator[tuple[str, Together]]:
     """Fits with a parameter of these kinds, and of its present one, the others as they are.
 
-    A kind with which no start can be simulated is left out, and so is another law of rate than the
-    present one where the slope of one is left open, which is added to `wide`.
+    Kinds that cannot be simulated are left out, and laws of rate where the slope is open (`wide`).
     """
     mine = fit.links.kind(name)
     for kind in sorted(dict.fromkeys(kinds), key=lambda kind: (kind in RATES, kind != mine)):

@@ -223,6 +223,12 @@ class JointData:
         errors = point.errors or ((),) * len(point.bests)
         return tuple(noise_of(*pair) for pair in zip(point.bests, errors, strict=True))
 
+    @property
+    def tried(self) -> dict[str, list[Alternative]]:
+        """The kinds that were tried, by parameter."""
+        names = dict.fromkeys(one.parameter for one in self.evidence)
+        return {name: [one for one in self.evidence if one.parameter == name] for name in names}
+
     def estimates(self, test: int) -> dict[str, ParameterEstimate]:
         """Parameters of one test, as its fit.json has them."""
         problem, values = self.problems[test], self.fit.found.values[test]

@@ -74,8 +74,7 @@ def with_words(result: Joint) -> Joint:
 def _evidence(result: JointData) -> list[tuple[str, str, str, float]]:
     """Of each parameter that was tried: the best kind, its own, and how much lower BIC is."""
     out = list[tuple[str, str, str, float]]()
-    for name in dict.fromkeys(one.parameter for one in result.evidence):
-        tried = [one for one in result.evidence if one.parameter == name]
+    for name, tried in result.tried.items():
         mine, best = next(o for o in tried if o.chosen), min(tried, key=lambda one: one.bic)
         out.append((name, best.kind, mine.kind, mine.bic - best.bic))
     return out

@@ -281,13 +281,9 @@ def _point(population: Population, problem: Problem) -> Array:
 def _aligned(
     problem: Problem, springs: Array, scattering: tuple[str, ...]
 ) -> tuple[Array, dict[str, float]]:
-    """The springs and what of the record fits them best, and that in the numbers of its file.
-
-    Of a history that goes on after the cycles that were fitted, only those tell it. Parameters that
-    change from specimen to specimen are fitted with it and then given up: held, a
-    stiffer specimen would be taken for one that is touched earlier.
-    Raises SimulationError if the springs cannot be simulated.
-    """
+    """The springs and what of the record fits them best, and that in the numbers of its file."""
+    # Parameters that change from specimen to specimen are fitted with it and then given up: held,
+    # a stiffer specimen would be taken for one that is touched earlier.
     params = problem.params.copy()
     for name, value in zip(problem.model.names, springs.tolist(), strict=True):
         one = params[name]
@@ -332,11 +328,9 @@ class _Drawn:
 
 
 def _draw(population: Population, problem: Problem, point: Array, draws: int, seed: int) -> _Drawn:
-    """Draw and simulate until there are so many; what is not admissible is drawn again.
-
-    What lies beyond the limits of a fit of the test is moved there, as a fit does: to draw it again
-    would leave one side of all other parameters out. What was aligned stays as it is at the point.
-    """
+    """Draw and simulate until there are so many; what is not admissible is drawn again."""
+    # What lies beyond the limits of a fit of the test is moved there, as a fit does: to draw it
+    # again would leave one side of all other parameters out.
     rng, other = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
     objective, tried = problem.objective, 0
     values, curves = list[Array](), list[dict[str, Array]]()
@@ -365,10 +359,7 @@ def _draw(population: Population, problem: Problem, point: Array, draws: int, se
 def _by_parameters(
     population: Population, aligning: Problem, point: Array, aligned: tuple[str, ...]
 ) -> dict[str, Array]:
-    """Half of the 95 % band (n,), SI, by what the result leaves uncertain, to first order.
-
-    What is aligned to the record would follow the parameters, by the samples of `aligning`.
-    """
+    """Half of the 95 % band (n,), SI, by what the result leaves uncertain, to first order."""
     objective, covariance = aligning.objective, population.covariance
     own = np.flatnonzero(np.diag(covariance) > 0.0)
     places = np.append(own, [aligning.index[name] for name in aligned]).astype(np.int64)
@@ -376,6 +367,7 @@ def _by_parameters(
     if not own.size or slopes is None:
         return {}
     jacobian, out = objective.jacobian(point, places), dict[str, Array]()
+    # What is aligned to the record would follow the parameters.
     follow = np.linalg.lstsq(jacobian[:, own.size :], jacobian[:, : own.size], rcond=None)[0]
     for name in objective.counted:
         moved = slopes[name][: own.size] - follow.T @ slopes[name][own.size :]
@@ -385,10 +377,7 @@ def _by_parameters(
 
 
 def _by_motion(problem: Problem, point: Array) -> dict[str, Array]:
-    """Half of the 95 % band (n,), SI, by what stays uncertain of a driving motion.
-
-    That is no more than the noise of a sample, wherever there is one.
-    """
+    """Half of the 95 % band (n,), SI, by what stays uncertain of a driving motion."""
     objective, out = problem.objective, dict[str, Array]()
     changes, level = objective.by_motion(point), objective.measurement.noise.of("displacement")
     if changes is None or objective.motion is None or level is None:
@@ -442,10 +431,7 @@ def _curve(
 
 
 def _grown(measurement: Measurement, source: Source) -> Array:
-    """Mean square of the law's error over that of the fitted cycles, (n,).
-
-    After the last fitted cycle it grows by the same amount with each, as a random walk does.
-    """
+    """Mean square of the law's error over that of the fitted cycles, (n,); each later one adds."""
     assert measurement.stress is not None
     grown = np.ones(measurement.stress.size)
     last = source.last_cycle or math.inf

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import csv
-import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,20 +18,26 @@ import numpy as np
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.report.figures import image
-from foamfit.report.readable import readable_unit, symbol
 from foamfit.report.render import page, words
 from foamfit.report.studies.parameters import DPI as SUMMARY_DPI
 from foamfit.report.studies.parameters import Compared, plot_parameters
-from foamfit.report.tables import by_test, by_test_tex
+from foamfit.report.tables import (
+    by_test,
+    by_test_tex,
+    names_of,
+    unit_of_all,
+    varied,
+    wide_cells,
+    wide_head,
+)
 from foamfit.results import Fit, ParameterEstimate, plain
-from foamfit.springs.parameters import NUISANCE, springs_first
+from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, listed
 
 if TYPE_CHECKING:
     import pandas as pd
 
 CURVES = ("stress_time", "displacement_time", "stress_strain")
-PARTS = ("", "_stderr", "_lo", "_hi", "_state")
 # What a row says of a test without a result.
 REFUSED, OPEN = "refused", "not fitted"
 _STATUS = {
@@ -49,11 +54,7 @@ _MOST_REFUSALS = 20  # that the terminal names
 
 @dataclass(frozen=True)
 class Row:
-    """What a batch knows of one test, or of one cycle of it; `test` is its folder.
-
-    `parameters` holds value, standard error, lower and upper end of the 95 % interval (SI), state
-    and unit of each, and lower and upper end of its range where it has one.
-    """
+    """What a batch knows of one test, or of one cycle of it; `test` is its folder."""
 
     test: str
     file: str
@@ -61,7 +62,7 @@ class Row:
     error: str | None = None
     misfit: Mapping[str, float | None] = field(default_factory=dict)
     runtime_s: float | None = None
-    parameters: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    parameters: Mapping[str, ParameterEstimate] = field(default_factory=dict)
 
     @property
     def has_fit(self) -> bool:
@@ -81,34 +82,22 @@ def row_of(test: str, file: str, result: Fit) -> Row:
     if result.status == "failed":
         told = [w for check in fatal for w in (check.warnings or (check.sentence,))]
         error = " ".join(["no acceptable fit was found:", *(told or result.warnings)[:1]])
-    cells = {}
-    for name, p in result.parameters.items():
-        ends = (*(p.ci95 or (None, None)), p.state, p.unit, *(p.range or ()))
-        cells[name] = plain([p.value, p.stderr, *ends])
     misfit, runtime = plain(result.misfit), plain(result.runtime_s)
-    return Row(test, file, result.status, error, misfit, runtime, cells)
+    return Row(test, file, result.status, error, misfit, runtime, result.parameters)
 
 
 # ------------------------------------------------------------------------------- the table
 
 
-def names_of(rows: Sequence[Row]) -> list[str]:
-    """Names of the parameters of any test, in their order, those of the springs first."""
-    return springs_first(name for row in rows for name in row.parameters)
-
-
 def table_rows(rows: Sequence[Row]) -> Iterator[list[Any]]:
     """Rows of summary.csv, the header first: SI, a row for each test, empty = not there."""
-    names = names_of(rows)
+    names = names_of(row.parameters for row in rows)
     head = ["test", "file", "status", "error", *(f"misfit_{name}" for name in CURVES), "runtime_s"]
-    yield [*head, *(f"{name}{part}" for name in names for part in PARTS)]
-    blank = [None] * len(PARTS)
+    yield [*head, *wide_head(names)]
     for row in rows:
         cells: list[Any] = [row.test, row.file, row.status, row.error]
         cells += [*(row.misfit.get(name) for name in CURVES), row.runtime_s]
-        for name in names:
-            cells += [*row.parameters.get(name, blank)][: len(PARTS)]
-        yield cells
+        yield cells + wide_cells(names, row.parameters)
 
 
 def table(rows: Sequence[Row]) -> pd.DataFrame:
@@ -167,15 +156,12 @@ def summary_words(rows: Sequence[Row]) -> str:
 def _parameter_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
     """Median and quartiles over the tests of each parameter that any test varied."""
     yield ["parameter", "median", "quartile", "quartile", "determined in", ""]
-    for name in names_of(rows):
-        cells = [row.parameters[name] for row in rows if name in row.parameters]
-        if all(cell[4] == "fixed" for cell in cells):
-            continue
-        values = np.array([math.nan if cell[0] is None else cell[0] for cell in cells])
-        factor, unit = readable_unit(float(np.nanmedian(np.abs(values))), cells[0][5])
-        middle = np.nanquantile(values, [0.5, 0.25, 0.75]) / factor
-        sure = sum(cell[4] == "determined" for cell in cells)
-        yield [name, *(f"{v:.4g}" for v in middle), f"{sure} of {len(cells)}", unit]
+    for name, each in varied([row.parameters for row in rows]).items():
+        known = [p for p in each if p is not None]
+        factor, unit = unit_of_all(known)
+        middle = np.quantile([p.value / factor for p in known], [0.5, 0.25, 0.75])
+        sure = sum(p.state == "determined" for p in known)
+        yield [name, *(f"{v:.4g}" for v in middle), f"{sure} of {len(known)}", unit]
 
 
 # ------------------------------------------------------------------------------- the page
@@ -190,8 +176,8 @@ def write_comparison(
     """
     fitted = [row for row in rows if row.has_fit]
     tests = [row.test for row in fitted]
-    found = {name: [_estimate(row, name) for row in fitted] for name in names_of(rows)}
-    found = {n: each for n, each in found.items() if n not in NUISANCE and _varied(each)}
+    every = varied([row.parameters for row in fitted])
+    found = {name: each for name, each in every.items() if name not in NUISANCE}
     text = by_test_tex("Test", by_test(tests, found))
     write_file(folder / "summary.tex", text.encode("utf-8", "replace"))
     if not (pictures and found):
@@ -208,35 +194,12 @@ def write_comparison(
     return png
 
 
-def _varied(each: Sequence[ParameterEstimate | None]) -> bool:
-    return any(one is not None and one.state != "fixed" for one in each)
-
-
-def _estimate(row: Row, name: str) -> ParameterEstimate | None:
-    """Return a parameter of a test; None if the test does not have it."""
-    value, stderr, low, high, state, unit, *span = row.parameters.get(name, [None] * 6)
-    if value is None:
-        return None
-    ends = None if low is None or high is None else (low, high)
-    return ParameterEstimate(
-        value,
-        stderr,
-        ends,
-        unit,
-        state != "fixed",
-        state,
-        "",
-        range=(span[0], span[1]) if span else None,
-    )
-
-
 def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | None = None) -> None:
     """Write summary.html whole, with a picture (PNG): one file that needs nothing else."""
     shown = rows
     if len(rows) > MOST_ON_PAGE:  # tests without a fit are always shown
         first = {id(row) for row in rows[:MOST_ON_PAGE]}
         shown = [row for row in rows if id(row) in first or not row.has_fit][: 2 * MOST_ON_PAGE]
-    columns = list(_columns(shown))
     measured = {name for row in shown for name, off in row.misfit.items() if off is not None}
     text = page(
         "summary",
@@ -247,36 +210,8 @@ def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | N
         total=len(rows),
         links=[f"{quote(row.test)}/report.html" for row in shown],
         reports=[(folder / row.test / "report.html").is_file() for row in shown],
-        columns=columns,
-        cells=[[_cell(row, column) for column in columns] for row in shown],
+        parameters=by_test([row.test for row in shown], varied([row.parameters for row in shown])),
         misfits={curve: told for curve, told in _MISFITS.items() if curve in measured},
         picture=picture and base64.b64encode(picture).decode("ascii"),
     )
     write_file(folder / "summary.html", text.encode("utf-8", "replace"))
-
-
-def _columns(rows: Sequence[Row]) -> Iterator[dict[str, Any]]:
-    """The parameters that any test varied, each in the unit in which it reads well."""
-    for name in names_of(rows):
-        every = (row.parameters.get(name) for row in rows)
-        there = [cell for cell in every if cell is not None and cell[0] is not None]
-        if not there or all(cell[4] == "fixed" for cell in there):
-            continue
-        size = float(np.median(np.abs([cell[0] for cell in there])))
-        factor, unit = readable_unit(size, there[0][5])
-        yield {"name": name, "symbol": symbol(name), "unit": unit, "factor": factor}
-
-
-def _cell(row: Row, column: Mapping[str, Any]) -> tuple[str, str, str, str]:
-    """Value, what to sort by, interval and state of a parameter of a test."""
-    found = row.parameters.get(column["name"])
-    if found is None or found[0] is None:
-        return "", "", "", ""
-
-    def shown(*ends: float) -> str:
-        return " to ".join(f"{end / column['factor']:.4g}" for end in ends).replace("-", "−")
-
-    value, _, low, high, state, _, *span = found
-    interval = "" if low is None or high is None else shown(low, high)
-    interval += f"; range {shown(*span)}" if span else ""
-    return shown(value), f"{value:.6g}", interval, state

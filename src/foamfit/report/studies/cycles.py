@@ -65,7 +65,7 @@ def write_cycles(
 
 def cycles_text(found: FittedCycles) -> str:
     """Return what the command prints of the cycles of a record."""
-    names = found.varied if len(found.varied) <= MOST_NAMES else []
+    names = found.varied if len(found.varied) <= MOST_NAMES else {}
     rows = [["cycle", "start strain", "misfit", *(own_name(name, found.model) for name in names)]]
     for number, one in sorted(found.results.items()):
         off = one.misfit.get("stress_strain") or one.misfit.get("stress_time")

@@ -119,7 +119,7 @@ def joint_text(found: JointData) -> str:
     """Return what the command prints of a joint fit."""
     evidence = {
         name: [["*" if o.chosen else "", o.kind, str(o.n_vary), f"{o.bic:.1f}"] for o in tried]
-        for name, tried in _evidence(found).items()
+        for name, tried in found.tried.items()
     }
     return words(
         "joint",
@@ -155,19 +155,13 @@ def joint_page(found: JointData, loops: bytes, compared: bytes, *, linked: bool 
         ],
         rule=RULE,
         ranged=any(one.range for one in found.parameters.values()),
-        evidence=_evidence(found),
+        evidence=found.tried,
         curves={name: CURVES[name] for name in _compared(found, CURVES)},
         of_curve=CURVES,
         noise=noise,
         each=each,
         linked=linked,
     )
-
-
-def _evidence(found: JointData) -> dict[str, list[Any]]:
-    """The kinds that were tried, by parameter."""
-    names = dict.fromkeys(one.parameter for one in found.evidence)
-    return {name: [one for one in found.evidence if one.parameter == name] for name in names}
 
 
 def _compared(found: JointData, curves: Iterable[str]) -> list[str]:

@@ -76,9 +76,7 @@ class Population:
     def _open(self) -> tuple[tuple[str, ...], Array]:
         """Uncertain quantities and their covariance given those that are held.
 
-        What a result leaves undetermined is correlated with other parameters: where it stays at its
-        value, these have the spread that is left to them then. Of each parameter no less is known
-        than that it lies between its limits.
+        Each is known at least to lie between its limits.
         """
         free = [name for name in self._uncertain if name not in self.held]
         free += [f"{name}:b" for name, one in self._known.items() if one.b_stderr]
@@ -106,18 +104,16 @@ class Population:
         return tuple(free), matrix - spread.T @ told
 
     def _error(self, name: str) -> float:
-        """Standard error of an uncertain quantity, SI; by its range where it has none.
-
-        In a joint result those of few tests are larger by what their intervals are.
-        """
+        """Standard error of an uncertain quantity, SI; by its range where it has none."""
         one = self.source.parameters[name.removesuffix(":b")]
-        given = (one.b_stderr, one.b_ci95) if name.endswith(":b") else (one.error, one.ci95)
-        error, ends = given
+        slope = name.endswith(":b")
+        error, ends = (one.b_stderr, one.b_ci95) if slope else (one.error, one.ci95)
         if error is None:
             assert one.span is not None
             return self._flat(name, one.span)
         if ends is None or not self.source.joint:
             return error
+        # Errors of few tests are larger by what their intervals are.
         return max(error, 0.5 * (ends[1] - ends[0]) / NORMAL)
 
     def _flat(self, name: str, span: Pair) -> float:
@@ -173,15 +169,12 @@ class Population:
 
     @cached_property
     def _correlation(self) -> Array:
-        """Correlation of the scattering parameters from specimen to specimen.
-
-        That of the result; of own parameters that change with the rate, or of which it says
-        nothing, that of their deviations.
-        """
+        """Correlation of the scattering parameters from specimen to specimen."""
         names, own = self.scattering, self._own
         out = np.eye(len(names))
         there, places = _places(names, self.source.changing)
         out[np.ix_(there, there)] = self.source.together[np.ix_(places, places)]
+        # Of own parameters with a trend, or of which the result says nothing: of their deviations.
         if own.slopes.any() or not set(own.names) <= set(self.source.changing):
             there, places = _places(names, own.names)
             alone = correlation(own.off, np.zeros((places.size, places.size)))
@@ -216,10 +209,7 @@ class Population:
 
     @property
     def trends(self) -> dict[str, float]:
-        """Own parameters that change with the rate, and by how much per unit of its logarithm.
-
-        Of the logarithm of the parameter where `is_logarithmic`.
-        """
+        """Change of own parameters (logarithms where `_in_logarithms`) by the logarithm of rate."""
         return dict(zip(self._own.names, self._own.slopes.tolist(), strict=True))
 
     def _in_logarithms(self, name: str) -> bool:
