@@ -42,9 +42,9 @@ def run(path: Path) -> None:
         if cell.cell_type == "code":
             cell.outputs = [o for o in cell.outputs if not is_compiling(o)]
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
-    notebook.metadata = {
-        "kernelspec": kernel, "language_info": {"name": "python"}, "run": digest(notebook)
-    }  # fmt: skip
+    language = {"name": "python"}
+    done = {"kernelspec": kernel, "language_info": language, "run": digest(notebook)}
+    notebook.metadata = done
     nbformat.write(notebook, path)
     outputs = (output for cell in notebook.cells for output in cell.get("outputs", ()))
     shown = [o.data["image/png"] for o in outputs if "image/png" in o.get("data", {})]
