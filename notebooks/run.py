@@ -24,6 +24,11 @@ def digest(notebook: nbformat.NotebookNode) -> str:
     return hashlib.sha256("\n\n".join(code).encode()).hexdigest()
 
 
+def is_compiling(output: nbformat.NotebookNode) -> bool:
+    """Whether an output only says that the solver is compiled, once after installation."""
+    return output.get("name") == "stderr" and output.text.startswith("foamfit: compiling")
+
+
 def run(path: Path) -> None:
     """Run a notebook in its folder and write it back; an error in a cell is raised."""
     notebook = nbformat.read(path, as_version=4)
@@ -34,10 +39,12 @@ def run(path: Path) -> None:
         cell.metadata = {key: cell.metadata[key] for key in ("tags",) if key in cell.metadata}
         if "live" in cell.metadata.get("tags", ()):
             cell.outputs, live = [], True
+        if cell.cell_type == "code":
+            cell.outputs = [o for o in cell.outputs if not is_compiling(o)]
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
-    notebook.metadata = {
-        "kernelspec": kernel, "language_info": {"name": "python"}, "run": digest(notebook)
-    }  # fmt: skip
+    language = {"name": "python"}
+    done = {"kernelspec": kernel, "language_info": language, "run": digest(notebook)}
+    notebook.metadata = done
     nbformat.write(notebook, path)
     outputs = (output for cell in notebook.cells for output in cell.get("outputs", ()))
     shown = [o.data["image/png"] for o in outputs if "image/png" in o.get("data", {})]
