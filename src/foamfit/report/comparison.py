@@ -243,7 +243,7 @@ def _correlation(content: Any, where: str) -> dict[tuple[str, str], float]:
         return {}
     try:
         return {
-            (str(one), str(other)): float(value)
+            (one, other): float(value)
             for one, row in zip(content["names"], content["matrix"], strict=True)
             for other, value in zip(content["names"], row, strict=True)
             if value is not None
@@ -289,7 +289,6 @@ def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
 
 
 def _as_it_is(param: Param) -> Compared:
-    """Row of a parameter of a law that defines no rows of its own."""
     factor, unit = (1e6, "MPa") if param.unit == "Pa" else (1.0, param.unit)
     label = "_".join(filter(None, param.symbol)) or param.name
     return Compared(label, unit, (param.name,), lambda value: value / factor)
@@ -377,7 +376,8 @@ def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
             if value is None or (idle and (value.state, value.value) == ("fixed", 0.0)):
                 continue
             remark = nothing or _remark(value, reference, eta, side, other)
-            yield _row(i if several else 0, quantity.label, quantity.unit, value, reference, remark)
+            told = (i if several else 0, quantity.label, quantity.unit)
+            yield Row(*told, *value[:3], *(reference or _Value())[:2], remark)
 
 
 def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
@@ -391,7 +391,8 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
     if item is None and value.value == 0.0 and not (reference and reference.value):
         return
     remark = nothing or _remark(value, reference, True, side, other)
-    yield _row(0, "η" if one_spring else "site η", "Pa·s", value, reference, remark)
+    told = (0, "η" if one_spring else "site η", "Pa·s")
+    yield Row(*told, *value[:3], *(reference or _Value())[:2], remark)
     soft = [i for i, kind in enumerate(side.kinds, 1) if law(kind).hysteretic]
     if item is None or len(soft) != 1 or nothing:
         return
@@ -408,14 +409,7 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
             ratio = ratio._replace(state=value.state, why=value.why)
         lost = ratio.state == "not determined" != value.state
         remark = f"not determined: {ratio.why}" if lost and not remark else remark
-        yield _row(0, "ζ", "", ratio, _Value(item.damping_ratio), remark)
-
-
-def _row(
-    spring: int, name: str, unit: str, value: _Value, reference: _Value | None, remark: str
-) -> Row:
-    beside = reference or _Value()
-    return Row(spring, name, unit, *value[:3], beside.value, beside.stderr, remark)
+        yield Row(0, "ζ", "", *ratio[:3], item.damping_ratio, None, remark)
 
 
 def _remark(value: _Value, reference: _Value | None, eta: bool, side: Side, other: Side) -> str:

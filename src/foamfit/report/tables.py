@@ -85,12 +85,13 @@ def names_of(each: Iterable[Parameters]) -> list[str]:
 
 def varied(each: Sequence[Parameters]) -> dict[str, list[ParameterEstimate | None]]:
     """Return the parameters that any test varied, of all tests; None where a test has no value."""
-    every = {name: [one.get(name) for one in each] for name in names_of(each)}
-    return {
-        name: [p if p is not None and np.isfinite(p.value) else None for p in there]
-        for name, there in every.items()
-        if any(p is not None and p.vary for p in there)
-    }
+    out = dict[str, list[ParameterEstimate | None]]()
+    for name in names_of(each):
+        there = (one.get(name) for one in each)
+        known = [p if p is not None and np.isfinite(p.value) else None for p in there]
+        if any(p is not None and p.vary for p in known):
+            out[name] = known
+    return out
 
 
 def wide_head(names: Iterable[str]) -> list[str]:

@@ -185,10 +185,9 @@ def batch(
         each = tuple(int(number) for number in each)
     if each is not None and cycles is not None:
         raise InputError("give either cycle or cycles, not both")
-    asked = vars(Options.of("batch", options))
     found = run(
         tests,
-        Recipe(model, asked, each, fix, vary, report, figure_width, history=cycles),
+        Recipe(model, options, each, fix, vary, report, figure_width, history=cycles),
         out=out,
         executor=executor,
         jobs=jobs,

@@ -263,10 +263,7 @@ class JointData:
             "relaxation": self.study.relaxation,
             "drive": self.drive,
             "seed": self.study.seed,
-            "status": self.status,
-            "warnings": self.warnings,
-            "sentences": self.sentences,
-            "rate0": self.rate0,
+            **{name: getattr(self, name) for name in ("status", "warnings", "sentences", "rate0")},
             "tests": {
                 name: {
                     "file": str(self.files[t]),
@@ -285,9 +282,7 @@ class JointData:
             "covariance": {"names": self.covariance[0], "matrix": self.covariance[1]},
             "specimens": {"names": self.fit.correlation[0], "correlation": self.fit.correlation[1]},
             "evidence": [asdict(one) for one in self.evidence],
-            "statistics": self.statistics,
-            "refused": self.refused,
-            "runtime_s": self.runtime_s,
+            **{name: getattr(self, name) for name in ("statistics", "refused", "runtime_s")},
         }
         return dict(plain(content))
 

@@ -157,7 +157,10 @@ class PredictedTest:
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``prediction.json``: SI, plain types, null = not there."""
-        m = self.measurement
+        m, model = self.measurement, Model.parse(self.model)
+        asked = ("relaxation", "drive", "seed", "draws", "redrawn", "rate", "fitted_rates")
+        found = ("extrapolated", "misfit", "inside", "by_cycle")
+        told = ("held", "aligned", "warnings", "sentences")
         content: dict[str, Any] = plain(
             {
                 "schema": SCHEMA,
@@ -168,19 +171,9 @@ class PredictedTest:
                 "last_cycle": m.last_cycle,
                 "result": self.source,
                 "joint": self.joint,
-                "model": Model.parse(self.model).words,
-                **Model.parse(self.model).options,
-                "relaxation": self.relaxation,
-                "drive": self.drive,
-                "seed": self.seed,
-                "draws": self.draws,
-                "redrawn": self.redrawn,
-                "rate": self.rate,
-                "fitted_rates": self.fitted_rates,
-                "extrapolated": self.extrapolated,
-                "misfit": self.misfit,
-                "inside": self.inside,
-                "by_cycle": self.by_cycle,
+                "model": model.words,
+                **model.options,
+                **{name: getattr(self, name) for name in (*asked, *found)},
                 "curves": {
                     name: {
                         "range": curve.range,
@@ -192,10 +185,7 @@ class PredictedTest:
                     for name, curve in self.curves.items()
                 },
                 "parameters": {name: vars(one) for name, one in self.parameters.items()},
-                "held": self.held,
-                "aligned": self.aligned,
-                "warnings": self.warnings,
-                "sentences": self.sentences,
+                **{name: getattr(self, name) for name in told},
             }
         )
         return content
