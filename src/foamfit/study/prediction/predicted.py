@@ -125,7 +125,8 @@ class PredictedTest:
 
     def __repr__(self) -> str:
         """Tell how well it meets the record."""
-        return "\n  ".join((f"{self.measurement.name} predicted from {self.source}", *self.sentences))
+        head = f"{self.measurement.name} predicted from {self.source}"
+        return "\n  ".join((head, *self.sentences))
 
     @property
     def law(self) -> str:
