@@ -141,10 +141,8 @@ def read_source(result: HasContent | str | Path) -> Source:
     if isinstance(result, str | Path):
         return _source(_Item(load_result(_file(Path(result))), str(result)))
     if not hasattr(result, "to_json_dict"):
-        raise InputError(
-            f"a prediction is made from a result of fit or joint or the path of one, not from "
-            f"a {type(result).__name__}"
-        )
+        told = f"not from a {type(result).__name__}"
+        raise InputError(f"a prediction is made from a result of fit or joint or its path, {told}")
     content = result.to_json_dict()
     where = content.get("test") or content.get("name") or "the result"
     return _source(_Item(content, str(where)))
@@ -200,8 +198,7 @@ class _Item:
     @property
     def error(self) -> float | None:
         """The item as a standard error; None if there is none, or it is zero."""
-        number = self.maybe
-        if number is not None and number < 0.0:
+        if (number := self.maybe or 0.0) < 0.0:
             raise InputError(f"{self.where} is {self.content!r}; it must not be negative")
         return number or None
 
@@ -220,9 +217,7 @@ def _source(given: _Item) -> Source:
     """What the content of fit.json or joint.json says."""
     where, content = given.where, given.content
     if not isinstance(content.get("parameters"), Mapping) or "model" not in content:
-        raise InputError(
-            f"{where} is not the result of a fit or of a joint fit (fit.json, joint.json)"
-        )
+        raise InputError(f"{where} is not the result of a fit or joint fit (fit.json, joint.json)")
     joint, drive = "tests" in content, content.get("drive")
     try:
         model = Model.of_result(content)
@@ -235,9 +230,8 @@ def _source(given: _Item) -> Source:
         name: (one if joint else one.item("data")).item("rate").maybe for name, one in tests.items()
     }
     parameters = _parameters(given, model, joint, rates)
-    names, correlation = _correlation(
-        given, *(("covariance", "matrix") if joint else ("correlation", "matrix")), parameters
-    )
+    key = "covariance" if joint else "correlation"
+    names, correlation = _correlation(given, key, "matrix", parameters)
     changing, together = _correlation(given, "specimens", "correlation", parameters)
     noise = given.items("noise") if content.get("noise") else {}
     return Source(
@@ -275,11 +269,9 @@ def _parameters(
         for name, item in given.items("parameters").items()
         if name not in NUISANCE
     }
-    for name in model.names:
-        if name not in found and split_name(name)[1] != "eta":
-            raise InputError(
-                f"{given.where} has no parameter {name}, which its model {model.name} has"
-            )
+    needed = (name for name in model.names if split_name(name)[1] != "eta")
+    if lost := [name for name in needed if name not in found]:
+        raise InputError(f"{given.where} has no parameter {lost[0]} of its model {model.name}")
     if unknown := [name for name in found if name not in model.names]:
         raise InputError(f"{given.where}: {unknown[0]} is no parameter of its model {model.name}")
     return {name: Identified("fixed", 0.0) for name in model.names} | found
