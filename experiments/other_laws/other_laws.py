@@ -61,7 +61,7 @@ LAWS = (
         "microscale",
         1,
         more={"stiffening": True, "mullins": True},
-    ),  # fmt: skip
+    ),
     Compared("bistable", "bistable"),
     Compared("bistable, relaxation", "bistable", 1),
     Compared("bistable, power-law damper", "bistable-power-damper", 0, "power_law_damper"),
