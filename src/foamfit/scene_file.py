@@ -75,7 +75,7 @@ class _Part:
             raise InputError(f"{self.where} {error}.") from None
 
     def parts(self, key: str, name: str, wrong: str) -> list[_Part]:
-        """Return the tables of a list, numbered from 1; InputError if it is none."""
+        """Return the tables of a list, numbered from 1; raise InputError if it is not a list."""
         given = self.table.get(key, [])
         if not isinstance(given, list) or not all(isinstance(one, dict) for one in given):
             raise InputError(f"{self.where} {wrong}.")

@@ -22,7 +22,7 @@ _LOWEST, _LOADED, _STILL_LOADED = 0.02, 0.01, 0.05
 # Share of its peak stress up to which the rise of a later cycle is taken for straight, the fewest
 # samples of it, and the places that are tried for its foot.
 _EARLY, _FEWEST, _PLACES = 0.1, 5, 400
-_BEGUN = 3.0  # times the least load: the load of a first rise that has surely begun
+_BEGUN = 3.0  # times the least load: above it the first rise has certainly begun
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def find_cycles(record: Record) -> list[Cycle]:
     free = float(np.median(stress[w <= low + _LOWEST * size]))
     least = free + _LOADED * (float(stress.max()) - free)
     peaks, rests = [int(turns[0])], [0]
-    # An approach is no part of the way to a peak: this is counted from where the load begins.
+    # The way to a peak starts where the load begins; the approach before it does not count.
     first = next((int(turn) for turn in turns[::2] if stress[turn] >= least), 0)
     light = np.flatnonzero(stress[:first] <= free + _BEGUN * (least - free))
     low = max(low, float(w[light[-1]])) if light.size else low

@@ -18,11 +18,8 @@ EFFECTS = {
 }
 
 
-def describe(test: Measurement, audit: EnergyAudit, *, exact: bool = True) -> str:
-    """Write what was read of a test, what was done to it, and its energy and momentum.
-
-    With `exact` also which quantities have no ±.
-    """
+def describe(test: Measurement, audit: EnergyAudit) -> str:
+    """Write what was read of a test, what was done to it, its energy, and what has no ±."""
     lines = [
         ("test", [test.name]),
         ("file", [str(test.path or "none")]),
@@ -34,7 +31,7 @@ def describe(test: Measurement, audit: EnergyAudit, *, exact: bool = True) -> st
         ("energy", audit.sentences()),
     ]
     effects = {name.replace("_", " "): effect for name, effect in taken_for_exact(test).items()}
-    if exact and effects:
+    if effects:
         told = ", ".join(f"1 % of the {name} is {effect}" for name, effect in effects.items())
         sentences = [
             f"The TOML states no ± of {listed(effects)}, which therefore count as exact.",

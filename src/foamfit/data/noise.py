@@ -135,7 +135,7 @@ def noise_before_contact(
     found = dict[str, NoiseLevel]()
     for name, values in ((c, v[:n]) for c, v in whole.items() if n >= MIN_REST):
         (sigma, time), bent = (_noise_about(values, degree) for degree in (1, 3))
-        # A machine that speeds up before contact: its bend is no correlated noise (BIC).
+        # The path of a machine that accelerates is curved; that is not correlated noise (BIC).
         if sigma > bent[0] * n ** (2.0 * bent[1] / n):
             sigma, time = bent
         how = f"estimated from {n} samples before contact"
@@ -153,9 +153,13 @@ def _noise_about(values: Array, degree: int) -> tuple[float, float]:
     """Noise of samples about a polynomial: standard deviation and correlation time in samples."""
     n, x = values.size, np.linspace(-1.0, 1.0, values.size)
     off = values - np.polyval(np.polyfit(x, values, degree), x)
-    phi = lag_one(off)
-    time = correlation_time(phi) if 2 / np.sqrt(n) < phi < 1 else 1.0
-    return float(np.sqrt(off @ off / (n - degree - 1))), time
+    return float(np.sqrt(off @ off / (n - degree - 1))), _time_shown(off)
+
+
+def _time_shown(residual: Array) -> float:
+    """Correlation time, in samples, if the residual shows a significant one, else 1."""
+    phi = lag_one(residual)
+    return correlation_time(phi) if 2 / np.sqrt(residual.size) < phi < 1 else 1.0
 
 
 class Level(NamedTuple):
@@ -179,8 +183,7 @@ def mean_level(values: Array, noise: NoiseLevel) -> Level:
     """Level of a signal at rest: the mean of its samples; few of them do not show their noise."""
     n, sigma, time, zero = len(values), noise.sigma, noise.time, float(values.mean())
     if n >= MIN_REST:
-        phi = lag_one(values - zero)
-        time = max(time, correlation_time(phi)) if 2 / np.sqrt(n) < phi < 1 else time
+        time = max(time, _time_shown(values - zero))
     if n >= MIN_REST * time:
         sigma = float(np.std(values, ddof=1))
     return Level(zero, sigma * float(np.sqrt(min(time, n) / n)), n)

@@ -19,9 +19,10 @@ from foamfit.springs.exchange import exchanges
 from foamfit.springs.laws.record import Law
 from foamfit.springs.parameters import NUISANCE, relaxation_names, split_name
 
-# Minima whose springs exchange properties at most, and descents for each that is not the best.
+# Most minima whose springs exchange properties, and most descents from each but the best.
 EXCHANGES, EXCHANGED = 8, 16
-# Share of the best cost, if that misses more than noise, by which an end may be worse and lead on.
+# Where the best point misses more than noise: share of its cost by which another end may be worse
+# and still have its springs exchanged.
 DETOUR = 0.5
 # Ends of the search whose cost is above the best by less than so many variances of the noise are
 # settled anew, at most so many; points of the box closer than the last are one minimum.
@@ -73,8 +74,8 @@ def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
 
     Which of two springs in series owns which branch shows in few samples: the loop of the chain
     hardly changes where they exchange it, so each such exchange has a minimum of its own. Each
-    minimum that may lead to the best one is exchanged in turn. Returned are the costs
-    of the ends, as by `search`.
+    minimum that may lead to the best one is exchanged in turn. Returned are the costs of the ends,
+    as by `search`.
     """
     if tracker.best_values is None or not has_several(space.model):
         return []

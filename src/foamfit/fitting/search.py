@@ -35,8 +35,8 @@ NOISY = 0.005  # noise of a motion, over its range, that is much
 AROUND = 200  # points about the best one among which another search begins
 # Share of the box that counts as its edge, and where inside a descent begins again.
 EDGE, INSIDE = 0.02, (0.35, 0.5, 0.65)
-# Change of the logarithm of a parameter that leads out of a wrong minimum, and the cost over the
-# noise floor, which has a margin, from which on it is tried.
+# Change of the logarithm of a parameter that leads out of a wrong minimum; it is tried if the cost
+# is above this share of the noise floor, which includes a margin.
 APART, MISSING = 1.2, 0.8
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
 PROMISING = 100.0
@@ -266,7 +266,7 @@ def _descended(tracker: Tracker, space: Space, starts: Iterable[Array]) -> list[
 def _apart(tracker: Tracker, space: Space) -> Iterator[Array]:
     """Points with one positive parameter of the best changed by a factor, larger and smaller.
 
-    All descents may end in one wrong minimum: none is made where only noise is left.
+    All descents may end in the same wrong minimum. There are none where only noise is left.
     """
     if tracker.best_values is None or tracker.best_cost < MISSING * tracker.objective.floor:
         return

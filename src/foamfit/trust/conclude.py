@@ -245,7 +245,7 @@ def _estimates(
 
 
 def _followed(one: ParameterEstimate, missed: tuple[float, str]) -> ParameterEstimate:
-    """Call nothing determined that belongs to curves which the model does not follow."""
+    """Call a parameter weak at best where the fit misses a curve by more than `POOR`."""
     off, curve = missed
     if off <= POOR or one.state != "determined":
         return one

@@ -8,7 +8,7 @@ scale, `fitting.box.Scales.of_parameter`), so that parameters and curves can be 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -83,12 +83,6 @@ class Insight:
         covariance = (vt[seen].T * errors[seen] ** 2) @ vt[seen]
         scale = np.sqrt(np.where(np.isfinite(self._variance), self._variance, np.nan))
         return np.asarray(covariance / np.outer(scale, scale))
-
-    def stderr_with(self, quieter: str, factor: float = 0.5) -> Array:
-        """Standard errors, SI, (k,), if the noise of one curve were `factor` of what it is."""
-        scaled = self.scaled.copy()
-        scaled[self._rows(quieter)] /= factor
-        return replace(self, scaled=scaled).stderr
 
     def along(self, name: str, curve: str) -> Array:
         """Sensitivity of one curve to one parameter, (n_samples,)."""

@@ -32,7 +32,7 @@ REFITS, ENOUGH_DRAWS, MOST_DRAWS = 9, 40, 100_000
 # Evaluations of a refit, and its slopes.
 EVALUATIONS, SLOPES = 6.0, 0.6
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
-# noise makes that much difference in one test of ten thousand, but minima and parameters are many.
+# noise makes that much difference in one test of ten thousand, but there are many minima.
 HARDLY_WORSE = 2.0
 Announce = Callable[[str], None]
 Minima = Sequence[tuple[Array, Array]]  # points at which descents ended, and their residuals

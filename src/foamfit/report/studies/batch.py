@@ -106,7 +106,7 @@ def table(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Return the table in a summary.csv; InputError if it is none."""
+    """Read a summary.csv; raise InputError if the file is not one."""
     try:
         text = read_whole(path).decode()
         rows = [[cell or None for cell in row] for row in csv.reader(text.splitlines(True))]
