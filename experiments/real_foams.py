@@ -2,9 +2,8 @@
 
 Method. Every uniaxial specimen of running-shoe foam (arXiv:2602.12694, LivingMatterLab/CANN) is
 fitted by four laws: misfit, values, their scatter between specimens of one foam, and whether these
-specimens get the same state. Beside them stand two impacts on cartilage (JoVE 64450). The
-measurements are not part of this repository; FOAMFIT_DATA holds shoe-foam/, shoe-foam-twins/ and
-cartilage-impact/.
+specimens get the same state. The measurements are not part of this repository; FOAMFIT_DATA holds
+shoe-foam/ and shoe-foam-twins/.
 
 Answer. Microscale springs with relaxation leave 0.43 to 0.93 % of the range: see real_foams.md.
 Beside it: real_foams.csv (every parameter of every fit) and real_foams.png (one loop, two laws).
@@ -52,8 +51,6 @@ LAWS: dict[str, tuple[str, int, int | None]] = {
 BEST, PLAIN = "microscale, relaxation", "bistable"
 SHOWN = "new-heel-comp-1"  # in the picture
 SOURCE = "arXiv:2602.12694 (LivingMatterLab/CANN)"
-CARTILAGE = {"test_1_impact": 0.785, "test_3_impact": 0.905}  # velocity, m/s
-STRIKER = '[striker]\nmass = "358.39 g"\nvelocity = "{velocity} m/s"\n'
 
 
 def first_cycles(data: Path, folder: Path, foams: tuple[str, ...] = ()) -> Iterator[Measurement]:
@@ -203,18 +200,6 @@ def _write_values(side: Axes, result: Fit) -> None:
     )  # fmt: skip
 
 
-def cartilage_table(data: Path, toml: Path) -> str:
-    rows = []
-    for name, velocity in CARTILAGE.items():
-        studies.write_specimen(toml, "0.563 mm", "8.5 mm", "")
-        toml.write_text(toml.read_text() + STRIKER.format(velocity=velocity))
-        result = ff.fit(ff.read_test(data / "cartilage-impact" / f"{name}.csv", toml))
-        misfits = (f"{result.misfit[c]:.3f}" for c in ("stress_time", "displacement_time"))
-        rows.append([name, *misfits, f"{result.energy['impulse_ratio']:.2f}", result.status])
-    head = "test | misfit of stress-time | misfit of displacement-time | impulse over momentum"
-    return studies.markdown(f"{head} | status", rows)
-
-
 def main() -> dict[str, Fit]:
     """Write page and table; return the fits of which the picture is drawn."""
     data = studies.measurements("shoe-foam", "shoe-foam-twins")
@@ -232,12 +217,11 @@ def main() -> dict[str, Fit]:
                 print(f"{test.name:18}{law:24}{misfit} %  {seconds:.1f} s", flush=True)
                 if test.name == SHOWN and law in (PLAIN, BEST):
                     shown[law] = result
-        cartilage = cartilage_table(data, Path(folder) / "specimen.toml")
     table = pd.DataFrame(rows)
     studies.write_csv(table, TABLE, 6)
     page = (HERE / "real_foams.template.md").read_text(encoding="utf-8").format(
         source=SOURCE, count=len(tests), misfits=misfit_table(table), laws=law_table(table),
-        scatter=scatter_table(table), cartilage=cartilage,
+        scatter=scatter_table(table),
     )  # fmt: skip
     (HERE / "real_foams.md").write_text(page)
     return shown

@@ -1,4 +1,4 @@
-"""What does `foamfit batch` cost beside its fits? Speed-up, overhead, memory, page, on paper.
+"""What does `foamfit batch` cost beside its fits? Speed-up, overhead, memory, on paper.
 
 Method. Synthetic impacts on one spring with 1 % noise are fitted by the command and by its parts.
 Other work on the machine slows everything, so processor times stand beside times of the clock.
@@ -15,21 +15,18 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import foamfit as ff
-from foamfit.report.studies.batch import row_of, table_rows, write_page, write_summary
 from foamfit.study.batch_work import Recipe, Task, fingerprint, put, settings_key, stored, work
 
 HERE = Path(__file__).parent
@@ -192,64 +189,6 @@ def measure_memory(place: Path) -> dict[str, Any]:
     return {"tests": MANY, "after": at, "called again, nothing to do": again}
 
 
-def measure_page(place: Path) -> dict[str, Any]:
-    """Size of the page of many tests, and how long a browser takes to show it."""
-    rows = fabricated_rows(place, MANY)
-    began = time.perf_counter()
-    write_page(rows, place, "a batch")
-    made = time.perf_counter() - began
-    found: dict[str, Any] = {
-        "tests": MANY,
-        "MB": (place / "summary.html").stat().st_size / 1e6,
-        "made_s": made,
-    }
-    if (browser := shutil.which("chromium")) is None:
-        return found
-    page = (place / "summary.html").read_text(encoding="utf-8")
-    script = (
-        "<script>addEventListener('load', () => setTimeout(() => {"
-        "const shown = performance.now(), heads = document.querySelector('table').tHead.rows[0];"
-        "heads.cells[5].click(); document.body.offsetHeight;"
-        "document.title = `load ${shown} sort ${performance.now() - shown}`;}, 0));</script>"
-    )
-    (place / "timed.html").write_text(page.replace("</body>", script + "</body>"))
-    words = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=20000"]
-    (place / "empty.html").write_text("<!DOCTYPE html><title>x</title>")
-    used = []
-    for name in ("empty.html", "timed.html"):
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        made_page = subprocess.run(
-            [browser, *words, "--dump-dom", f"file://{place / name}"],
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        used.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    told = made_page.split("<title>")[1].split("</title>")[0].split()
-    return found | {
-        "browser_load_ms": float(told[1]),
-        "browser_sort_ms": float(told[3]),
-        "browser, more processor time than for an empty page, s": used[1] - used[0],
-    }
-
-
-def fabricated_rows(place: Path, count: int) -> list[Any]:
-    """Rows like those of one fit, with other names and values."""
-    if not (place / "tests").exists():
-        make_tests(place / "tests", 2, 601)
-    path = sorted((place / "tests").iterdir())[0]
-    result = ff.fit(ff.read_test(path, place / "foam.toml"), starts=1, intervals="local")
-    base, rng = row_of("t", "t.csv", result), np.random.default_rng(0)
-    rows = []
-    for i in range(count):
-        values = {
-            n: replace(p, value=p.value * rng.normal(1, 0.02)) for n, p in base.parameters.items()
-        }
-        rows.append(replace(base, test=f"test-{i:05d}", parameters=values))
-    return rows
-
-
 def measure_parts(place: Path) -> dict[str, Any]:
     """What the one process that leads a batch does for a test, ms, and what lies on the disk."""
     make_tests(place / "tests", 50, 601)
@@ -275,10 +214,6 @@ def measure_parts(place: Path) -> dict[str, Any]:
                 50,
             ),
         }
-    rows = fabricated_rows(place, MANY)
-    found["summary.csv_ms_per_test"] = timed(lambda _: write_summary(rows, place), 3) / MANY
-    found["summary.csv_kB_per_test"] = (place / "summary.csv").stat().st_size / 1e3 / MANY
-    assert len(list(table_rows(rows))) == MANY + 1
     return found
 
 
@@ -295,7 +230,6 @@ MEASURES = {
     "speedup-reports": measure_speedup,
     "overhead": measure_overhead,
     "memory": measure_memory,
-    "page": measure_page,
     "parts": measure_parts,
 }
 

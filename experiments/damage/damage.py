@@ -3,9 +3,8 @@
 Method. shoe-foam-twins/ (arXiv:2602.12694, LivingMatterLab/CANN) are five specimens each of the
 heel of a new and of a worn shoe, compressed 6 times; lattice-cycles/ (printed TPU lattices,
 mev43/FYP-Cyclic-Compression-Data-Analysis) are 1000 cycles, of which 145 are recorded. Every cycle
-is fitted on its own by a microscale spring with relaxation; then three cycles of each twin
-together, and the parameters that each cycle has of its own are chosen by BIC. The measurements are
-not part of this repository.
+is fitted on its own by a microscale spring with relaxation. The measurements are not part of this
+repository.
 
 Answer. Snap-through and relaxation change from cycle to cycle: see damage.md. Beside it: twins.csv,
 twins.png, lattice.csv and lattice.png.
@@ -23,12 +22,9 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pandas as pd
-from selection import Selection, select_own
 
 import foamfit as ff
-from foamfit.one_model import Options
 from foamfit.report.figures import BLUE, DPI, VERMILION
-from foamfit.study.shared import Group
 from foamfit.text import significant
 
 HERE = Path(__file__).parent
@@ -40,7 +36,6 @@ LAW = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spre
 NAMES = tuple(f"s1_{name}" for name in (*LAW, "g1", "tau1"))
 SHOWN = ("start_strain", "dissipated_energy", "misfit_stress_strain", *NAMES)
 SHARES = ("start_strain", "misfit_stress_strain")
-TOGETHER = (1, 2, 4)
 LATTICES, LATTICE_CYCLES = ("tpu87-20", "tpu87-35", "tpu87-50"), (1, 2, 10, 100, 1000)
 LATTICE = """\
 time = { column = "Total Time (s)" }
@@ -57,20 +52,16 @@ def is_pressure(column: str) -> bool:
 # ------------------------------------------------------------------------------- the twins
 
 
-def fit_twins(data: Path, toml: Path) -> tuple[pd.DataFrame, list[Group]]:
-    """One row per specimen and cycle, and for each specimen the cycles to be fitted together."""
-    rows, groups = [], []
+def fit_twins(data: Path, toml: Path) -> pd.DataFrame:
+    """One row per specimen and cycle."""
+    rows = []
     for name, height, diameter in studies.twins(data / "shoe-foam-twins"):
         studies.write_specimen(toml, height, diameter)
         path = data / "shoe-foam-twins" / f"{name}_raw.txt"
         found = ff.fit_cycles(path, toml, intervals="local", **MODEL)
         rows.append(found.by_cycle.reset_index().assign(specimen=name))
-        fits = [found.results[n] for n in TOGETHER]
-        options = Options(relaxation=1)
-        problems = tuple(options.problem(r.measurement, r.model, r.params) for r in fits)
-        groups.append(Group(problems, tuple(p.vector() for p in problems)))
         print(name, len(found.results), "cycles", file=sys.stderr)
-    return specimen_first(rows), groups
+    return specimen_first(rows)
 
 
 def specimen_first(tables: list[pd.DataFrame]) -> pd.DataFrame:
@@ -110,10 +101,6 @@ def changed(group: pd.DataFrame, column: str, first: int, last: int) -> tuple[fl
     return float(ratio.mean()), float(ratio.std()), int((ratio > 1).sum())
 
 
-def named(column: str) -> str:
-    return "dissipated energy" if "energy" in column else f"`{column.removeprefix('s1_')}`"
-
-
 def twins_told(table: pd.DataFrame) -> str:
     """What changes from the first to the second and from the second to the sixth cycle."""
     lines = []
@@ -130,34 +117,6 @@ def twins_told(table: pd.DataFrame) -> str:
         )
     lines.append("- Worn against new: see the study of [twins](../twins/README.md).")
     return "\n".join(lines)
-
-
-def steps_table(selection: Selection) -> str:
-    rows, tests = [], len(selection.best.fits)
-    for step in selection.steps:
-        off = np.array([[m["stress_strain"] for m in fit.misfits] for fit in step.fits], float)
-        ends = [f"{100 * a:.2f}–{100 * b:.2f} %" for a, b in np.transpose([off.min(0), off.max(0)])]
-        own = ", ".join(name[3:] for name in step.own) or "nothing"
-        mark = " (chosen)" if step is selection.best else ""
-        won = f"{100 * selection.explained(step):.2g} %"
-        rows.append([own + mark, step.n_vary // tests, f"{step.bic:.0f}", *ends, won])
-    misfits = (f"misfit of cycle {n}" for n in TOGETHER)
-    head = ["of each cycle", "parameters", "BIC", *misfits, "of what sharing costs, won back"]
-    return studies.markdown(head, rows)
-
-
-def chosen_told(selection: Selection) -> str:
-    best, parts = selection.best, []
-    for name in best.own:
-        middle = np.median([fit.value(name) for fit in best.fits], axis=0)
-        kilo, unit = (1e-3, " kPa") if is_pressure(name) else (1.0, "")
-        shown = ", ".join(significant(kilo * value, 3) for value in middle)
-        parts.append(f"`{name[3:]}` {shown}{unit}")
-    own, shared = (", ".join(f"`{n[3:]}`" for n in ns) for ns in (best.own, best.fits[0].shared))
-    return (
-        f"Each cycle has {own} of its own; {shared} are shared. Median over the specimens in "
-        f"cycles {', '.join(map(str, TOGETHER))}: {'; '.join(parts)}."
-    )
 
 
 def draw_twins(table: pd.DataFrame) -> None:
@@ -256,17 +215,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         toml = Path(folder) / "specimen.toml"
         lattices, found = fit_lattices(data, toml)
-        twins, groups = fit_twins(data, toml)
+        twins = fit_twins(data, toml)
     studies.write_csv(twins, HERE / "twins.csv", 6)
     studies.write_csv(lattices, HERE / "lattice.csv", 6)
     draw_twins(twins)
     draw_lattices(lattices, found)
-    selection = select_own(groups, progress=lambda _, what: print(what, file=sys.stderr))
     studies.write_page(
         HERE, "damage.md", twins=twin_table(twins), told=twins_told(twins),
-        cycles=", ".join(map(str, TOGETHER)), n_eff=selection.n_eff, steps=steps_table(selection),
-        chosen=chosen_told(selection), lattice=lattice_table(lattices),
-        lattice_told=lattice_told(lattices),
+        lattice=lattice_table(lattices), lattice_told=lattice_told(lattices),
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Does `--model auto` find the structure that made a test? And what does it say of real foam?
+"""Does `--model auto` find the structure that made a test?
 
 Method. Synthetic impacts on chains of known structure, 401 samples, white noise of 0.5-1 % of the
 range on stress and displacement; springs, heights and velocities are random. Twenty tests of
@@ -10,40 +10,30 @@ by the simulation alone and before it is climbed, if
 - every simpler model, fitted to the curves without noise, keeps a misfit (RMS over both
   curves) of at least half the noise, so that chi-square is at least a quarter above the floor.
 
-Where FOAMFIT_DATA names the measurements of others (see experiments/real_foams.py), the ladder also
-climbs the first cycles of running-shoe foam; they stay where they lie.
+Answer. It finds 82 of 83 clear tests: see README.md.
 
-Answer. It finds 82 of 83 clear tests; on shoe foam it takes the microscale spring with relaxation.
-
-    python experiments/ladder/ladder.py              # tables, picture and README
+    python experiments/ladder/ladder.py              # table and README
     python experiments/ladder/ladder.py --tests 2
 """
 
 from __future__ import annotations
 
-import os
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.patches import Rectangle
 
 import foamfit as ff
-from foamfit.auto import LADDER
 from foamfit.data.measurement import Measurement, Specimen, Striker
 from foamfit.fitting.problem import make_params
-from foamfit.results import rung_name
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 import studies  # noqa: E402
-from real_foams import first_cycles  # noqa: E402
 
 HEIGHT, AREA, MASS, SAMPLES = 1.2e-3, 1.9635e-5, 7e-3, 401
 CLEAR_MISFIT, CLEAR_DAMPING = 0.5, 0.05
@@ -185,27 +175,6 @@ def climb(seed: int, kind: int, case: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# ---------------------------------------------------------------- real foam
-
-
-def climb_foams(data: Path) -> Iterator[dict[str, Any]]:
-    """Compare models on the first cycle of each shoe foam; one row for each model."""
-    with tempfile.TemporaryDirectory() as folder:
-        for test in first_cycles(data, Path(folder)):
-            ladder = ff.fit(test, model="auto").ladder
-            for one in ladder.rungs:
-                yield {
-                    "specimen": test.name, "model": one.name,
-                    "misfit": one.misfit["stress_strain"], "predicted": one.predicted_misfit,
-                    "gain": one.gain, "gain over": one.gain_over, "varied": one.n_vary,
-                    "rank": one.rank, "runs p": one.runs_p,
-                    "not determined": len(one.not_determined), "weak": len(one.weak),
-                    "seconds": one.seconds, "chosen": one.chosen,
-                    "said": " ".join(ladder.sentences) if one.chosen else "",
-                }  # fmt: skip
-            print(test.name, *ladder.sentences, sep="\n  ", flush=True)
-
-
 # ---------------------------------------------------------------- what is written
 
 
@@ -233,90 +202,21 @@ def wrong_sentences(table: pd.DataFrame) -> str:
     return "\n".join(["Clear tests that are taken for another structure:", "", *lines])
 
 
-def percents(row: pd.Series, *names: str) -> list[str]:
-    """Write shares in percent."""
-    return [f"{100 * row[name]:.2f}" for name in names]
-
-
-def foam_table(table: pd.DataFrame) -> str:
-    """The chosen model of each specimen, beside one bistable spring."""
-    rows = []
-    for name, own in table.groupby("specimen", sort=False):
-        one, plain = own[own["chosen"]].iloc[0], own[own["model"] == "bistable"].iloc[0]
-        rows.append(
-            [name, one["model"], *percents(one, "misfit", "predicted"), one["varied"],
-             one["not determined"], *percents(plain, "misfit"), f"{own['seconds'].sum():.1f}"]
-        )  # fmt: skip
-    head = "specimen | chosen | misfit % | predicted % | varied | n.d. | bistable: misfit % | "
-    return studies.markdown(head + "seconds, all models", rows)
-
-
-def model_table(table: pd.DataFrame) -> str:
-    """The models of one specimen."""
-    rows = []
-    for _, row in table.iterrows():
-        mark, over = "**" if row["chosen"] else "", row["gain over"]
-        gain = f"{100 * float(row['gain']):.0f}".replace("-", "−") if over else "–"
-        rows.append(
-            [f"{mark}{row['model']}{mark}", *percents(row, "misfit", "predicted"), gain,
-             over or "–", row["varied"], row["rank"], row["not determined"],
-             f"{row['seconds']:.1f}"]
-        )  # fmt: skip
-    head = "model | misfit % | predicted % | gain % | over | varied | rank | n.d. | s"
-    return studies.markdown(head, rows)
-
-
-def picture(table: pd.DataFrame, path: Path) -> None:
-    """Counts of chosen against true structure, clear and unclear tests side by side."""
-    truths = [name_of(*one) for one in STRUCTURES]
-    models = [
-        rung_name(model.name, damping, model.relaxation)
-        for group in LADDER
-        for model in group
-        for damping in ("without", "with")
-    ]
-    models = [name for name in models if name in truths or (table["chosen"] == name).any()]
-    with studies.sheet(path, 8.4, 4.3) as figure:
-        panels = figure.subplots(1, 2, sharey=True)
-        for axes, clear in zip(panels, (True, False), strict=True):
-            rows = table[table["clear"] == clear]
-            counts = pd.crosstab(rows["structure"], rows["chosen"])
-            counts = counts.reindex(index=truths, columns=models, fill_value=0).to_numpy()
-            totals = np.maximum(counts.sum(axis=1, keepdims=True), 1)
-            axes.imshow(counts / totals, cmap="Blues", vmin=0, vmax=1.3)
-            for (i, j), count in np.ndenumerate(counts):
-                if count:
-                    colour = "white" if count > 0.6 * totals[i, 0] else "black"
-                    axes.text(j, i, str(count), ha="center", va="center", fontsize=9, color=colour)
-            for i, truth in enumerate(truths):
-                corner = models.index(truth) - 0.5, i - 0.5
-                frame = {"edgecolor": studies.VERMILION, "linewidth": 1.2, "clip_on": False}
-                axes.add_patch(Rectangle(corner, 1, 1, fill=False, **frame))
-            names = [[n.replace(" with", "\nwith") for n in names] for names in (models, truths)]
-            axes.set_xticks(range(len(models)), names[0], rotation=45, ha="right", fontsize=8)
-            axes.set_yticks(range(len(truths)), names[1], fontsize=8)
-            kind = "clear" if clear else "unclear"
-            axes.set_title(f"{len(rows)} {kind} synthetic tests", fontsize=10)
-            axes.set_xlabel("chosen", fontsize=9)
-            axes.tick_params(length=0)
-        panels[0].set_ylabel("true (framed)", fontsize=9)
+def confusion(table: pd.DataFrame) -> str:
+    """Counts of chosen against true structure, of all tests."""
+    counts = pd.crosstab(table["structure"], table["chosen"]).reset_index()
+    return studies.markdown(counts.columns, counts.to_numpy())
 
 
 def write_page(folder: Path) -> None:
-    """Write the page from the tables that lie in the folder."""
+    """Write the page from the table that lies in the folder."""
     table = pd.read_csv(folder / "structures.csv")
-    foams, first, said = "Not made: FOAMFIT_DATA was not set.", "", ""
-    if (folder / "foams.csv").is_file():
-        rows = pd.read_csv(folder / "foams.csv", keep_default_na=False)
-        one = rows[rows["specimen"] == rows["specimen"].iloc[0]]
-        foams, first = foam_table(rows), model_table(one)
-        said = one[one["chosen"]]["said"].iloc[0]
     clear = table[table["clear"]]
     studies.write_page(
         HERE, out=folder, machine=studies.circumstances(), samples=SAMPLES,
         damping=100 * CLEAR_DAMPING, misfit=CLEAR_MISFIT, structures=structure_table(table),
         found=int(clear["found"].sum()), clear=len(clear), rate=100 * clear["found"].mean(),
-        wrong=wrong_sentences(table), foams=foams, first=first, said=said,
+        wrong=wrong_sentences(table), confusion=confusion(table),
     )  # fmt: skip
     print(structure_table(table))
     print(f"{clear['found'].sum()} of {len(clear)} clear tests found")
@@ -324,21 +224,16 @@ def write_page(folder: Path) -> None:
 
 def main() -> None:
     parser = studies.arguments(__doc__, HERE, tests=(20, "tests of each structure"), seed=2014)
-    parser.add_argument("--part", choices=["all", "structures", "foams", "page"], default="all")
+    parser.add_argument("--page", action="store_true", help="write the page of what was run")
     options = parser.parse_args()
-    place = options.out / "structures.csv"
-    if options.part in ("all", "structures"):
+    if not options.page:
         ff.fit(random_test(np.random.default_rng(0), "bistable", False)[1])  # compiles
         rows = []
         for case in range(1, options.tests + 1):
             for kind in range(len(STRUCTURES)):
                 rows.append(climb(options.seed, kind, case))
                 print(*list(rows[-1].values())[:-1], flush=True)
-                studies.write_csv(rows, place)
-    data = Path(os.environ.get("FOAMFIT_DATA", ""))
-    if options.part in ("all", "foams") and (data / "shoe-foam").is_dir():
-        studies.write_csv(climb_foams(data), options.out / "foams.csv", 6)
-    picture(pd.read_csv(place), options.out / "ladder.png")
+                studies.write_csv(rows, options.out / "structures.csv")
     write_page(options.out)
 
 

@@ -29,10 +29,8 @@ One command runs them and writes a line per scene and rtol; another shows one sc
 
     python experiments/stability/fresh.py --scenes 400 --out fresh.csv
     python experiments/stability/fresh.py --scene base:17 --rtol 1e-6
-    python experiments/stability/fresh.py --again fresh.csv --out again.csv
 
-`--again` takes only the scenes of a file that were wrong. Another checkout's solver is judged with
-PYTHONPATH=that/checkout/src.
+Another checkout's solver is judged with PYTHONPATH=that/checkout/src.
 """
 
 from __future__ import annotations
@@ -60,7 +58,6 @@ from scipy.optimize import minimize_scalar
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
-from energy import rebound_of  # noqa: E402
 from independent import LOOSE, Truth, follow, judge, over_range  # noqa: E402
 from scenes import Point, designed, scene_of  # noqa: E402
 
@@ -708,7 +705,7 @@ def judged(
         "dip": truth.dip, "judge_steps": truth.steps, "switches": truth.switches,
         "true_end": truth.contact_end, "outcome": "answer", "reason": "", "method": "",
         "displacement": math.nan, "base_stress": math.nan, "error": math.nan, "end": math.nan,
-        "slope": math.nan, "energy": math.nan, "seconds": math.nan, "steps": 0,
+        "slope": math.nan, "seconds": math.nan, "steps": 0,
     }  # fmt: skip
     began = time.perf_counter()
     try:
@@ -722,9 +719,6 @@ def judged(
         return found | {"outcome": "failure", "reason": f"{type(wrong).__name__}: {wrong}"[:200]}
     found["seconds"] = time.perf_counter() - began
     found |= {"method": answer.method, "steps": answer.steps}
-    bounced = rebound_of(*scene[:2])
-    if bounced is not None and answer.contact_end is not None:
-        found["energy"] = energy_error(scene, answer, bounced) / rtol
     if not sure:
         return found
     found["displacement"] = over_range(answer.displacement, truth.displacement) / rtol
@@ -739,24 +733,11 @@ def judged(
         found["slope"] = slope_error(spec, scene, rtol, most, known)
     except ff.SimulationError:
         found["reason"] = "derivatives refused"
-    if max(found["error"], np.nan_to_num(found["energy"])) > BAD or not math.isfinite(
-        found["error"]
-    ):
+    if not found["error"] <= BAD:
         found["outcome"] = "failure"
     elif found["slope"] > slope_bar(rtol):
         found["outcome"] = "wrong derivative"
     return found
-
-
-def energy_error(scene: Scene, answer: ff.Response, bounced: tuple[float, float, float]) -> float:
-    """Hold the end of contact, and the speed of the flight after it, against those by energy."""
-    end, speed, _ = bounced
-    worst = abs(answer.contact_end / end - 1.0)  # type: ignore[operator]
-    after = np.flatnonzero(scene[2] > answer.contact_end)
-    if after.size > 1:
-        flown = np.diff(answer.displacement[-1, after[[0, -1]]]) / np.diff(scene[2][after[[0, -1]]])
-        worst = max(worst, abs(-float(flown[0]) - speed) / scene[1].velocity)  # type: ignore[union-attr]
-    return float(worst)
 
 
 def reason_of(refusal: ff.SimulationError) -> str:
@@ -786,7 +767,6 @@ def summary(lines: pd.DataFrame) -> pd.DataFrame:
                 "over 1 rtol": int((known.error > POOR).sum()),
                 "over 3 rtol": int((known.error > BAD).sum()),
                 "largest": known.error.max(),
-                "largest energy": known.energy.max(),
                 "derivatives": int(known.slope.notna().sum()),
                 "refused derivatives": int((known.reason == "derivatives refused").sum()),
                 "wrong derivatives": int((known.slope > slope_bar(rtol)).sum()),
@@ -858,19 +838,13 @@ def main() -> None:
     ask.add_argument("--processes", type=int, default=2, choices=(1, 2))
     ask.add_argument("--scene", help="show one, as family:number")
     ask.add_argument("--resume", action="store_true", help="keep the scenes that --out has")
-    ask.add_argument("--again", type=Path, help="take the wrong scenes of this file")
     given = ask.parse_args()
     rtols = tuple(given.rtol or RTOLS)
     if given.scene:
         show(given.scene, rtols[0] if given.rtol else 1e-6)
         return
-    if given.again:
-        names = dict.fromkeys(wrong(pd.read_csv(given.again)).scene)
-        split = [name.split(":") for name in names]
-        tasks = [(family, int(number), rtols) for family, number in split]
-    else:
-        numbers = range(given.first, given.first + given.scenes)
-        tasks = [(f, n, rtols) for f in given.family or FAMILIES for n in numbers]
+    numbers = range(given.first, given.first + given.scenes)
+    tasks = [(f, n, rtols) for f in given.family or FAMILIES for n in numbers]
     lines: list[dict[str, Any]] = []
     if given.resume and given.out.exists():
         lines = pd.read_csv(given.out).fillna({"reason": "", "method": ""}).to_dict("records")

@@ -12,17 +12,7 @@ from scipy import stats
 from conftest import DATA, EXPERIMENTS, needs_data
 
 sys.path.insert(0, str(EXPERIMENTS / "twins"))
-from twins import (
-    Change,
-    Group,
-    change_of,
-    counted_together,
-    lost,
-    mean_loop,
-    needed,
-    power,
-    studies,
-)
+from twins import Change, Group, change_of, counted_together, lost, mean_loop, studies
 
 
 def test_a_change_is_welchs_test_of_the_logarithms() -> None:
@@ -73,15 +63,6 @@ def test_comparisons_are_counted_together_and_the_largest_comes_first() -> None:
     assert [one.name for one in found] == ["b", "c", "a"]
     assert [one.adjusted for one in found] == pytest.approx([0.03, 0.9, 0.04])
     assert [one.stands_out for one in found] == [True, False, True]
-
-
-def test_the_power_of_a_comparison_is_that_of_drawn_ones() -> None:
-    drawn = np.random.default_rng(0).standard_normal((2, 5, 4000))
-    drawn[1] += 1.4
-    seen = stats.ttest_ind(drawn[0], drawn[1]).pvalue < 0.05
-    assert power(1.4, 5) == pytest.approx(seen.mean(), abs=0.025)
-    # Two-sided, 5 %, 80 %: 17 for 1.0 (Cohen 1988, table 2.4.1)
-    assert needed(1.0) == 17
 
 
 def test_the_mean_loop_of_one_loop_is_that_loop() -> None:

@@ -17,7 +17,6 @@ from conftest import EXPERIMENTS
 
 sys.path.insert(0, str(EXPERIMENTS / "stability"))
 import fresh
-from energy import rebound_of
 from independent import follow, over_range
 
 # Spreads that meet far away; snap-through wider than snap-back, and the other way round; a snap
@@ -97,20 +96,6 @@ def test_the_judge_follows_the_law(law: tuple[float, ...]) -> None:
     assert over_range(truth.displacement, H * strain[None]) <= 1e-11
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_the_judge_keeps_energy(law: tuple[float, ...]) -> None:
-    chain = ff.Chain([ff.LinearSpring(3e6), ff.MicroscaleSpring(*law)], [H / 4, H], AREA)
-    drive = ff.Impact(0.5, 2.0)
-    bounced = rebound_of(chain, drive)
-    assert bounced is not None
-    time = np.linspace(0.0, 1.5 * bounced[0], 60)
-    truth = follow(chain, drive, time)
-    assert truth.contact_end == pytest.approx(bounced[0], rel=1e-10)
-    flown = np.diff(truth.displacement[-1, -2:])[0] / np.diff(time[-2:])[0]
-    assert -flown == pytest.approx(bounced[1], rel=1e-9)
-    assert bounced[1] < drive.velocity  # the loop keeps something
-
-
 # ----------------------------------------------------------------------------------- closed forms
 
 
@@ -121,14 +106,16 @@ def test_an_impact_keeps_what_the_loop_takes(law: tuple[float, ...], soft: float
     chain = ff.Chain([ff.LinearSpring(soft), *springs] if soft else springs,
                      [H / 4, H] if soft else [H], AREA)  # fmt: skip
     drive = ff.Impact(0.5, 2.0)
-    bounced = rebound_of(chain, drive)
-    assert bounced is not None
-    time = np.linspace(0.0, 1.5 * bounced[0], 60)
+    time = np.linspace(0.0, 0.2, 400)
+    truth = follow(chain, drive, time)
+    assert truth.contact_end is not None
+    want = np.diff(truth.displacement[-1, -2:])[0]
+    assert -want < drive.velocity * time[1]  # the loop keeps something
     for rtol in (1e-4, 1e-6, 1e-8):
         answer = ff.simulate(chain, drive, time, rtol=rtol)
-        assert answer.contact_end == pytest.approx(bounced[0], rel=rtol)
-        flown = np.diff(answer.displacement[-1, -2:])[0] / np.diff(time[-2:])[0]
-        assert -flown == pytest.approx(bounced[1], rel=3.0 * rtol)
+        assert answer.contact_end == pytest.approx(truth.contact_end, rel=rtol)
+        flown = np.diff(answer.displacement[-1, -2:])[0]
+        assert flown == pytest.approx(want, rel=3.0 * rtol)
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -180,7 +167,6 @@ def test_fresh_scenes_with_memory(family: str) -> None:
             judged += 1
             assert line["outcome"] == "answer", line
             assert line["error"] <= 1.0, line
-            assert not line["energy"] > 3.0, line
             assert not line["slope"] > fresh.slope_bar(line["rtol"]), line
     assert judged >= 6
 
