@@ -16,12 +16,12 @@ Answer. `foamfit.fit` solves all problems in 3 s; see identification.md.
 
     python experiments/error_vs_runtime/identification.py           # at most 35 min of one core
     python experiments/error_vs_runtime/identification.py --budget 1 --seeds 2
-    python experiments/error_vs_runtime/identification.py --redraw  # figures and tables only
+    python experiments/error_vs_runtime/identification.py --redraw  # figures and page only
 
 Writes identification_runs.csv.gz (every improvement by more than 2 %, and when a problem was
-solved) and identification_runs.json (machine, versions, arguments) after each problem; then
-identification.csv, .md and figures. FOAMFIT_DATA names the folder of the measurements by others;
-without it the shoe foam is left out.
+solved) and identification_runs.json (machine, versions, arguments); then identification.md and
+figures. FOAMFIT_DATA names the folder of the measurements by others; without it the shoe foam is
+left out.
 """
 
 # ruff: noqa: E402  (the number of threads is read when NumPy is imported)
@@ -34,20 +34,23 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"  # one thread for all, so that processor time is elapsed time
 
 import argparse
+import json
 import platform
+import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-import identification_report as told
 import lmfit
 import numpy as np
 import pandas as pd
-from identification_report import METHODS, OWN, SOLVED, Array, Setup, studies
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 import foamfit as ff
@@ -57,6 +60,41 @@ from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import box_starts
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+import studies
+
+Array = NDArray[np.float64]
+SOLVED = 1.05  # cost over the best known cost at which a problem counts as solved
+RUN = ["problem", "coordinates", "method", "seed"]
+COLUMNS = [*RUN, "seconds", "evaluations", "cost"]
+OWN = "foamfit.fit"
+LEAST_SQUARES = ("leastsq", "least_squares")
+GROUPS = {
+    "least squares": LEAST_SQUARES,
+    "direct": ("nelder", "powell"),
+    "global": ("differential_evolution", "basinhopping", "dual_annealing", "ampgo"),
+}
+METHODS = tuple(name for group in GROUPS.values() for name in group)
+COORDINATES = {
+    "si": "lmfit.Parameters in SI, bounds of make_params",
+    "box": "lmfit.Parameters in the coordinates of foamfit's search",
+}
+# Colours that all can tell apart (Okabe & Ito, and two more); lines differ in their dashes too.
+STYLES: dict[str, tuple[str, str]] = {
+    OWN: (studies.BLUE, "-"),
+    "leastsq": ("black", "-"),
+    "least_squares": (studies.SKY, "--"),
+    "nelder": (studies.GREEN, "-"),
+    "powell": ("#999933", "--"),
+    "differential_evolution": (studies.VERMILION, "-"),
+    "basinhopping": (studies.ORANGE, "--"),
+    "dual_annealing": (studies.PURPLE, "-."),
+    "ampgo": ("#6b6b6b", ":"),
+}
+SLOPES = {
+    "differences": "take forward differences with a step of 1e-5",
+    "problem": "are given the derivatives that the project's own search uses (`Problem.slopes`)",
+}
 GZIP = {"method": "gzip", "mtime": 0}
 ENOUGH = 1.001  # cost over the best known at which a run ends
 RECORDED = 0.98  # cost over the last recorded one below which it is recorded
@@ -120,14 +158,8 @@ class RunOver(Exception):  # noqa: N818 (nothing went wrong)
 class Recorder:
     """The lowest cost of one run so far, against seconds and evaluations.
 
-    Parameters
-    ----------
-    objective : Objective
-        Of the problem: only evaluations of the same curves count as progress.
-    budget : float
-        Processor time after which the run is over, s.
-    known : float
-        Best known cost; near it the run is over too.
+    Only evaluations of the curves of `objective` count as progress. The run is over after `budget`
+    seconds of processor time, or near the best `known` cost.
     """
 
     objective: Objective
@@ -141,13 +173,7 @@ class Recorder:
     ended: float = np.nan
 
     def count(self) -> float:
-        """Count an evaluation of a residual or of its derivative; returns the seconds so far.
-
-        Raises
-        ------
-        RunOver
-            When the time is up.
-        """
+        """Count an evaluation of a residual or of its derivative; returns the seconds so far."""
         seconds = time.process_time() - self.began
         if seconds > self.budget:
             raise RunOver
@@ -155,13 +181,7 @@ class Recorder:
         return seconds
 
     def note(self, objective: Objective, values: Array, residual: Array) -> None:
-        """Take down an evaluation.
-
-        Raises
-        ------
-        RunOver
-            When the run is over.
-        """
+        """Take down an evaluation, and end the run (`RunOver`) where nothing is left to gain."""
         seconds = self.count()
         if objective.measurement is self.objective.measurement:
             cost = float(residual @ residual)
@@ -174,14 +194,7 @@ class Recorder:
             raise RunOver
 
     def finished(self) -> list[tuple[float, int, float]]:
-        """Rows of the run, the last one at its end.
-
-        Raises
-        ------
-        RuntimeError
-            If the recorded cost is not that of the recorded point: the method minimised another
-            function than the others.
-        """
+        """Rows of the run, the last one at its end, if the cost is that of the recorded point."""
         if self.values is not None:
             residual = self.objective.residual(self.values)
             if not np.isclose(float(residual @ residual), self.cost, rtol=1e-6):
@@ -235,17 +248,7 @@ def random_points(space: Space, rng: np.random.Generator) -> Iterator[Array]:
 
 @dataclass(frozen=True)
 class Variables:
-    """What a method of lmfit varies, and the way from there to the problem's flat vector.
-
-    Parameters
-    ----------
-    problem : Problem
-        The problem.
-    space : Space
-        Its box.
-    coordinates : str
-        "si" or "box".
-    """
+    """What a method of lmfit varies, in "si" or "box", and the way to the problem's flat vector."""
 
     problem: Problem
     space: Space
@@ -303,7 +306,7 @@ def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int, deriva
     rng = np.random.default_rng(seed)
     for point in random_points(variables.space, rng):
         options = _options(method, int(rng.integers(2**31)))
-        if method in told.LEAST_SQUARES and derivatives == "problem":
+        if method in LEAST_SQUARES and derivatives == "problem":
             options |= {"Dfun" if method == "leastsq" else "jac": variables.jacobian}
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # of lmfit's covariances, which nobody reads here
@@ -345,11 +348,13 @@ def best_known(case: Case, problem: Problem) -> float:
 
 def run_all(options: argparse.Namespace, log: Path, notes: Path) -> None:
     """Run every method on every problem and seed; writes what was run after each problem."""
-    names = ("foamfit", "lmfit", "scipy", "numpy", "numba")
     where = f"{studies.processor()}, {os.cpu_count()} cores, {platform.machine()}"
-    machine = {"processor": where, **studies.versions(*names)}
-    setup = Setup(machine, options.budget, options.seeds, options.derivatives, {}, {})
-    frames: list[pd.DataFrame] = []
+    versions = studies.versions("foamfit", "lmfit", "scipy", "numpy", "numba")
+    known, frames = dict[str, float](), list[pd.DataFrame]()
+    setup = {
+        "machine": {"processor": where, **versions}, "budget_s": options.budget,
+        "seeds": options.seeds, "derivatives": options.derivatives, "known": known,
+    }  # fmt: skip
     ways = [("own", OWN), *((c, m) for c in options.coordinates for m in options.methods)]
     for key in options.problems:
         case = CASES[key]
@@ -357,12 +362,11 @@ def run_all(options: argparse.Namespace, log: Path, notes: Path) -> None:
             print(f"{key}: left out, FOAMFIT_DATA names no folder of measurements")
             continue
         problem = case.problem()
-        known = best_known(case, problem)
-        print(f"{key}: best known cost {known:.6g} of {problem.objective.n_data} samples")
+        known[key] = best_known(case, problem)
         for coordinates, method in ways:
             ended = []
             for seed in range(options.seeds):
-                recorder = Recorder(problem.objective, options.budget, known)
+                recorder = Recorder(problem.objective, options.budget, known[key])
                 with recorded(recorder):
                     if method == OWN:
                         run_own(case, problem, seed)
@@ -370,43 +374,125 @@ def run_all(options: argparse.Namespace, log: Path, notes: Path) -> None:
                         run_lmfit(problem, method, coordinates, seed, options.derivatives)
                 recorder.ended = time.process_time() - recorder.began
                 rows = [(key, coordinates, method, seed, *row) for row in recorder.finished()]
-                frames.append(pd.DataFrame(rows, columns=told.COLUMNS))
-                ended.append(f"{recorder.cost / known:.3g}")
-            print(
-                f"  {coordinates:4} {method:24} cost over best known: {' '.join(ended)}", flush=True
-            )
-        setup.titles[key], setup.known[key] = case.title, known
+                frames.append(pd.DataFrame(rows, columns=COLUMNS))
+                ended.append(f"{recorder.cost / known[key]:.3g}")
+            print(key, coordinates, method, "cost over best known:", *ended, flush=True)
         pd.concat(frames).to_csv(log, index=False, float_format="%.5g", compression=GZIP)
-        setup.write(notes)
+        notes.write_text(json.dumps(setup, indent=1) + "\n")
 
 
-def _listed(choices: Iterable[str]) -> Callable[[str], list[str]]:
-    """Read a list like "impact,chain" for argparse."""
+# ---------------------------------------------------------------- page and figures
 
-    def read(text: str) -> list[str]:
-        for item in text.split(","):
-            if item not in choices:
-                raise argparse.ArgumentTypeError(f"{item!r} is none of {', '.join(choices)}")
-        return text.split(",")
 
-    return read
+def solved_after(runs: pd.DataFrame, known: dict[str, float]) -> pd.DataFrame:
+    """One row for each run: seconds until it was solved (inf if never)."""
+    solved = runs["cost"] <= SOLVED * runs["problem"].map(known)
+    first = runs[solved].groupby(RUN)["seconds"].first()
+    every = pd.MultiIndex.from_frame(runs[RUN].drop_duplicates())
+    return first.reindex(every).fillna(np.inf).rename("solved_after_s").reset_index()
+
+
+def draw_curves(
+    runs: pd.DataFrame, coordinates: str, known: dict[str, float], budget: float, path: Path
+) -> None:
+    """Misfit over the best known against seconds: median and quartiles over the seeds."""
+    elapsed = np.geomspace(0.01, budget, 200)
+    among = runs[runs["coordinates"].isin(("own", coordinates))]
+    with studies.sheet(path, 7.0, 1.7 * len(known) + 0.9) as figure:
+        grid = figure.subplots(len(known), len(GROUPS), sharex=True, sharey=True, squeeze=False)
+        for key, row in zip(known, grid, strict=True):
+            for axes, methods in zip(row, GROUPS.values(), strict=True):
+                for name in (*methods, OWN):
+                    chosen = among[(among["problem"] == key) & (among["method"] == name)]
+                    if len(chosen):
+                        _band(axes, elapsed, chosen, known[key], name)
+                axes.set(xscale="log", yscale="log")
+                axes.set(xlim=(elapsed[0], elapsed[-1]), ylim=(0.9, 300.0))
+                axes.axhline(1.0, color="0.75", linewidth=0.8, zorder=0)
+                studies.gridlines(axes)
+            row[0].set_ylabel("misfit over\nbest known (–)")
+            row[len(GROUPS) // 2].set_title(CASES[key].title)
+        for axes, title in zip(grid[-1], GROUPS, strict=True):
+            axes.set_xlabel(f"processor time (s): {title}")
+        told = f"{COORDINATES[coordinates]}: median and quartiles of {runs['seed'].nunique()} seeds"
+        figure.suptitle(told, fontsize=8)
+        names = [name for name in STYLES if name in set(among["method"])]
+        handles = [Line2D([], [], label=name, **_line(name)) for name in names]
+        figure.legend(handles=handles, loc="outside lower center", ncols=5, handlelength=3.2)
+
+
+def _band(axes: Axes, elapsed: Array, runs: pd.DataFrame, known: float, name: str) -> None:
+    """Draw one method: what each seed had reached at each second, as median and quartiles."""
+    reached = []
+    for _, run in runs.groupby("seed", sort=False):
+        at = np.searchsorted(run["seconds"].to_numpy(), elapsed, side="right") - 1
+        misfit = np.sqrt(run["cost"].to_numpy() / known)
+        reached.append(np.where(at >= 0, misfit[at], np.inf))
+    low, middle, high = np.quantile(reached, (0.25, 0.5, 0.75), axis=0, method="inverted_cdf")
+    there = list(np.isfinite(high))  # from when on three quarters of the seeds have anything
+    line = _line(name)
+    axes.fill_between(elapsed, low, high, where=there, color=line["color"], alpha=0.15, linewidth=0)
+    axes.plot(elapsed, middle, **line)
+
+
+def _line(name: str) -> dict[str, Any]:
+    """Colour, dashes and width of a method's line."""
+    colour, dash = STYLES[name]
+    return {"color": colour, "linestyle": dash, "linewidth": 2.0 if name == OWN else 1.1}
+
+
+def summary(ends: pd.DataFrame, known: dict[str, float]) -> str:
+    """Markdown: one row for each method, one column for each problem."""
+    rows = []
+    for (coordinates, method), own in ends.groupby(["coordinates", "method"], sort=False):
+        cells = []
+        for key in known:
+            after = own.loc[own["problem"] == key, "solved_after_s"]
+            median = np.quantile(after, 0.5, method="inverted_cdf")
+            told = f"{median:.2f} s" if np.isfinite(median) else "never"
+            cells.append(f"{np.isfinite(after).sum()} of {len(after)}, {told}")
+        solved = np.isfinite(own["solved_after_s"])
+        rows.append([method, coordinates, *cells, f"{solved.sum()} of {len(own)}"])
+    titles = [CASES[key].title for key in known]
+    return studies.markdown(["method", "in", *titles, "all"], rows)
+
+
+def report(runs: pd.DataFrame, setup: dict[str, Any], folder: Path) -> None:
+    """Write page and figures of recorded runs."""
+    lowest = runs.groupby("problem")["cost"].min()
+    known = {key: min(cost, float(lowest[key])) for key, cost in setup["known"].items()}
+    there = [
+        coordinates for coordinates in COORDINATES if (runs["coordinates"] == coordinates).any()
+    ]
+    curves = []
+    for coordinates in there:
+        name = f"identification_{coordinates}.png"
+        draw_curves(runs, coordinates, known, setup["budget_s"], folder / name)
+        curves.append(f"![Misfit against seconds, {COORDINATES[coordinates]}]({name})")
+    template = (HERE / "identification.template.md").read_text(encoding="utf-8")
+    page = template.format(
+        seeds=setup["seeds"], problems=len(known), budget=setup["budget_s"],
+        machine=", ".join(f"{k} {v}" for k, v in setup["machine"].items()),
+        slopes=SLOPES[setup["derivatives"]], table=summary(solved_after(runs, known), known),
+        curves="\n\n".join(curves),
+    )  # fmt: skip
+    (folder / "identification.md").write_text(page, encoding="utf-8")
 
 
 def main() -> None:
     parser = studies.arguments(__doc__, HERE, budget=(3.0, "seconds of a run"), seeds=10)
     for name, choices in {
-        "problems": CASES, "methods": METHODS, "coordinates": told.COORDINATES,
+        "problems": CASES, "methods": METHODS, "coordinates": COORDINATES,
     }.items():  # fmt: skip
-        parser.add_argument(f"--{name}", type=_listed(choices), default=list(choices))
-    parser.add_argument("--derivatives", choices=list(told.SLOPES), default="differences")
+        choices = list(choices)
+        parser.add_argument(f"--{name}", nargs="+", choices=choices, default=choices)
+    parser.add_argument("--derivatives", choices=list(SLOPES), default="differences")
     parser.add_argument("--redraw", action="store_true", help="draw what was recorded")
     options = parser.parse_args()
     log, notes = (options.out / f"identification_runs.{end}" for end in ("csv.gz", "json"))
     if not options.redraw:
         run_all(options, log, notes)
-    if not log.exists():
-        raise SystemExit(f"nothing was run: there is no {log}")
-    told.report(pd.read_csv(log), Setup.read(notes), options.out)
+    report(pd.read_csv(log), json.loads(notes.read_text()), options.out)
 
 
 if __name__ == "__main__":
