@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,7 +18,6 @@ from scipy.integrate import DOP853, LSODA, Radau
 from scipy.optimize import brentq
 
 from foamfit.springs import kernels as law
-from foamfit.springs.law import BISTABLE
 
 METHODS = {"DOP853": DOP853, "LSODA": LSODA, "Radau": Radau}
 TINY = 4 * np.finfo(float).eps
@@ -40,12 +38,6 @@ def at_rest(row):
 def entered(branch, rising):
     """Branch that a spring enters when it leaves another."""
     return law.above(branch) if rising else law.below(branch)
-
-
-@compiled
-def answer(row, branch, driven, by_stress):
-    """Strain at a stress, or stress at a strain."""
-    return law.strain_on(row, branch, driven) if by_stress else law.stress_on(row, branch, driven)
 
 
 # ---------------------------------------------------------------- a mass law.above every spring
@@ -388,55 +380,6 @@ def _root(gap: Callable[[float], float], low: float, high: float) -> float:
     return float(brentq(gap, low, high, xtol=TINY * high, rtol=TINY))
 
 
-# ---------------------------------------------------------------- one spring without inertia
-
-
-@compiled
-def along_strain(x, y, row, branch):
-    """dσ/dε."""
-    return law.slope_on(row, branch, x)
-
-
-@compiled
-def along_stress(x, y, row, branch):
-    """dε/dσ."""
-    return 1.0 / law.slope_on(row, branch, y)
-
-
-@compiled
-def change_along_stress(y, row, branch):
-    """Derivative of dε/dσ = (1-x)²/k by ε."""
-    curved, k, x0, _ = law.branch_shape(row, branch)
-    return -2.0 * (1.0 - (y - x0)) / k if curved else 0.0
-
-
-def _pieces(row: np.ndarray, driven: np.ndarray, by_stress: bool) -> list[tuple[int, float, float]]:
-    """Cut a history at its turning points and switches: (branch, from, to), in order."""
-    ends = {
-        law.A: (-np.inf, row[law.SIGMA_A if by_stress else law.EPS_A]),
-        law.D: (row[law.SIGMA_A], row[law.SIGMA_HAT_C])
-        if by_stress
-        else (row[law.EPS_A], row[law.EPS_HAT_C]),
-        law.C: (row[law.SIGMA_C if by_stress else law.EPS_C], np.inf),
-        law.E: (row[law.SIGMA_HAT_A], row[law.SIGMA_C])
-        if by_stress
-        else (row[law.EPS_HAT_A], row[law.EPS_C]),
-    }
-    turns = [0, *(np.flatnonzero(np.diff(np.sign(np.diff(driven)))) + 1), driven.size - 1]
-    out, branch = [], at_rest(row)
-    for a, b in pairwise(turns):
-        here, there = driven[a], driven[b]
-        while True:
-            low, high = ends[branch] if row[law.KIND] == BISTABLE else (-np.inf, np.inf)
-            stop = min(there, high) if there > here else max(there, low)
-            if stop != here:
-                out.append((branch, here, stop))
-            if stop == there:
-                break
-            branch, here = entered(branch, there > here), stop
-    return out
-
-
 def along(
     solver: Any, points: np.ndarray, done: int, out: np.ndarray, sense: float = 1.0
 ) -> tuple[int, np.ndarray]:
@@ -456,30 +399,3 @@ def along(
             out[done:last] = solver.dense_output()(points[done:last])[0]
             done = last
     return done, solver.y
-
-
-def quasi_static(
-    row: np.ndarray, driven: np.ndarray, by_stress: bool, method: str, rtol: float
-) -> np.ndarray:
-    """One undamped spring along a history of strain, or of stress: the other quantity, (n,).
-
-    What is driven is the independent variable, so that switches and turning points are known and
-    nothing has to be searched; one solver for each piece between them.
-    """
-    out = np.zeros(driven.size)
-    function = along_stress if by_stress else along_strain
-    branch = at_rest(row)
-    y = np.array([answer(row, branch, driven[0], by_stress)])
-    atol = rtol * (1e-2 if by_stress else 1e-2 * row[law.K0])
-    out[0], done = y[0], 1
-    for branch, start, stop in _pieces(row, driven, by_stress):
-
-        def slope(x: float, y: np.ndarray, branch: int = branch) -> np.ndarray:
-            return np.array([[change_along_stress(y[0], row, branch) if by_stress else 0.0]])
-
-        solver = METHODS[method](
-            lambda x, y, branch=branch: (function(x, y[0], row, branch),), start, y, stop,
-            rtol=rtol, atol=atol, **({} if method == "DOP853" else {"jac": slope}),
-        )  # fmt: skip
-        done, y = along(solver, driven, done, out, 1.0 if stop > start else -1.0)
-    return out

@@ -37,7 +37,7 @@ class Scene:
     Attributes
     ----------
     own, outside : sequences of float
-        Tolerances of the project's solver (None = it has none here) and of SciPy's.
+        Tolerances of the project's solver and of SciPy's.
     substeps : sequence of int
         Steps of the fixed-step schemes between two samples.
     longest : float
@@ -51,7 +51,7 @@ class Scene:
     chain: ff.Chain
     drive: Drive
     time: Array
-    own: Sequence[float | None] = tuple(10.0**-k for k in range(2, 13))
+    own: Sequence[float] = tuple(10.0**-k for k in range(2, 13))
     outside: Sequence[float] = tuple(10.0**-k for k in range(3, 13))
     substeps: Sequence[int] = tuple(2**k for k in range(11))
     longest: float = 0.3
@@ -94,14 +94,6 @@ def scenes() -> list[Scene]:
     bare = ff.Chain(two.springs, two.heights, AREA, site_damping=two.site_damping)
     rtol = tuple(10.0**-k for k in range(5, 11))
     return [
-        Scene(
-            "one_spring_displacement", "one spring, displacement drive", one,
-            ff.DisplacementDrive(HEIGHT * loop(spring, SAMPLES, False)), t, own=(None,),
-        ),
-        Scene(
-            "one_spring_stress", "one spring, stress drive", one,
-            ff.StressDrive(loop(spring, SAMPLES, True)), t, own=(None,),
-        ),
         Scene("one_spring_impact", "one spring, impact at 2.0 m/s", one, ff.Impact(MASS, 2.0), t),
         Scene(
             "one_spring_impact_damped", "one spring with a dashpot of 50 Pa·s, impact at 2.0 m/s",
@@ -197,8 +189,8 @@ def own(scene: Scene) -> dict[str, list[Competitor]]:
         family: [
             Competitor(
                 family,
-                "closed form" if rtol is None else f"rtol = {rtol:.0e}",
-                lambda rtol=rtol or 1e-6, function=function: function(rtol),
+                f"rtol = {rtol:.0e}",
+                lambda rtol=rtol, function=function: function(rtol),
             )
             for rtol in scene.own
         ]
@@ -213,9 +205,7 @@ def others(scene: Scene) -> dict[str, list[Competitor]]:
     rows = np.array([spring.row for spring in scene.chain.springs])
     heights = np.array(scene.chain.heights)
     made = plan(scene.chain, scene.drive, scene.time)
-    if isinstance(scene.drive, ff.Impact):
-        return _impact(scene, made, rows, heights)
-    return _quasi_static(scene, rows[0], heights[0])
+    return _impact(scene, made, rows, heights)
 
 
 def _impact(scene: Scene, made: Plan, rows: Array, heights: Array) -> dict[str, list[Competitor]]:
@@ -231,28 +221,7 @@ def _impact(scene: Scene, made: Plan, rows: Array, heights: Array) -> dict[str, 
         system = restarted.System(rows, heights, made.mass, made.drag, made.speed)
         return restarted.impact(system, t, method, rtol, scene.looks)
 
-    schemes = (fixed_step.VERLET, fixed_step.RK4, fixed_step.MIDPOINT)
-    return _ladders(scene, [(fixed_step.NAMES[s], s) for s in schemes], fixed, outside)
-
-
-def _quasi_static(scene: Scene, row: Array, height: float) -> dict[str, list[Competitor]]:
-    drive = scene.drive
-    by_stress = isinstance(drive, ff.StressDrive)
-    driven = drive.stress if isinstance(drive, ff.StressDrive) else drive.displacement / height
-    driven = np.array(driven)
-
-    def answer(y: Array) -> Answer:
-        return (height * y, driven) if by_stress else (height * driven, y)
-
-    def fixed(scheme: int, substeps: int) -> Answer:
-        out = np.zeros(driven.size)
-        fixed_step.quasi_static(row, driven, by_stress, substeps, scheme, out)
-        return answer(out)
-
-    def outside(method: str, rtol: float) -> Answer:
-        return answer(restarted.quasi_static(row, driven, by_stress, method, rtol))
-
-    schemes = (fixed_step.HEUN, fixed_step.RK4, fixed_step.MIDPOINT)
+    schemes = (fixed_step.VERLET, fixed_step.RK4)
     return _ladders(scene, [(fixed_step.NAMES[s], s) for s in schemes], fixed, outside)
 
 

@@ -58,16 +58,6 @@ def test_impact(benchmark: Any, name: str, way: str) -> None:
     benchmark(run)
 
 
-@pytest.mark.parametrize("name", ["one_spring_displacement", "one_spring_stress"])
-@pytest.mark.parametrize("way", ["simulate", "kernel"])
-def test_closed_form(benchmark: Any, name: str, way: str) -> None:
-    scene = SCENES[name]
-    benchmark.group = "closed form"
-    run = kinds.own(scene)[kinds.PUBLIC if way == "simulate" else kinds.KERNEL][0].run
-    run()
-    benchmark(run)
-
-
 @pytest.mark.parametrize("count", SIZES)
 @pytest.mark.parametrize("drive", ["stress", "impact"])
 def test_springs(benchmark: Any, drive: str, count: int) -> None:
