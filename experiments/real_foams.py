@@ -1,9 +1,8 @@
 """How well do the laws fit the measurements of others, and do twins get the same states?
 
 Method. Every uniaxial specimen of running-shoe foam (arXiv:2602.12694, LivingMatterLab/CANN) is
-fitted by four laws: misfit, values, their scatter between specimens of one foam, and whether these
-specimens get the same state. The measurements are not part of this repository; FOAMFIT_DATA holds
-shoe-foam/ and shoe-foam-twins/.
+fitted by four laws: misfit, values, and whether specimens of one foam get the same state. The
+measurements are not part of this repository; FOAMFIT_DATA holds shoe-foam/ and shoe-foam-twins/.
 
 Answer. Microscale springs with relaxation leave 0.43 to 0.93 % of the range: see real_foams.md.
 Beside it: real_foams.csv (every parameter of every fit) and real_foams.png (one loop, two laws).
@@ -15,7 +14,6 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -110,25 +108,6 @@ def law_table(table: pd.DataFrame) -> str:
     return studies.markdown(f"{head} | twins agree", rows)
 
 
-def scatter_table(table: pd.DataFrame) -> str:
-    rows = []
-    foams = table.groupby("foam", sort=False)["test"].nunique()
-    for law in (PLAIN, "microscale", BEST):
-        for name, own in table[table["law"] == law].groupby("parameter", sort=False):
-            groups = (own[own["foam"] == foam] for foam in foams.index)
-            rows.append([f"{law}: {name}", *map(_scatter, groups)])
-    head = ["law and parameter", *(f"{foam}, {count}" for foam, count in foams.items())]
-    return studies.markdown(head, rows)
-
-
-def _scatter(group: pd.DataFrame) -> str:
-    values = group["value"].to_numpy(dtype=float)
-    mean, spread = abs(values.mean()), values.std(ddof=1)
-    shown = f"{100.0 * spread / mean:.0f}" if mean > spread / len(values) ** 0.5 else "–"
-    state, most = Counter(group["state"]).most_common(1)[0]
-    return f"{shown} ({state} {most})"
-
-
 def draw(results: dict[str, Fit], path: Path) -> None:
     """Draw the measured loop, both laws on it, their residuals, and the values of the better."""
     best = results[BEST]
@@ -221,7 +200,6 @@ def main() -> dict[str, Fit]:
     studies.write_csv(table, TABLE, 6)
     page = (HERE / "real_foams.template.md").read_text(encoding="utf-8").format(
         source=SOURCE, count=len(tests), misfits=misfit_table(table), laws=law_table(table),
-        scatter=scatter_table(table),
     )  # fmt: skip
     (HERE / "real_foams.md").write_text(page)
     return shown

@@ -63,12 +63,6 @@ SOLVERS: dict[str, dict[str, Any]] = {
     "exponential recursion": {"color": ORANGE, "marker": "x", "linestyle": "--"},
     "Runge-Kutta 4": {"color": GREEN, "marker": "+", "linestyle": "--"},
 }  # fmt: skip
-DRIVES: dict[str, dict[str, Any]] = {
-    "stress drive": {"color": BLUE, "marker": "o"},
-    "displacement drive": {"color": VERMILION, "marker": "D"},
-    "impact, no spring snaps": {"color": GREEN, "marker": "^"},
-    "impact, every spring snaps": {"color": "black", "marker": "s"},
-}
 
 
 @dataclass
@@ -290,25 +284,6 @@ def draw_scene(table: pd.DataFrame, title: str, path: Path) -> None:
         figure.legend(loc="outside right center")
 
 
-def draw_scaling(table: pd.DataFrame, path: Path) -> None:
-    """Time over springs and over samples."""
-    with studies.sheet(path, 7.0, 3.0) as figure:
-        axes = figure.subplots(1, 2, sharey=True)
-        for ax, over in zip(axes, ("springs", "samples"), strict=True):
-            for (drive, solver), part in table[table["over"] == over].groupby(["drive", "solver"]):
-                line = {"linestyle": "-" if solver == PUBLIC else ":", "linewidth": 1.0}
-                named = over == "springs" and solver == PUBLIC
-                line |= {"label": drive if named else None, "markersize": 3.5}
-                ax.plot(part[over], part["median (s)"], **line, **DRIVES[str(drive)])
-            ax.set(xscale="log", yscale="log", xlabel=f"{over} (–)")
-            studies.gridlines(ax)
-        axes[0].set(title="501 samples", ylabel="processor time of one run (s)")
-        axes[1].set_title("one spring")
-        for dash, name in (("-", "simulate"), (":", "kernel that the fit calls")):
-            axes[0].plot([], [], color="0.4", linestyle=dash, label=name)
-        figure.legend(loc="outside lower center", ncols=3)
-
-
 # ---------------------------------------------------------------- tables
 
 
@@ -386,7 +361,6 @@ def main() -> None:
         return
     heading = ["Run time against springs and samples", where]
     sizes = write(scaling(longest=4.0), options.out / "scaling", heading)
-    draw_scaling(sizes, options.out / "scaling.png")
     summary = pd.DataFrame(rows)
     studies.write_csv(summary, options.out / "summary.csv")
     tables = {"table": summary, "sizes": per_sample(sizes), "exponents": exponents(sizes)}

@@ -91,10 +91,6 @@ STYLES: dict[str, tuple[str, str]] = {
     "dual_annealing": (studies.PURPLE, "-."),
     "ampgo": ("#6b6b6b", ":"),
 }
-SLOPES = {
-    "differences": "take forward differences with a step of 1e-5",
-    "problem": "are given the derivatives that the project's own search uses (`Problem.slopes`)",
-}
 GZIP = {"method": "gzip", "mtime": 0}
 ENOUGH = 1.001  # cost over the best known at which a run ends
 RECORDED = 0.98  # cost over the last recorded one below which it is recorded
@@ -300,13 +296,13 @@ def _values(params: lmfit.Parameters) -> Array:
     return np.array([parameter.value for parameter in params.values()])
 
 
-def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int, derivatives: str) -> None:
+def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int) -> None:
     """Minimise by a method of lmfit, over and over from other points of the box."""
     variables = Variables(problem, problem.space(), coordinates)
     rng = np.random.default_rng(seed)
     for point in random_points(variables.space, rng):
         options = _options(method, int(rng.integers(2**31)))
-        if method in LEAST_SQUARES and derivatives == "problem":
+        if method in LEAST_SQUARES:
             options |= {"Dfun" if method == "leastsq" else "jac": variables.jacobian}
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # of lmfit's covariances, which nobody reads here
@@ -320,9 +316,9 @@ def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int, deriva
 
 
 def _options(method: str, seed: int) -> dict[str, object]:
-    """What a knowing user would set: chance from the seed, scales and steps of least_squares."""
+    """What a knowing user would set: chance from the seed, scales of least_squares."""
     if method == "least_squares":
-        return {"x_scale": "jac", "diff_step": 1e-5}
+        return {"x_scale": "jac"}
     if method in ("differential_evolution", "basinhopping", "dual_annealing"):
         return {"seed": seed}
     if method == "ampgo":
@@ -353,7 +349,7 @@ def run_all(options: argparse.Namespace, log: Path, notes: Path) -> None:
     known, frames = dict[str, float](), list[pd.DataFrame]()
     setup = {
         "machine": {"processor": where, **versions}, "budget_s": options.budget,
-        "seeds": options.seeds, "derivatives": options.derivatives, "known": known,
+        "seeds": options.seeds, "known": known,
     }  # fmt: skip
     ways = [("own", OWN), *((c, m) for c in options.coordinates for m in options.methods)]
     for key in options.problems:
@@ -371,7 +367,7 @@ def run_all(options: argparse.Namespace, log: Path, notes: Path) -> None:
                     if method == OWN:
                         run_own(case, problem, seed)
                     else:
-                        run_lmfit(problem, method, coordinates, seed, options.derivatives)
+                        run_lmfit(problem, method, coordinates, seed)
                 recorder.ended = time.process_time() - recorder.began
                 rows = [(key, coordinates, method, seed, *row) for row in recorder.finished()]
                 frames.append(pd.DataFrame(rows, columns=COLUMNS))
@@ -473,7 +469,7 @@ def report(runs: pd.DataFrame, setup: dict[str, Any], folder: Path) -> None:
     page = template.format(
         seeds=setup["seeds"], problems=len(known), budget=setup["budget_s"],
         machine=", ".join(f"{k} {v}" for k, v in setup["machine"].items()),
-        slopes=SLOPES[setup["derivatives"]], table=summary(solved_after(runs, known), known),
+        table=summary(solved_after(runs, known), known),
         curves="\n\n".join(curves),
     )  # fmt: skip
     (folder / "identification.md").write_text(page, encoding="utf-8")
@@ -486,7 +482,6 @@ def main() -> None:
     }.items():  # fmt: skip
         choices = list(choices)
         parser.add_argument(f"--{name}", nargs="+", choices=choices, default=choices)
-    parser.add_argument("--derivatives", choices=list(SLOPES), default="differences")
     parser.add_argument("--redraw", action="store_true", help="draw what was recorded")
     options = parser.parse_args()
     log, notes = (options.out / f"identification_runs.{end}" for end in ("csv.gz", "json"))

@@ -1,9 +1,9 @@
 """Do discrete micro-springs converge to the microscale spring, and do their inner loops close?
 
 Method. n micro-springs in series, at the ranks (j - 1/2)/n, each with branches a and c of one
-spring and snap stresses of its own, are followed from event to event: between events the stress
-alone says the strain, and at an event one micro-spring snaps. Stress is prescribed, with partial
-unloading and partial reloading. The law of `foamfit.MicroscaleSpring` is what they should come to.
+spring and snap stresses of its own (`recovery/cycles.py`), are followed along a prescribed stress,
+with partial unloading and partial reloading. The law of `foamfit.MicroscaleSpring` is what they
+should come to.
 
 Answer. Their largest difference in strain falls as 1/n, and inner loops close to 1e-15: README.md.
 
@@ -18,20 +18,23 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 import foamfit as ff
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
+sys.path[:0] = [str(HERE.parent), str(HERE.parent / "recovery")]
+from cycles import Ensemble  # noqa: E402
+
 import studies  # noqa: E402
 
 Array = NDArray[np.float64]
 
-SPRING = ff.MicroscaleSpring(
-    k0=5.5e5, kc=2.5e5, eps_star=0.08, sigma_plus=1.3e5, spread_plus=0.4, sigma_minus=5.5e4,
-    spread_minus=0.77,
-)  # fmt: skip
+VALUES = {
+    "k0": 5.5e5, "kc": 2.5e5, "eps_star": 0.08, "sigma_plus": 1.3e5, "spread_plus": 0.4,
+    "sigma_minus": 5.5e4, "spread_minus": 0.77, "stiffening": 1.0, "softening": 0.0,
+    "weakening": 0.0,
+}  # fmt: skip
+SPRING = ff.MicroscaleSpring(**VALUES)
 NUMBERS = (2, 3, 5, 10, 20, 30, 50, 100, 200, 300, 500, 1000)
 SHOWN = 10
 # Turning points of the stress, Pa: a loop, two inner loops in it, one in an inner loop, and on.
@@ -39,44 +42,13 @@ TURNS = (0.0, 1.6e5, 6e4, 1.2e5, 8e4, 1.2e5, 6e4, 1.6e5, 2.5e5, 1.5e4, 1.2e5, 4e
 BETWEEN = 400  # samples between turning points, for comparing
 
 
-class Chain:
-    """Micro-springs in series, each on branch a or c; the lowest ranks are on c."""
-
-    def __init__(self, spring: ff.MicroscaleSpring, n: int) -> None:
-        ranks = norm.ppf((np.arange(n) + 0.5) / n)
-        self.spring, self.n, self.snapped = spring, n, 0
-        self.plus = spring.sigma_plus * np.exp(spring.spread_plus * ranks)
-        # one that would come back at a higher stress than it snaps at does both at the same
-        self.minus = np.minimum(self.plus, spring.sigma_minus * np.exp(spring.spread_minus * ranks))
-
-    def strain(self, stress: float) -> float:
-        """Mean strain of the micro-springs at a stress."""
-        s, p = self.spring, self.snapped / self.n
-        on_a, on_c = stress / (s.k0 + stress), s.eps_star + stress / (s.kc + stress)
-        return (1.0 - p) * on_a + p * on_c
-
-    def event(self, stress: float, target: float) -> float | None:
-        """Stress of the next event on the way from a stress to another, if there is one."""
-        if target > stress:
-            there = self.snapped < self.n and self.plus[self.snapped] <= target
-            return max(float(self.plus[self.snapped]), stress) if there else None
-        there = self.snapped > 0 and self.minus[self.snapped - 1] > target
-        return min(float(self.minus[self.snapped - 1]), stress) if there else None
-
-    def follow(self, history: Array) -> tuple[Array, Array, Array]:
-        """Strain at each stress of a history, and strain and stress before and after each event."""
-        out, path, stress = np.empty(history.size), [(0.0, 0.0)], 0.0
-        for j, target in enumerate(history):
-            up = target > stress
-            while (at := self.event(stress, float(target))) is not None:
-                path.append((self.strain(at), at))
-                self.snapped += 1 if up else -1
-                path.append((self.strain(at), at))
-                stress = at
-            stress = float(target)
-            out[j] = self.strain(stress)
-            path.append((out[j], stress))
-        return out, *np.array(path).T
+def followed(n: int, history: Array) -> Array:
+    """Strain of n micro-springs at each stress of a history."""
+    row, out = Ensemble(VALUES, n), np.empty(history.size)
+    for j, stress in enumerate(history):
+        row.stress, row.snapped = float(stress), row.after(float(stress))
+        out[j] = row.strain(row.stress, row.snapped)
+    return out
 
 
 def history(between: int = BETWEEN) -> Array:
@@ -88,14 +60,14 @@ def history(between: int = BETWEEN) -> Array:
 def errors(n: int) -> tuple[float, float]:
     """Largest and RMS difference of strain between n micro-springs and the law."""
     stress = history()
-    miss = Chain(SPRING, n).follow(stress)[0] - SPRING.strain(stress)
+    miss = followed(n, stress) - SPRING.strain(stress)
     return float(np.abs(miss).max()), float(np.sqrt(np.mean(miss**2)))
 
 
 def returns(n: int | None) -> float:
     """Largest difference of strain where an inner loop comes back to the stress it left at."""
     turns = np.array(TURNS)
-    strain = SPRING.strain(turns) if n is None else Chain(SPRING, n).follow(turns)[0]
+    strain = SPRING.strain(turns) if n is None else followed(n, turns)
     # the second visit of a turning point, with nothing beyond it in between
     return max(abs(strain[b] - strain[a]) for a, b in ((1, 7), (2, 6), (3, 5), (8, 12)))
 
@@ -111,11 +83,10 @@ def draw(table: list[tuple[int, float, float]], path: Path) -> None:
     black, blue, vermilion, grey = studies.BLACK, studies.BLUE, studies.VERMILION, studies.GREY
     with studies.sheet(path, 7.0, 3.0, 150) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.35, 1.0))
-        _, strain, stress = Chain(SPRING, SHOWN).follow(np.array(TURNS))
-
         along = history()
         left.plot(100 * SPRING.strain(along), along / 1e3, color=black, lw=1.6, label="the law")
-        left.plot(100 * strain, stress / 1e3, color=blue, lw=0.9, label=f"{SHOWN} micro-springs")
+        few = 100 * followed(SHOWN, along)
+        left.plot(few, along / 1e3, color=blue, lw=0.9, label=f"{SHOWN} micro-springs")
         left.set(xlabel="strain (%)", ylabel="stress (kPa)", title="(a) a loop with inner loops")
         left.legend(loc="upper left")
         n = np.array([row[0] for row in table])

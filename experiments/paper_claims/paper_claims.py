@@ -444,41 +444,6 @@ def draw_literal(drive: Drive, path: Path) -> None:
         right.legend(loc="upper right")
 
 
-def draw_ratios(readings: dict[str, dict[str, float]], path: Path) -> None:
-    """Every reading of the damping ratio over the paper's value: those near it, and all."""
-    rows = np.arange(len(readings))[::-1]
-    looks: dict[str, dict[str, Any]] = {
-        FOAM_2: {"color": GREEN, "marker": "D", "ms": 6.5, "mfc": "white"},
-        MODEL_3: {"color": BLUE, "marker": "s", "ms": 4.5},
-        MODEL_2: {"color": VERMILION, "marker": "o", "ms": 4.5},
-    }
-    with studies.sheet(path, 7.0, 4.4) as figure:
-        near, wide = figure.subplots(1, 2, sharey=True)
-        for ax in (near, wide):
-            ax.axvline(1.0, color=BLACK, lw=0.8)
-            ax.grid(axis="y", color="0.92", lw=0.6)
-            ax.set_axisbelow(True)
-            for name, look in looks.items():
-                paper = ff.published[name].damping_ratio or math.nan
-                values = [reading[name] / paper for reading in readings.values()]
-                ax.plot(values, rows, ls="none", label=f"{name} (paper {paper})", **look)
-        near.set(
-            xlim=(0.88, 1.12), ylim=(-0.7, len(rows) - 0.3), title="(a) near the paper's values"
-        )
-        near.set_yticks(rows, [in_mathtext(label) for label in readings])
-        wide.set(xscale="log", title="(b) all")
-        wide.set_xticks([1, 3, 10, 30], ["1", "3", "10", "30"])
-        figure.legend(*wide.get_legend_handles_labels(), loc="outside upper center", ncols=3)
-        figure.supxlabel("ζ by this reading over ζ in the paper (–)", fontsize=8)
-
-
-def in_mathtext(label: str) -> str:
-    """Set the symbols of a label as matplotlib does: k_h+ as $k_{h+}$."""
-    label = label.replace("−", "-").replace("k₀", "$k_{0}$").replace("- ", "− ")
-    label = re.sub(r"([kε])_(h[+-]|[ac*])", r"$\1_{\2}$", label)
-    return label.replace("ε", r"\varepsilon")
-
-
 def draw_energy(path: Path) -> None:
     """Published loops and how far the published impact goes; energy lost over velocity."""
     with studies.sheet(path, 7.0, 2.9) as figure:
@@ -527,7 +492,6 @@ def main() -> None:
     drive = drive_of_impact()
     draw_oscillation(drive, damper_needed(drive), HERE / "oscillation.png")
     draw_literal(drive, HERE / "literal.png")
-    draw_ratios(ratio_readings(), HERE / "ratios.png")
     draw_energy(HERE / "energy.png")
     page = (HERE / "page.template.md").read_text(encoding="utf-8")
     values = of_oscillation() | of_literal() | of_ratios() | of_energy() | of_microscale()

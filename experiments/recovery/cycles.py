@@ -42,13 +42,14 @@ class Ensemble:
     """Micro-springs in a row at one stress, with what each remembers."""
 
     values: dict[str, float]
+    count: int = MICRO_SPRINGS
 
     def __post_init__(self) -> None:
         """Begin unloaded; ranks are those of equal shares."""
-        v, ranks = self.values, ndtri((np.arange(MICRO_SPRINGS) + 0.5) / MICRO_SPRINGS)
+        v, ranks = self.values, ndtri((np.arange(self.count) + 0.5) / self.count)
         self.first = v["sigma_plus"] * np.exp(v["spread_plus"] * ranks)
         self.back = v["sigma_minus"] * np.exp(v["spread_minus"] * ranks)
-        self.snapped = np.zeros(MICRO_SPRINGS, bool)
+        self.snapped = np.zeros(self.count, bool)
         self.ever = self.snapped.copy()
         self.stress = 0.0
 

@@ -3,7 +3,7 @@
 Method. Each scene is answered by the solver and by brute force or root finding. Fifteen
 families are drawn at random from a seed (every scene is synthetic):
 
-- study: the ranges of scenes.py, another seed;
+- study: the ranges of scenes.py;
 - base: impacts on a chain whose base spring has a dashpot, with a mass above it; windows from 1e-7
   s on, shorter than the contact or longer;
 - gap: unilateral springs that open, with derivatives by parameters;
@@ -25,17 +25,16 @@ A tenth of those with memory ask for derivatives.
 
 Answer. None of those that can be judged is over `rtol`, and no derivative is wrong: README.md.
 
-One command runs them and writes a line per scene and rtol; another shows one scene:
+One command runs them and writes a line per scene and rtol:
 
     python experiments/stability/fresh.py --scenes 400 --out fresh.csv
-    python experiments/stability/fresh.py --scene base:17 --rtol 1e-6
+    python experiments/stability/fresh.py --page          # README.md of fresh.csv and worn.csv
 
 Another checkout's solver is judged with PYTHONPATH=that/checkout/src.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import math
@@ -56,12 +55,13 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE))
+sys.path[:0] = [str(HERE), str(HERE.parent)]
 
 from independent import LOOSE, Truth, follow, judge, over_range  # noqa: E402
 from scenes import Point, designed, scene_of  # noqa: E402
 
 import foamfit as ff  # noqa: E402
+import studies  # noqa: E402
 
 Array = NDArray[np.float64]
 Scene = tuple[ff.Chain, ff.Impact | ff.StressDrive | ff.DisplacementDrive, Array]
@@ -745,11 +745,6 @@ def reason_of(refusal: ff.SimulationError) -> str:
     return next((key for key, part in REASONS.items() if part in str(refusal)), "other")
 
 
-def reasons(refused: pd.DataFrame) -> str:
-    """Count the reasons of refused scenes."""
-    return ", ".join(f"{k} {n}" for k, n in refused.reason.value_counts().items())
-
-
 def summary(lines: pd.DataFrame) -> pd.DataFrame:
     """Count per family and rtol."""
     rows = []
@@ -763,10 +758,10 @@ def summary(lines: pd.DataFrame) -> pd.DataFrame:
                 "chaotic": len(steady) - len(known), "beyond the judge": len(group) - len(steady),
                 "answers": int((known.outcome != "refused").sum()),
                 "refused": len(refused),
-                "reasons": reasons(refused),
+                "reasons": ", ".join(f"{k} {n}" for k, n in refused.reason.value_counts().items()),
                 "over 1 rtol": int((known.error > POOR).sum()),
                 "over 3 rtol": int((known.error > BAD).sum()),
-                "largest": known.error.max(),
+                "largest / rtol": known.error.max(),
                 "derivatives": int(known.slope.notna().sum()),
                 "refused derivatives": int((known.reason == "derivatives refused").sum()),
                 "wrong derivatives": int((known.slope > slope_bar(rtol)).sum()),
@@ -792,6 +787,29 @@ def run(
         yield from pool.map(lines_of, tasks, chunksize=4)
 
 
+# ---------------------------------------------------------------------------------------- the page
+
+
+def write_page() -> None:
+    """Write README.md of the scenes that are kept."""
+    lines = pd.concat([pd.read_csv(HERE / name) for name in ("fresh.csv", "worn.csv")])
+    lines["reason"] = lines.reason.fillna("")
+    table, plain = summary(lines), set(FAMILIES) - {*MEMORY, *REMEMBERING}
+    tables = {
+        name: studies.shown(table[table.family.isin(families)], 2)
+        for name, families in (("fresh", plain), ("memory", MEMORY), ("worn", REMEMBERING))
+    }
+    worn = lines[lines.family.isin(REMEMBERING)]
+    studies.write_page(
+        HERE, **tables, fresh_scenes=lines.scene.nunique(), fresh_seed=SEED,
+        fresh_judged=lines[lines.judge == "judged"].scene.nunique(),
+        worn_scenes=worn.scene.nunique(),
+    )  # fmt: skip
+
+
+# ------------------------------------------------------------------------------------ the command
+
+
 def compile_all(families: tuple[str, ...]) -> None:
     """Take a few scenes of each family, so that none of those that are timed compiles."""
     for family in families:
@@ -801,47 +819,24 @@ def compile_all(families: tuple[str, ...]) -> None:
                 ff.simulate(*scene)
 
 
-def show(name: str, rtol: float) -> None:
-    """Print solver and judge side by side for one scene."""
-    family, _, number = name.partition(":")
-    spec = spec_of(family, int(number))
-    scene = scene_from(spec)
-    print(json.dumps(spec, indent=1))
-    truth = judge(*scene, MOST[family], follower(scene, spec))
-    found = judged(spec, scene, truth, rtol, MOST[family], {})
-    for key, value in found.items():
-        print(f"{key:>14}  {value}")
-    if truth.why or found["outcome"] == "refused":
-        return
-    answer = ff.simulate(*scene, rtol=rtol)
-    print(f"\ncontact ends at {answer.contact_end} s; judge: {truth.contact_end} s")
-    print(f"{'t (s)':>12} {'base (Pa)':>16} {'judge':>16} {'top (m)':>16} {'judge':>16}")
-    off = np.abs(answer.base_stress - truth.base_stress)
-    shown = np.unique(np.append(np.linspace(0, off.size - 1, 12).astype(int), off.argmax()))
-    for j in shown:
-        mark = " < largest error" if j == off.argmax() else ""
-        print(
-            f"{scene[2][j]:12.5g} {answer.base_stress[j]:16.9g} {truth.base_stress[j]:16.9g} "
-            f"{answer.displacement[-1, j]:16.9g} {truth.displacement[-1, j]:16.9g}{mark}"
-        )
-
-
 def main() -> None:
     """Run the command line."""
     warnings.simplefilter("ignore")
-    ask = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    ask.add_argument("--scenes", type=int, default=400, help="per family")
-    ask.add_argument("--first", type=int, default=0, help="number of the first scene")
+    ask = studies.arguments(
+        __doc__, scenes=(400, "per family"), first=(0, "number of the first scene")
+    )
     ask.add_argument("--family", action="append", choices=FAMILIES)
     ask.add_argument("--rtol", type=float, action="append")
     ask.add_argument("--out", type=Path, default=HERE / "fresh.csv")
     ask.add_argument("--processes", type=int, default=2, choices=(1, 2))
-    ask.add_argument("--scene", help="show one, as family:number")
     ask.add_argument("--resume", action="store_true", help="keep the scenes that --out has")
+    ask.add_argument(
+        "--page", action="store_true", help="write README.md of fresh.csv and worn.csv"
+    )
     given = ask.parse_args()
     rtols = tuple(given.rtol or RTOLS)
-    if given.scene:
-        show(given.scene, rtols[0] if given.rtol else 1e-6)
+    if given.page:
+        write_page()
         return
     numbers = range(given.first, given.first + given.scenes)
     tasks = [(f, n, rtols) for f in given.family or FAMILIES for n in numbers]
@@ -865,8 +860,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(HERE.parent))
-    from unchanged import keep_unchanged
-
-    with keep_unchanged(HERE):
-        main()
+    studies.run(main, HERE)

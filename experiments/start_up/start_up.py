@@ -1,23 +1,21 @@
 """From the command to the report: how long does it take, warm and at first use, and where?
 
-Method. A synthetic impact of 600 rows (published foam-1/model-1 at 2 m/s, 1 % white noise) is
-fitted by `foamfit fit`, each time in a new process. "First use" is the first fit after
-installation: nothing is compiled (an empty NUMBA_CACHE_DIR). The parts are those of one more
-process, which calls in turn what the command calls; in the last part, figures are drawn in other
-processes where there are two cores, as by the command.
+Method. A synthetic impact (published foam-1/model-1 at 2 m/s, 1 % white noise) is fitted by
+`foamfit fit`, each time in a new process. "First use" is the first fit after installation: nothing
+is compiled (an empty NUMBA_CACHE_DIR). The parts are those of one more process, which calls in turn
+what the command calls; in the last part, figures are drawn in other processes where there are two
+cores, as by the command.
 
-Answer. 2.3 s once compiled, 11.4 s at first use; README.md says where the time goes.
+Answer. 600 rows: 2.3 s once compiled, 11.4 s at first use; README.md says where the time goes. A
+million rows: 6.2 s, 384 MiB.
 
-    python experiments/start_up/start_up.py                 # table of this version
-    python experiments/start_up/start_up.py --before PATH   # and of another checkout, in turns
-
-Another checkout is the `src` folder of an earlier version; it runs with this Python.
+    python experiments/start_up/start_up.py                            # the table of README.md
+    python experiments/start_up/start_up.py --rows 1000000 --warm 1 --first 0
 """
 
 from __future__ import annotations
 
 import os
-import platform
 import resource
 import statistics
 import subprocess
@@ -26,12 +24,16 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
+
+import foamfit as ff
+
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 import studies  # noqa: E402
-from million_rows import write  # noqa: E402
 
-ROWS, WARM, FIRST = 600, 9, 3
+TOML = '[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n'
+TOML += '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
 PARTS = (
     "start of Python, command line",
     "CSV and TOML read (pandas, pint, parts of SciPy)",
@@ -40,7 +42,7 @@ PARTS = (
     "figures, report, result folder",
 )
 PROBE = """
-import contextlib, gc, sys, time
+import gc, sys, time
 gc.set_threshold(100_000, 20, 10)  # as the command
 marks = [time.perf_counter()]
 import foamfit.cli
@@ -50,11 +52,8 @@ test = foamfit.read_test(sys.argv[1])
 marks.append(time.perf_counter())
 from foamfit import api
 from foamfit.report.folder import save_result
-try:
-    from foamfit.cli.options import drawing_beside
-except ImportError:  # earlier versions draw in their own process
-    drawing_beside = None
-with contextlib.nullcontext() if drawing_beside is None else drawing_beside() as drawers:
+from foamfit.cli.options import drawing_beside
+with drawing_beside() as drawers:
     if drawers is not None:
         drawers.begin()
     marks.append(time.perf_counter())
@@ -67,102 +66,73 @@ gc.freeze()  # as the command: what is left goes with the process
 """
 
 
-def environment(source: Path | None, cache: Path | None) -> dict[str, str]:
-    """Variables for a version of foamfit and, at first use, an empty cache."""
-    changed = {"MPLBACKEND": "Agg"}
-    if source is not None:
-        changed["PYTHONPATH"] = str(source)
-    if cache is not None:
-        changed["NUMBA_CACHE_DIR"] = str(cache)
-    return os.environ | changed
+def write(folder: Path, rows: int) -> Path:
+    """Write the synthetic test."""
+    item = ff.published["foam-1/model-1"]
+    chain = ff.Chain(item.chain.springs, item.chain.heights, item.chain.area)
+    t = np.linspace(-0.1e-3, 0.8e-3, rows)
+    response = ff.simulate(chain, ff.Impact(7e-3, 2.0), t)
+    rng = np.random.default_rng(0)
+    stress = response.base_stress + 1.0 / chain.area * rng.standard_normal(rows)
+    motion = response.displacement[-1] + 4e-6 * rng.standard_normal(rows)
+    path = folder / "synthetic.csv"
+    columns = {"stress": stress.round(), "displacement": motion.round(9)}
+    return studies.write_test(path, TOML, time=(t - t[0]).round(10), **columns)
 
 
-def fitted(test: Path, variables: dict[str, str]) -> tuple[float, float]:
-    """Wall time and processor time of one fit by the command, s."""
-    command = [sys.executable, "-m", "foamfit", "fit", str(test), "--quiet"]
+def run(command: list[str], cache: str | None = None) -> tuple[float, float, str]:
+    """Wall time and processor time of a command, s, and its output; with a cache of its own."""
+    variables = os.environ | {"MPLBACKEND": "Agg"} | ({"NUMBA_CACHE_DIR": cache} if cache else {})
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    with tempfile.TemporaryDirectory() as folder:
-        began = time.perf_counter()
-        subprocess.run(
-            [*command, "--out", f"{folder}/result"], check=True, env=variables,
-            stderr=subprocess.DEVNULL,
-        )  # fmt: skip
-        wall = time.perf_counter() - began
+    began = time.perf_counter()
+    done = subprocess.run(command, check=True, env=variables, capture_output=True, text=True)
+    wall = time.perf_counter() - began
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return wall, used
+    return wall, used, done.stdout
 
 
-def parts(test: Path, variables: dict[str, str]) -> list[float]:
-    """Wall time of each of `PARTS`, s."""
-    with tempfile.TemporaryDirectory() as folder:
-        began = time.perf_counter()
-        done = subprocess.run(
-            [sys.executable, "-c", PROBE, str(test), f"{folder}/result"], check=True,
-            env=variables, capture_output=True, text=True,
-        )  # fmt: skip
-        wall = time.perf_counter() - began
-    measured = [float(part) for part in done.stdout.split()]
-    return [wall - sum(measured[1:]), *measured[1:]]
+def measure(test: Path, folder: str, first: int, warm: int) -> dict[str, float]:
+    """Medians: first use, warm, its processor time, and the parts."""
+    out = f"{folder}/result"
+    fit = [sys.executable, "-m", "foamfit", "fit", str(test), "--quiet", "--out", out]
+    probe = [sys.executable, "-c", PROBE, str(test), out]
+    found: dict[str, list[float]] = {}
 
+    def keep(name: str, value: float) -> None:
+        found.setdefault(name, []).append(value)
 
-def measure(sources: list[Path | None], test: Path) -> list[list[float]]:
-    """Medians for each version: first use, warm, its processor time, and the parts.
-
-    The versions take turns, so that a busy machine is busy for all.
-    """
-    runs: list[dict[str, list[list[float]]]] = [
-        {"first": [], "warm": [], "parts": []} for _ in sources
-    ]
-    for _ in range(FIRST):
-        for source, kept in zip(sources, runs, strict=True):
-            with tempfile.TemporaryDirectory() as cache:
-                kept["first"].append([fitted(test, environment(source, Path(cache)))[0]])
-    for source in sources:
-        fitted(test, environment(source, None))  # what is not compiled yet
-    for _ in range(WARM):
-        for source, kept in zip(sources, runs, strict=True):
-            variables = environment(source, None)
-            kept["warm"].append(list(fitted(test, variables)))
-            kept["parts"].append(parts(test, variables))
-    return [
-        [
-            statistics.median(column)
-            for name in ("first", "warm", "parts")
-            for column in zip(*kept[name], strict=True)
-        ]
-        for kept in runs
-    ]
-
-
-def table(names: list[str], measured: list[list[float]]) -> str:
-    """A Markdown table with a column for each version."""
-    rows = (
-        f"first use, from command to report (median of {FIRST})",
-        f"warm, from command to report (median of {WARM})",
-        "processor time of its first process",
-        *(f"– {part}" for part in PARTS),
-    )
-    told = ([f"{value:.2f}" for value in values] for values in zip(*measured, strict=True))
-    cells = ([row, *values] for row, values in zip(rows, told, strict=True))
-    return studies.markdown([f"{ROWS} rows; wall time in s", *names], cells)
+    for _ in range(first):
+        with tempfile.TemporaryDirectory() as cache:
+            keep(f"first use, from command to report (median of {first})", run(fit, cache)[0])
+    run(fit)  # what is not compiled yet
+    for _ in range(warm):
+        wall, used, _ = run(fit)
+        keep(f"warm, from command to report (median of {warm})", wall)
+        keep("processor time of its first process", used)
+        wall, _, printed = run(probe)
+        parts = [float(part) for part in printed.split()]
+        for name, part in zip(PARTS, [wall - sum(parts[1:]), *parts[1:]], strict=True):
+            keep(f"– {name}", part)
+    return {name: statistics.median(values) for name, values in found.items()}
 
 
 def main() -> None:
-    parser = studies.arguments(__doc__)
-    parser.add_argument("--before", type=Path, metavar="PATH", help="src folder of another version")
-    before = parser.parse_args().before
-    sources: list[Path | None] = [None] if before is None else [before, None]
+    parser = studies.arguments(
+        __doc__, HERE, rows=600, first=(3, "fits at first use"), warm=(9, "fits once compiled")
+    )
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        measured = measure(sources, write(Path(folder), ROWS))
-    told = table(["now"] if before is None else ["before", "now"], measured)
-    print(told)
-    if before is not None:
-        machine = f"{os.cpu_count()} cores, {platform.machine()}"
-        machine += f", Python {platform.python_version()}"
-        page = (HERE / "page.template.md").read_text(encoding="utf-8")
-        text = page.replace("{table}", told).replace("{machine}", machine)
-        (HERE / "README.md").write_text(text, encoding="utf-8")
+        test = write(Path(folder), options.rows)
+        measured = measure(test, folder, options.first, options.warm)
+    rows = ((name, f"{seconds:.2f}") for name, seconds in measured.items())
+    table = studies.markdown([f"{options.rows} rows", "wall time (s)"], rows)
+    print(table)
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    print(f"peak memory {peak:.0f} MiB")
+    if options.rows == 600:
+        machine = f"{os.cpu_count()} cores, {studies.circumstances()}"
+        studies.write_page(HERE, out=options.out, table=table, machine=machine)
 
 
 if __name__ == "__main__":

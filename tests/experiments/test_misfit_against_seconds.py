@@ -53,7 +53,7 @@ def test_every_method_lowers_the_same_cost_until_its_time_is_up(
     plain = type(problem.objective).residual
     recorder = identification.Recorder(problem.objective, 0.4, known=0.0)
     with identification.recorded(recorder):
-        identification.run_lmfit(problem, method, coordinates, 3, "differences")
+        identification.run_lmfit(problem, method, coordinates, 3)
     assert type(problem.objective).residual is plain
     recorder.ended = 0.4
     seconds, evaluations, costs = np.transpose(recorder.finished())

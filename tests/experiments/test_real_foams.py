@@ -42,13 +42,6 @@ def test_states_agree_where_all_twins_got_the_same() -> None:
     assert lines[5].startswith("| microscale, relaxation | 2 | 4.00 % |")
 
 
-def test_scatter_is_the_deviation_of_twins_over_their_mean() -> None:
-    lines = real_foams.scatter_table(table(ROWS)).splitlines()
-    assert lines[0] == "| law and parameter | heel, 2 |"
-    assert lines[2] == "| bistable: s1_k0 | 14 (determined 2) |"
-    assert lines[3] == "| bistable: s1_kc | 71 (weak 1) |"
-
-
 def test_misfits_stand_by_specimen_and_law() -> None:
     lines = real_foams.misfit_table(table(ROWS)).splitlines()
     assert lines[2:] == [f"| heel-comp-{n} | 1.00 | 2.00 | 3.00 | 4.00 |" for n in (1, 2)]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,14 +13,13 @@ import pytest
 import foamfit as ff
 from conftest import EXPERIMENTS
 from foamfit.solve import simulation
-from foamfit.solve.plan import plan
+from foamfit.solve.plan import Motion, plan
 
 sys.path.insert(0, str(EXPERIMENTS / "stability"))
 import fresh
 import independent
-import judges
 import scenes
-from scenes import Point, designed, scene_of, swept
+from scenes import HISTORIES, STRIKER, Point, designed, scene_of
 
 RTOL = 1e-6
 # Dashpot of S1 (Pa·s), mass above it (kg) and window (s) of the published foam-2 chain.
@@ -45,18 +46,32 @@ def ended(point: Point) -> tuple[ff.Response | None, str]:
     return answer, ""
 
 
+def bare(point: Point, rtol: float, implicit: bool | None) -> Motion:
+    """Run a scene once, without the check by shorter steps that `simulate` makes."""
+    chain, drive, time = scene_of(point)
+    made = plan(chain, drive, time)._replace(implicit=implicit)
+    return made.run(chain.arrays.rows, chain.arrays.heights, rtol)
+
+
+def difference(one: ff.Response | Motion, other: ff.Response | Motion) -> float:
+    """Largest difference of displacement, or of base stress, over the range of each."""
+    return max(
+        independent.over_range(one.displacement, other.displacement),
+        independent.over_range(one.base_stress, other.base_stress),
+    )
+
+
 def judge(point: Point, answer: ff.Response) -> None:
     """Hold an answer to shorter steps, and to brute force where that is affordable."""
-    scene = scene_of(point)
     if answer.steps:
-        implicit = answer.method == "Radau IIA"
-        miss = judges.refined(scene, answer, RTOL, implicit=implicit, most=200_000)
-        assert miss is not None
-        assert miss <= RTOL, point
-    truth = independent.judge(*scene, 300_000)
+        finer = [
+            bare(point, fine * RTOL, implicit=answer.method == "Radau IIA") for fine in (1e-2, 1e-4)
+        ]
+        kept = [difference(answer, motion) for motion in finer if motion.unresolved <= RTOL]
+        assert min(kept) <= RTOL, point
+    truth = independent.judge(*scene_of(point), 300_000)
     if not truth.why and truth.unsure <= 0.1 * RTOL:
-        assert independent.over_range(answer.displacement, truth.displacement) <= RTOL, point
-        assert independent.over_range(answer.base_stress, truth.base_stress) <= RTOL, point
+        assert difference(answer, truth) <= RTOL, point
 
 
 def cheap(point: Point) -> bool:
@@ -66,6 +81,49 @@ def cheap(point: Point) -> bool:
 
 
 # ------------------------------------------------------------------------------------- the scenes
+
+BASES = {
+    "impact, 1": Point(velocity=3.0),
+    "impact, 2": Point(kinds="unilateral+bistable", springs=2, eta=10.0, mass=5e-6, velocity=3.0),
+    "stress": Point(drive="stress", springs=2, eta=100.0, duration=100.0, samples=401),
+    "stress, mass": Point(drive="stress", top_mass=5e-6, site_eta=10.0, samples=401),
+    "displacement": Point(drive="displacement", springs=3, eta=10.0, samples=401, duration=100.0),
+    "displacement, mass": Point(drive="displacement", springs=2, mass=1e-6, samples=401),
+}
+SWEEPS: dict[str, list[float]] = {
+    "kc_ratio": [1.0, 10.0, 1e2, 1e3, 1e4, 1e5],
+    "dsigma_ratio": [0.0, -1e-6, -0.5, -0.9, -0.98, -0.99],
+    "kh_plus_ratio": [0.0, 1e-6, 1e-3, 0.1, 10.0, 100.0],
+    "kh_minus_ratio": [0.0, 1e-6, 1e-3, 0.1, 10.0, 100.0],
+    "mass": [0.0, 1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7, 1e-6, 1e-4, STRIKER],
+    "top_mass": [0.0, 1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-6, STRIKER],
+    "eta": [0.0, 1e-6, 1e-3, 1.0, 1e3, 1e5, 1e6, 1e7, 1e8],
+    "site_eta": [0.0, 1e-6, 1e-3, 1.0, 1e3, 1e5, 1e6, 1e7, 1e8],
+    "velocity": [1e-3, 1e-2, 0.1, 1.0, 10.0, 30.0, 60.0, 100.0],
+    "height": [1e-6, 1e-5, 1e-4, 1e-2, 0.1, 1.0],
+    "springs": [1, 2, 5, 10, 30, 100, 300, 1000],
+    "samples": [5, 17, 100, 1000, 10_000, 100_000, 1_000_000],
+}
+
+
+def swept() -> Iterator[tuple[str, Point]]:
+    """Scenes that leave a usual one along one axis, to its extreme; with the axis."""
+    for name, base in BASES.items():
+        for axis, values in SWEEPS.items():
+            if axis == "velocity" and base.drive != "impact":
+                continue
+            if axis == "top_mass" and base.drive != "stress":
+                continue
+            if axis == "mass" and base.springs == 1:
+                continue
+            for value in values:
+                if axis == "samples" and value > 1e5 and name not in ("impact, 1", "stress"):
+                    continue
+                yield axis, replace(base, **{axis: value})
+    for history in HISTORIES:
+        for name, base in BASES.items():
+            if not name.startswith("impact"):
+                yield "history", replace(base, history=history)
 
 
 @pytest.mark.parametrize("part", range(4))
@@ -131,16 +189,16 @@ def test_vibrations_that_cannot_be_followed_are_refused_by_size(
     assert f"{motion.unresolved:.1g}" in str(refusal.value)
     massless = ff.Chain(chain.springs, chain.heights, chain.area)  # without any vibration
     want = ff.simulate(massless, drive, time, rtol=1e-9)
-    assert judges.difference(motion, want) <= motion.unresolved
+    assert difference(motion, want) <= motion.unresolved
 
 
 def test_damped_out_vibrations_are_accounted_for() -> None:
     """What implicit steps lose is inside what they say they lose."""
-    point = Point(drive="displacement", springs=3, eta=10.0, mass=scenes.STRIKER, samples=101,
+    point = Point(drive="displacement", springs=3, eta=10.0, mass=STRIKER, samples=101,
                   duration=25.0)  # fmt: skip
-    right = judges.bare(scene_of(point), 1e-10, implicit=False)
-    got = judges.bare(scene_of(point), RTOL, implicit=True)
-    miss = judges.difference(got, right)
+    right = bare(point, 1e-10, implicit=False)
+    got = bare(point, RTOL, implicit=True)
+    miss = difference(got, right)
     assert miss <= got.unresolved + 10.0 * RTOL
 
 
@@ -151,7 +209,7 @@ def test_a_light_onsite_damper_beside_heavy_dashpots() -> None:
     assert answer is not None
     assert answer.method == "Radau IIA"
     without = ff.simulate(*scene_of(dataclasses.replace(point, site_eta=0.0)), rtol=RTOL)
-    assert judges.difference(answer, without) <= 1e-9  # the damper carries 1e-11 of the stress
+    assert difference(answer, without) <= 1e-9  # the damper carries 1e-11 of the stress
 
 
 def test_the_layer_after_a_jump_of_the_velocity_is_passed() -> None:
@@ -170,20 +228,19 @@ def test_the_layer_after_a_jump_of_the_velocity_is_passed() -> None:
 def test_a_single_sample_of_a_stress(implicit: bool) -> None:
     chain = ff.Chain([scenes.spring_of(Point(eta=10.0))] * 2, [1e-3, 1e-3], 1e-5)
     scene = (chain, ff.StressDrive([1e5]), np.zeros(1))
-    assert judges.bare(scene, RTOL, implicit).base_stress == pytest.approx([1e5])
+    made = plan(*scene)._replace(implicit=implicit)
+    motion = made.run(chain.arrays.rows, chain.arrays.heights, RTOL)
+    assert motion.base_stress == pytest.approx([1e5])
 
 
-# ------------------------------------------------------------------------------------- the judges
+# -------------------------------------------------------------------------------------- the judge
 
 
-def test_the_judges_see_a_wrong_answer() -> None:
+def test_the_judge_sees_a_wrong_answer() -> None:
     """A base stress that is 1e-5 off."""
     scene = scene_of(Point(springs=2, kinds="linear+bistable", eta=100.0, velocity=3.0))
     answer = ff.simulate(*scene, rtol=RTOL)
     coarse = dataclasses.replace(answer, base_stress=answer.base_stress * (1.0 + 1e-5))
-    miss = judges.refined(scene, coarse, RTOL, implicit=False, most=200_000)
-    assert miss is not None
-    assert miss > RTOL
     truth = independent.judge(*scene)
     assert independent.over_range(answer.base_stress, truth.base_stress) <= RTOL
     assert independent.over_range(coarse.base_stress, truth.base_stress) > RTOL
