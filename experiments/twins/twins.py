@@ -9,7 +9,7 @@ comparisons of a cycle counted together (Holm).
 Answer. The worn heel dissipates less, but no parameter changes by more than the specimens of one
 heel differ: see README.md, which this writes with batch.csv, wear.csv and a picture.
 
-    FOAMFIT_DATA=path/to/data python experiments/twins/twins.py
+    FOAMFIT_DATA=path/to/data python experiments/twins/twins.py    # --page: from the tables alone
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from __future__ import annotations
 import math
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -30,7 +29,7 @@ import foamfit as ff
 from foamfit.report.figures import BLUE, GREY, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.springs.parameters import unit_of
-from foamfit.text import listed, percent, significant
+from foamfit.text import percent, significant
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
@@ -49,38 +48,29 @@ ENERGY, PEAK = "dissipated energy", "peak stress"
 UNITS = {ENERGY: (1e3, "kJ/m³"), PEAK: (1e3, "kPa")}
 LEVEL = 0.05  # of what is said to stand out, all comparisons of a cycle together
 POINTS = 200  # of a mean loop
-# Measured strain and stress of each specimen by group; joint.json by cycle and group.
+# Measured strain and stress of each specimen by group.
 Loops = Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]]
-Found = Mapping[int, Mapping[str, Mapping[str, Any]]]
 
 
 # ------------------------------------------------------------------------------- fits
 
 
-@dataclass(frozen=True)
-class Made:
-    """What is fitted, the batch and the joint fits by cycle, and the measured loops by cycle."""
-
-    table: pd.DataFrame
-    found: Found
-    measured: Mapping[int, Loops]
-
-
-def measure(data: Path, folder: Path) -> Made:
-    """Make all fits: each cycle of each test, then each group together."""
-    studies.place_twins(data, folder)
+def measure(folder: Path) -> None:
+    """Fit each cycle of each test, then each group together; writes batch.csv and wear.csv."""
     found = ff.batch(
         folder, out=folder / "runs", model="microscale", relaxation=1, drive="displacement",
         cycle="all", intervals="local", report=False,
     )  # fmt: skip
     split = found["test"].str.extract(r"^(?P<specimen>.*)_raw(?:/cycle-(?P<cycle>\d+))?$")
     table = pd.concat([split, found.drop(columns=["test", "file"])], axis=1)
-    print(f"batch: {len(table)} fits", flush=True)
+    errors = [name for name in table if name.endswith("_stderr")]
+    studies.write_csv(table.drop(columns=errors), HERE / "batch.csv", 5)
     counts = table["cycle"].dropna().astype(int).value_counts()
     # A cycle that few records have is no group.
     full = sorted(n for n, count in counts.items() if count == table["specimen"].nunique())
-    together = {n: fit_together(folder, n) for n in full}
-    return Made(table, together, {n: loops(folder, n) for n in full})
+    frames = [wear(fit_together(folder, n), loops(folder, n)).assign(cycle=n) for n in full]
+    rows = pd.concat(frames)
+    studies.write_csv(rows[["cycle", *rows.columns.drop("cycle")]], HERE / "wear.csv")
 
 
 def fit_together(folder: Path, cycle: int) -> dict[str, dict[str, Any]]:
@@ -141,225 +131,137 @@ def lost(loop: tuple[np.ndarray, np.ndarray]) -> float:
 # ------------------------------------------------------------------------------- comparison
 
 
-@dataclass(frozen=True)
-class Group:
-    """Values of one quantity in the specimens of a group, their common value and spread.
+class Group(NamedTuple):
+    """A quantity of a group, of its logarithm: mean, standard error, spread between specimens."""
 
-    `mean`, `stderr` and `spread` are of the logarithm. `ends` are the 95 % intervals of the single
-    values, `sure` says whether each is determined.
-    """
-
-    values: tuple[float, ...]
     mean: float
     stderr: float
     spread: float
-    ends: tuple[tuple[float, float] | None, ...] = ()
-    sure: tuple[bool, ...] = ()
+    count: int
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Group:
         """Measured values, whose errors are nothing beside their spread."""
         logs = np.log(values)
         spread = float(np.std(logs, ddof=1))
-        return cls(tuple(values), float(np.mean(logs)), spread / math.sqrt(len(logs)), spread)
+        return cls(float(np.mean(logs)), spread / math.sqrt(len(logs)), spread, len(logs))
 
     @classmethod
     def of_joint(cls, item: Mapping[str, Any]) -> Group:
         """A scattering parameter of joint.json, its spread apart from errors of measurement."""
-        tests = list(item["tests"].values())
-        return cls(
-            tuple(one["value"] for one in tests),
-            math.log(item["value"]),
-            item["stderr"] / item["value"],
-            item["scatter"],
-            tuple(one["ci95"] and tuple(one["ci95"]) for one in tests),
-            tuple(one["state"] == "determined" for one in tests),
-        )
+        value, error = item["value"], item["stderr"]
+        return cls(math.log(value), error / value, item["scatter"], len(item["tests"]))
 
-    @property
-    def common(self) -> float:
-        """The common value: the median specimen's."""
-        return math.exp(self.mean)
-
-    @property
-    def ci95(self) -> tuple[float, float]:
-        """Its 95 % interval, with Student's t."""
-        half = float(stats.t.ppf(0.975, len(self.values) - 1)) * self.stderr
-        return math.exp(self.mean - half), math.exp(self.mean + half)
-
-    @property
-    def edges(self) -> tuple[float, float]:
-        """One standard deviation between specimens to either side of the common value."""
-        return math.exp(self.mean - self.spread), math.exp(self.mean + self.spread)
+    def row(self, name: str) -> dict[str, float]:
+        """Common value (the median specimen's), its 95 % interval (Student's t) and the spread."""
+        half = float(stats.t.ppf(0.975, self.count - 1)) * self.stderr
+        low, high = math.exp(self.mean - half), math.exp(self.mean + half)
+        ends = {f"{name}_lo": low, f"{name}_hi": high}
+        return {name: math.exp(self.mean), **ends, f"{name}_spread": self.spread}
 
 
-@dataclass(frozen=True)
-class Change:
-    """A quantity in the worn group over that in the new one, less one (Welch's test of logarithms).
-
-    `size` is the change over the spread between specimens, both of the logarithm; `adjusted` is p
-    with all comparisons of a cycle counted.
-    """
-
-    name: str
-    new: Group
-    worn: Group
-    change: float
-    ci95: tuple[float, float]
-    p: float
-    size: float
-    adjusted: float = math.nan
-
-    @property
-    def stands_out(self) -> bool:
-        """Whether there is a change in spite of the scatter, all comparisons counted."""
-        return self.adjusted < LEVEL
-
-
-def change_of(name: str, new: Group, worn: Group) -> Change:
-    """Compare two groups."""
+def change_of(quantity: str, new: Group, worn: Group) -> dict[str, Any]:
+    """Compare two groups by Welch's test of the logarithms: the worn over the new one, less one."""
     difference, error = worn.mean - new.mean, math.hypot(new.stderr, worn.stderr)
-    freedom = error**4 / sum(g.stderr**4 / (len(g.values) - 1) for g in (new, worn))
+    freedom = error**4 / sum(g.stderr**4 / (g.count - 1) for g in (new, worn))
     half = float(stats.t.ppf(0.975, freedom)) * error
-    p = 2.0 * float(stats.t.sf(abs(difference) / error, freedom))
     spread = math.hypot(new.spread, worn.spread) / math.sqrt(2.0)
-    size = abs(difference) / spread if spread > 0.0 else math.inf
-    ends = math.expm1(difference - half), math.expm1(difference + half)
-    return Change(name, new, worn, math.expm1(difference), ends, p, size)
+    return {
+        "quantity": quantity, **new.row("new"), **worn.row("worn"),
+        "change": math.expm1(difference), "change_lo": math.expm1(difference - half),
+        "change_hi": math.expm1(difference + half),
+        "change_over_spread": abs(difference) / spread if spread > 0.0 else math.inf,
+        "p": 2.0 * float(stats.t.sf(abs(difference) / error, freedom)),
+    }  # fmt: skip
 
 
-def counted_together(changes: Sequence[Change]) -> list[Change]:
+def counted_together(changes: pd.DataFrame) -> pd.DataFrame:
     """The changes by their size, largest first, with p adjusted for their number (Holm 1979)."""
-    out, least = list[Change](), 0.0
-    for i, one in enumerate(sorted(changes, key=lambda one: one.p)):
-        least = max(least, min((len(changes) - i) * one.p, 1.0))
-        out.append(replace(one, adjusted=least))
-    return sorted(out, key=lambda one: -one.size)
+    found = changes.sort_values("p", kind="stable")
+    left = len(found) - np.arange(len(found))
+    found["p_adjusted"] = np.maximum.accumulate(np.minimum(left * found["p"], 1.0))
+    return found.sort_values("change_over_spread", ascending=False, ignore_index=True)
 
 
-def wear(found: Mapping[str, Mapping[str, Any]], measured: Loops) -> list[Change]:
+def wear(found: Mapping[str, Mapping[str, Any]], measured: Loops) -> pd.DataFrame:
     """What differs between the joint fits of two groups, and what their loops say without a law."""
-    out = [
+    rows = [
         change_of(name, *(Group.of([one(loop) for loop in measured[g]]) for g in GROUPS))
         for name, one in ((ENERGY, lost), (PEAK, lambda loop: float(loop[1].max())))
     ]
     for name in SCATTERING:
         new, worn = (Group.of_joint(found[group]["parameters"][name]) for group in GROUPS)
-        out.append(change_of(name, new, worn))
-    return counted_together(out)
-
-
-# ------------------------------------------------------------------------------- in words
-
-
-def shown_change(one: Change) -> str:
-    """Write a change with its 95 % interval."""
-    value, low, high = (f"{100 * end:+.0f}".replace("-", "−") for end in (one.change, *one.ci95))
-    return f"{value} % ({low} to {high} %)"
-
-
-def verdict(one: Change) -> str:
-    """Whether a change stands out of the scatter between specimens."""
-    if one.stands_out:
-        return "stands out"
-    return f"a hint, p = {significant(one.p, 1)}" if one.p < LEVEL else "within scatter"
-
-
-def headline(changes: Sequence[Change]) -> str:
-    """Name what stands out."""
-    there = [one.name.removeprefix("s1_") for one in changes if one.stands_out]
-    if not there:
-        return "no change stands out of the scatter between specimens"
-    return f"{listed(there)} {'stands' if len(there) == 1 else 'stand'} out of the scatter"
-
-
-def unit_for(one: Change) -> tuple[float, str]:
-    """Factor and name of the unit in which a quantity reads well."""
-    return UNITS.get(one.name) or readable_unit(one.new.common, unit_of(one.name))
-
-
-def title(one: Change) -> str:
-    unit = unit_for(one)[1]
-    return f"{one.name.removeprefix('s1_')}{f' ({unit})' if unit else ''}"
-
-
-def code(name: str) -> str:
-    """Write the name of a parameter as such."""
-    return name if name in UNITS else f"`{name.removeprefix('s1_')}`"
-
-
-# ------------------------------------------------------------------------------- pictures
-
-
-def draw_wear(changes: Sequence[Change], measured: Loops, cycle: int, path: Path) -> None:
-    """The mean loops, and each quantity new against worn."""
-    with studies.sheet(path, 7.6, 6.4) as figure:
-        grid = figure.add_gridspec(3, 4)
-        ax = figure.add_subplot(grid[0, :2])
-        for group, colour in COLOURS.items():
-            strain, stress, spread = mean_loop(measured[group])
-            for part in (slice(None, POINTS), slice(POINTS, None)):
-                low, high = ((stress + sign * spread)[part] / 1e3 for sign in (-1.0, 1.0))
-                ax.fill_between(strain[part], low, high, color=colour, alpha=0.15, linewidth=0)
-            ax.plot(strain, stress / 1e3, color=colour, linewidth=1.2, label=group)
-        ax.set(xlabel="strain", ylabel="stress (kPa)", title="mean loops ± standard deviation")
-        ax.legend(loc="upper left")
-        places = [grid[0, 2], grid[0, 3], *(grid[r, c] for r in (1, 2) for c in range(4))]
-        for place, one in zip(places, changes, strict=True):
-            draw_change(figure.add_subplot(place), one)
-        figure.suptitle(
-            f"Running-shoe foam, cycle {cycle}, new heel against worn: {headline(changes)}; "
-            "largest change over spread first\n"
-            "points: specimens with 95 % intervals, hollow if not well determined; line and band: "
-            "common value and its 95 % interval;\n"
-            f"dashed: spread between specimens. {SOURCE}",
-            x=0.01, ha="left", fontsize=7.5,
-        )  # fmt: skip
-
-
-def draw_change(ax: Any, one: Change) -> None:
-    """One quantity: specimens, common value and spread of both groups."""
-    factor, _ = unit_for(one)
-    for x, (name, group) in enumerate((("new", one.new), ("worn", one.worn))):
-        colour, span = COLOURS[name], [x - 0.36, x + 0.36]
-        low, high = (end / factor for end in group.ci95)
-        ax.fill_between(span, low, high, color=colour, alpha=0.18, linewidth=0, zorder=0)
-        ax.plot(span, [group.common / factor] * 2, color=colour, linewidth=1.6, zorder=1)
-        for edge in group.edges:
-            ax.plot(span, [edge / factor] * 2, "--", color=colour, linewidth=0.7, zorder=1)
-        at, count = x + np.linspace(-0.24, 0.24, len(group.values)), len(group.values)
-        given = zip(
-            at, group.values, group.ends or [None] * count, group.sure or [True] * count,
-            strict=True,
-        )  # fmt: skip
-        for here, value, ends, sure in given:
-            if ends is not None:
-                ax.plot([here] * 2, [end / factor for end in ends], color=GREY, linewidth=0.8)
-            fill = colour if sure else "white"
-            ax.plot(here, value / factor, "o", color=colour, markersize=3.4, mfc=fill, mew=0.8)
-    ax.set_xlim(-0.55, 1.55)
-    ax.set_xticks([0, 1], GROUPS)
-    ax.set_title(
-        f"{title(one)}\n{shown_change(one)}\n{one.size:.1f} spreads: {verdict(one)}",
-        fontsize=7, fontweight="bold" if one.stands_out else "normal",
-    )  # fmt: skip
-    ax.locator_params(axis="y", nbins=5)
+        rows.append(change_of(name, new, worn))
+    return counted_together(pd.DataFrame(rows))
 
 
 # ------------------------------------------------------------------------------- the page
 
 
-def change_rows(changes: Sequence[Change]) -> str:
+def shown_change(one: Any) -> str:
+    """Write a change with its 95 % interval."""
+    ends = (one.change, one.change_lo, one.change_hi)
+    value, low, high = (f"{100 * end:+.0f}".replace("-", "−") for end in ends)
+    return f"{value} % ({low} to {high} %)"
+
+
+def verdict(one: Any) -> str:
+    """Whether a change stands out of the scatter between specimens."""
+    if one.p_adjusted < LEVEL:
+        return "stands out"
+    return f"a hint, p = {significant(one.p, 1)}" if one.p < LEVEL else "within scatter"
+
+
+def draw(changes: pd.DataFrame, measured: Loops, path: Path) -> None:
+    """The mean loops of the first cycle, and the change of each quantity in two cycles."""
+    with studies.sheet(path, 7.4, 3.4) as figure:
+        left, right = figure.subplots(1, 2)
+        for group, colour in COLOURS.items():
+            strain, stress, spread = mean_loop(measured[group])
+            for part in (slice(None, POINTS), slice(POINTS, None)):
+                low, high = ((stress + sign * spread)[part] / 1e3 for sign in (-1.0, 1.0))
+                left.fill_between(strain[part], low, high, color=colour, alpha=0.15, linewidth=0)
+            left.plot(strain, stress / 1e3, color=colour, linewidth=1.2, label=group)
+        left.set(xlabel="strain (–)", ylabel="stress (kPa)", title="mean loops ± deviation")
+        left.legend(loc="upper left")
+        order = list(changes[changes["cycle"] == FIRST]["quantity"])[::-1]
+        for cycle, off, colour in ((FIRST, 0.12, studies.BLACK), (LATER, -0.12, GREY)):
+            own = (
+                100.0
+                * changes[changes["cycle"] == cycle]
+                .set_index("quantity")
+                .loc[order, ["change", "change_lo", "change_hi"]]
+            )
+            ends = [own["change"] - own["change_lo"], own["change_hi"] - own["change"]]
+            right.errorbar(
+                own["change"], np.arange(len(order)) + off, xerr=ends, fmt="o", color=colour,
+                markersize=3.5, linewidth=0.9, label=f"cycle {cycle}",
+            )  # fmt: skip
+        right.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
+        right.set_yticks(range(len(order)), [name.removeprefix("s1_") for name in order])
+        right.set(xlabel="worn over new, less one (%)", title="changes with 95 % intervals")
+        right.legend(loc="lower right")
+        figure.suptitle(
+            f"Running-shoe foam, new heel against worn. {SOURCE}", x=0.01, ha="left", fontsize=8
+        )
+
+
+def change_rows(changes: pd.DataFrame) -> str:
     """Rows of the page's table of changes."""
-    rows = []
-    for one in changes:
-        factor, cells = unit_for(one)[0], []
-        for group in (one.new, one.worn):
-            told = [significant(v / factor, 3) for v in (group.common, *group.ci95)]
-            cells += [f"{told[0]} ({told[1]} to {told[2]})", percent(group.spread)]
-        sizes = (significant(number, 2) for number in (one.size, one.p, one.adjusted))
-        rows.append([title(one), *cells, shown_change(one), *sizes, verdict(one)])
-    return studies.lines(rows)
+
+    def cells(one: Any) -> Iterator[str]:
+        factor, unit = UNITS.get(one.quantity) or readable_unit(one.new, unit_of(one.quantity))
+        yield one.quantity.removeprefix("s1_") + (f" ({unit})" if unit else "")
+        for group in GROUPS:
+            ends = (getattr(one, group + end) for end in ("", "_lo", "_hi"))
+            value, low, high = (significant(end / factor, 3) for end in ends)
+            yield f"{value} ({low} to {high})"
+            yield percent(getattr(one, f"{group}_spread"))
+        yield shown_change(one)
+        yield from (significant(x, 2) for x in (one.change_over_spread, one.p, one.p_adjusted))
+        yield verdict(one)
+
+    return studies.lines(cells(one) for one in changes.itertuples())
 
 
 def batch_rows(table: pd.DataFrame) -> str:
@@ -375,68 +277,35 @@ def batch_rows(table: pd.DataFrame) -> str:
     return studies.lines(rows)
 
 
-def told(changes: Sequence[Change]) -> str:
-    """Name what stands out, what may, and what does not."""
-    parts = {
-        "Stands out of the scatter between specimens": [o for o in changes if o.stands_out],
-        f"A hint (p below {LEVEL} on its own)": [
-            o for o in changes if o.p < LEVEL and not o.stands_out
-        ],
-        "Within the scatter": [o for o in changes if o.p >= LEVEL],
-    }
-    return "\n".join(
-        f"- {words}: {'; '.join(f'{code(o.name)} {shown_change(o)}' for o in ones) or 'nothing'}."
-        for words, ones in parts.items()
-    )
-
-
-def write_tables(table: pd.DataFrame, changes: Mapping[int, Sequence[Change]]) -> None:
-    """Write batch.csv and wear.csv."""
-    errors = [name for name in table if name.endswith("_stderr")]
-    studies.write_csv(table.drop(columns=errors), HERE / "batch.csv", 5)
-    rows = []
-    for cycle, ones in changes.items():
-        for one in ones:
-            row: dict[str, Any] = {"cycle": cycle, "quantity": one.name}
-            for name, group in (("new", one.new), ("worn", one.worn)):
-                low, high = group.ci95
-                row |= {name: group.common, f"{name}_lo": low, f"{name}_hi": high}
-                row[f"{name}_spread"] = group.spread
-            row |= {"change": one.change, "change_lo": one.ci95[0], "change_hi": one.ci95[1]}
-            row |= {"change_over_spread": one.size, "p": one.p, "p_adjusted": one.adjusted}
-            rows.append(row)
-    studies.write_csv(rows, HERE / "wear.csv")
-
-
-def write(made: Made) -> None:
-    """Write tables, picture and page of what was found."""
-    changes = {n: wear(made.found[n], made.measured[n]) for n in made.found}
-    draw_wear(changes[FIRST], made.measured[FIRST], FIRST, HERE / "new_against_worn.png")
-    write_tables(made.table, changes)
-    table, off = made.table, made.table["misfit_stress_strain"]
-    everywhere = [
-        code(name)
-        for name in (ENERGY, PEAK, *SCATTERING)
-        if all(one.stands_out for ones in changes.values() for one in ones if one.name == name)
-    ]
+def write(measured: Loops) -> None:
+    """Write picture and page of the tables."""
+    table, changes = pd.read_csv(HERE / "batch.csv"), pd.read_csv(HERE / "wear.csv")
+    draw(changes, measured, HERE / "new_against_worn.png")
+    off, out = table["misfit_stress_strain"], changes["p_adjusted"] < LEVEL
+    everywhere = out.groupby(changes["quantity"]).all()
     studies.write_page(
-        HERE, first=FIRST, later=LATER, last=max(changes), fits=len(table),
+        HERE, first=FIRST, later=LATER, last=changes["cycle"].max(), fits=len(table),
         fitted=int(table["status"].isin(["ok", "warnings"]).sum()),
         misfit_low=percent(off.min()), misfit_high=percent(off.max()),
         misfit_median=percent(off.median()), batch=batch_rows(table),
         names=" | ".join(f"`{name}`" for name in LAW), dashes=" | ".join("---" for _ in LAW),
-        told_first=told(changes[FIRST]), told_later=told(changes[LATER]),
-        everywhere=", ".join(everywhere) or "nothing", wear_first=change_rows(changes[FIRST]),
-        wear_later=change_rows(changes[LATER]),
+        everywhere=", ".join(everywhere.index[everywhere]) or "nothing",
+        wear_first=change_rows(changes[changes["cycle"] == FIRST]),
+        wear_later=change_rows(changes[changes["cycle"] == LATER]),
     )  # fmt: skip
 
 
 def main() -> None:
-    studies.arguments(__doc__).parse_args()
+    parser = studies.arguments(__doc__)
+    parser.add_argument("--page", action="store_true", help="only write picture and page")
+    options = parser.parse_args()
     data = studies.measurements("shoe-foam-twins") / "shoe-foam-twins"
-    with tempfile.TemporaryDirectory() as folder:
-        made = measure(data, Path(folder))
-    write(made)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        studies.place_twins(data, folder)
+        if not options.page:
+            measure(folder)
+        write(loops(folder, FIRST))
 
 
 if __name__ == "__main__":

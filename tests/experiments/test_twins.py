@@ -6,63 +6,45 @@ import math
 import sys
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
 from conftest import DATA, EXPERIMENTS, needs_data
 
 sys.path.insert(0, str(EXPERIMENTS / "twins"))
-from twins import Change, Group, change_of, counted_together, lost, mean_loop, studies
+from twins import Group, change_of, counted_together, lost, mean_loop, studies
 
 
 def test_a_change_is_welchs_test_of_the_logarithms() -> None:
     new, worn = (10.0, 11.0, 9.0, 10.5, 9.5), (8.0, 9.0, 7.0, 8.5, 6.5)
     one = change_of("quantity", Group.of(new), Group.of(worn))
     found = stats.ttest_ind(np.log(worn), np.log(new), equal_var=False)
-    assert one.p == pytest.approx(found.pvalue)
+    assert one["p"] == pytest.approx(found.pvalue)
     ends = found.confidence_interval(0.95)
-    assert one.ci95 == pytest.approx((math.expm1(ends.low), math.expm1(ends.high)))
+    assert one["change_lo"] == pytest.approx(math.expm1(ends.low))
+    assert one["change_hi"] == pytest.approx(math.expm1(ends.high))
     gone = np.mean(np.log(worn)) - np.mean(np.log(new))
-    assert one.change == pytest.approx(math.expm1(gone))
+    assert one["change"] == pytest.approx(math.expm1(gone))
     spread = math.sqrt(0.5 * (np.var(np.log(new), ddof=1) + np.var(np.log(worn), ddof=1)))
-    assert one.size == pytest.approx(-gone / spread)
+    assert one["change_over_spread"] == pytest.approx(-gone / spread)
 
 
 def test_a_scattering_parameter_brings_the_interval_of_the_joint_fit() -> None:
-    logs = np.array([-0.2, 0.1, 0.0, 0.15, -0.05])
-    values = 5e5 * np.exp(logs)
-    stderr = float(np.std(logs, ddof=1)) / math.sqrt(5)
-    item = {
-        "value": 5e5 * math.exp(logs.mean()), "stderr": 5e5 * math.exp(logs.mean()) * stderr,
-        "scatter": 0.12,
-        "tests": {
-            str(i): {"value": v, "ci95": None if i else [0.9 * v, 1.1 * v], "state": "determined"}
-            for i, v in enumerate(values)
-        },
-    }  # fmt: skip
-    group = Group.of_joint(item)
-    half = stats.t.ppf(0.975, 4) * stderr
-    assert group.ci95 == pytest.approx(
-        (group.common * math.exp(-half), group.common * math.exp(half))
-    )
-    assert group.edges == pytest.approx(
-        (group.common * math.exp(-0.12), group.common * math.exp(0.12))
-    )
-    assert group.ends[0] == pytest.approx((0.9 * values[0], 1.1 * values[0]))
-    assert group.ends[1:] == (None,) * 4
+    item = {"value": 5e5, "stderr": 2e4, "scatter": 0.12, "tests": dict.fromkeys("01234")}
+    row = Group.of_joint(item).row("new")
+    half = stats.t.ppf(0.975, 4) * 0.04
+    assert row["new_lo"] == pytest.approx(5e5 * math.exp(-half))
+    assert row["new_hi"] == pytest.approx(5e5 * math.exp(half))
+    assert (row["new"], row["new_spread"]) == (pytest.approx(5e5), 0.12)
 
 
 def test_comparisons_are_counted_together_and_the_largest_comes_first() -> None:
-    group = Group.of((1.0, 1.1, 0.9))
-
-    def change(name: str, p: float, size: float) -> Change:
-        return Change(name, group, group, 0.1, (0.0, 0.2), p, size)
-
-    given = [change("a", 0.02, 1.0), change("b", 0.01, 3.0), change("c", 0.9, 2.0)]
+    rows = [("a", 0.02, 1.0), ("b", 0.01, 3.0), ("c", 0.9, 2.0)]
+    given = pd.DataFrame(rows, columns=["quantity", "p", "change_over_spread"])
     found = counted_together(given)
-    assert [one.name for one in found] == ["b", "c", "a"]
-    assert [one.adjusted for one in found] == pytest.approx([0.03, 0.9, 0.04])
-    assert [one.stands_out for one in found] == [True, False, True]
+    assert list(found["quantity"]) == ["b", "c", "a"]
+    assert list(found["p_adjusted"]) == pytest.approx([0.03, 0.9, 0.04])
 
 
 def test_the_mean_loop_of_one_loop_is_that_loop() -> None:
