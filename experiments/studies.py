@@ -28,7 +28,13 @@ import foamfit as ff
 from foamfit.report.figures import drawing
 from unchanged import keep_unchanged
 
+# What the columns of measurements of others are: a machine's gap, and the printed lattices'.
 GAP = 'displacement = { column = "Gap (um)", counts_down = true }'
+LATTICE = """\
+time = { column = "Total Time (s)" }
+displacement = { column = "Position(Linear:Position) (mm)", counts_down = true }
+force = { column = "Force(Linear:Load) (kN)", scale = -1 }
+cycle = { column = "Total Cycles" }"""
 # Okabe and Ito's colours, which all can tell apart.
 BLACK, GREY, BLUE, SKY = "#000000", "#8c8c8c", "#0072B2", "#56B4E9"
 VERMILION, ORANGE, GREEN, PURPLE = "#D55E00", "#E69F00", "#009E73", "#CC79A7"

@@ -7,7 +7,7 @@ is fitted on its own by a microscale spring with relaxation. The measurements ar
 repository.
 
 Answer. Snap-through and relaxation change from cycle to cycle: see damage.md. Beside it: twins.csv,
-twins.png, lattice.csv and lattice.png.
+lattice.csv and lattice.png.
 
     FOAMFIT_DATA=path/to/data python experiments/damage/damage.py
 """
@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 
 import foamfit as ff
-from foamfit.report.figures import BLUE, DPI, VERMILION
+from foamfit.report.figures import DPI
 from foamfit.text import significant
 
 HERE = Path(__file__).parent
@@ -37,11 +37,6 @@ NAMES = tuple(f"s1_{name}" for name in (*LAW, "g1", "tau1"))
 SHOWN = ("start_strain", "dissipated_energy", "misfit_stress_strain", *NAMES)
 SHARES = ("start_strain", "misfit_stress_strain")
 LATTICES, LATTICE_CYCLES = ("tpu87-20", "tpu87-35", "tpu87-50"), (1, 2, 10, 100, 1000)
-LATTICE = """\
-time = { column = "Total Time (s)" }
-displacement = { column = "Position(Linear:Position) (mm)", counts_down = true }
-force = { column = "Force(Linear:Load) (kN)", scale = -1 }
-cycle = { column = "Total Cycles" }"""
 
 
 def is_pressure(column: str) -> bool:
@@ -119,31 +114,11 @@ def twins_told(table: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def draw_twins(table: pd.DataFrame) -> None:
-    units = {**dict.fromkeys(SHARES, (100, " (%)")), "s1_tau1": (1, " (s)")}
-    units["dissipated_energy"] = 1e-3, " (kJ/m³)"
-    with studies.sheet(HERE / "twins.png", 7.4, 5.2, DPI) as figure:
-        axes = figure.subplots(3, 4)
-        for ax, column in zip(axes.flat, SHOWN, strict=True):
-            scale, unit = units.get(column, (1e-3, " (kPa)") if is_pressure(column) else (1, ""))
-            for name, colour, off in (("new", BLUE, -0.06), ("worn", VERMILION, 0.06)):
-                by = kind(table, name).groupby("cycle")[column].agg(["mean", "std", "count"])
-                by = by[by["count"] == 5]
-                ax.errorbar(
-                    by.index + off, scale * by["mean"], scale * by["std"], color=colour,
-                    marker="o", markersize=3, linewidth=0.8, label=name,
-                )  # fmt: skip
-            title = column.removeprefix("s1_").removesuffix("_stress_strain").replace("_energy", "")
-            ax.set(title=title + unit, xlabel="cycle", xticks=range(1, 7))
-            ax.set_ylim(bottom=0)
-        axes.flat[0].legend(loc="lower right")
-
-
 # ------------------------------------------------------------------------------- the lattices
 
 
 def fit_lattices(data: Path, toml: Path) -> tuple[pd.DataFrame, dict[str, ff.CycleFits]]:
-    studies.write_specimen(toml, "12 mm", "20 mm", LATTICE)
+    studies.write_specimen(toml, "12 mm", "20 mm", studies.LATTICE)
     found = {
         name: ff.fit_cycles(
             data / "lattice-cycles" / f"{name}_raw.csv", toml, cycles=LATTICE_CYCLES,
@@ -218,7 +193,6 @@ def main() -> None:
         twins = fit_twins(data, toml)
     studies.write_csv(twins, HERE / "twins.csv", 6)
     studies.write_csv(lattices, HERE / "lattice.csv", 6)
-    draw_twins(twins)
     draw_lattices(lattices, found)
     studies.write_page(
         HERE, "damage.md", twins=twin_table(twins), told=twins_told(twins),

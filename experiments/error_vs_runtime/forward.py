@@ -4,8 +4,7 @@ Method. For every scene of `scenes.py`: the error of the project's solver, of fi
 of three of SciPy's integrators against the judge of the stability study (`independent.py`, some 14
 digits), over the median time of many runs. All solvers of a scene take turns in one process, and
 processor time is counted, so that a busy machine disturbs all of them alike; ratios compare medians
-of one run. A table (CSV, Markdown) and a figure per scene, the scaling with springs and samples,
-and a summary go to `forward/`.
+of one run. A table (CSV, Markdown) and a figure per scene and a summary go to `forward/`.
 
 Answer. With an error below 2e-6 the project's solver takes 7 µs to 7 ms, SciPy 30 to 300 times as
 long: see forward/summary.md.
@@ -37,7 +36,6 @@ import scenes as kinds
 from scenes import KERNEL, PUBLIC, Competitor, Scene
 
 import foamfit as ff
-from foamfit.solve.plan import plan
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
@@ -159,103 +157,6 @@ def _take_turns(timed: list[Timed], budget: float) -> None:
     gc.enable()
 
 
-# ---------------------------------------------------------------- scaling
-
-
-def _impact(count: int, samples: int, velocity: float) -> Scene:
-    t = np.linspace(0.0, kinds.LENGTH, samples)
-    return Scene("", "", kinds.graded(count), ff.Impact(kinds.MASS, velocity), t)
-
-
-def _driven(count: int, samples: int, by_stress: bool) -> Scene:
-    t = np.linspace(0.0, kinds.LENGTH, samples)
-    chain = kinds.graded(count)
-    spring = kinds.MODEL_2.bistable
-    stress = 1.1 * kinds.loop(spring, samples, True)  # past C1 of the hardest one
-    drive: ff.StressDrive | ff.DisplacementDrive = ff.StressDrive(stress)
-    if not by_stress:
-        most = ff.simulate(chain, drive, t).displacement[-1].max()
-        shape = kinds.loop(spring, samples, False)
-        drive = ff.DisplacementDrive(most * shape / shape.max())
-    return Scene("", "", chain, drive, t)
-
-
-SCALED: dict[str, Callable[[int, int], Scene]] = {
-    "stress drive": lambda n, samples: _driven(n, samples, True),
-    "displacement drive": lambda n, samples: _driven(n, samples, False),
-    "impact, no spring snaps": lambda n, samples: _impact(n, samples, 0.5),
-    "impact, every spring snaps": lambda n, samples: _impact(n, samples, 2.2),
-}
-
-
-def scaling(longest: float) -> pd.DataFrame:
-    """Time of the project's solver against springs (501 samples) and samples (one spring)."""
-    springs = [(n, kinds.SAMPLES) for n in (1, 3, 10, 30, 100, 300, 1000)]
-    samples = [(1, n) for n in (101, 316, 1001, 3162, 10001, 31623, 100001)]
-    rows: list[dict[str, Any]] = []
-    for drive, make in SCALED.items():
-        for over, sizes in (("springs", springs), ("samples", samples)):
-            for count, n in sizes:
-                first, times, runs = _timed(make(count, n))
-                rows += [
-                    {"drive": drive, "over": over, "springs": count, "samples": n, "solver": solver,
-                     "median (s)": np.median(one), "runs": runs}
-                    for solver, one in times.items()
-                ]  # fmt: skip
-                if first >= longest:
-                    break
-    return pd.DataFrame(rows)
-
-
-def _timed(scene: Scene) -> tuple[float, dict[str, list[float]], int]:
-    """Time of a first run of a scene, the times of both ways to call the solver, and runs."""
-    made = plan(scene.chain, scene.drive, scene.time)
-    rows, heights = scene.chain.arrays.rows, scene.chain.arrays.heights
-    runs: dict[str, Callable[[], object]] = {
-        KERNEL: lambda: made.run(rows, heights, 1e-6, everything=False),
-        PUBLIC: lambda: ff.simulate(scene.chain, scene.drive, scene.time),
-    }
-    first = seconds(runs[KERNEL])
-    if first < 0.5:
-        first = seconds(runs[KERNEL])
-    at_once = max(1, round(SHORTEST / first))
-    turns = min(max(round(0.1 / (first * at_once)), 3), 21) if first < 1.0 else 1
-    times: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in range(turns):
-        for name, run in runs.items():
-            times[name].append(seconds(run, at_once))
-    return first, times, turns * at_once
-
-
-def exponents(table: pd.DataFrame) -> pd.DataFrame:
-    """Slopes of log time over log size: of a line through all sizes, and of the last decade."""
-    rows = []
-    for (drive, over, solver), part in table.groupby(["drive", "over", "solver"], sort=False):
-        x, y = np.log10(part[over].to_numpy(float)), np.log10(part["median (s)"].to_numpy(float))
-        last = x >= x[-1] - 1.01
-        rows.append(
-            {
-                "drive": drive, "over": over, "from": part[over].iloc[0],
-                "to": part[over].iloc[-1], "solver": solver,
-                "exponent": np.polyfit(x, y, 1)[0],
-                "exponent of the last decade": np.polyfit(x[last], y[last], 1)[0],
-            }
-        )  # fmt: skip
-    return pd.DataFrame(rows)
-
-
-def per_sample(table: pd.DataFrame) -> pd.DataFrame:
-    """Time of the closed-form drives per sample and spring, ns."""
-    part = table[table["drive"].isin(["stress drive", "displacement drive"])].copy()
-    part["ns per sample and spring"] = 1e9 * part["median (s)"] / part["springs"] / part["samples"]
-    large = (
-        (part["springs"] >= 100)
-        | (part["samples"] >= 10000)
-        | ((part["springs"] == 1) & (part["samples"] == kinds.SAMPLES))
-    )
-    return part[large][["drive", "springs", "samples", "solver", "ns per sample and spring"]]
-
-
 # ---------------------------------------------------------------- figures
 
 
@@ -359,14 +260,10 @@ def main() -> None:
         print(scene.name, *told, f"({time.perf_counter() - began:.0f} s)", file=sys.stderr)
     if options.scenes:
         return
-    heading = ["Run time against springs and samples", where]
-    sizes = write(scaling(longest=4.0), options.out / "scaling", heading)
     summary = pd.DataFrame(rows)
     studies.write_csv(summary, options.out / "summary.csv")
-    tables = {"table": summary, "sizes": per_sample(sizes), "exponents": exponents(sizes)}
     text = (HERE / "summary.template.md").read_text(encoding="utf-8").format(
-        wanted=f"{WANTED:g}", where=where, samples=kinds.SAMPLES,
-        **{name: studies.shown(one) for name, one in tables.items()},
+        wanted=f"{WANTED:g}", where=where, table=studies.shown(summary)
     )  # fmt: skip
     (options.out / "summary.md").write_text(text, encoding="utf-8")
 

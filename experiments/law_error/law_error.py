@@ -28,16 +28,16 @@ import numpy as np
 import pandas as pd
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
-from scipy.special import ndtr
 
 import foamfit as ff
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
+sys.path[:0] = [str(HERE.parent / "recovery"), str(HERE.parent)]
+from truth import Microscale, Motion, Rig  # noqa: E402
+
 import studies  # noqa: E402
 
 NOISE = 0.005  # of the range
-BISECTIONS = 60
 
 
 @dataclass(frozen=True)
@@ -53,37 +53,6 @@ class Curves:
 
 
 # ---------------------------------------------------------------- laws that are not the fitted one
-
-
-def microscale(time_: np.ndarray, strain: np.ndarray) -> np.ndarray:
-    """Stress of a spring of log-normal snap stresses with one relaxation, sample by sample."""
-    k0, kc, eps_star = 5.5e5, 2.5e5, 0.08
-    plus, spread_plus, minus, spread_minus = 1.3e5, 0.4, 5.5e4, 0.77
-    g, tau = 0.5, 0.2
-    p, q, before, out = 0.0, 0.0, 0.0, []
-
-    def state(stress: float, p: float) -> tuple[float, float]:
-        """Strain, and the fraction that is snapped."""
-        up = down = 0.0
-        if stress > 0.0:
-            up = ndtr(np.log(stress / plus) / spread_plus)
-            down = max(up, ndtr(np.log(stress / minus) / spread_minus))
-        p = min(max(p, up), down)
-        return (1 - p) * stress / (k0 + stress) + p * (eps_star + stress / (kc + stress)), p
-
-    for i, eps in enumerate(strain):
-        low, high = -0.5 * k0, 1e8
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if state(middle, p)[0] < eps else (low, middle)
-        p = state(middle, p)[1]
-        if i:
-            step = time_[i] - time_[i - 1]
-            left = np.exp(-step / tau)
-            q = q * left + g * tau * (1.0 - left) / step * (middle - before)
-        before = middle
-        out.append(middle + q)
-    return np.array(out)
 
 
 SPRING = ff.BistableSpring(
@@ -142,9 +111,13 @@ def curves(kind: str) -> Curves:
     """The test of one kind, without noise."""
     if kind == "microscale and relaxation":
         height, area = 10e-3, 4.6e-5
-        time_ = np.linspace(0.0, 5.0, 1000)[:930]
-        strain = 0.5 * (1.0 - np.abs(2.0 * time_ / 5.0 - 1.0))
-        return Curves(time_, microscale(time_, strain), strain * height, height, area)
+        clock = np.linspace(0.0, 5.0, 1000)
+        turn, most = clock[499:501], 2e-3 * clock[499]  # the samples beside the turn
+        motion = Motion((0.0, *turn, 5.0), (0.0, most, most, 0.0), ("line",) * 3)
+        foam = Microscale(5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77, terms=((0.5, 0.2),))
+        course = Rig((foam,), (height,), area, motion=motion).run(0.0, 5.0)
+        clock = clock[:930]
+        return Curves(clock, course.stress(clock), course.top(clock, False), height, area)
     if kind == "rounded kinks":
         return impact(width=0.03, rate=0.0)
     if kind == "rate effect":

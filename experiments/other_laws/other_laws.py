@@ -87,11 +87,6 @@ TESTS = (
 )
 SHOWN = ("turbo-comp-1", "outplane-4s-1", "tpu87-20 cycle 10", "test_1_impact")
 VELOCITY = {"test_1_impact": 0.785, "test_3_impact": 0.905}  # m/s
-LATTICE_COLUMNS = """\
-time = { column = "Total Time (s)" }
-displacement = { column = "Position(Linear:Position) (mm)", counts_down = true }
-force = { column = "Force(Linear:Load) (kN)", scale = -1 }
-cycle = { column = "Total Cycles" }"""
 
 
 # ------------------------------------------------------------------------------- the tests
@@ -114,7 +109,7 @@ def read(group: str, name: str, data: Path, folder: Path) -> Measurement:
     elif group == LATTICE:
         stem, _, number = name.split()
         path, cycle = data / "lattice-cycles" / f"{stem}_raw.csv", int(number)
-        studies.write_specimen(toml, "12 mm", "20 mm", LATTICE_COLUMNS)
+        studies.write_specimen(toml, "12 mm", "20 mm", studies.LATTICE)
     else:
         path = data / "cartilage-impact" / f"{name}.csv"
         studies.write_specimen(toml, "0.563 mm", "8.5 mm", "")

@@ -34,7 +34,7 @@ from foamfit.springs.published import PublishedSet
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 import studies  # noqa: E402
-from studies import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION  # noqa: E402
+from studies import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILION  # noqa: E402
 
 Array = NDArray[np.float64]
 
@@ -415,35 +415,6 @@ def draw_oscillation(drive: Drive, needed: float, path: Path) -> None:
         axes[3].legend(loc="upper left")
 
 
-def draw_literal(drive: Drive, path: Path) -> None:
-    """Displacement by the literal reading, and its error when the drive is played slower."""
-    heavy = "7 g, η = 0", {"color": VERMILION}
-    damped = "7 g, η = 10⁴ Pa·s", {"color": PURPLE}
-    with studies.sheet(path, 7.0, 2.8) as figure:
-        left, right = figure.subplots(1, 2)
-        for mass, damper, (name, style) in (
-            (STRIKER, 0.0, heavy),
-            (STRIKER, ETA, damped),
-            (OWN_MASS, 0.0, ("5.56 mg, η = 0", {"color": SKY})),
-            (0.0, 0.0, ("equilibrium", {"color": BLACK, "ls": "--"})),
-        ):
-            got = driven(drive, mass, damper)
-            left.plot(1e3 * drive.time, 1e3 * got.displacement[-1], label=name, **style)
-        left.set(xlabel="time (ms)", ylabel="displacement (mm)")
-        left.set(title="(a) the same stress history in real time")
-        left.set_ylim(top=0.68)
-        left.legend(loc="upper left", ncols=2, columnspacing=1.0, handlelength=1.6)
-        factors = np.geomspace(1.0, 1000.0, 25)
-        for damper, marker, (name, style) in ((0.0, "o", heavy), (ETA, "s", damped)):
-            errors = [slowed(drive, damper, s) for s in factors]
-            right.loglog(factors, errors, marker=marker, ms=3, lw=0.9, label=name, **style)
-        mark(right, math.sqrt(STRIKER / OWN_MASS), "= 5.56 mg\nin real time")
-        right.set(xlabel="how many times slower the drive is played (–)")
-        right.set(ylabel="RMS displacement error (% of peak)")
-        right.set(title="(b) 7 g under a slowed drive")
-        right.legend(loc="upper right")
-
-
 def draw_energy(path: Path) -> None:
     """Published loops and how far the published impact goes; energy lost over velocity."""
     with studies.sheet(path, 7.0, 2.9) as figure:
@@ -491,7 +462,6 @@ def main() -> None:
     studies.arguments(__doc__).parse_args()
     drive = drive_of_impact()
     draw_oscillation(drive, damper_needed(drive), HERE / "oscillation.png")
-    draw_literal(drive, HERE / "literal.png")
     draw_energy(HERE / "energy.png")
     page = (HERE / "page.template.md").read_text(encoding="utf-8")
     values = of_oscillation() | of_literal() | of_ratios() | of_energy() | of_microscale()

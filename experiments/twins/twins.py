@@ -240,7 +240,7 @@ def draw(changes: pd.DataFrame, measured: Loops, path: Path) -> None:
         right.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
         right.set_yticks(range(len(order)), [name.removeprefix("s1_") for name in order])
         right.set(xlabel="worn over new, less one (%)", title="changes with 95 % intervals")
-        right.legend(loc="lower right")
+        right.legend(loc="upper right")
         figure.suptitle(
             f"Running-shoe foam, new heel against worn. {SOURCE}", x=0.01, ha="left", fontsize=8
         )

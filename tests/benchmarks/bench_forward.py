@@ -59,12 +59,15 @@ def test_impact(benchmark: Any, name: str, way: str) -> None:
 
 
 @pytest.mark.parametrize("count", SIZES)
-@pytest.mark.parametrize("drive", ["stress", "impact"])
+@pytest.mark.parametrize("drive", ["stress", "displacement", "impact"])
 def test_springs(benchmark: Any, drive: str, count: int) -> None:
     benchmark.group = f"springs, {drive}"
     t = np.linspace(0.0, kinds.LENGTH, kinds.SAMPLES)
-    load = kinds.loop(kinds.MODEL_2.bistable, t.size, True)
-    given = ff.StressDrive(load) if drive == "stress" else ff.Impact(kinds.MASS, 2.2)
+    load = kinds.loop(kinds.MODEL_2.bistable, t.size, drive == "stress")
+    given = {
+        "stress": ff.StressDrive(load), "displacement": ff.DisplacementDrive(kinds.HEIGHT * load),
+        "impact": ff.Impact(kinds.MASS, 2.2),
+    }[drive]  # fmt: skip
     run = kernel(kinds.graded(count), given, t)
     run()
     benchmark.pedantic(run, rounds=3 if count == 1000 else 20)
