@@ -54,11 +54,8 @@ def make_tests(folder: Path, count: int, samples: int, linear: bool = False) -> 
     rng = np.random.default_rng(0)
     for i in range(count):
         s, u = (c + 0.01 * np.ptp(c) * rng.standard_normal(samples) for c in curves)
-        rows = "\n".join(
-            f"{1e3 * a:.6f},{1e-6 * b:.6f},{1e3 * c:.6f}" for a, b, c in zip(t, s, u, strict=True)
-        )
-        text = f"time (ms),stress (MPa),displacement (mm)\n{rows}\n"
-        (folder / f"t{i:05d}.csv").write_text(text)
+        columns = {"time": t.round(9), "stress": s.round(), "displacement": u.round(9)}
+        studies.write_test(folder / f"t{i:05d}.csv", **columns)
     (folder.parent / "foam.toml").write_text(TOML)
 
 

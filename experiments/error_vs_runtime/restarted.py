@@ -380,21 +380,16 @@ def _root(gap: Callable[[float], float], low: float, high: float) -> float:
     return float(brentq(gap, low, high, xtol=TINY * high, rtol=TINY))
 
 
-def along(
-    solver: Any, points: np.ndarray, done: int, out: np.ndarray, sense: float = 1.0
-) -> tuple[int, np.ndarray]:
+def along(solver: Any, points: np.ndarray, done: int, out: np.ndarray) -> tuple[int, np.ndarray]:
     """Step a solver to its end; fills `out` at the points from `done` on that it passes.
 
     Returns how many points are done, and the last state.
     """
-    start = solver.t
     while solver.status == "running":
         message = solver.step()
         if solver.status == "failed":
             raise RuntimeError(f"{type(solver).__name__}: {message}")
-        ahead = points[done:]
-        rest = (sense * (solver.t - ahead) >= 0.0) & (sense * (ahead - start) >= 0.0)
-        last = done + (rest.size if rest.all() else int(rest.argmin()))
+        last = int(np.searchsorted(points, solver.t, side="right"))
         if last > done:
             out[done:last] = solver.dense_output()(points[done:last])[0]
             done = last

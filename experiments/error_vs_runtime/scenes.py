@@ -88,40 +88,21 @@ def scenes() -> list[Scene]:
     """Return all scenes, the small ones first."""
     t = np.linspace(0.0, LENGTH, SAMPLES)
     spring = MODEL_2.bistable
-    damped = ff.BistableSpring(*spring.seven, eta=50.0)
     one = ff.Chain([spring], [HEIGHT], AREA)
     two = MODEL_3.chain
-    bare = ff.Chain(two.springs, two.heights, AREA, site_damping=two.site_damping)
     rtol = tuple(10.0**-k for k in range(5, 11))
     return [
         Scene("one_spring_impact", "one spring, impact at 2.0 m/s", one, ff.Impact(MASS, 2.0), t),
-        Scene(
-            "one_spring_impact_damped", "one spring with a dashpot of 50 Pa·s, impact at 2.0 m/s",
-            ff.Chain([damped], [HEIGHT], AREA), ff.Impact(MASS, 2.0), t,
-        ),
-        Scene(
-            "two_springs_impact", "two springs, onsite damper, impact at 2.3 m/s", bare,
-            ff.Impact(MASS, 2.3), t,
-        ),
         Scene(
             "two_springs_mass_impact",
             "two springs with the specimen's mass between, onsite damper, impact at 2.3 m/s", two,
             ff.Impact(MASS, 2.3), t, outside=tuple(10.0**-k for k in range(3, 12)), longest=1.0,
         ),
         Scene(
-            "10_springs_impact", "10 springs, impact at 2.2 m/s", graded(10),
-            ff.Impact(MASS, 2.2), t,
-        ),
-        Scene(
             "10_springs_mass_impact",
             "10 springs with dashpots of 2 Pa·s and 9 masses between, impact at 2.2 m/s",
             graded(10, MODEL_2.specimen_mass, 2.0), ff.Impact(MASS, 2.2), t,
             outside=rtol, looks=4, longest=0.6,
-        ),
-        Scene(
-            "100_springs_impact", "100 springs, impact at 2.2 m/s", graded(100),
-            ff.Impact(MASS, 2.2), t, own=(1e-3, 1e-6, 1e-9, 1e-12), outside=rtol, longest=0.5,
-            looks=4,
         ),
         Scene(
             "1000_springs_impact", "1000 springs, impact at 2.2 m/s", graded(1000),

@@ -12,7 +12,6 @@ hundredth of its standard error and anything else within 1e-3. What differs is l
 
 from __future__ import annotations
 
-import argparse
 import csv
 import math
 import sys
@@ -26,8 +25,10 @@ import foamfit as ff
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
-sys.path.insert(0, str(ROOT / "recovery"))
+sys.path[:0] = [str(ROOT / "recovery"), str(ROOT)]
 from rig import Impact, Slow, impact, slow, write  # noqa: E402
+
+import studies  # noqa: E402
 
 Row = tuple[str, str, str]  # result, quantity, value
 FILE = HERE / "frozen.csv"
@@ -57,20 +58,8 @@ FITS = {  # reconstruction, model, drive
     "foam-2/4.5mps": ("linear+bistable", "impact"),
     "foam-2/4.44mps": ("microscale", "displacement"),
 }
-JOINT = """name = "synthetic loops"
-tests = ["loop-*.csv"]
-model = "microscale"
-drive = "displacement"
-
-[parameters]
-s1_k0 = "shared"
-s1_kc = "shared"
-s1_eps_star = "shared"
-s1_spread_plus = "shared"
-s1_sigma_minus = "shared"
-s1_spread_minus = "shared"
-s1_sigma_plus = "scatter"
-"""
+SHARED = ("k0", "kc", "eps_star", "spread_plus", "sigma_minus", "spread_minus")
+KINDS = dict.fromkeys(SHARED, "shared") | {"sigma_plus": "scatter"}
 
 
 def of_fit(name: str, result: ff.FitResult) -> Iterator[Row]:
@@ -138,16 +127,12 @@ def together(folder: Path) -> Iterator[Row]:
         stress = ff.simulate(ff.Chain([spring], [1e-2], 1e-4), ff.DisplacementDrive(moved), time)
         noisy = stress.base_stress + 300.0 * rng.standard_normal(time.size)
         path = folder / (f"loop-{i}.csv" if i < 3 else "other.csv")
-        rows = zip(time, moved * 1e3, noisy / 1e3, strict=True)
-        lines = [
-            "time (s),displacement (mm),stress (kPa)",
-            *(f"{t:.9g},{w:.9g},{s:.9g}" for t, w, s in rows),
-        ]
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         text = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n[noise]\nstress = "300 Pa"\n'
-        path.with_suffix(".toml").write_text(text, encoding="utf-8")
-    (folder / "STUDY.toml").write_text(JOINT, encoding="utf-8")
-    found = ff.joint(folder / "STUDY.toml", jobs=1)
+        studies.write_test(path, text, time=time, stress=noisy, displacement=moved)
+    study = studies.write_study(
+        folder / "STUDY.toml", ["loop-*.csv"], "microscale", KINDS, drive="displacement"
+    )
+    found = ff.joint(study, jobs=1)
     for name, one in found.parameters.items():
         yield "joint", f"{name} value", repr(float(one.value))
         if one.ci95 is not None:
@@ -182,7 +167,7 @@ def changed(before: dict[tuple[str, str], str], now: dict[tuple[str, str], str])
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = studies.arguments(__doc__)
     parser.add_argument("--renew", action="store_true")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:

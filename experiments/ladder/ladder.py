@@ -189,19 +189,6 @@ def structure_table(table: pd.DataFrame) -> str:
     return studies.markdown(head, rows)
 
 
-def wrong_sentences(table: pd.DataFrame) -> str:
-    wrong = table[table["clear"] & ~table["found"]]
-    if wrong.empty:
-        return "No clear test is taken for another structure."
-    told = (
-        "- {structure} (case {case}) for {chosen}: the simpler models miss by "
-        "{misfit of simpler over noise:.2f} times the noise; runs test p = {runs p:.2g}, "
-        "neighbours test p = {lag p:.2g}, {ended}"
-    )
-    lines = [told.format(**row) for row in wrong.to_dict("records")]
-    return "\n".join(["Clear tests that are taken for another structure:", "", *lines])
-
-
 def confusion(table: pd.DataFrame) -> str:
     """Counts of chosen against true structure, of all tests."""
     counts = pd.crosstab(table["structure"], table["chosen"]).reset_index()
@@ -216,7 +203,7 @@ def write_page(folder: Path) -> None:
         HERE, out=folder, machine=studies.circumstances(), samples=SAMPLES,
         damping=100 * CLEAR_DAMPING, misfit=CLEAR_MISFIT, structures=structure_table(table),
         found=int(clear["found"].sum()), clear=len(clear), rate=100 * clear["found"].mean(),
-        wrong=wrong_sentences(table), confusion=confusion(table),
+        confusion=confusion(table),
     )  # fmt: skip
     print(structure_table(table))
     print(f"{clear['found'].sum()} of {len(clear)} clear tests found")

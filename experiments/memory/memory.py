@@ -222,13 +222,11 @@ def main(fresh: bool) -> None:
     data = studies.measurements("shoe-foam", "shoe-foam-twins")
     study(data, Table(fresh))
     table, values = pd.read_csv(TABLE), pd.read_csv(PARAMETERS)
-    page = (HERE / "page.template.md").read_text(encoding="utf-8")
-    text = page.format(
-        source=real_foams.SOURCE, summary=summary(table), specimens=per_specimen(table),
+    studies.write_page(
+        HERE, source=real_foams.SOURCE, summary=summary(table), specimens=per_specimen(table),
         values=values_table(values), inside=coverage(table), seconds=seconds(table),
         verified=coverage(table, chosen=False),
     )  # fmt: skip
-    (HERE / "README.md").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

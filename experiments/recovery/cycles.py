@@ -1,19 +1,20 @@
 """Do the intervals hold where springs remember, on records of three cycles?
 
-A synthetic foam is a row of discrete micro-springs (model.md, section 8), each with a flag "has
-snapped once", and one relaxation term; a machine comes from before contact, with zeros of its own,
-and presses it three times without leaving it. Nothing of this comes from foamfit: the stress at a
-strain is found by bisection over the row. Each record goes the way of a user: a CSV with noise on
+Method. A synthetic foam is a row of discrete micro-springs (model.md, section 8), each with a flag
+"has snapped once", and one relaxation term; a machine comes from before contact, with zeros of its
+own, and presses it three times without leaving it. Nothing of this comes from foamfit: the stress
+at a strain is found by bisection over the row. Each record goes the way of a user: a CSV with noise on
 force and motion, `foamfit.read_test` with `cycles=(1, 3)`, `foamfit.fit` with stiffening and the
 Mullins effect. It counts the 95 % intervals that hold the truth, and the determined values that lie
 further outside than their interval is wide ("far").
+
+Answer. 92.2 % of 477 intervals hold the truth, no value lies far outside: README.md.
 
     python experiments/recovery/cycles.py --tests 50 --raw rows.csv     # resumable; 15 s a test
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import tempfile
 import time
@@ -23,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from rig import draw_microscale
-from rigs import JOB, Row, run, sentence, share
+from rigs import JOB, Row, percents, run, sentence, studies
 from scipy.optimize import minimize_scalar
 from scipy.special import ndtri
 from truth import Array
@@ -180,17 +181,15 @@ def run_test(family: str, name: str, seed: int) -> list[Row]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tests", type=int, default=50)
+    parser = studies.arguments(__doc__, tests=50, jobs=(1, "processes"))
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--raw", type=Path, help="rows of all tests; resumed")
-    parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
     seeds = range(options.first_seed, options.first_seed + options.tests)
     rows = run(run_test, [("memory", "three cycles", s) for s in seeds], options.raw, options.jobs)
     given = rows[rows["low"].notna()]
     for name, group in [*given.groupby("parameter", sort=False), ("all", given)]:
-        holds, low, high = share(group["holds"])
+        holds, low, high = percents(group["holds"])
         told = f"{holds:.1f} % ({low:.1f} to {high:.1f}) of {len(group)}, far {group['far'].sum()}"
         print(f"{name:16} {told}")
     print("states:", rows["state"].value_counts().to_dict())

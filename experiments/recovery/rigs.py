@@ -1,12 +1,14 @@
 """Do the 95 % intervals hold on records as rigs write them?
 
-`rig` makes synthetic impacts, recorded by an oscilloscope from before the contact, and synthetic
-slow tests, whose motion drives the fit and has noise. Each record goes the way of a user: a CSV and
+Method. `rig` makes synthetic impacts, recorded by an oscilloscope from before the contact, and
+synthetic slow tests, whose motion drives the fit and has noise. Each goes the way of a user: a CSV,
 its TOML, `foamfit.read_test`, the defaults of `foamfit.fit`. A row for each parameter keeps truth
 and interval; a test that cannot be read or fitted is a row with its sentence. Intervals of the
 springs' parameters are counted, those of contact time, zero, velocity and mass apart. A value is
 far if it is called determined and its interval misses the truth by more than its own width. The
 search has missed the minimum of a slow test where the true springs follow its stress better.
+
+Answer. They hold in 94.7 % of impacts and of slow tests of one spring, in 91.7 % of two: README.md.
 
 With `--invariance` each impact is written several ways: with another zero of the motion, another
 clock, fewer rows before contact. The moves of its parameters are counted in standard errors.
@@ -18,8 +20,6 @@ clock, fewer rows before contact. The moves of its parameters are counted in sta
 
 from __future__ import annotations
 
-import argparse
-import platform
 import re
 import sys
 import tempfile
@@ -35,13 +35,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from rig import Impact, Record, Slow, impact, slow, write
-from scipy.stats import binomtest
 from truth import Bistable, Rig
 
 import foamfit as ff
 from foamfit.errors import InputError, SimulationError
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+import studies  # noqa: E402
+
 Row = dict[str, Any]
 Job = tuple[str, str, int]
 JOB = ["family", "class", "test"]
@@ -248,6 +250,13 @@ def run(
     return rows[[job in asked for job in zip(*(rows[key] for key in JOB), strict=True)]]
 
 
+def percents(held: pd.Series) -> list[float]:
+    """Per cent of what holds, and its binomial 95 % interval."""
+    if not len(held):
+        return [np.nan] * 3
+    return [100.0 * part for part in studies.share(held.astype(bool).tolist()).values()]
+
+
 def coverage(rows: pd.DataFrame, by: str) -> pd.DataFrame:
     """Count the intervals that hold, for each value of a column and for all together."""
     fits = rows[rows["parameter"].notna()]
@@ -257,7 +266,7 @@ def coverage(rows: pd.DataFrame, by: str) -> pd.DataFrame:
         mine = fits.loc[fits.index.intersection(group.index)]
         springs, zeros = mine[own.loc[mine.index]], mine[~own.loc[mine.index]]
         given, known = springs[springs["low"].notna()], zeros[zeros["low"].notna()]
-        holds, low, high = share(given["holds"])
+        holds, low, high = percents(given["holds"])
         missed = given["over truth"] > MISSED
         each = group.drop_duplicates(JOB)
         out.append(
@@ -271,9 +280,9 @@ def coverage(rows: pd.DataFrame, by: str) -> pd.DataFrame:
                 "to %": high,
                 "far": int(given["far"].sum()),
                 "missed": int((each["over truth"] > MISSED).sum()),
-                "others hold %": share(given["holds"][~missed])[0],
+                "others hold %": percents(given["holds"][~missed])[0],
                 "not determined": int((springs["state"] == "not determined").sum()),
-                "zeros etc. hold %": share(known["holds"])[0],
+                "zeros etc. hold %": percents(known["holds"])[0],
                 "zeros etc. far": int(known["far"].sum()),
                 "warned": int((each["status"] == "warnings").sum()),
                 "seconds": each["seconds"].median(),
@@ -302,15 +311,6 @@ def moves(rows: pd.DataFrame, by: str) -> pd.DataFrame:
     return pd.DataFrame(out)
 
 
-def share(held: pd.Series) -> tuple[float, float, float]:
-    """Per cent of what holds, and its binomial 95 % interval."""
-    if not len(held):
-        return np.nan, np.nan, np.nan
-    held = held.astype(bool)
-    error = binomtest(int(held.sum()), len(held)).proportion_ci(method="wilson")
-    return 100.0 * held.mean(), 100.0 * error.low, 100.0 * error.high
-
-
 def tell(rows: pd.DataFrame, invariance: bool) -> pd.DataFrame:
     """Print the tables and the failures; return the table of classes."""
     count = moves if invariance else coverage
@@ -328,15 +328,13 @@ def tell(rows: pd.DataFrame, invariance: bool) -> pd.DataFrame:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = studies.arguments(__doc__, tests=200, jobs=(1, "processes"))
     parser.add_argument("--family", choices=[*FAMILIES], help="by default both")
     parser.add_argument("--classes", default="", help="a pattern that names of classes begin with")
-    parser.add_argument("--tests", type=int, default=200)
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--invariance", action="store_true", help="impacts written several ways")
     parser.add_argument("--raw", type=Path, help="rows of all tests; resumed")
     parser.add_argument("--out", type=Path, help="the table of classes")
-    parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
     families = [options.family] if options.family else list(FAMILIES)
     families = ["impact"] if options.invariance else families
@@ -351,7 +349,7 @@ def main() -> None:
     table = tell(rows, options.invariance)
     if options.out is not None:
         table.to_csv(options.out, index=False, float_format="%.4g")
-    print(f"foamfit {ff.__version__}, Python {platform.python_version()}, {platform.machine()}")
+    print(studies.circumstances())
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
 from functools import cache, partial
@@ -69,11 +69,8 @@ Spec = dict[str, Any]
 
 SEED = 2027
 RTOLS = (1e-4, 1e-6, 1e-8)
-MOST = {"study": 4_000_000, "base": 10_000_000, "gap": 4_000_000, "turns": 4_000_000,
-        "long": 20_000_000, "microscale": 4_000_000, "relaxation": 4_000_000,
-        "microscale+relaxation": 4_000_000, "mixed": 4_000_000, "motion": 0,
-        "motion+relaxation": 4_000_000, "worn": 4_000_000, "worn+relaxation": 4_000_000,
-        "worn chain": 4_000_000, "worn motion": 4_000_000}  # fmt: skip
+MOST = {"base": 10_000_000, "long": 20_000_000}  # steps times springs of the judge
+USUAL_MOST = 4_000_000
 BAD, POOR = 3.0, 1.0  # error over rtol
 SLOPE_BAR = 1e-3  # error of a derivative over its range, at an rtol of up to 1e-5
 
@@ -676,7 +673,7 @@ def lines_of(
 ) -> list[dict[str, Any]]:
     """Answer and judge a scene at each rtol; `most` bounds the judge's steps times springs."""
     family, number, rtols = task
-    spec, most = spec_of(family, number), most or MOST[family]
+    spec, most = spec_of(family, number), most or MOST.get(family, USUAL_MOST)
     scene = scene_from(spec)
     began = time.perf_counter()
     truth = judge(*scene, most, follower(scene, spec))
@@ -776,17 +773,6 @@ def wrong(lines: pd.DataFrame) -> pd.DataFrame:
     return lines[(lines.error > POOR) | (lines.slope > np.maximum(SLOPE_BAR, 100.0 * lines.rtol))]
 
 
-def run(
-    tasks: list[tuple[str, int, tuple[float, ...]]], processes: int
-) -> Iterator[list[dict[str, Any]]]:
-    """Judge scenes, in as many processes."""
-    if processes == 1:
-        yield from map(lines_of, tasks)
-        return
-    with ProcessPoolExecutor(processes) as pool:
-        yield from pool.map(lines_of, tasks, chunksize=4)
-
-
 # ---------------------------------------------------------------------------------------- the page
 
 
@@ -846,7 +832,7 @@ def main() -> None:
         done = {line["scene"] for line in lines}
         tasks = [task for task in tasks if f"{task[0]}:{task[1]}" not in done]
     compile_all(tuple(dict.fromkeys(family for family, *_ in tasks)))
-    for found in run(tasks, given.processes):
+    for found in ProcessPoolExecutor(given.processes).map(lines_of, tasks, chunksize=4):
         lines += found
         if len(lines) % (50 * len(rtols)) == 0:
             print(f"{len(lines) // len(rtols)} scenes", file=sys.stderr, flush=True)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from independent import Array, Truth
-from mpmath import exp, inf, log, mp, mpf, ncdf, sqrt
+from mpmath import exp, findroot, inf, log, mp, mpf, ncdf, sqrt
 
 DIGITS = 30
 
@@ -106,10 +106,7 @@ def _spring(spring: Any) -> _Linear:
 
 
 def _root(springs: list[_Linear], heights: list[Any], top: Any, s: Any) -> Any:
-    """Stress at which the elongations add up: Illinois steps inside a bracket, from the last one.
-
-    A step of another kind every third time halves the bracket.
-    """
+    """Stress at which the elongations add up, by bisection of a bracket about the last one."""
 
     def miss(at: Any) -> Any:
         return sum(h * p.strain(at) for h, p in zip(heights, springs, strict=True)) - top
@@ -132,25 +129,8 @@ def _root(springs: list[_Linear], heights: list[Any], top: Any, s: Any) -> Any:
             low = max(low - step, (low + floor) / 2) if low > floor else low - step
             low_miss = miss(low)
         step *= 2
-    close = mpf(10) ** (2 - DIGITS)
-    for n in range(400):
-        if high - low <= close * max(abs(low), abs(high)):
-            break
-        at = (
-            (low + high) / 2
-            if n % 3 == 2
-            else low - low_miss * (high - low) / (high_miss - low_miss)
-        )
-        if not low < at < high:
-            at = (low + high) / 2
-        found = miss(at)
-        if found == 0:
-            return at
-        if found < 0:
-            low, low_miss = at, found
-        else:
-            high, high_miss = at, found
-    return (low + high) / 2
+    close = mpf(10) ** (2 - DIGITS) * max(abs(low), abs(high))
+    return findroot(miss, (low, high), solver="bisect", tol=close, maxsteps=400, verify=False)
 
 
 def follow(chain: Any, drive: Any, time: Array, tol: float = 0.0, most: int = 0) -> Truth:
