@@ -9,7 +9,6 @@ are the study's own: each case draws from `numpy.random.default_rng([seed, ..., 
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import platform
 import sys
@@ -209,9 +208,8 @@ def write_study(
 
 def twins(data: Path) -> Iterator[tuple[str, str, str]]:
     """Name, height and diameter of each specimen of shoe-foam-twins/."""
-    with (data / "specimens.csv").open(encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            yield row["test"], f"{row['height_mm']} mm", f"{row['diameter_mm']} mm"
+    for row in pd.read_csv(data / "specimens.csv", dtype=str).itertuples():
+        yield row.test, f"{row.height_mm} mm", f"{row.diameter_mm} mm"
 
 
 def place_twins(data: Path, folder: Path) -> None:

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 import foamfit as ff
 from foamfit.study.batch_work import Recipe, Task, fingerprint, put, settings_key, stored, work
@@ -89,13 +90,6 @@ def called(place: Path, *words: object) -> dict[str, float]:
     }
 
 
-def runtimes(folder: Path) -> float:
-    """Sum of the run times of all fits, s."""
-    import pandas as pd
-
-    return float(pd.read_csv(folder / "summary.csv")["runtime_s"].sum())
-
-
 def measure_speedup(place: Path, *words: str) -> dict[str, Any]:
     """One process against two; the same numbers from both.
 
@@ -154,7 +148,7 @@ def measure_overhead(place: Path) -> dict[str, Any]:
         "fit_ms": 1e3 * spent[1] / count,
         "beside_ms": 1e3 * (spent[0] - spent[1]) / count,
         "whole command, beside its fits, per test, start included (clock, ms)": 1e3
-        * (out["wall_s"] - runtimes(place / "whole"))
+        * (out["wall_s"] - pd.read_csv(place / "whole" / "summary.csv")["runtime_s"].sum())
         / TINY,
     }
 

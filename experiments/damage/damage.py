@@ -149,39 +149,20 @@ def lattice_told(table: pd.DataFrame) -> str:
             f"- From cycle {first} to {last} the peak stress changes by a factor of {peak:.2f}, "
             f"the dissipated energy by {loss:.2f} (mean of three lattices)."
         )
-    last = table[table["cycle"] == 1000].set_index("specimen")["start_strain"]
-    gone = ", ".join(f"{100 * value:.1f} % ({name})" for name, value in last.items())
-    lines.append(f"- At cycle 1000 contact starts at a strain of {gone}, and it still rises.")
-    lines.append(
-        "- Cycle 1 starts under the preload of the machine (20 N), which no law that starts at "
-        "zero stress follows: hence its larger misfit."
-    )
     return "\n".join(lines)
 
 
-def draw_lattices(table: pd.DataFrame, found: dict[str, ff.CycleFits]) -> None:
+def draw_lattices(found: dict[str, ff.CycleFits]) -> None:
     colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, len(LATTICE_CYCLES)))
-    with studies.sheet(HERE / "lattice.png", 7.4, 3.9, DPI) as figure:
-        axes = figure.subplots(2, 3)
-        for ax, (name, one) in zip(axes[0], found.items(), strict=True):
+    with studies.sheet(HERE / "lattice.png", 7.4, 2.3, DPI) as figure:
+        axes = figure.subplots(1, 3)
+        for ax, (name, one) in zip(axes, found.items(), strict=True):
             for (cycle, result), colour in zip(sorted(one.results.items()), colours, strict=True):
                 m = result.measurement
                 strain = m.displacement / m.specimen.height + m.start_strain
                 ax.plot(strain, m.stress / 1e3, color=colour, linewidth=0.8, label=f"cycle {cycle}")
             ax.set(title=name, xlabel="strain from the first contact", ylabel="stress (kPa)")
-        axes[0, 0].legend(fontsize=6)
-        shown = {
-            "start_strain": ("start strain (%)", 100.0, False),
-            "peak_stress": ("peak stress over cycle 1", 1.0, True),
-            "dissipated_energy": ("dissipated energy over cycle 1", 1.0, True),
-        }
-        for ax, (column, (title, scale, relative)) in zip(axes[1], shown.items(), strict=True):
-            for name, group in table.groupby("specimen"):
-                values = scale * group[column].to_numpy()
-                values = values / values[0] if relative else values
-                ax.plot(group["cycle"], values, "o-", markersize=3, linewidth=0.8, label=name)
-            ax.set(title=title, xlabel="cycle", xscale="log")
-        axes[1, 0].legend(fontsize=6)
+        axes[0].legend(fontsize=6)
 
 
 def main() -> None:
@@ -193,7 +174,7 @@ def main() -> None:
         twins = fit_twins(data, toml)
     studies.write_csv(twins, HERE / "twins.csv", 6)
     studies.write_csv(lattices, HERE / "lattice.csv", 6)
-    draw_lattices(lattices, found)
+    draw_lattices(found)
     studies.write_page(
         HERE, "damage.md", twins=twin_table(twins), told=twins_told(twins),
         lattice=lattice_table(lattices), lattice_told=lattice_told(lattices),

@@ -41,10 +41,11 @@ import tempfile
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import lmfit
 import numpy as np
@@ -111,15 +112,13 @@ class Case:
 
     def problem(self) -> Problem:
         """Read the test and make the problem ready, as `foamfit.fit` does."""
-        return make_problem(self.read(), self.model, self.drive, None, None, False)
-
-    def read(self) -> ff.Measurement:
-        """Read the test."""
         if self.specimen is None:
-            return ff.read_test(HERE.parent / self.file)
-        with tempfile.TemporaryDirectory() as folder:
-            toml = studies.write_specimen(Path(folder) / "specimen.toml", *self.specimen, "")
-            return ff.read_test(studies.measurements() / self.file, toml)
+            test = ff.read_test(HERE.parent / self.file)
+        else:
+            with tempfile.TemporaryDirectory() as folder:
+                toml = studies.write_specimen(Path(folder) / "specimen.toml", *self.specimen, "")
+                test = ff.read_test(studies.measurements() / self.file, toml)
+        return make_problem(test, self.model, self.drive, None, None, False)
 
 
 CASES = {
@@ -216,15 +215,12 @@ def recorded(recorder: Recorder) -> Iterator[None]:
         recorder.count()
         return out
 
-    Objective.residual = residual  # type: ignore[method-assign]
-    Objective.jacobian = jacobian  # type: ignore[method-assign]
-    try:
+    with (
+        suppress(RunOver),
+        patch.object(Objective, "residual", residual),
+        patch.object(Objective, "jacobian", jacobian),
+    ):
         yield
-    except RunOver:
-        pass
-    finally:
-        Objective.residual = plain  # type: ignore[method-assign]
-        Objective.jacobian = derivative  # type: ignore[method-assign]
 
 
 def run_own(case: Case, problem: Problem, seed: int) -> None:

@@ -16,10 +16,10 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE.parent / "recovery"), str(HERE.parent)]
@@ -40,16 +40,6 @@ RECORDS: dict[str, rig.Impact | rig.Slow] = {
     "slow test, microscale, 0.3 % noise": rig.Slow(rows=1000),
     "slow test, microscale with relaxation, 0.3 % noise": rig.Slow(relaxation=1, rows=1000),
 }
-
-
-@contextmanager
-def exact_motion() -> Iterator[None]:
-    """Take every motion for exact, as it was sampled."""
-    usual, curves.EXACT = curves.EXACT, 1.0
-    try:
-        yield
-    finally:
-        curves.EXACT = usual
 
 
 def timed(fit: Callable[[], Any]) -> float:
@@ -74,7 +64,7 @@ def pair(setup: rig.Impact | rig.Slow, seed: int) -> tuple[float, float]:
     keywords["drive"] = drive
     ff.fit(test, starts=1, **keywords)  # compiles
     own = timed(lambda: ff.fit(test, **keywords))
-    with exact_motion():
+    with patch.object(curves, "EXACT", 1.0):  # every motion is exact, as it was sampled
         return own, timed(lambda: ff.fit(test, params=held, **keywords))
 
 

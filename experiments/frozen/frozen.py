@@ -12,7 +12,6 @@ hundredth of its standard error and anything else within 1e-3. What differs is l
 
 from __future__ import annotations
 
-import csv
 import math
 import sys
 import tempfile
@@ -20,6 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 import foamfit as ff
 
@@ -128,7 +128,9 @@ def together(folder: Path) -> Iterator[Row]:
         noisy = stress.base_stress + 300.0 * rng.standard_normal(time.size)
         path = folder / (f"loop-{i}.csv" if i < 3 else "other.csv")
         text = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n[noise]\nstress = "300 Pa"\n'
-        studies.write_test(path, text, time=time, stress=noisy, displacement=moved)
+        table = {"time (s)": time, "displacement (mm)": 1e3 * moved, "stress (kPa)": noisy / 1e3}
+        pd.DataFrame(table).to_csv(path, index=False, float_format="%.9g")
+        path.with_suffix(".toml").write_text(text, encoding="utf-8")
     study = studies.write_study(
         folder / "STUDY.toml", ["loop-*.csv"], "microscale", KINDS, drive="displacement"
     )
@@ -173,13 +175,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as place:
         rows = [*simulations(), *fits(Path(place)), *together(Path(place))]
     if options.renew:
-        with FILE.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows(
-                [("result", "quantity", "value"), *rows]
-            )
+        pd.DataFrame(rows, columns=["result", "quantity", "value"]).to_csv(FILE, index=False)
         return 0
-    with FILE.open(newline="", encoding="utf-8") as file:
-        before = {(name, what): value for name, what, value in list(csv.reader(file))[1:]}
+    kept = pd.read_csv(FILE, dtype=str, keep_default_na=False).itertuples(index=False)
+    before = {(name, what): value for name, what, value in kept}
     now = {(name, what): value for name, what, value in rows}
     told = changed(before, now)
     print("\n".join(told) or f"All {len(now)} numbers are as they were.")

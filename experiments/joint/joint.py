@@ -14,12 +14,11 @@ white noise of 0.25 % of the largest stress, which the TOML states.
 Answer. Four tests have half the standard errors of one; intervals hold in 92 to 98 %: README.md.
 
     python experiments/joint/joint.py                 # all; writes joint.csv and joint.md
-    python experiments/joint/joint.py --only log --draws 20
+    python experiments/joint/joint.py --only log --draws 20 --out FOLDER
 """
 
 from __future__ import annotations
 
-import platform
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -135,31 +134,12 @@ def rates(draws: int, folder: Path, kind: str, slope: float) -> Iterator[Row]:
                "share": chosen.count(name) / draws}  # fmt: skip
 
 
-def table(frame: pd.DataFrame) -> str:
-    """The rows as markdown."""
-    rows = []
-    for row in frame.to_dict("records"):
-        given = {key for key, value in row.items() if not pd.isna(value)}
-        mean = f"{row['mean']:.3g}" if "mean" in given else ""
-        if "spread" in given:
-            mean += f" ± {row['spread']:.2f} standard errors"
-        share = f"{100 * row['share']:.0f} %" if "share" in given else ""
-        ends = f"{100 * row['low']:.0f} to {100 * row['high']:.0f} %" if "low" in given else ""
-        rows.append([row["study"], row["what"], row["draws"], mean, share, ends])
-    return studies.markdown("study | what | draws | mean | share | 95 % of the share", rows)
-
-
-def save(rows: list[Row], folder: Path) -> None:
-    """Write joint.csv and joint.md; of studies that were not run now the older rows stay."""
-    path, columns = folder / "joint.csv", "study what draws mean spread share low high"
-    frame = pd.DataFrame(rows).reindex(columns=columns.split())
-    if path.is_file():
-        older = pd.read_csv(path)
-        frame = pd.concat([older[~older["study"].isin(frame["study"])], frame])
-    frame.to_csv(path, index=False, lineterminator="\n")
-    machine = f"{platform.machine()}, Python {platform.python_version()}"
-    (folder / "joint.md").write_text(f"{table(frame)}\n\n{machine}\n")
-    print(table(frame))
+def write(frame: pd.DataFrame, folder: Path) -> None:
+    """Write joint.csv and joint.md."""
+    frame.to_csv(folder / "joint.csv", index=False, lineterminator="\n")
+    table = studies.shown(frame)
+    (folder / "joint.md").write_text(f"{table}\n\n{studies.circumstances()}\n", encoding="utf-8")
+    print(table)
 
 
 STUDIES: dict[str, tuple[Any, int, tuple[Any, ...]]] = {  # maker, draws, each with one of these
@@ -183,7 +163,7 @@ def main() -> None:
                 for row in maker(count, place, *case):
                     rows.append(row)
                     print(row, flush=True)
-    save(rows, given.out)
+    write(pd.DataFrame(rows), given.out)
 
 
 if __name__ == "__main__":

@@ -160,21 +160,19 @@ def read(kind: str, draw: int | None) -> ff.Measurement:
         return ff.read_test(studies.write_test(Path(folder) / "test.csv", toml, **columns))
 
 
-def draws_of(kind: str, draws: int, raw: Path | None) -> pd.DataFrame:
-    """A row for each parameter and draw; `raw` is gone on with."""
-    rows = pd.read_csv(raw) if raw is not None and raw.exists() else pd.DataFrame()
-    done = set(rows.loc[rows["kind"] == kind, "draw"]) if len(rows) else set()
+def draws_of(kind: str, draws: int) -> pd.DataFrame:
+    """A row for each parameter and draw."""
+    rows = list[dict[str, Any]]()
     without = ff.fit(read(kind, None))
-    for draw in sorted(set(range(draws)) - done):
+    for draw in range(draws):
         began = time.perf_counter()
         result = ff.fit(read(kind, draw))
         seconds = time.perf_counter() - began
         found = any(item["law_error"] is not None for item in result.noise.values())
-        new = []
         for name, item in result.parameters.items():
             if item.vary:
                 low, high = item.ci95 or (np.nan, np.nan)
-                new.append(
+                rows.append(
                     {
                         "kind": kind, "draw": draw, "parameter": name, "value": item.value,
                         "best without noise": without.parameters[name].value, "low": low,
@@ -182,12 +180,7 @@ def draws_of(kind: str, draws: int, raw: Path | None) -> pd.DataFrame:
                         "found": found, "seconds": seconds,
                     }
                 )  # fmt: skip
-        rows = pd.concat([rows, pd.DataFrame(new)], ignore_index=True)
-        if raw is not None and draw % 20 == 19:
-            rows.to_csv(raw, index=False)
-    if raw is not None:
-        rows.to_csv(raw, index=False)
-    return rows[(rows["kind"] == kind) & (rows["draw"] < draws)]
+    return pd.DataFrame(rows)
 
 
 def coverage(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
@@ -232,12 +225,11 @@ def summary_of(table: pd.DataFrame) -> pd.DataFrame:
 
 def main() -> None:
     parser = studies.arguments(__doc__, HERE, draws=200)
-    parser.add_argument("--raw", type=Path, help="one row per parameter and draw; resumed")
     options = parser.parse_args()
     tables = []
     for kind in KINDS:
         began = time.perf_counter()
-        tables.append(pd.DataFrame(coverage(draws_of(kind, options.draws, options.raw))))
+        tables.append(pd.DataFrame(coverage(draws_of(kind, options.draws))))
         print(f"{kind}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
         print(tables[-1].round(3).to_string(index=False), file=sys.stderr, flush=True)
     table = pd.concat(tables)

@@ -7,8 +7,7 @@ are predicted. The measurements are not part of this repository; FOAMFIT_DATA ho
 shoe-foam-twins/.
 
 Answer. See README.md, which this writes with memory.csv (a row for each cycle of each specimen),
-parameters.csv (every parameter of every fit) and memory.png. A call goes on where the last one
-ended; --fresh begins anew.
+parameters.csv (every parameter of every fit) and memory.png.
 
     FOAMFIT_DATA=path/to/data python experiments/memory/memory.py
 """
@@ -66,60 +65,44 @@ def misfits(test: Measurement, result: Fit) -> dict[int, float]:
     }
 
 
-class Table:
-    """Rows that are written as they come, so that an interrupted study goes on."""
-
-    def __init__(self, fresh: bool) -> None:
-        there = TABLE.exists() and not fresh
-        self.rows = pd.read_csv(TABLE).to_dict("records") if there else []
-        self.values = pd.read_csv(PARAMETERS).to_dict("records") if there else []
-
-    def has(self, test: str, what: str) -> bool:
-        """Whether a part of a test is there."""
-        return any(row["test"] == test and row["what"] == what for row in self.rows)
-
-    def add(self, test: str, what: str, rows: list[dict[str, Any]], result: Fit) -> None:
-        """Add a part of a test and the parameters of its fit, and write both tables."""
-        self.rows += [{"test": test, "what": what, **row} for row in rows]
-        self.values += [
-            {
-                "test": test, "what": what, "parameter": name, "value": p.value,
-                "stderr": p.stderr, "unit": p.unit, "state": p.state,
-            }
-            for name, p in (real_foams.varied(result) if what != PREDICTED else {}).items()
-        ]  # fmt: skip
-        studies.write_csv(self.rows, TABLE)
-        studies.write_csv(self.values, PARAMETERS)
-        told = ", ".join(f"{100.0 * row['misfit']:.2f} %" for row in rows)
-        print(f"{test:18}{what:16}{told}", flush=True)
-
-
 def fitted(test: Measurement, **more: Any) -> tuple[Fit, float]:
     began = time.process_time()  # the machine may be shared
     return ff.fit(test, **MEMORY, **more), time.process_time() - began
 
 
-def study(data: Path, table: Table) -> None:
-    """Fit and predict what is missing in the table."""
+def study(data: Path) -> None:
+    """Fit and predict; both tables are written as rows come."""
+    rows, values = list[dict[str, Any]](), list[dict[str, Any]]()
+
+    def add(test: str, what: str, more: list[dict[str, Any]], result: Fit) -> None:
+        rows.extend({"test": test, "what": what, **row} for row in more)
+        values.extend(
+            {
+                "test": test, "what": what, "parameter": name, "value": p.value,
+                "stderr": p.stderr, "unit": p.unit, "state": p.state,
+            }
+            for name, p in (real_foams.varied(result) if what != PREDICTED else {}).items()
+        )  # fmt: skip
+        studies.write_csv(rows, TABLE)
+        studies.write_csv(values, PARAMETERS)
+        print(test, what, *(f"{100.0 * row['misfit']:.2f} %" for row in more), flush=True)
+
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for test in real_foams.first_cycles(data, folder):
-            if not table.has(test.name, FIRST):
-                result, seconds = fitted(test, relaxation=1)
-                miss = misfits(test, result)[test.cycle]
-                row = {"cycle": 1, "misfit": miss, "inside": np.nan, "seconds": seconds}
-                table.add(test.name, FIRST, [row], result)
+            result, seconds = fitted(test, relaxation=1)
+            miss = misfits(test, result)[test.cycle]
+            row = {"cycle": 1, "misfit": miss, "inside": np.nan, "seconds": seconds}
+            add(test.name, FIRST, [row], result)
         for specimen, file, toml in histories(data, folder):
-            if table.has(specimen, HISTORY):
-                continue
             test = ff.read_test(file, toml, cycles=(1, 3))
             result, seconds = fitted(test, relaxation=2)
             later = ff.predict(result, ff.read_test(file, toml, cycles=(1, 5)))
             whole = {"cycle": "1-3", "misfit": result.misfit["stress_strain"], "seconds": seconds}
             each = [{"cycle": n, "misfit": m} for n, m in misfits(test, result).items()]
-            table.add(specimen, HISTORY, [whole, *each], result)
+            add(specimen, HISTORY, [whole, *each], result)
             told = [{"cycle": n, **one} for n, one in later.by_cycle.items() if n > 3]
-            table.add(specimen, PREDICTED, told, result)
+            add(specimen, PREDICTED, told, result)
             if specimen == SHOWN:
                 draw(later, HERE / "memory.png")
 
@@ -218,9 +201,11 @@ def values_table(values: pd.DataFrame) -> str:
     return studies.markdown(head, rows)
 
 
-def main(fresh: bool) -> None:
-    data = studies.measurements("shoe-foam", "shoe-foam-twins")
-    study(data, Table(fresh))
+def main() -> None:
+    parser = studies.arguments(__doc__)
+    parser.add_argument("--page", action="store_true", help="only write the page, from the tables")
+    if not parser.parse_args().page:
+        study(studies.measurements("shoe-foam", "shoe-foam-twins"))
     table, values = pd.read_csv(TABLE), pd.read_csv(PARAMETERS)
     studies.write_page(
         HERE, source=real_foams.SOURCE, summary=summary(table), specimens=per_specimen(table),
@@ -230,6 +215,4 @@ def main(fresh: bool) -> None:
 
 
 if __name__ == "__main__":
-    parser = studies.arguments(__doc__)
-    parser.add_argument("--fresh", action="store_true", help="forget what is there")
-    main(parser.parse_args().fresh)
+    main()

@@ -3,8 +3,8 @@
 Method. A synthetic foam is a row of discrete micro-springs (model.md, section 8), each with a flag
 "has snapped once", and one relaxation term; a machine comes from before contact, with zeros of its
 own, and presses it three times without leaving it. Nothing of this comes from foamfit: the stress
-at a strain is found by bisection over the row. Each record goes the way of a user: a CSV with noise on
-force and motion, `foamfit.read_test` with `cycles=(1, 3)`, `foamfit.fit` with stiffening and the
+at a strain is found by bisection over the row. Each record goes the way of a user: a CSV with noise
+on force and motion, `foamfit.read_test` with `cycles=(1, 3)`, `foamfit.fit` with stiffening and the
 Mullins effect. It counts the 95 % intervals that hold the truth, and the determined values that lie
 further outside than their interval is wide ("far").
 
@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from rig import draw_microscale
-from rigs import JOB, Row, percents, run, sentence, studies
+from rigs import JOB, Row, judged, percents, run, sentence, studies
 from scipy.optimize import minimize_scalar
 from scipy.special import ndtri
 from truth import Array
@@ -168,16 +168,8 @@ def run_test(family: str, name: str, seed: int) -> list[Row]:
     except Exception as error:
         return [about | {"error": sentence(error)}]
     about |= {"rows": ROWS, "status": result.status, "seconds": time.perf_counter() - began}
-    rows = []
-    for parameter, true in truth.items():
-        found = result.parameters[parameter]
-        low, high = map(float, found.ci95 or (np.nan, np.nan))
-        outside = max(low - true, true - high)
-        far = found.state == "determined" and bool(outside > high - low)
-        own = {"parameter": parameter, "truth": true, "value": found.value, "state": found.state}
-        ends = {"low": low, "high": high, "stderr": found.stderr}
-        rows.append(about | own | ends | {"holds": bool(outside <= 0.0), "far": far})
-    return rows
+    found = result.parameters
+    return [about | judged(name, value, found[name]) for name, value in truth.items()]
 
 
 def main() -> None:

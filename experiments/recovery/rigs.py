@@ -157,6 +157,18 @@ def sentence(error: Exception) -> str:
     return f"{told} ({Path(last.filename).name}:{last.lineno})"
 
 
+def judged(parameter: str, truth: float, estimate: Any) -> Row:
+    """Hold an estimate against the truth."""
+    low, high = map(float, estimate.ci95 or (np.nan, np.nan))
+    outside = max(low - truth, truth - high)
+    return {
+        "parameter": parameter, "truth": truth, "value": float(estimate.value), "low": low,
+        "high": high, "stderr": estimate.stderr, "state": estimate.state,
+        "holds": bool(outside <= 0.0),
+        "far": estimate.state == "determined" and bool(outside > high - low),
+    }  # fmt: skip
+
+
 def run_test(family: str, name: str, seed: int) -> list[Row]:
     """Make, write, read and fit one test: a row for each free parameter, or one for the failure."""
     about: Row = {"family": family, "class": name, "test": seed}
@@ -172,28 +184,8 @@ def run_test(family: str, name: str, seed: int) -> list[Row]:
     if family == "slow":
         with suppress(SimulationError):
             about["over truth"] = over_truth(record, test, result.chain)
-    rows = []
-    for parameter, estimate in estimates.items():
-        if not estimate.vary:
-            continue
-        truth = record.truth[parameter]
-        low, high = map(float, estimate.ci95 or (np.nan, np.nan))
-        outside = max(low - truth, truth - high)
-        rows.append(
-            about
-            | {
-                "parameter": parameter,
-                "truth": truth,
-                "value": float(estimate.value),
-                "low": low,
-                "high": high,
-                "stderr": estimate.stderr,
-                "state": estimate.state,
-                "holds": bool(outside <= 0.0),
-                "far": estimate.state == "determined" and bool(outside > high - low),
-            }
-        )
-    return rows
+    found = estimates.items()
+    return [about | judged(name, record.truth[name], one) for name, one in found if one.vary]
 
 
 def ways(record: Record) -> Iterator[tuple[str, Record]]:

@@ -815,7 +815,6 @@ def main() -> None:
     ask.add_argument("--rtol", type=float, action="append")
     ask.add_argument("--out", type=Path, default=HERE / "fresh.csv")
     ask.add_argument("--processes", type=int, default=2, choices=(1, 2))
-    ask.add_argument("--resume", action="store_true", help="keep the scenes that --out has")
     ask.add_argument(
         "--page", action="store_true", help="write README.md of fresh.csv and worn.csv"
     )
@@ -827,10 +826,6 @@ def main() -> None:
     numbers = range(given.first, given.first + given.scenes)
     tasks = [(f, n, rtols) for f in given.family or FAMILIES for n in numbers]
     lines: list[dict[str, Any]] = []
-    if given.resume and given.out.exists():
-        lines = pd.read_csv(given.out).fillna({"reason": "", "method": ""}).to_dict("records")
-        done = {line["scene"] for line in lines}
-        tasks = [task for task in tasks if f"{task[0]}:{task[1]}" not in done]
     compile_all(tuple(dict.fromkeys(family for family, *_ in tasks)))
     for found in ProcessPoolExecutor(given.processes).map(lines_of, tasks, chunksize=4):
         lines += found
