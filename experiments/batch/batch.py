@@ -137,7 +137,7 @@ def measure_overhead(place: Path) -> dict[str, Any]:
         if i == 20:  # all is loaded
             spent[:] = [0.0, 0.0]
         began = time.process_time()
-        mark = fingerprint(key, path.read_bytes(), toml.read_bytes())
+        mark = fingerprint(key, path.read_bytes(), toml.read_bytes(), None)
         work(Task(path.stem, path, toml, recipe, mark, place / "out" / path.stem))
         spent[0] += time.process_time() - began
     batch_work.fit = real
@@ -188,8 +188,8 @@ def measure_parts(place: Path) -> dict[str, Any]:
     for name, pages in {"no report": False, "reports": True}.items():
         recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=pages)
         key, path = settings_key(recipe), paths[0]
-        mark = fingerprint(key, path.read_bytes(), toml.read_bytes())
-        content = path.read_bytes(), toml.read_bytes()
+        mark = fingerprint(key, path.read_bytes(), toml.read_bytes(), None)
+        content = path.read_bytes(), toml.read_bytes(), None
         outcome = work(Task(path.stem, path, toml, recipe, mark, None, content))
         assert outcome.files is not None
         out = place / name
@@ -198,9 +198,9 @@ def measure_parts(place: Path) -> dict[str, Any]:
             "kB": sum(map(len, outcome.files.values())) / 1e3,
             "write_ms": timed(lambda i, f=outcome.files, o=out: put(f, o / f"t{i}"), 50),
             "again_ms": timed(
-                lambda i, k=key, o=out, m=mark: (
-                    fingerprint(k, paths[i].read_bytes(), toml.read_bytes()),
-                    stored(o / f"t{i}", m, False),
+                lambda i, k=key, o=out, m=mark, r=recipe: (
+                    fingerprint(k, paths[i].read_bytes(), toml.read_bytes(), None),
+                    stored(o / f"t{i}", m, r),
                 ),
                 50,
             ),

@@ -170,7 +170,7 @@ def draws_of(kind: str, draws: int) -> pd.DataFrame:
         seconds = time.perf_counter() - began
         found = any(item["law_error"] is not None for item in result.noise.values())
         for name, item in result.parameters.items():
-            if item.vary:
+            if item.vary and name.startswith("s1_"):  # not of the record
                 low, high = item.ci95 or (np.nan, np.nan)
                 rows.append(
                     {
