@@ -33,6 +33,7 @@ from foamfit.fitting.problem import make_params  # noqa: E402
 from foamfit.springs.parameters import NUISANCE  # noqa: E402
 
 SEEDS = range(1, 9)
+HEAD = "# What do contact, zeros and the noise of a motion cost a fit?"
 RECORDS: dict[str, rig.Impact | rig.Slow] = {
     "impact that begins at the contact": rig.Impact(samples=500, trimmed=True),
     "impact from before the contact, any zero": rig.Impact(samples=500),
@@ -79,7 +80,7 @@ def main() -> None:
         print(rows[-1], flush=True)
     told = f"Medians of {len(SEEDS)} records, processor time, fits in turns."
     table = studies.markdown("synthetic record | fit | taken for exact | ratio", rows)
-    (HERE / "unknowns.md").write_text(f"{table}\n\n{told}\n", encoding="utf-8")
+    (HERE / "unknowns.md").write_text(f"{HEAD}\n\n{table}\n\n{told}\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
