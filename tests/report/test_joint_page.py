@@ -18,7 +18,8 @@ from foamfit.report.studies.joint import joint_page, joint_text, plot_compared, 
 from foamfit.study.joint import JointResult
 from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import Alternative, fit_jointly
-from foamfit.study.joint_result import Alone, JointData
+from foamfit.study.joint_result import JointData
+from foamfit.study.shared import Group
 from foamfit.study.study_file import Study
 
 RATES = (0.01, 0.1, 1.0)
@@ -66,7 +67,7 @@ def found(tmp_path_factory) -> JointData:
             Alternative("s1_sigma_plus", "log rate", True, 10.0, 13, 300.0),
             Alternative("s1_sigma_plus", "own", False, 14.0, 14, 299.0),
         ),
-        n_eff=90, alone=Alone(290.0, 21, 40.0, fit.found.misfits), refused={}, status="warnings",
+        alone=Group(tuple(problems), tuple(vectors)), refused={}, status="warnings",
         warnings=("x.csv is left out: it holds <nothing>.",), sentences=("One sentence.",),
         runtime_s=1.0,
     )  # fmt: skip

@@ -27,13 +27,12 @@ from foamfit.report.shown import JointViews
 from foamfit.report.studies.joint import save_joint
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
-from foamfit.study.joint_estimates import common_covariance, parameters_of
+from foamfit.study.joint_estimates import common_covariance, parameters_of, with_words
 from foamfit.study.joint_fit import JointFit, Map, fit_jointly
-from foamfit.study.joint_result import Alone, JointData
-from foamfit.study.joint_words import with_words
+from foamfit.study.joint_result import JointData
+from foamfit.study.processes import begin, workers
 from foamfit.study.shared import Group
 from foamfit.study.study_file import AUTO, Study, read_study
-from foamfit.study.workers import begin, workers
 from foamfit.text import counted
 
 # Tests that are searched as a fit of their own is; the others start at what these have found.
@@ -379,8 +378,7 @@ def _conclude(
         covariance=common_covariance(fit),
         evidence=tried[0],
         open_slopes=tried[1],
-        n_eff=alone.n_eff,
-        alone=Alone(alone.alone, alone.n_alone, alone.bic_alone, alone.misfits),
+        alone=alone,
         refused=refused,
     )
     return with_words(result)

@@ -25,7 +25,7 @@ from foamfit.fitting.together import Together, fit_linked
 from foamfit.springs.parameters import NUISANCE, split_name
 from foamfit.study.shared import bic
 from foamfit.trust import covariance
-from foamfit.trust.joint_covariance import JointPoint
+from foamfit.trust.best_point import JointPoint
 from foamfit.trust.ranges import ALIKE, ITERATIONS, TRIALS
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.residuals.noise_process import noise_processes
@@ -182,7 +182,7 @@ def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, floa
     one less than their number). And a shared value can be held off its best one while all tests are
     followed about as well, as for one test (`trust.ranges`).
     """
-    if not point.errs:
+    if not point.uncertainty.errs:
         return {}
     out = _over_specimens(point.found, each)
     shared = [name for name in point.found.shared if point.found.links.kind(name) == "shared"]

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.measurement import Measurement
+from foamfit.fitting.links import RATES
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import SCHEMA, Fit, Loop, ParameterEstimate, loop_of, plain
 from foamfit.springs.model import Model
 from foamfit.study.joint_fit import Alternative, JointFit
-from foamfit.study.shared import bic
+from foamfit.study.shared import Group
 from foamfit.study.study_file import Study
 from foamfit.text import counted
 from foamfit.trust.best_point import BestPoint
@@ -27,10 +27,10 @@ from foamfit.trust.checklist import status_of, warnings_of
 from foamfit.trust.conclude import conclude, noise_of
 
 # Keys of a parameter that only some kinds have.
-_SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
+_OF_SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
+_OF_RATE = ("b", "b_stderr", "b_ci95", "b_range")
 # Questions to a search of one test.
 _OF_A_SEARCH = ("ended", "agree")
-_RATE = ("b", "b_stderr", "b_ci95", "b_range")
 
 
 @dataclass(frozen=True)
@@ -87,22 +87,10 @@ class JointParameter:
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return its part of joint.json."""
-        gone = {
-            *(() if self.kind == "scatter" else _SCATTER),
-            *(() if self.kind.endswith("rate") else _RATE),
-            *(() if self.tests is not None else ("tests",)),
-        }
+        gone = ["tests"] if self.tests is None else []
+        gone += [key for key in _OF_SCATTER if self.kind != "scatter"]
+        gone += [key for key in _OF_RATE if self.kind not in RATES]
         return {key: value for key, value in asdict(self).items() if key not in gone}
-
-
-@dataclass(frozen=True, eq=False)
-class Alone:
-    """What the fits of the tests one by one come to, all together."""
-
-    chi2: float
-    n_vary: int
-    bic: float
-    misfits: tuple[dict[str, float | None], ...]  # As `Together.misfits`
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +142,7 @@ class JointData:
     parameters: Mapping[str, JointParameter]
     covariance: tuple[tuple[str, ...], Array]  # Names and matrix, SI; see `to_json_dict`
     evidence: tuple[Alternative, ...]
-    n_eff: int  # Effective samples that the evidence counts
-    alone: Alone
+    alone: Group  # The fits of the tests one by one
     refused: Mapping[str, str]  # File and sentence
     # Parameters whose slope by rate the tests leave open, and by how much; see `open_slope`.
     open_slopes: Mapping[str, float] = field(default_factory=dict)
@@ -178,12 +165,10 @@ class JointData:
     def loops(self) -> tuple[Loop, ...]:
         """The loop of each test, measured and fitted."""
         out = list[Loop]()
-        for name, problem, values in zip(
-            self.tests, self.problems, self.fit.found.values, strict=True
-        ):
-            curves = problem.objective.simulate(values, everything=True).curves
+        for name, best in zip(self.tests, self.fit.point.bests, strict=True):
+            curves, test = best.simulated.curves, best.problem.measurement
             fitted = curves.get("stress_strain"), curves.get("stress_time")
-            if (loop := loop_of(problem.measurement, *fitted)) is not None:
+            if (loop := loop_of(test, *fitted)) is not None:
                 out.append(loop._replace(name=name))
         return tuple(out)
 
@@ -191,11 +176,6 @@ class JointData:
     def problems(self) -> tuple[Problem, ...]:
         """What was fitted, for each test."""
         return self.fit.found.problems
-
-    @property
-    def measurements(self) -> tuple[Measurement, ...]:
-        """The tests."""
-        return tuple(problem.measurement for problem in self.problems)
 
     @property
     def drive(self) -> str | None:
@@ -206,8 +186,7 @@ class JointData:
     @property
     def bic(self) -> float:
         """Bayesian information criterion, counted as that of the tests one by one in `alone`."""
-        found = self.fit.found
-        return bic(found.cost, found.n_data, found.n_vary, self.n_eff)
+        return self.alone.bic(self.fit.found.cost, self.fit.found.n_vary)
 
     @property
     def shares(self) -> tuple[float, ...]:
@@ -237,13 +216,13 @@ class JointData:
             if problem.is_exact(name):
                 continue
             one, param = self.parameters[name], problem.params[name]
-            if not param.vary:
+            if param.vary:
+                at = one.estimate(self.tests[test])
+                method = at.ci95 and "local covariance"
+                out[name] = replace(at, value=value, ci95_method=method, range=None)
+            else:
                 why = "held fixed" if param.expr is None else f"tied by {param.expr}"
                 out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
-                continue
-            at = one if one.tests is None else one.tests[self.tests[test]]
-            judged = (at.state or "fixed", at.why or "", at.ci95 and "local covariance")
-            out[name] = ParameterEstimate(value, at.stderr, at.ci95, one.unit, True, *judged)
         return out
 
     def to_json_dict(self) -> dict[str, Any]:
@@ -273,7 +252,7 @@ class JointData:
                     "chi2_share": self.shares[t],
                     "noise": self.noise[t],
                     "n_data": self.problems[t].objective.n_data,
-                    "data_sha256": self.measurements[t].data_sha256,
+                    "data_sha256": self.problems[t].measurement.data_sha256,
                     "values": {name: one.value for name, one in self.estimates(t).items()},
                 }
                 for t, name in enumerate(self.tests)
@@ -305,9 +284,9 @@ class JointData:
             "chisqr": found.cost,
             "redchi": found.cost / max(found.n_data - found.n_vary, 1),
             "n_effective": self.fit.point.covariance.effective,
-            "n_eff": self.n_eff,
+            "n_eff": self.alone.n_eff,
             "bic": self.bic,
-            "bic_alone": self.alone.bic,
-            "n_vary_alone": self.alone.n_vary,
-            "chisqr_alone": self.alone.chi2,
+            "bic_alone": self.alone.bic_alone,
+            "n_vary_alone": self.alone.n_alone,
+            "chisqr_alone": self.alone.alone,
         }
