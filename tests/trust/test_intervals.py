@@ -35,9 +35,8 @@ from foamfit.trust import intervals, resample
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.intervals import Choice, assess
-from foamfit.trust.profile import Tracing, departures
+from foamfit.trust.profile import Refit, Tracing, departures
 from foamfit.trust.ranges import Open
-from foamfit.trust.refit import Refit
 from foamfit.trust.resample import block_length, bootstrap, mcmc
 from foamfit.trust.residuals.noise_process import NoiseProcess, noise_process
 

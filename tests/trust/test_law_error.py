@@ -35,8 +35,8 @@ from foamfit.trust.covariance import (
     half_width,
 )
 from foamfit.trust.intervals import Choice
+from foamfit.trust.profile import Refit
 from foamfit.trust.ranges import ALIKE, alike, left_open, tolerance
-from foamfit.trust.refit import Refit
 from foamfit.trust.resample import bootstrap
 from foamfit.trust.residuals.law_error import curve_errors
 from foamfit.trust.residuals.noise_process import NoiseProcess

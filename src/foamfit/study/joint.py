@@ -20,6 +20,7 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import Tracker, descend
+from foamfit.fitting.together import Together
 from foamfit.one_model import Options, Progress, identify, weigh_motion
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import check_target, try_target
@@ -31,7 +32,6 @@ from foamfit.study.joint_estimates import common_covariance, parameters_of, with
 from foamfit.study.joint_fit import JointFit, Map, fit_jointly
 from foamfit.study.joint_result import JointData
 from foamfit.study.processes import begin, workers
-from foamfit.study.shared import Group
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
 
@@ -152,7 +152,7 @@ def joint(
             for name in (*fit.found.shared, *fit.found.own)
             if fit.found.links.kind(name) in RATES or name in auto
         ]
-        tried = joint_fit.evidence(fit.found, asked, alone.n_eff, kinds, [alone.vectors])
+        tried = joint_fit.evidence(fit.found, asked, alone.n_eff, kinds, [alone.values])
         result = _conclude(study, tests, fit, alone, tried, refused)
         result = replace(result, runtime_s=time.perf_counter() - began)
     tell(1.0, "done")
@@ -277,7 +277,7 @@ def _own_fits(
     refused: dict[str, str],
     each: Map,
     tell: Progress,
-) -> tuple[list[_Test], Group]:
+) -> tuple[list[_Test], Together]:
     """Tests that can be fitted, and what a fit of each alone finds.
 
     A few, spread over the rates, are searched; the others descend from what these have found, and
@@ -319,7 +319,7 @@ def _own_fits(
             rate = loading_rate(tests[t].problem.measurement, moved)
             tests[t] = replace(tests[t], rate=rate, rate_error=0.0)
     kept = [tests[t] for t in there]
-    return kept, Group(tuple(test.problem for test in kept), vectors)
+    return kept, Together.of_own_fits([test.problem for test in kept], vectors)
 
 
 def _own_fit(
@@ -360,7 +360,7 @@ def _conclude(
     study: Study,
     tests: Sequence[_Test],
     fit: JointFit,
-    alone: Group,
+    alone: Together,
     tried: tuple[tuple[joint_fit.Alternative, ...], dict[str, float]],
     refused: Mapping[str, str],
 ) -> JointResult:

@@ -181,7 +181,7 @@ def with_words(result: Joint) -> Joint:
         lost=list(lost),
         large=large,
         top=(top, share) if len(result.tests) > 3 and share > DOMINANT else None,
-        gap=result.bic - result.alone.bic_alone,
+        gap=result.bic - result.alone.bic(result.alone.n_eff),
         together=span_of(result.fit.found.misfits),
         alone=span_of(result.alone.misfits),
         evidence=_evidence(result),

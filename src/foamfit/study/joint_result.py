@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,10 @@ from foamfit.arrays import Array
 from foamfit.fitting.links import RATES
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
+from foamfit.fitting.together import Together
 from foamfit.results import SCHEMA, Fit, Loop, ParameterEstimate, loop_of, plain
 from foamfit.springs.model import Model
 from foamfit.study.joint_fit import Alternative, JointFit
-from foamfit.study.shared import Group
 from foamfit.study.study_file import Study
 from foamfit.text import counted
 from foamfit.trust.best_point import BestPoint
@@ -93,40 +93,29 @@ class JointParameter:
         return {key: value for key, value in asdict(self).items() if key not in gone}
 
 
-@dataclass(frozen=True, eq=False)
-class TestFit:
-    """One test of a joint fit, and what its result is made of."""
+def fit_of_test(
+    problem: Problem, values: Array, parameters: dict[str, ParameterEstimate], note: str, seed: int
+) -> Fit:
+    """The result of a test: its curves at the joint fit, its parameters as that has them.
 
-    __test__ = False
-
-    problem: Problem
-    values: Array
-    parameters: dict[str, ParameterEstimate]
-    note: str
-    seed: int
-
-    def fit(self) -> Fit:
-        """The result of the test: its curves at the joint fit, its parameters as that has them.
-
-        `systematic` is what the ± of this test's own TOML do to a fit of it alone.
-        """
-        self.problem.put(self.values)
-        record = SearchRecord(self.seed, 0, time.perf_counter())
-        made = conclude(BestPoint(self.problem, self.values), record)
-        checklist = tuple(check for check in made.checklist if check.key not in _OF_A_SEARCH)
-        own = {
-            name: replace(one, systematic=made.parameters.get(name, one).systematic)
-            for name, one in self.parameters.items()
-        }
-        return replace(
-            made,
-            parameters=own,
-            notes=(self.note, *made.notes),
-            checklist=checklist,
-            status=status_of(checklist),
-            warnings=warnings_of(checklist),
-            budget=None,
-        )
+    `systematic` is what the ± of this test's own TOML do to a fit of it alone.
+    """
+    problem.put(values)
+    made = conclude(BestPoint(problem, values), SearchRecord(seed, 0, time.perf_counter()))
+    checklist = tuple(check for check in made.checklist if check.key not in _OF_A_SEARCH)
+    own = {
+        name: replace(one, systematic=made.parameters.get(name, one).systematic)
+        for name, one in parameters.items()
+    }
+    return replace(
+        made,
+        parameters=own,
+        notes=(note, *made.notes),
+        checklist=checklist,
+        status=status_of(checklist),
+        warnings=warnings_of(checklist),
+        budget=None,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +131,7 @@ class JointData:
     parameters: Mapping[str, JointParameter]
     covariance: tuple[tuple[str, ...], Array]  # Names and matrix, SI; see `to_json_dict`
     evidence: tuple[Alternative, ...]
-    alone: Group  # The fits of the tests one by one
+    alone: Together  # The fits of the tests one by one
     refused: Mapping[str, str]  # File and sentence
     # Parameters whose slope by rate the tests leave open, and by how much; see `open_slope`.
     open_slopes: Mapping[str, float] = field(default_factory=dict)
@@ -186,7 +175,7 @@ class JointData:
     @property
     def bic(self) -> float:
         """Bayesian information criterion, counted as that of the tests one by one in `alone`."""
-        return self.alone.bic(self.fit.found.cost, self.fit.found.n_vary)
+        return self.fit.found.bic(self.alone.n_eff)
 
     @property
     def shares(self) -> tuple[float, ...]:
@@ -265,13 +254,13 @@ class JointData:
         }
         return dict(plain(content))
 
-    def test_fits(self) -> Iterator[TestFit]:
-        """What the result folder of each test is made of."""
+    def test_fits(self) -> Iterator[Callable[[], Fit]]:
+        """What makes the result of each test, in any process."""
         others = counted(len(self.tests) - 1, "other test")
         note = f"Fitted together with {others} ({self.study.name}): intervals are those of all."
         pairs = zip(self.problems, self.fit.found.values, strict=True)
         for t, (problem, values) in enumerate(pairs):
-            yield TestFit(problem, values, self.estimates(t), note, self.study.seed)
+            yield partial(fit_of_test, problem, values, self.estimates(t), note, self.study.seed)
 
     @property
     def statistics(self) -> dict[str, float | int]:
@@ -286,7 +275,7 @@ class JointData:
             "n_effective": self.fit.point.covariance.effective,
             "n_eff": self.alone.n_eff,
             "bic": self.bic,
-            "bic_alone": self.alone.bic_alone,
-            "n_vary_alone": self.alone.n_alone,
-            "chisqr_alone": self.alone.alone,
+            "bic_alone": self.alone.bic(self.alone.n_eff),
+            "n_vary_alone": self.alone.n_vary,
+            "chisqr_alone": self.alone.cost,
         }

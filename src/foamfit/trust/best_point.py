@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from foamfit.fitting.together import Together
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Block, Covariance, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
-from foamfit.trust.residuals.noise_process import basis_of, noise_processes, parts
+from foamfit.trust.residuals.noise_process import basis_of, parts
 
 # Share of the residuals along a direction that a cycle takes at most, so that it is not all.
 MOST_TAKEN = 0.99
@@ -131,17 +132,13 @@ class BestPoint:
 
     @cached_property
     def errors(self) -> tuple[CurveError, ...]:
-        """Whether the residual of each counted curve is noise, or holds an error of the law too.
+        """Whether the residual of each counted curve is noise, or holds an error of the law too."""
+        return curve_errors(*self.to_judge())
 
-        The noise of a driving stress comes through the springs as slow waves of the displacement,
-        which look like an error of the law but are none.
-        """
-        jacobian, pseudo = self.weighted
-        scaled, objective = jacobian * self.sizes, self.problem.objective
-        if objective.drive == "stress":
-            noise = noise_processes(pseudo, scaled, objective.sizes)
-            return tuple(CurveError(process) for process in noise)
-        return tuple(curve_errors(pseudo, scaled, objective.sizes))
+    def to_judge(self, taken: Array | None = None) -> tuple[Any, ...]:
+        """What `curve_errors` takes; `taken` is what a joint fit took of the noise."""
+        (jacobian, pseudo), objective = self.weighted, self.problem.objective
+        return pseudo, jacobian * self.sizes, objective.sizes, taken, objective.drive == "stress"
 
     @property
     def misfits(self) -> bool:

@@ -23,9 +23,9 @@ from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, Intervals, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, split_name
 from foamfit.text import engineering, listed, percent
+from foamfit.trust import SENTENCES, say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK, covariance
-from foamfit.trust.sentences import SENTENCES, say
 
 # Misfit over the standard deviation of a curve above which the curve was not fitted at all, and
 # over its range above which it was fitted poorly.

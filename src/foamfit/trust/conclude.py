@@ -24,7 +24,7 @@ from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstima
 from foamfit.springs import laws
 from foamfit.springs.parameters import any_param, split_name, unit_of
 from foamfit.text import engineering, listed, percent
-from foamfit.trust import covariance
+from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
 from foamfit.trust.budget import make_budget
 from foamfit.trust.checklist import (
@@ -37,7 +37,6 @@ from foamfit.trust.checklist import (
 )
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
-from foamfit.trust.sentences import say
 
 # Factor between an interval and the local one from which on the local standard error is given up.
 ASTRAY = 2.0

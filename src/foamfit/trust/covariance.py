@@ -57,11 +57,6 @@ class Covariance:
     noise: tuple[NoiseProcess, ...]  # Noise of each curve, in units of the residual
 
     @property
-    def tau(self) -> tuple[float, ...]:
-        """Autocorrelation time of each curve, samples."""
-        return tuple(process.tau for process in self.noise)
-
-    @property
     def stderr(self) -> Array:
         """Standard errors, (k,)."""
         return np.sqrt(np.diag(self.matrix))

@@ -17,11 +17,11 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import Tracker
 from foamfit.results import Intervals
+from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import PLACED, Tracing, departures
 from foamfit.trust.resample import bootstrap, check_emcee, mcmc, walkers
 from foamfit.trust.residuals.noise_process import parts
-from foamfit.trust.sentences import say
 
 # The default profiles a parameter if the root of the cost departs from a straight line by this
 # share at the end of its local interval.

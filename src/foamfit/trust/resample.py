@@ -14,10 +14,10 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
+from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.refit import Refit
+from foamfit.trust.profile import Refit
 from foamfit.trust.residuals.noise_process import NoiseProcess, parts
-from foamfit.trust.sentences import say
 
 # Farthest that a walker of a Markov chain begins from the best point along a direction that the
 # test does not fix, over the scales of the parameters; and how often its way there is halved where
