@@ -5,6 +5,7 @@ import csv
 import json
 import re
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -237,8 +238,8 @@ def scattering(n=5, **more):
 def test_what_scatters_is_drawn_as_it_varies_together(tmp_path, together):
     names, matrix = ["s1_k0", "s1_sigma_plus"], [[1.0, together], [together, 1.0]]
     content = scattering(specimens={"names": names, "correlation": matrix})
-    drawn, rng = population(content, tmp_path), np.random.default_rng(0)
-    logs = np.log([drawn.draw(rng)[[0, 3]] for _ in range(400)])
+    drawn = islice(population(content, tmp_path).draws(0), 400)
+    logs = np.log([one[[0, 3]] for one in drawn])
     ranks = np.argsort(np.argsort(logs, axis=0), axis=0)
     assert np.corrcoef(ranks.T)[0, 1] == pytest.approx(together, abs=0.03)
 

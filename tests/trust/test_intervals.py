@@ -231,7 +231,7 @@ def test_the_intervals_of_a_soft_loss_agree_with_each_other(loss):
     bench = Bench(Curve(time, data, loss=loss))
     best = least_squares(bench.objective.residual, [1.0, 0.3], xtol=1e-14, ftol=1e-14).x
     around = BestPoint(bench, best, ("a", "b"))  # type: ignore[arg-type]
-    drawn = np.percentile(bootstrap(around, 400, seed=0).values, [2.5, 97.5], axis=0)
+    drawn = np.percentile(bootstrap(around, 400, seed=0)[0], [2.5, 97.5], axis=0)
     for column, name in enumerate("ab"):
         width = 2.0 * around.quantiles[column] * around.spread.stderr[column]
         low, high = profile(around, name).ci95
@@ -390,14 +390,14 @@ def test_a_better_point_is_told(impact):
 def test_the_bootstrap_agrees_with_the_local_errors(rho):
     """Standard deviations of 600 draws scatter by 1/√1200 = 3 %, and by the blocks."""
     around = curve(rho=rho)
-    drawn = bootstrap(around, 600, seed=3).values
+    drawn = bootstrap(around, 600, seed=3)[0]
     assert drawn.std(axis=0) == pytest.approx(around.spread.stderr, rel=0.15 if rho else 0.08)
-    assert np.array_equal(drawn[:20], bootstrap(around, 20, seed=3).values)
-    assert not np.array_equal(drawn[:20], bootstrap(around, 20, seed=4).values)
+    assert np.array_equal(drawn[:20], bootstrap(around, 20, seed=3)[0])
+    assert not np.array_equal(drawn[:20], bootstrap(around, 20, seed=4)[0])
 
 
 def test_the_bootstrap_of_an_impact_agrees_with_the_local_errors(impact):
-    drawn = bootstrap(impact, 60, seed=1).values
+    drawn = bootstrap(impact, 60, seed=1)[0]
     ratio = drawn.std(axis=0) / impact.spread.stderr
     # 60 draws scatter by 9 %; three of these, and ε_a and Δσ are not quite parabolic.
     assert np.all((ratio > 0.7) & (ratio < 1.4))
@@ -502,7 +502,7 @@ def test_where_nothing_can_be_simulated_a_chain_gives_up():
     chain = mcmc(around, 100, seed=0)
     assert len(chain.samples) == 0
     assert "nothing can be simulated" in chain.sentence()
-    assert around.problem.objective.evaluations - before == resample.HALVINGS
+    assert around.problem.objective.evaluations - before <= 3 * resample.walkers(around)
 
 
 @pytest.mark.parametrize("method", ["bootstrap", "mcmc"])

@@ -389,7 +389,6 @@ class _Run:
         self._save_sometimes()
 
     def _take(self, future: Future[Outcome]) -> None:
-        """Take one fit that is done."""
         name, path, size = self.waiting.pop(future)
         self.ahead -= size
         try:

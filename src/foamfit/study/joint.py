@@ -161,9 +161,6 @@ def joint(
     return result
 
 
-# ------------------------------------------------------------------------------- reading
-
-
 def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], dict[str, str]]:
     """Read all tests; those that cannot be used are refused, each with its sentence."""
     found, refused = list[tuple[str, Path, Measurement]](), dict[str, str]()
@@ -267,9 +264,6 @@ def _several(rates: Sequence[float | None]) -> bool:
     return len(known) > 1 and max(known) > (1.0 + SAME_RATE) * min(known)
 
 
-# ------------------------------------------------------------------------------- own fits
-
-
 def _own_fits(
     study: Study,
     options: Options,
@@ -346,9 +340,6 @@ def _own_fit(
     return tracker.best_values, tracker.best_cost / problem.objective.n_data
 
 
-# ------------------------------------------------------------------------------- the result
-
-
 def _choices(tests: Sequence[_Test]) -> tuple[str, ...]:
     """Kinds between which there can be evidence: laws of rate only where there are several."""
     rates = [test.rate for test in tests]
@@ -364,7 +355,6 @@ def _conclude(
     tried: tuple[tuple[joint_fit.Alternative, ...], dict[str, float]],
     refused: Mapping[str, str],
 ) -> JointResult:
-    """Assemble the result."""
     names = tuple(test.name for test in tests)
     rates = tuple(test.rate for test in tests)
     result = JointResult(

@@ -87,7 +87,6 @@ def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParam
 
 
 def _scattering(fit: JointFit, name: str, tests: dict[str, TestValue]) -> JointParameter:
-    """One parameter that scatters between specimens."""
     unit, spread, kind = unit_of(name), fit.spreads.get(name), "scatter"
     if spread is None:
         why = "too few tests determine it to tell its common value"

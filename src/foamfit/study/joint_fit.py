@@ -159,9 +159,6 @@ def errors_of(found: Together, each: Map = map) -> tuple[tuple[CurveError, ...],
     return tuple(each(curve_errors, *zip(*work, strict=True)))
 
 
-# ------------------------------------------------------------------------------- ranges
-
-
 def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, float]]:
     """What the error of the law leaves open of what tests share; empty where all is noise.
 
@@ -236,9 +233,6 @@ def _held(point: JointPoint, name: str, sign: float) -> float:
             return end
         off = abs(end - value) * nearer(rise, missed - found.cost, 0.8)
     return value
-
-
-# ------------------------------------------------------------------------------- evidence
 
 
 @dataclass(frozen=True)

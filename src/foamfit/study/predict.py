@@ -191,9 +191,6 @@ def predict(
     )
 
 
-# ------------------------------------------------------------------------------- the test
-
-
 def _outside(source: Source, rate: float | None) -> str | None:
     """Say how the rate of a test lies outside the fitted ones; None if it does not."""
     if rate is None or not source.rates:
@@ -315,13 +312,8 @@ def _admissible(problem: Problem, values: Array) -> bool:
     return problem.model.rows(own) is not None
 
 
-# ------------------------------------------------------------------------------- the band
-
-
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """Draws of specimens and their curves."""
-
     values: list[Array]
     curves: list[dict[str, Array]]
     redrawn: int
@@ -331,8 +323,7 @@ def _draw(population: Population, problem: Problem, point: Array, draws: int, se
     """Draw and simulate until there are so many; what is not admissible is drawn again."""
     # What lies beyond the limits of a fit of the test is moved there, as a fit does: to draw it
     # again would leave one side of all other parameters out.
-    rng, other = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
-    objective, tried = problem.objective, 0
+    objective, specimens, tried = problem.objective, population.draws(seed), 0
     values, curves = list[Array](), list[dict[str, Array]]()
     params = [problem.params[name] for name in problem.model.names]
     common = point[: len(params)]
@@ -340,8 +331,7 @@ def _draw(population: Population, problem: Problem, point: Array, draws: int, se
     high = np.maximum([one.max for one in params], common)
     while len(values) < draws and tried < TRIES * draws:
         tried += 1
-        uncertain = population.root @ other.standard_normal(len(params))
-        one = np.clip(population.draw(rng) + uncertain, low, high)
+        one = np.clip(next(specimens), low, high)
         try:
             simulated = objective.simulate(np.append(one, point[one.size :]))
         except SimulationError:

@@ -64,7 +64,6 @@ def read_study(path: str | Path) -> Study:
 
 
 def _read(path: Path, content: Mapping[str, Any]) -> Study:
-    """Check the content of a study; InputError names the key."""
     for key in ("tests", "model"):
         if key not in content:
             raise InputError(f"{key} is missing; give it like {_EXAMPLES[key]}")
@@ -106,7 +105,6 @@ def _read(path: Path, content: Mapping[str, Any]) -> Study:
 
 
 def _tests(path: Path, patterns: Any) -> tuple[tuple[str, Path], ...]:
-    """Names and files of the tests."""
     patterns = [patterns] if isinstance(patterns, str) else patterns
     if not isinstance(patterns, list) or not all(isinstance(p, str) for p in patterns):
         raise InputError(f"tests must be a list like {_EXAMPLES['tests']}")

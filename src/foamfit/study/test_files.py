@@ -72,7 +72,6 @@ def _whole(path: Path) -> Path:
 
 
 def _matches(pattern: str | Path, base: Path) -> list[Path]:
-    """The files of one pattern."""
     path = base / pattern
     if path.is_dir():
         there = _tests_in(path)

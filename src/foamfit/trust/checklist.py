@@ -297,9 +297,6 @@ def _time_shift(e: Findings) -> Check:
     return _check("time_shift", late == 0.0, late=told)
 
 
-# ---------------------------------------------------------------- what was left out
-
-
 def _shift_hint(best: BestPoint, determined: Sequence[str]) -> float | None:
     """Time (s) by which the motion channel is late, where the test plainly shows it, else None.
 

@@ -7,7 +7,7 @@ What the result leaves uncertain of them is a covariance; what changes from spec
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -69,8 +69,6 @@ class Population:
             for name in self._uncertain
             if parameters[name].error is None and parameters[name].span is None
         )
-
-    # ------------------------------------------------------------------ what the result leaves open
 
     @cached_property
     def _open(self) -> tuple[tuple[str, ...], Array]:
@@ -137,11 +135,6 @@ class Population:
         return slopes @ matrix @ slopes.T
 
     @cached_property
-    def root(self) -> Array:
-        """Matrix square root of `covariance`."""
-        return _root(self.covariance)
-
-    @cached_property
     def quantile(self) -> float:
         """Half of a 95 % interval over a standard error, as the intervals have it in the middle.
 
@@ -154,8 +147,6 @@ class Population:
             if one.ci95 is not None and one.stderr is not None and not self.source.joint
         ]
         return max(NORMAL, float(np.median(ratios))) if ratios else NORMAL
-
-    # ------------------------------------------------------------------ from specimen to specimen
 
     @cached_property
     def scattering(self) -> tuple[str, ...]:
@@ -187,11 +178,6 @@ class Population:
         return min(len(self.source.parameters[name].tests) for name in self.scattering)
 
     @cached_property
-    def _changed(self) -> Array:
-        """Root of the correlation of the scattering parameters."""
-        return _root(self._correlation)
-
-    @cached_property
     def _own(self) -> _Own:
         """Own parameters of the tests, in logarithms where `_in_logarithms`."""
         names = [name for name in self.scattering if self.source.parameters[name].kind == "own"]
@@ -216,8 +202,6 @@ class Population:
         tests = self.source.parameters[name].tests
         return is_logarithmic(split_name(name)[1]) and min(tests) > 0.0
 
-    # ------------------------------------------------------------------ values of one test
-
     @property
     def _means(self) -> dict[str, float]:
         """Own parameters that have a trend: the median over the tests is that of no rate."""
@@ -241,23 +225,26 @@ class Population:
                 return found
         return None
 
-    def draw(self, rng: np.random.Generator) -> Array:
-        """Draw the scatter between specimens.
+    def draws(self, seed: int) -> Iterator[Array]:
+        """Draw specimens: their scatter, and what the result leaves uncertain.
 
         Parameters change together from specimen to specimen. Their spreads are known from n tests:
         the deviates are Student's t with n - 1 degrees of freedom.
         """
-        values, own = dict[str, float](), dict[str, float]()
+        rng, other = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
+        changed, uncertain = _root(self._correlation), _root(self.covariance)
         freedom = max(self.fewest - 1 - bool(self._own.slopes.any()), 1)
-        tail = math.sqrt(freedom / rng.chisquare(freedom))
-        drawn = tail * (self._changed @ rng.standard_normal(len(self.scattering)))
-        for name, z in zip(self.scattering, drawn.tolist(), strict=True):
-            one = self.source.parameters[name]
-            if one.kind == "scatter":
-                values[name] = one.value * _exp(one.scatter * z)
-            else:
-                own[name] = self._own.at(name, z)
-        return self._vector(own, values)
+        while True:
+            values, own = dict[str, float](), dict[str, float]()
+            tail = math.sqrt(freedom / rng.chisquare(freedom))
+            drawn = tail * (changed @ rng.standard_normal(len(self.scattering)))
+            for name, z in zip(self.scattering, drawn.tolist(), strict=True):
+                one = self.source.parameters[name]
+                if one.kind == "scatter":
+                    values[name] = one.value * _exp(one.scatter * z)
+                else:
+                    own[name] = self._own.at(name, z)
+            yield self._vector(own, values) + uncertain @ other.standard_normal(len(self.names))
 
     def _vector(self, own: dict[str, float], drawn: dict[str, float] | None = None) -> Array:
         """Values in their order, at the rate and the height of the test.
