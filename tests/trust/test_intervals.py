@@ -596,7 +596,7 @@ def test_the_command_makes_intervals_one_way_and_tells_the_cost(tmp_path: Path):
     assert not (tmp_path / "out").exists()
     done = CliRunner().invoke(main, [*call, "--bootstrap", "40", "--json"])
     assert done.exit_code == 0
-    assert "block bootstrap: 40 refits, about" in done.stderr
+    assert "intervals by bootstrap: 240 simulations, about" in done.stderr
     content = json.loads(done.stdout)
     assert content["parameters"]["s1_kc"]["ci95_method"] == "block bootstrap"
     assert any("40 of 40 refits" in note for note in content["notes"])
