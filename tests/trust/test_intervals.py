@@ -561,7 +561,7 @@ def test_the_result_says_what_made_each_interval(tmp_path: Path):
     _, measurement = synthetic_impact(samples=201)
     told: list[str] = []
     result = ff.fit(measurement, starts=3, intervals="profile", tell=told.append)
-    assert "refits" in told[0]
+    assert "simulations" in told[0]
     assert " s" in told[0]
     varied = [p for p in result.parameters.values() if p.ci95 is not None]
     assert {p.ci95_method for p in varied} == {"profile likelihood"}
