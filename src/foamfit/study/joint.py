@@ -29,7 +29,7 @@ from foamfit.report.studies.joint import save_joint
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
 from foamfit.study.joint_estimates import common_covariance, parameters_of, with_words
-from foamfit.study.joint_fit import JointFit, Map, fit_jointly
+from foamfit.study.joint_fit import Map, fit_jointly
 from foamfit.study.joint_result import JointData
 from foamfit.study.processes import begin, workers
 from foamfit.study.study_file import AUTO, Study, read_study
@@ -140,9 +140,12 @@ def joint(
     with workers(jobs, len(tests), FEW) as each:
         tests, alone = _own_fits(study, options, tests, refused, each, tell)
         links, starts = _links(study, tests), alone.starts(ONE_FOR_ALL)
-        kinds, free = _choices(tests), {n for one in alone.problems for n in one.free()}
+        names, rates = tuple(test.name for test in tests), tuple(test.rate for test in tests)
+        # There is no evidence for a law of rate but from several rates, nor for a scatter.
+        kinds = [kind for kind in KINDS if kind not in ("scatter", *RATES)]
+        kinds += RATES if None not in rates and _several(rates) else ()
         tell(0.5, "together")
-        auto = [name for name, kind in study.kinds.items() if kind == AUTO and name in free]
+        auto = [name for name, kind in study.kinds.items() if kind == AUTO and name in alone.own]
         if auto:
             links = joint_fit.choose_kinds(alone.problems, links, auto, starts, alone.n_eff, kinds)
         fit = fit_jointly(alone.problems, links, starts, each=each)
@@ -153,8 +156,22 @@ def joint(
             if fit.found.links.kind(name) in RATES or name in auto
         ]
         tried = joint_fit.evidence(fit.found, asked, alone.n_eff, kinds, [alone.values])
-        result = _conclude(study, tests, fit, alone, tried, refused)
-        result = replace(result, runtime_s=time.perf_counter() - began)
+        result = JointResult(
+            study=study,
+            tests=names,
+            files=tuple(test.file for test in tests),
+            rates=rates,
+            rate0=_median_rate(rates),
+            fit=fit,
+            parameters=parameters_of(fit, names),
+            covariance=common_covariance(fit),
+            evidence=tried[0],
+            open_slopes=tried[1],
+            alone=alone,
+            refused=refused,
+            runtime_s=time.perf_counter() - began,
+        )
+        result = with_words(result)
     tell(1.0, "done")
     if out is not None:
         result.save(out, jobs=jobs, report=report)
@@ -338,37 +355,3 @@ def _own_fit(
         return _own_fit(measurement, model, params, options, ())
     weigh_motion(problem, tracker)
     return tracker.best_values, tracker.best_cost / problem.objective.n_data
-
-
-def _choices(tests: Sequence[_Test]) -> tuple[str, ...]:
-    """Kinds between which there can be evidence: laws of rate only where there are several."""
-    rates = [test.rate for test in tests]
-    rated = None not in rates and _several(rates)
-    return tuple(kind for kind in KINDS if kind != "scatter" and (rated or kind not in RATES))
-
-
-def _conclude(
-    study: Study,
-    tests: Sequence[_Test],
-    fit: JointFit,
-    alone: Together,
-    tried: tuple[tuple[joint_fit.Alternative, ...], dict[str, float]],
-    refused: Mapping[str, str],
-) -> JointResult:
-    names = tuple(test.name for test in tests)
-    rates = tuple(test.rate for test in tests)
-    result = JointResult(
-        study=study,
-        tests=names,
-        files=tuple(test.file for test in tests),
-        rates=rates,
-        rate0=_median_rate(rates),
-        fit=fit,
-        parameters=parameters_of(fit, names),
-        covariance=common_covariance(fit),
-        evidence=tried[0],
-        open_slopes=tried[1],
-        alone=alone,
-        refused=refused,
-    )
-    return with_words(result)

@@ -38,7 +38,9 @@ def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
             scale *= one.stderr / before if one and before > 0.0 else 1.0
         scales.append(scale)
     count = len(scales)
-    return point.names, point.covariance.matrix[:count, :count] * np.outer(scales, scales)
+    return point.names, point.uncertainty.covariance.matrix[:count, :count] * np.outer(
+        scales, scales
+    )
 
 
 def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, JointParameter]:

@@ -187,9 +187,7 @@ class JointData:
     @cached_property
     def noise(self) -> tuple[dict[str, dict[str, Any]], ...]:
         """Noise of each counted curve of each test, by which it is weighted; as in fit.json."""
-        point = self.fit.point
-        errors = point.errors or ((),) * len(point.bests)
-        return tuple(noise_of(*pair) for pair in zip(point.bests, errors, strict=True))
+        return tuple(map(noise_of, self.fit.point.bests, self.fit.point.errors))
 
     @property
     def tried(self) -> dict[str, list[Alternative]]:
@@ -272,7 +270,7 @@ class JointData:
             "n_vary": found.n_vary,
             "chisqr": found.cost,
             "redchi": found.cost / max(found.n_data - found.n_vary, 1),
-            "n_effective": self.fit.point.covariance.effective,
+            "n_effective": self.fit.point.uncertainty.covariance.effective,
             "n_eff": self.alone.n_eff,
             "bic": self.bic,
             "bic_alone": self.alone.bic(self.alone.n_eff),

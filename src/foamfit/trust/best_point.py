@@ -298,11 +298,6 @@ class JointPoint:
                 variances.append(float(self.inflations[name][t]) if self.inflations else 1.0)
         return (np.array(rows), np.array(variances)) if rows else None
 
-    @property
-    def covariance(self) -> Covariance:
-        """Covariance of all unknowns, SI."""
-        return self.uncertainty.covariance
-
     def of_common(self, name: str) -> tuple[float, float]:
         """Standard error and degrees of freedom of what is in `names`; NaN of anything else."""
         row = np.array([1.0 if one == name else 0.0 for one in self.names])
