@@ -389,30 +389,22 @@ def check_out(out: Path) -> None:
         return
     try:
         for path in sorted(out.iterdir()):
-            _check_foreign(out, path)
+            name = path.name
+            if is_left(name) or (name in BATCH_FILES and path.is_file()):
+                continue
+            if path.is_dir() and not path.is_symlink():
+                inside = list(path.iterdir())
+                foreign = [inner.name for inner in inside if not is_written(inner)]
+                if not inside or (not foreign and any(one.name in MARKS for one in inside)):
+                    continue
+                name = "/".join([name, *foreign[:1]])
+            raise InputError(
+                f"{out} holds {name}, which foamfit did not write; choose a new or an empty folder"
+            )
         if not os.access(out, os.W_OK | os.X_OK):
             raise PermissionError(0, f"Permission denied in {out.resolve()}")
     except OSError as error:
         raise InputError(f"{out} cannot be written: {reason(error)}") from None
-
-
-def _check_foreign(out: Path, path: Path) -> None:
-    """Refuse what stands in the folder of a batch and was not written by one."""
-    if is_left(path.name):
-        return
-    name = path.name
-    if path.is_dir() and not path.is_symlink():
-        inside = list(path.iterdir())
-        foreign = next((inner.name for inner in inside if not is_written(inner)), None)
-        known = foreign is None and any(inner.name in MARKS for inner in inside)
-        if known or not inside:
-            return
-        name = f"{path.name}/{foreign}" if foreign is not None else path.name
-    elif path.name in BATCH_FILES and path.is_file():
-        return
-    raise InputError(
-        f"{out} holds {name}, which foamfit did not write; choose a new or an empty folder"
-    )
 
 
 @contextmanager
