@@ -38,7 +38,7 @@ from foamfit.trust.intervals import Choice, assess
 from foamfit.trust.profile import Refit, Tracing, departures
 from foamfit.trust.ranges import Open
 from foamfit.trust.resample import block_length, bootstrap, mcmc
-from foamfit.trust.residuals.noise_process import NoiseProcess, noise_process
+from foamfit.trust.residuals.noise_process import NoiseProcess, noise_processes
 
 
 def autoregressive(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
@@ -164,7 +164,7 @@ def _refitted(problem: Problem, values: np.ndarray, names: tuple[str, ...]) -> n
 def test_the_noise_process_finds_an_autoregression_of_second_order():
     rng = np.random.default_rng(0)
     noise = lfilter([1.0], [1.0, -1.2, 0.5], rng.standard_normal(20500))[500:]
-    found = noise_process(noise)
+    found = noise_processes(noise, np.empty((noise.size, 0)), (noise.size,))[0]
     assert found.coefficients == pytest.approx([1.2, -0.5], abs=0.03)
     assert found.variance == pytest.approx(noise.var(), rel=1e-3)
 
@@ -191,8 +191,8 @@ def test_what_a_fit_takes_from_the_noise_is_given_back():
         residual = autoregressive(rng, n, rho)
         residual -= basis @ np.linalg.lstsq(basis, residual, rcond=None)[0]
         for out, process in (
-            (plain, noise_process(residual)),
-            (mended, noise_process(residual, basis)),
+            (plain, noise_processes(residual, basis[:, :0], (residual.size,))[0]),
+            (mended, noise_processes(residual, basis, (residual.size,))[0]),
         ):
             out.append(process.variance * process.tau)
     assert np.mean(plain) < 0.75 * 8.0

@@ -181,11 +181,10 @@ def _determined(e: Findings) -> Check:
     A nuisance parameter that is not determined shows in the intervals of the others.
     """
     own = {name: item for name, item in e.estimates.items() if name not in NUISANCE}
-    vanishing = [name for name in own if _vanishes(e, name)]
-    warnings = []
+    vanishing, warnings = [name for name in own if _vanishes(e, name)], list[str]()
+    named = [(name, item) for name, item in own.items() if name not in vanishing]
     for state in ("not determined", "weak"):
-        of = {name: item.why for name, item in own.items() if item.state == state}
-        of = {name: why for name, why in of.items() if name not in vanishing}
+        of = {name: item.why for name, item in named if item.state == state}
         groups = [(", ".join(names), why) for why, names in groupby(of, key=of.__getitem__)]
         told = "; ".join(f"{names} ({why})" for names, why in groups)
         if len(groups) > REASONS:

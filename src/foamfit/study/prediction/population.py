@@ -7,7 +7,7 @@ What the result leaves uncertain of them is a covariance; what changes from spec
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -218,17 +218,13 @@ class Population:
         """The common values, at the rate of the test."""
         return self._vector(self._means)
 
-    def nearest(self, admissible: Callable[[Array], bool]) -> Array | None:
-        """Values with the own parameters of the admissible test nearest to their means."""
+    def candidates(self) -> Iterator[Array]:
+        """The common values, then those with the own parameters of a test, the nearest first."""
+        yield self.point
         own = self._own
-        if not own.names:
-            return None
-        scale = np.maximum(np.sqrt(np.mean(own.off**2, axis=0)), 1e-300)
+        scale = np.maximum(np.sqrt(np.sum(own.off**2, axis=0)), 1e-300)
         for row in own.off[np.argsort(np.sum((own.off / scale) ** 2, axis=1))]:
-            found = self._vector(self._own_values(own.mean + row))
-            if admissible(found):
-                return found
-        return None
+            yield self._vector(self._own_values(own.mean + row))
 
     def draws(self, seed: int) -> Iterator[Array]:
         """Draw specimens: their scatter, and what the result leaves uncertain.
