@@ -12,7 +12,7 @@ from typing import NoReturn
 import lmfit
 import numpy as np
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, single_threaded
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate, rate_error
@@ -87,6 +87,7 @@ class _Test:
     rate_error: float = 0.0  # Of its logarithm
 
 
+@single_threaded
 def joint(
     path: str | Path | Study,
     *,

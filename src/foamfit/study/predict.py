@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, single_threaded
 from foamfit.data.csv_file import read_test
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
@@ -59,6 +59,7 @@ class Prediction(PredictedTest):
         return save_prediction(self, folder, report=report, width=figure_width)
 
 
+@single_threaded
 def predict(
     result: HasContent | str | Path,
     test: Measurement | str | Path,
