@@ -223,8 +223,10 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
             check_time_shift(measurement, chosen)
         except InputError:  # it was that of another record
             late = False
-    more = {"time_shift": late, "relaxation": source.model.relaxation}
-    problem = make_problem(measurement, source.model.name, chosen, None, None, inside, **more)
+    law, terms = source.model.name, source.model.relaxation
+    problem = make_problem(
+        measurement, law, chosen, None, None, inside, time_shift=late, relaxation=terms
+    )
     objective, same = problem.objective, source.sha256 == measurement.data_sha256
     if not same or source.smoothed is None or chosen != "displacement":
         return problem
