@@ -26,9 +26,9 @@ import pandas as pd
 from selection import Selection, select_own
 
 import foamfit as ff
+from foamfit.fitting.together import Together
 from foamfit.one_model import Options
 from foamfit.report.figures import BLUE, DPI, VERMILION
-from foamfit.study.shared import Group
 from foamfit.text import significant
 
 HERE = Path(__file__).parent
@@ -57,7 +57,7 @@ def is_pressure(column: str) -> bool:
 # ------------------------------------------------------------------------------- the twins
 
 
-def fit_twins(data: Path, toml: Path) -> tuple[pd.DataFrame, list[Group]]:
+def fit_twins(data: Path, toml: Path) -> tuple[pd.DataFrame, list[Together]]:
     """One row per specimen and cycle, and for each specimen the cycles to be fitted together."""
     rows, groups = [], []
     for name, height, diameter in studies.twins(data / "shoe-foam-twins"):
@@ -68,7 +68,7 @@ def fit_twins(data: Path, toml: Path) -> tuple[pd.DataFrame, list[Group]]:
         fits = [found.results[n] for n in TOGETHER]
         options = Options(relaxation=1)
         problems = tuple(options.problem(r.measurement, r.model, r.params) for r in fits)
-        groups.append(Group(problems, tuple(p.vector() for p in problems)))
+        groups.append(Together.of_own_fits(problems, [p.vector() for p in problems]))
         print(name, len(found.results), "cycles", file=sys.stderr)
     return specimen_first(rows), groups
 

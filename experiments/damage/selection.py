@@ -14,7 +14,6 @@ from foamfit.arrays import Array
 from foamfit.fitting.links import Links
 from foamfit.fitting.together import ITERATIONS, Together, fit_linked
 from foamfit.springs.parameters import NUISANCE
-from foamfit.study.shared import Group
 
 Progress = Callable[[float, str], None]
 
@@ -69,7 +68,7 @@ class Selection:
         return (worst - step.cost) / max(worst - self.alone, 1e-300)
 
 
-def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> Selection:
+def select_own(groups: Sequence[Together], *, progress: Progress | None = None) -> Selection:
     """Choose which parameters each test has of its own, by forward selection.
 
     Begins with all parameters of the springs shared. In each step every shared parameter is tried
@@ -80,7 +79,7 @@ def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> 
 
     Parameters
     ----------
-    groups : sequence of Group
+    groups : sequence of Together
         Of one model, with the same parameters varying.
     progress : callable, optional
         Told the fraction done and what is going on.
@@ -112,21 +111,21 @@ def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> 
         found = min(trials, key=lambda step: step.bic)
         steps.append(_exchanged(groups, _finished(groups, found), tell))
         chosen += steps[-1].bic < now.bic
-    n_alone = sum(group.n_alone for group in groups)
-    alone = sum(group.alone for group in groups)
+    n_alone = sum(group.n_vary for group in groups)
+    alone = sum(group.cost for group in groups)
     tell(1.0, "done")
     n_eff = sum(group.n_eff for group in groups)
-    score = sum(group.bic_alone for group in groups)
+    score = sum(group.bic(group.n_eff) for group in groups)
     return Selection(tuple(steps), chosen, n_eff, alone, n_alone, score)
 
 
-def _exchanged(groups: Sequence[Group], step: Step, tell: Progress) -> Step:
+def _exchanged(groups: Sequence[Together], step: Step, tell: Progress) -> Step:
     """Exchange an own parameter for a shared one as long as this lowers BIC."""
     shared = step.fits[0].shared
     for _ in range(EXCHANGES if len(step.own) > 1 else 0):
         # Also from the own fits: what was compensated by the parameter that is exchanged must move.
         near = [
-            [list(fit.values), list(group.vectors)]
+            [list(fit.values), list(group.values)]
             for fit, group in zip(step.fits, groups, strict=True)
         ]
         trials = list[Step]()
@@ -143,7 +142,7 @@ def _exchanged(groups: Sequence[Group], step: Step, tell: Progress) -> Step:
     return step
 
 
-def _finished(groups: Sequence[Group], trial: Step) -> Step:
+def _finished(groups: Sequence[Together], trial: Step) -> Step:
     """Fit to the end what was tried."""
     pairs = zip(trial.fits, groups, strict=True)
     starts = [[list(fit.values), *group.starts()] for fit, group in pairs]
@@ -151,14 +150,14 @@ def _finished(groups: Sequence[Group], trial: Step) -> Step:
 
 
 def step_of(
-    groups: Sequence[Group],
+    groups: Sequence[Together],
     own: tuple[str, ...],
     starts: Sequence[list[list[Array]]] | None = None,
     iterations: int = ITERATIONS,
 ) -> Step:
     """Fit all groups with these own parameters.
 
-    `starts` holds those of each group, as `fit_linked` takes them; by default `Group.starts`.
+    `starts` holds those of each group, as `fit_linked` takes them; by default `Together.starts`.
     """
     starts = [group.starts() for group in groups] if starts is None else starts
     names = {name for group in groups for one in group.problems for name in one.free()}
@@ -168,4 +167,4 @@ def step_of(
         for group, start in zip(groups, starts, strict=True)
     )
     pairs = zip(groups, fits, strict=True)
-    return Step(own, fits, sum(group.bic(fit.cost, fit.n_vary) for group, fit in pairs))
+    return Step(own, fits, sum(fit.bic(group.n_eff) for group, fit in pairs))

@@ -25,8 +25,8 @@ import numpy as np
 import pandas as pd
 
 import foamfit as ff
+from foamfit.fitting.together import bic
 from foamfit.report.figures import BLUE, DPI, GREY, VERMILION
-from foamfit.study.shared import bic
 from foamfit.text import listed, percent
 
 HERE = Path(__file__).parent

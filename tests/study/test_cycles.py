@@ -206,7 +206,7 @@ def test_three_cycles_of_a_shoe_foam_share_all_but_snap_through_and_relaxation(t
     sys.path.insert(0, str(EXPERIMENTS / "damage"))
     from selection import step_of
 
-    from foamfit.study.shared import Group
+    from foamfit.fitting.together import Together
 
     toml = tmp_path / "specimen.toml"
     toml.write_text(
@@ -224,7 +224,7 @@ def test_three_cycles_of_a_shoe_foam_share_all_but_snap_through_and_relaxation(t
     assert all(off < 0.0065 for off in found.by_cycle["misfit_stress_strain"])
     fits = list(found.results.values())
     problems = [Options(relaxation=1).problem(r.measurement, r.model, r.params) for r in fits]
-    group = Group(tuple(problems), tuple(p.vector() for p in problems))
+    group = Together.of_own_fits(problems, [p.vector() for p in problems])
     step = step_of([group], ("s1_sigma_plus", "s1_spread_plus", "s1_g1"))
     assert step.n_vary == 15 + 2 * 3  # and zeros of motion and stress of each cycle
     assert all(one["stress_strain"] < 0.011 for one in step.fits[0].misfits)

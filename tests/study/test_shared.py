@@ -8,7 +8,7 @@ import pytest
 
 from conftest import EXPERIMENTS, HEIGHT, synthetic_loop
 from foamfit.fitting.problem import make_problem
-from foamfit.study.shared import Group, effective_samples
+from foamfit.fitting.together import Together, effective_samples
 
 sys.path.insert(0, str(EXPERIMENTS / "damage"))
 from selection import select_own
@@ -32,7 +32,7 @@ def group(changes, noise=0.01, seed=0):
             values[problem.index[name]] = getattr(spring, name[3:])
         problems.append(problem)
         vectors.append(values)
-    return Group(tuple(problems), tuple(vectors))
+    return Together.of_own_fits(problems, vectors)
 
 
 STEEPER = [{}, {"kh_plus": 12e6}, {"kh_plus": 10e6}]
@@ -72,8 +72,8 @@ def test_groups_have_the_same_own_parameters_and_shared_values_of_their_own():
 
 def test_an_error_of_the_law_has_few_effective_samples():
     noisy = group([{}])
-    white = effective_samples(noisy.problems[0], noisy.vectors[0])
-    wrong = noisy.vectors[0].copy()
+    white = effective_samples(noisy.problems[0], noisy.values[0])
+    wrong = noisy.values[0].copy()
     wrong[noisy.problems[0].index["s1_k0"]] *= 1.3
     assert 15 < white < 40
     assert effective_samples(noisy.problems[0], wrong) < white - 5
