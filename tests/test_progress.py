@@ -227,7 +227,7 @@ def test_the_best_misfit_is_that_of_all_fitted_curves_and_costs_no_evaluation() 
     line.watch(problem, values)
     assert problem.objective.evaluations == counts
     best = BestPoint(problem, values)
-    assert line.misfit == pytest.approx(misfit_of(best, best.residual), rel=1e-6)
+    assert line.misfit == pytest.approx(misfit_of(best.problem.objective, best.residual), rel=1e-6)
     line.progress(0.5, "cycle 2: loop")  # of another test
     assert line.misfit is None
     line.close()

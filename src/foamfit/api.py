@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Unpack
 
 import lmfit
 
+from foamfit.arrays import single_threaded
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
 from foamfit.one_model import SEARCHED, Keywords, Options, Progress, identify, judge
@@ -66,6 +67,7 @@ class FitResult(Fit):
         return save_result(self, folder, report=report, width=figure_width)
 
 
+@single_threaded
 def fit(
     measurement: Measurement,
     *,

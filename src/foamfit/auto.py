@@ -18,11 +18,12 @@ import lmfit
 import numpy as np
 
 from foamfit import one_model, text
+from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.curves import choose_drive
-from foamfit.fitting.problem import make_params
-from foamfit.fitting.search import SearchStoppedError, what_stopped
+from foamfit.fitting.problem import Problem, make_params
+from foamfit.fitting.search import SearchStoppedError, has_several, what_stopped
 from foamfit.one_model import Found, Options, Progress
 from foamfit.report import render
 from foamfit.results import Fit, Ladder, Rung, rung_name
@@ -33,21 +34,24 @@ from foamfit.text import percent
 from foamfit.trust import evidence
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import input_first
-from foamfit.trust.evidence import BLOCKS, MARGIN, SHARE, Tried, predicted_misfit
+from foamfit.trust.evidence import BLOCKS, MARGIN, SHARE, Tried, misfit_of, predicted_misfit
 from foamfit.trust.intervals import Announce, Choice
 from foamfit.trust.residuals.residual_tests import BENT, find_structure, neighbours_test, runs_test
 
-# From the simplest up, in groups: one spring; a linear spring below it or its relaxation; two
-# springs; three; two that relax. More springs have more parameters (23 and more) than a loop has
-# features. Springs that remember take too long in three, others gain nothing in the last group.
+# From the simplest up, in groups: one spring; a linear spring below it or its relaxation; one that
+# softens where it has snapped; two springs; three; two that relax. More springs have more
+# parameters (23 and more) than a loop has features. Springs that remember take too long in three,
+# others gain nothing in the last group.
 _OWN = [law.kind for law in map(laws.law, laws.PAPER) if law.hysteretic and not law.word]
 _SLOW = [kind for kind in _OWN if laws.law(kind).remembers]
 _QUICK = [kind for kind in _OWN if kind not in _SLOW]
+_ALL = dict.fromkeys(laws.OPTIONS, True)
 LADDER = tuple(
     tuple(Model.parse(name, terms) for name, terms in group)
     for group in (
         [(kind, 0) for kind in _OWN],
         [*((f"linear+{kind}", 0) for kind in _OWN), *((kind, 1) for kind in _OWN)],
+        [(with_options(kind, **_ALL), 1) for kind in _SLOW if laws.law(kind).options],
         [(f"{kind}+{kind}", 0) for kind in _OWN],
         [(f"linear+{kind}+{kind}", 0) for kind in _QUICK],
         [(f"{kind}+{kind}", 1) for kind in _SLOW],
@@ -57,7 +61,7 @@ LADDER = tuple(
 HISTORY = (
     *((Model.parse(kind, 1),) for kind in _SLOW),
     *(
-        (Model.parse(with_options(kind, **dict.fromkeys(laws.OPTIONS, True)), terms),)
+        (Model.parse(with_options(kind, **_ALL), terms),)
         for kind in _SLOW
         for terms in (1, 2)
         if laws.law(kind).options
@@ -71,11 +75,18 @@ HOPELESS = 1.1
 # Two of them take a minute even under a known motion: they are not tried where one, perhaps with
 # relaxation, misses the curves by no more than this share of the range.
 CLOSE = 0.01
+# Two that forget are not searched further where a first search misses the curves by so many times
+# more than one spring.
+UNPROMISING = 1.2
 # Share of the time of a comparison after which only the chosen model is left to be judged.
 CHOSEN = 0.9
 # While models are compared: only the chosen one gets ranges and better intervals, which cost as
 # much as a search.
 COMPARED = Choice("local", ranges=False)
+
+
+class _UnpromisingError(Exception):
+    """Why a chain is not searched further."""
 
 
 def _dampers(params: lmfit.Parameters) -> list[str]:
@@ -162,13 +173,14 @@ class _Comparison:
         self.options = replace(options, drive=options.drive or choose_drive(measurement))
         self.began, limit = time.perf_counter(), options.max_time
         self.deadline = None if limit is None else time.monotonic() + limit
-        self.skipped: list[str] = []  # models that cannot be tried, and why
+        self.skipped: list[str] = []  # models that are not tried, and why
+        self.unpromising: list[Model] = []  # those of them whose first search was poor
         self.groups = self._models()
         self.of, self.number = sum(map(len, self.groups)), 0  # models in all, and the present one
         self.tried: list[Tried] = []
         self.fits: list[Found] = []  # of what was tried, in its order
         self.stopped: str | None = None
-        self.ended = "there are no richer ones that this test allows"
+        self.ended = "there are no richer ones left to try"
 
     def _models(self) -> list[list[Model]]:
         """Return the models that the test allows, in their groups.
@@ -208,7 +220,7 @@ class _Comparison:
             below = len(self.tried)
             for model in group:
                 self.number += 1
-                if why := _hopeless(model, self.tried):
+                if why := _hopeless(model, self.tried, self.unpromising):
                     self._skip(model, why)
                 else:
                     self._family(model)
@@ -233,6 +245,10 @@ class _Comparison:
                 return
             try:
                 one = self._fit(model, damping, left, i / len(dampings), 1.0 / len(dampings))
+            except _UnpromisingError as error:
+                self.unpromising.append(model)
+                self._skip(model, str(error))
+                return
             except SimulationError as error:  # a dashpot would not help
                 self._skip(model, str(error).removeprefix(f"{self.measurement.name}: "))
                 return
@@ -261,11 +277,24 @@ class _Comparison:
             self.progress(done, f"model {self.number} of {self.of}: {named}: {what}")
 
         options = replace(self.options, max_time=left, relaxation=model.relaxation)
-        found = one_model.identify(self.measurement, model.name, params, options, tell)
+        look = self._look if has_several(model) else None
+        found = one_model.identify(self.measurement, model.name, params, options, tell, look)
         result, best = one_model.judge(found, COMPARED, lambda _: None)
         predicted = None if result.stopped else self._predicted(best)
         self.fits.append(found)
         return Tried(result, damping, best, time.perf_counter() - began, predicted)
+
+    def _look(self, problem: Problem, values: Array) -> None:
+        """End the fit of a chain whose first search is far worse than the best of one spring."""
+        alone = [one for one in self.tried if not has_several(Model.parse(one.result.model))]
+        objective = problem.objective
+        found = misfit_of(objective, objective.residual(values)[: objective.n_data])
+        best = min(alone, key=lambda one: one.misfit, default=None)
+        if best is not None and found > UNPROMISING * best.misfit:
+            raise _UnpromisingError(
+                f"its first search misses the curves by {percent(found)} of the range, "
+                f"{best.name} by {percent(best.misfit)}"
+            )
 
     def _predicted(self, best: BestPoint) -> float | None:
         """Return the misfit of samples that are held back; None if the time is up."""
@@ -275,8 +304,8 @@ class _Comparison:
             return None
 
 
-def _hopeless(model: Model, tried: Sequence[Tried]) -> str:
-    """Say why a chain with springs that remember cannot win; "" where it may, and of others."""
+def _hopeless(model: Model, tried: Sequence[Tried], unpromising: Sequence[Model] = ()) -> str:
+    """Say why a model that takes long cannot win; "" where it may, and of others."""
 
     def least(kinds: Sequence[str], most: float = math.inf) -> tuple[float, str]:
         """Misfit of one spring of these kinds with no more relaxation terms, and its name."""
@@ -290,7 +319,13 @@ def _hopeless(model: Model, tried: Sequence[Tried]) -> str:
             f"one {title} misses the curves by {percent(found.misfit)} of the range",
         )
 
+    for poor in unpromising:
+        if Counter(poor.kinds) <= Counter(model.kinds):
+            return f"the first search with {poor.name} was poor"
     slow = [kind for kind in model.kinds if kind in _SLOW]
+    if any(model.options.values()):
+        (one, told), (other, against) = least([model.words]), least(_QUICK)
+        return f"{told}, {against}" if one > other else ""
     if len(model.kinds) == 1 or not slow:
         return ""
     near, told = least(slow)

@@ -43,6 +43,8 @@ from foamfit.trust.ranges import Open, left_open
 Progress = Callable[[float, str], None]
 # Called with the problem and the best point so far, many times a second; must be quick.
 Watch = Callable[[Problem, Array], None]
+# Called with the problem and the best point of the first search; what it raises ends the fit.
+Look = Callable[[Problem, Array], None]
 
 # Descents of the search for each spring, for each of several hysteretic springs in series, and at
 # most in all.
@@ -190,6 +192,7 @@ def identify(
     params: lmfit.Parameters | None,
     options: Options,
     progress: Progress,
+    look: Look | None = None,
 ) -> Found:
     """Search and refine; see `foamfit.fit` for the arguments and the errors."""
     began = time.perf_counter()
@@ -199,6 +202,7 @@ def identify(
     deadline = None if options.max_time is None else time.monotonic() + options.max_time
     better = None if options.watch is None else partial(options.watch, problem)
     tracker = Tracker(problem.objective, deadline, better)
+    tracker.looked = None if look is None else partial(look, problem)
     record = SearchRecord(options.seed, starts, began)
     record = _search(problem, tracker, record, progress)
     if tracker.best_values is None:

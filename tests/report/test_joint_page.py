@@ -13,12 +13,13 @@ from conftest import AREA, HEIGHT
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
+from foamfit.fitting.together import Together
 from foamfit.report.figures import STYLE, image, laid_out
 from foamfit.report.studies.joint import joint_page, joint_text, plot_compared, plot_joint
 from foamfit.study.joint import JointResult
 from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import Alternative, fit_jointly
-from foamfit.study.joint_result import Alone, JointData
+from foamfit.study.joint_result import JointData
 from foamfit.study.study_file import Study
 
 RATES = (0.01, 0.1, 1.0)
@@ -66,7 +67,7 @@ def found(tmp_path_factory) -> JointData:
             Alternative("s1_sigma_plus", "log rate", True, 10.0, 13, 300.0),
             Alternative("s1_sigma_plus", "own", False, 14.0, 14, 299.0),
         ),
-        n_eff=90, alone=Alone(290.0, 21, 40.0, fit.found.misfits), refused={}, status="warnings",
+        alone=Together.of_own_fits(problems, vectors), refused={}, status="warnings",
         warnings=("x.csv is left out: it holds <nothing>.",), sentences=("One sentence.",),
         runtime_s=1.0,
     )  # fmt: skip

@@ -461,7 +461,7 @@ def test_a_study_is_read_once(folder, tmp_path, monkeypatch):
 def test_what_the_folders_need_is_imported_beside_the_fit(folder, tmp_path, monkeypatch):
     """Where other processes draw them: not for one job, and not without reports."""
     begun = list[tuple[str, ...]]()
-    monkeypatch.setattr("foamfit.study.workers.prepare", begun.append)
+    monkeypatch.setattr("foamfit.study.processes.prepare", begun.append)
     monkeypatch.setattr(joint_module, "_read", lambda *_: (_ for _ in ()).throw(ff.InputError("x")))
     words = ["joint", write_study(folder, 's1_k0 = "shared"'), "--out", tmp_path / "out"]
     for more in (["--jobs", "1"], ["--jobs", "2", "--no-report"]):

@@ -6,7 +6,7 @@ import numpy as np
 
 from conftest import HEIGHT, synthetic_loop
 from foamfit.fitting.problem import make_problem
-from foamfit.study.shared import effective_samples
+from foamfit.fitting.together import effective_samples
 
 SPRING, LOOP = synthetic_loop(noise=0.0)
 

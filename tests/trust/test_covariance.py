@@ -17,6 +17,10 @@ def ar1(n: int, rho: float, seed: int) -> np.ndarray:
     return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white)[500:]
 
 
+def about(value: float, half: float) -> tuple[tuple[float, float], str]:
+    return (value - half, value + half), "95 % interval"
+
+
 @pytest.mark.parametrize("rho", [0.5, 0.8, 0.9])
 def test_autocorrelation_time_of_an_autoregressive_noise(rho):
     """τ = (1+ρ)/(1-ρ) in closed form."""
@@ -114,14 +118,14 @@ def test_the_half_width_is_that_of_students_t():
     ],
 )
 def test_states(half, value, expected):
-    assert state(value, half, 1.0, 0.0, 10.0)[0] == expected
+    assert state("s1_k0", value, about(value, half), 1.0, (0.0, 10.0))[0] == expected
 
 
 @pytest.mark.parametrize(
     ("half", "told"), [(1.5, "±150 % of its"), (39.2, "±39 times its"), (14522.57, "more than 100")]
 )
 def test_hopeless_intervals_are_told_in_numbers_that_can_be_read(half, told):
-    assert told in state(1.0, half, 1.0, 0.0, 10.0)[1]
+    assert told in state("s1_k0", 1.0, about(1.0, half), 1.0, (0.0, 10.0))[1]
 
 
 def test_parameters_that_no_curve_follows_have_no_covariance():

@@ -10,8 +10,7 @@ from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import fit_linked
 from foamfit.study.joint_fit import errors_of, fit_jointly
-from foamfit.trust.best_point import BestPoint
-from foamfit.trust.joint_covariance import JointPoint
+from foamfit.trust.best_point import BestPoint, JointPoint
 
 SPRING, WHOLE = synthetic_loop(noise=0.0)
 LOOP = replace(WHOLE, displacement=WHOLE.displacement[::2], stress=WHOLE.stress[::2])

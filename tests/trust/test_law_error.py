@@ -35,8 +35,8 @@ from foamfit.trust.covariance import (
     half_width,
 )
 from foamfit.trust.intervals import Choice
+from foamfit.trust.profile import Refit
 from foamfit.trust.ranges import ALIKE, alike, left_open, tolerance
-from foamfit.trust.refit import Refit
 from foamfit.trust.resample import bootstrap
 from foamfit.trust.residuals.law_error import curve_errors
 from foamfit.trust.residuals.noise_process import NoiseProcess
@@ -335,7 +335,7 @@ def test_the_bootstrap_adds_noise_to_the_curve_and_keeps_the_error_of_the_law():
     best = fitted(0)[1]
     chosen = ("s1_k0", "s1_kc", "s1_kh_plus")
     around = BestPoint(best.problem, best.values, chosen)
-    drawn = bootstrap(around, 40, seed=2).values
+    drawn = bootstrap(around, 40, seed=2)[0]
     assert drawn.mean(axis=0) == pytest.approx(
         around.values[[around.index[n] for n in chosen]], abs=float("inf"), rel=0.01
     )

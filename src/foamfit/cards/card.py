@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, single_threaded
 from foamfit.cards.curves import Curves, fitted_rates, follow, guessed, loading_curves
 from foamfit.cards.figure import draw
 from foamfit.cards.records import Record, read_records
@@ -154,6 +154,7 @@ class Card:
         return path
 
 
+@single_threaded
 def card(
     result: HasContent | str | Path,
     *,

@@ -74,7 +74,7 @@ def read_records(result: object) -> list[Record]:
         path = Path(result)
         return read_records(load(path if path.is_dir() else path.parent))
     if isinstance(result, JointData):
-        return [Record.of(one.fit()) for one in result.test_fits()]
+        return [Record.of(one()) for one in result.test_fits()]
     if isinstance(result, SavedJoint):
         return [Record.of(one) for one in result.results.values()]
     if isinstance(result, Fit):

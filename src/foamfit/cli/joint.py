@@ -54,7 +54,7 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
         from foamfit.report.studies.joint import joint_text
         from foamfit.study.joint import FEW_FOLDERS
         from foamfit.study.joint import joint as fit_jointly
-        from foamfit.study.workers import begin
+        from foamfit.study.processes import begin
 
         compile_rest()
         if not output.no_report:

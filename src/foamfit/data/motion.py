@@ -11,7 +11,7 @@ likelihood (REML).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -367,8 +367,21 @@ def follow(
     """Find the motion behind a displacement (n,), m, at times (n,), s, or samples.
 
     `counts` marks the samples to go by, by default all. A noise that is not given, or that the
-    data contradict, is estimated again from what the motion leaves.
+    data contradict, is estimated again from what the motion leaves. Motions found are kept: every
+    model of a record, and every resampling of its other curves, goes by the same one.
     """
+    raw = (None if given is None else given.tobytes() for given in (time, displacement, counts))
+    return _found(*raw, noise)
+
+
+@lru_cache(maxsize=32)
+def _found(
+    raw_time: bytes | None, raw_displacement: bytes, raw_counts: bytes | None, noise: NoiseLevel
+) -> SmoothMotion:
+    """Find the motion from the bytes of the arrays of `follow`."""
+    displacement = np.frombuffer(raw_displacement)
+    time = None if raw_time is None else np.frombuffer(raw_time)
+    counts = None if raw_counts is None else np.frombuffer(raw_counts, bool)
     taken = np.ones(displacement.size, bool) if counts is None else counts
     times = np.arange(displacement.size, dtype=float) if time is None else time
     own, w = times[taken], displacement[taken]

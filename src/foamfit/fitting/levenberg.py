@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 
+# Steps in a row after which the Jacobian is only updated, and how far the gain of such a step may
+# be from the expected one, as a share of it.
+UPDATES, PREDICTED = 6, 0.5
+
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
@@ -72,6 +76,16 @@ class Iterate:
         """Gain of the cost that the Jacobian predicts for a step."""
         return -float(step @ (2.0 * self.gradient + self.normal @ step))
 
+    def updated(self, point: Array, residual: Array) -> Iterate:
+        """Return another point, its Jacobian that of this one but for what the step has shown.
+
+        Of all Jacobians that agree with the step it is the one nearest to this (Broyden 1965, Math.
+        Comp. 19, 577).
+        """
+        step = point - self.point
+        shown = residual - self.residual - self.jacobian @ step
+        return Iterate(point, residual, self.jacobian + np.outer(shown, step / float(step @ step)))
+
 
 def damped_step(gradient: Array, normal: Array, damping: float, held: NDArray[np.bool_]) -> Array:
     """Gauss-Newton step of what is not held, its damping over the diagonal of the normal matrix."""
@@ -99,31 +113,42 @@ def descend(
 
     The damping follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). It ends when two steps in a
     row lower the cost by less than the share `enough`, or when the expected gain is below `least`.
-    A point with an infinite residual is refused; the start must have a finite one.
+    A point with an infinite residual is refused; the start must have a finite one. Where steps gain
+    what was expected the Jacobian of one test, which costs as much as many residuals, is updated;
+    no descent ends on an updated one unless its `iterations` are over.
     """
     low, high = box
     at = Iterate(start, residual(start), jacobian(start))
-    growth, small = 2.0, 0
+    growth, small, updates = 2.0, 0, 0
     for _ in range(iterations):
         held = ((at.point <= low) & (at.gradient > 0)) | ((at.point >= high) & (at.gradient < 0))
         step = damped_step(at.gradient, at.normal, damping, held | (low == high))
-        if not step.any() or at.expected(step) < least:
+        ended = not step.any() or at.expected(step) < least
+        if not ended:
+            trial = np.clip(at.point + step, low, high)
+            moved = trial - at.point
+            found = residual(trial)
+            gain = at.cost - float(found @ found)
+            if gain > 0.0:
+                small = small + 1 if gain < enough * at.cost else 0
+                ratio = gain / max(at.expected(moved), 1e-300)
+                damping *= max(1.0 / 3.0, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3)
+                growth = 2.0
+                if small >= 2 and not updates:
+                    return replace(at, point=trial, residual=found)
+                close = abs(ratio - 1.0) < PREDICTED and updates < UPDATES and small < 2
+                if close and not isinstance(at.jacobian, Blocks):
+                    updates += 1
+                    at = at.updated(trial, found)
+                else:
+                    updates, at = 0, Iterate(trial, found, jacobian(trial))
+                continue
+            if not updates:
+                damping *= growth
+                growth *= 2.0
+                ended = damping > 1e8 or float(np.max(np.abs(moved))) < 1e-9
+        if updates:
+            updates, at = 0, Iterate(at.point, at.residual, jacobian(at.point))
+        elif ended:
             break
-        trial = np.clip(at.point + step, low, high)
-        moved = trial - at.point
-        found = residual(trial)
-        gain = at.cost - float(found @ found)
-        if gain > 0.0:
-            small = small + 1 if gain < enough * at.cost else 0
-            ratio = gain / max(at.expected(moved), 1e-300)
-            damping *= max(1.0 / 3.0, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3)
-            growth = 2.0
-            if small == 2:
-                return replace(at, point=trial, residual=found)
-            at = Iterate(trial, found, jacobian(trial))
-        else:
-            damping *= growth
-            growth *= 2.0
-            if damping > 1e8 or float(np.max(np.abs(moved))) < 1e-9:
-                break
     return at

@@ -80,7 +80,8 @@ class Tracker:
     """Counts and times the evaluations of an objective and keeps the best point ever seen.
 
     `ends` holds the parameters at which the descents on the drive's curves ended; `better` is
-    called with every point that is the best so far, `pulse` at every so many evaluations.
+    called with every point that is the best so far, `pulse` at every so many evaluations, `looked`
+    with the best point of the first search. What `looked` raises ends the fit.
     """
 
     objective: Objective
@@ -89,6 +90,7 @@ class Tracker:
     best_values: Array | None = None
     best_cost: float = np.inf
     pulse: Callable[[], None] | None = None
+    looked: Callable[[Array], None] | None = None
     ends: list[Array] = field(default_factory=list)
 
     def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
@@ -206,6 +208,8 @@ def search(
         edges = _off_edges(tracker, space)
         apart = _descended(tracker, space, _apart(tracker, space))
         out += [(cost, 1) for cost in edges + apart]
+        if attempt == 0 and tracker.looked is not None and tracker.best_values is not None:
+            tracker.looked(tracker.best_values)
         least = IN_SERIES if several else max(attempts // 2, 2 if edges else 1)
         if attempt + 1 == attempts or _settled(tracker, out, attempt, least):
             break

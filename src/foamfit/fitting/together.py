@@ -7,6 +7,7 @@ has one value for all tests, one for each, scatters about a common value or foll
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,6 +26,10 @@ from foamfit.springs.parameters import NUISANCE
 
 # Descents end when two steps in a row gain less than this share, or after so many steps.
 ENOUGH, ITERATIONS = 1e-5, 80
+# Blocks of a curve that can show an error of the law: noise averages out in them.
+BLOCKS = 50
+# Vectors that more than one test's shared parameters start from.
+MOST_STARTS = 4
 # Least value of which a scattering parameter has the logarithm, and the largest logarithm.
 _TINY, _FAR = 1e-30, 100.0
 
@@ -181,6 +186,31 @@ class Together:
     # of rate, common value (its logarithm is the mean of theirs) of a scattering one.
     common: Mapping[str, tuple[float, ...]]
 
+    @classmethod
+    def of_own_fits(cls, problems: Sequence[Problem], values: Sequence[Array]) -> Together:
+        """Tests with nothing in common, at what the fit of each alone has found."""
+        pairs = zip(problems, values, strict=True)
+        costs = tuple(float(np.sum(p.objective.residual(own) ** 2)) for p, own in pairs)
+        own = _varying(problems)
+        return cls(tuple(problems), Links({}), (), own, tuple(values), costs, {})
+
+    def starts(self, most: int = MOST_STARTS) -> list[list[Array]]:
+        """Where other fits of these tests start: at these values, and at some tests' for all."""
+        count = len(self.values)
+        chosen = np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
+        pairs = list(zip(self.problems, self.values, strict=True))
+        one_for_all = ([p.with_springs(self.values[t], own) for p, own in pairs] for t in chosen)
+        return [list(self.values), *one_for_all]
+
+    @cached_property
+    def n_eff(self) -> int:
+        """Effective samples of the curves; see `effective_samples`."""
+        return sum(map(effective_samples, self.problems, self.values))
+
+    def bic(self, n_eff: int) -> float:
+        """Bayesian information criterion by so many effective samples, those of the own fits."""
+        return bic(self.cost, self.n_data, self.n_vary, n_eff)
+
     @property
     def cost(self) -> float:
         """Sum of squares of all tests."""
@@ -276,6 +306,26 @@ def fit_linked(
         costs,
         layout.common(best.point, values),
     )
+
+
+def effective_samples(problem: Problem, values: Array) -> int:
+    """Stretches of the curves of a test in which its own fit lies on one side.
+
+    What the own fit leaves is mostly an error of the law, which is no noise: one stretch on one
+    side, whatever its samples, says one thing. Counted over `BLOCKS` means of each curve.
+    """
+    residual, count = problem.objective.residual(values)[: problem.objective.n_data], 0
+    for part in np.split(residual, np.cumsum(problem.objective.sizes)[:-1]):
+        blocks = np.array_split(part, min(BLOCKS, part.size))
+        signs = np.sign([float(np.mean(block)) for block in blocks])
+        count += 1 + int(np.count_nonzero(np.diff(signs)))
+    return count
+
+
+def bic(cost: float, n_data: int, n_vary: int, n_eff: int) -> float:
+    """Bayesian information criterion n_eff ln(χ²/n) + k ln(n_eff)."""
+    n_eff = max(n_eff, 2)
+    return n_eff * math.log(max(cost, 1e-12 * n_data) / n_data) + n_vary * math.log(n_eff)
 
 
 def _varying(problems: Sequence[Problem]) -> tuple[str, ...]:

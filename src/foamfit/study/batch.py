@@ -16,6 +16,7 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Unpack
 
@@ -81,13 +82,27 @@ Progress = Callable[[State], None]
 
 @dataclass
 class Batch:
-    """The tests of a batch and what became of them; see `batch` for the arguments of `run`."""
+    """The tests of a batch, what became of them, and the fits that an executor has; see `batch`."""
 
     out: Path
     recipe: Recipe
     tests: list[tuple[str, Path]]
     toml: Path | None = None  # for all; else the one beside each
+    foreign: bool = False  # whether the executor's machines may have other files
+    fresh: bool = False
+    progress: Progress = lambda _: None
     rows: dict[str, tuple[Row, ...]] = field(default_factory=dict)  # by the name of the test
+    waiting: dict[Future[Outcome], tuple[str, Path, int]] = field(default_factory=dict)
+    ahead: int = 0  # bytes that wait
+    fitted: int = 0
+    wrong: int = 0
+    saved: float = field(default_factory=lambda: time.monotonic())  # when the summary was written
+    took: float = 0.0  # to write it, s
+
+    @cached_property
+    def key(self) -> str:
+        """What the results are made by."""
+        return settings_key(self.recipe)
 
     @property
     def summary(self) -> list[Row]:
@@ -110,6 +125,110 @@ class Batch:
             pictures, width = self.recipe.pages, self.recipe.width
             picture = tables.write_comparison(rows, self.out, title, width=width, pictures=pictures)
         tables.write_page(rows, self.out, title, picture)
+
+    def fit(self, executor: Executor) -> None:
+        """Fit what is to be fitted; what ends this leaves a summary of what is done."""
+        try:
+            for i, (name, path) in enumerate(self.tests):
+                self._begin(executor, name, path)
+                while len(self.waiting) >= MOST_AHEAD or self.ahead >= MOST_BYTES:
+                    self._collect(1.0)
+                self._collect(0.0)
+                while i == 0 and not self.foreign and self._is_cold() and self.waiting:
+                    self._collect(1.0)  # one compiles, for all
+            while self.waiting:
+                self._collect(1.0)
+        except BaseException:
+            for future in self.waiting:
+                future.cancel()
+            with without_ctrl_c(), suppress(InputError):
+                self.save()
+            raise
+        self.save(whole=True)
+
+    def _is_cold(self) -> bool:
+        """Whether the first fit compiles what the others need too."""
+        model = self.recipe.model
+        memory = model == "auto" or self.recipe.options["relaxation"] > 0
+        memory = memory or any(law.remembers for law in Model.parse(model).laws)
+        return memory and not cache.compiled("integrate_with_memory")
+
+    def _begin(self, executor: Executor, name: str, path: Path) -> None:
+        """Take the stored rows of a test, or have it fitted."""
+        toml = toml_beside(path) if self.toml is None else self.toml
+        folder = self.out / name
+        try:
+            data, settings, camera = read_whole(path), _bytes(toml), motion_file(toml)
+            motion = None if camera is None else _bytes(camera)
+        except OSError:  # who reads the test says it better
+            data, settings, motion = b"", None, None
+        mark = fingerprint(self.key, data, settings, motion)
+        known = None if self.fresh else stored(folder, mark, self.recipe)
+        if known is not None:
+            self._keep(name, tuple(replace(row, file=str(path)) for row in known))
+            return
+        content = (data, settings, motion) if self.foreign and data else None
+        out = None if self.foreign else folder.absolute()
+        task = Task(name, path, toml, self.recipe, mark, out, content)
+        try:
+            future = executor.submit(work, task)
+        except (BrokenExecutor, RuntimeError) as error:
+            raise self._ended(error) from error
+        size = len(data) + len(motion or b"") if content else 0
+        self.ahead += size
+        self.waiting[future] = (name, path, size)
+
+    def _collect(self, seconds: float) -> None:
+        """Take the fits that are done, waiting for one so long."""
+        done, _ = wait(self.waiting, seconds, FIRST_COMPLETED) if self.waiting else ((), ())
+        for future in [one for one in self.waiting if one in done]:
+            self._take(future)
+        self._save_sometimes()
+
+    def _take(self, future: Future[Outcome]) -> None:
+        name, path, size = self.waiting.pop(future)
+        self.ahead -= size
+        try:
+            outcome = future.result()
+        except (BrokenExecutor, CancelledError) as error:
+            raise self._ended(error) from error
+        except Exception as error:
+            self._keep(name, (Row(name, str(path), tables.REFUSED, _lost(error)),))
+            return
+        unwritten = outcome.unwritten
+        if unwritten is None and outcome.files is not None:
+            try:
+                put(outcome.files, self.out / name)
+            except InputError as error:
+                unwritten = str(error)
+        if unwritten is not None:
+            raise InputError(f"{unwritten}; {self._done_words()}")
+        self.fitted += 1
+        self._keep(name, outcome.rows)
+        self._save_sometimes()
+
+    def _keep(self, name: str, rows: tuple[Row, ...]) -> None:
+        self.rows[name] = rows
+        self.wrong += not all(row.has_fit for row in rows)
+        done = len(self.rows)
+        self.progress(State(done, self.wrong, len(self.tests) - done, self.fitted))
+
+    def _save_sometimes(self) -> None:
+        """Write the summary from time to time: what is killed leaves it as it was then."""
+        began = time.monotonic()
+        if began - self.saved < max(PAUSE, SHARE * self.took):
+            return
+        self.save()
+        self.saved = time.monotonic()
+        self.took = self.saved - began
+
+    def _ended(self, error: BaseException) -> InputError:
+        told = " ".join(str(error).split()) or "it has given up the tests"
+        return InputError(f"the executor has ended: {told}; {self._done_words()}")
+
+    def _done_words(self) -> str:
+        done, count = len(self.rows), counted(len(self.tests), "test")
+        return f"{done} of {count} are done and stay, call again for the others"
 
 
 def batch(
@@ -224,7 +343,8 @@ def run(
     if toml is not None and not toml.is_file():
         raise InputError(f"{toml}: no such file; name the TOML of the specimen of all tests")
     folder = Path("fits", "batch", recipe.model) if out is None else Path(out)
-    made = Batch(folder, recipe, find_tests(tests), toml)
+    found, tell = find_tests(tests), progress or (lambda _: None)
+    made = Batch(folder, recipe, found, toml, executor is not None, fresh, tell)
     check_out(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -232,7 +352,7 @@ def run(
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {reason(error)}") from None
     with _executor(executor, jobs, made) as runner:
-        _Run(made, runner, executor is not None, fresh, progress or (lambda _: None)).all()
+        made.fit(runner)
     return made
 
 
@@ -269,30 +389,22 @@ def check_out(out: Path) -> None:
         return
     try:
         for path in sorted(out.iterdir()):
-            _check_foreign(out, path)
+            name = path.name
+            if is_left(name) or (name in BATCH_FILES and path.is_file()):
+                continue
+            if path.is_dir() and not path.is_symlink():
+                inside = list(path.iterdir())
+                foreign = [inner.name for inner in inside if not is_written(inner)]
+                if not inside or (not foreign and any(one.name in MARKS for one in inside)):
+                    continue
+                name = "/".join([name, *foreign[:1]])
+            raise InputError(
+                f"{out} holds {name}, which foamfit did not write; choose a new or an empty folder"
+            )
         if not os.access(out, os.W_OK | os.X_OK):
             raise PermissionError(0, f"Permission denied in {out.resolve()}")
     except OSError as error:
         raise InputError(f"{out} cannot be written: {reason(error)}") from None
-
-
-def _check_foreign(out: Path, path: Path) -> None:
-    """Refuse what stands in the folder of a batch and was not written by one."""
-    if is_left(path.name):
-        return
-    name = path.name
-    if path.is_dir() and not path.is_symlink():
-        inside = list(path.iterdir())
-        foreign = next((inner.name for inner in inside if not is_written(inner)), None)
-        known = foreign is None and any(inner.name in MARKS for inner in inside)
-        if known or not inside:
-            return
-        name = f"{path.name}/{foreign}" if foreign is not None else path.name
-    elif path.name in BATCH_FILES and path.is_file():
-        return
-    raise InputError(
-        f"{out} holds {name}, which foamfit did not write; choose a new or an empty folder"
-    )
 
 
 @contextmanager
@@ -311,129 +423,6 @@ def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator
             yield pool
     finally:
         sweep(made.out.resolve(), [name for name, _ in made.tests])
-
-
-class _Run:
-    """The fits of a batch: given to an executor, collected, and the summary kept."""
-
-    def __init__(
-        self, made: Batch, executor: Executor, foreign: bool, fresh: bool, progress: Progress
-    ) -> None:
-        self.batch, self.executor = made, executor
-        self.foreign, self.fresh, self.progress = foreign, fresh, progress
-        self.waiting = dict[Future[Outcome], tuple[str, Path, int]]()
-        self.ahead = 0  # bytes that wait
-        self.fitted = self.wrong = 0
-        self.key = settings_key(made.recipe)
-        self.saved, self.took = time.monotonic(), 0.0
-
-    def all(self) -> None:
-        """Fit what is to be fitted; what ends this leaves a summary of what is done."""
-        try:
-            for i, (name, path) in enumerate(self.batch.tests):
-                self._begin(name, path)
-                while len(self.waiting) >= MOST_AHEAD or self.ahead >= MOST_BYTES:
-                    self._collect(1.0)
-                self._collect(0.0)
-                while i == 0 and not self.foreign and self._is_cold() and self.waiting:
-                    self._collect(1.0)  # one compiles, for all
-            while self.waiting:
-                self._collect(1.0)
-        except BaseException:
-            for future in self.waiting:
-                future.cancel()
-            with without_ctrl_c(), suppress(InputError):
-                self.batch.save()
-            raise
-        self.batch.save(whole=True)
-
-    def _is_cold(self) -> bool:
-        """Whether the first fit compiles what the others need too."""
-        recipe = self.batch.recipe
-        memory = recipe.model == "auto" or recipe.options["relaxation"] > 0
-        memory = memory or any(law.remembers for law in Model.parse(recipe.model).laws)
-        return memory and not cache.compiled("integrate_with_memory")
-
-    def _begin(self, name: str, path: Path) -> None:
-        """Take the stored rows of a test, or have it fitted."""
-        made = self.batch
-        toml = toml_beside(path) if made.toml is None else made.toml
-        folder = made.out / name
-        try:
-            data, settings, camera = read_whole(path), _bytes(toml), motion_file(toml)
-            motion = None if camera is None else _bytes(camera)
-        except OSError:  # who reads the test says it better
-            data, settings, motion = b"", None, None
-        mark = fingerprint(self.key, data, settings, motion)
-        known = None if self.fresh else stored(folder, mark, made.recipe)
-        if known is not None:
-            moved = tuple(replace(row, file=str(path)) for row in known)
-            self._keep(name, moved)
-            return
-        content = (data, settings, motion) if self.foreign and data else None
-        out = None if self.foreign else folder.absolute()
-        task = Task(name, path, toml, made.recipe, mark, out, content)
-        try:
-            future = self.executor.submit(work, task)
-        except (BrokenExecutor, RuntimeError) as error:
-            raise self._ended(error) from error
-        size = len(data) + len(motion or b"") if content else 0
-        self.ahead += size
-        self.waiting[future] = (name, path, size)
-
-    def _collect(self, seconds: float) -> None:
-        """Take the fits that are done, waiting for one so long."""
-        done, _ = wait(self.waiting, seconds, FIRST_COMPLETED) if self.waiting else ((), ())
-        for future in [one for one in self.waiting if one in done]:
-            self._take(future)
-        self._save_sometimes()
-
-    def _take(self, future: Future[Outcome]) -> None:
-        """Take one fit that is done."""
-        name, path, size = self.waiting.pop(future)
-        self.ahead -= size
-        try:
-            outcome = future.result()
-        except (BrokenExecutor, CancelledError) as error:
-            raise self._ended(error) from error
-        except Exception as error:
-            self._keep(name, (Row(name, str(path), tables.REFUSED, _lost(error)),))
-            return
-        unwritten = outcome.unwritten
-        if unwritten is None and outcome.files is not None:
-            try:
-                put(outcome.files, self.batch.out / name)
-            except InputError as error:
-                unwritten = str(error)
-        if unwritten is not None:
-            raise InputError(f"{unwritten}; {self._done_words()}")
-        self.fitted += 1
-        self._keep(name, outcome.rows)
-        self._save_sometimes()
-
-    def _keep(self, name: str, rows: tuple[Row, ...]) -> None:
-        made = self.batch
-        made.rows[name] = rows
-        self.wrong += not all(row.has_fit for row in rows)
-        left = len(made.tests) - len(made.rows)
-        self.progress(State(len(made.rows), self.wrong, left, self.fitted))
-
-    def _save_sometimes(self) -> None:
-        """Write the summary from time to time: what is killed leaves it as it was then."""
-        began = time.monotonic()
-        if began - self.saved < max(PAUSE, SHARE * self.took):
-            return
-        self.batch.save()
-        self.saved = time.monotonic()
-        self.took = self.saved - began
-
-    def _ended(self, error: BaseException) -> InputError:
-        told = " ".join(str(error).split()) or "it has given up the tests"
-        return InputError(f"the executor has ended: {told}; {self._done_words()}")
-
-    def _done_words(self) -> str:
-        done, count = len(self.batch.rows), counted(len(self.batch.tests), "test")
-        return f"{done} of {count} are done and stay, call again for the others"
 
 
 def _bytes(path: Path) -> bytes | None:

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,6 @@ from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
 from foamfit.report.studies.batch import REFUSED, Row, row_of
 from foamfit.report.studies.cycles import write_cycles
-from foamfit.results import Fit
 from foamfit.springs import laws
 from foamfit.study.cycles import fit_cycles
 
@@ -196,9 +196,7 @@ def _fitted(task: Task) -> tuple[tuple[Row, ...], Write]:
     """The rows of a test, and what writes its files into a folder."""
     try:
         with _inputs(task) as (path, toml):
-            if task.recipe.cycles is None or isinstance(task.recipe.cycles, int):
-                return _one(task, path, toml)
-            return _several(task, path, toml)
+            return _results(task, path, toml)
     except (InputError, SimulationError) as error:
         why = str(error)
     except (MemoryError, OSError):  # of this machine
@@ -208,38 +206,24 @@ def _fitted(task: Task) -> tuple[tuple[Row, ...], Write]:
     return (Row(task.name, str(task.path), REFUSED, " ".join(why.split())),), lambda _: None
 
 
-def _one(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write]:
-    recipe = task.recipe
-    assert not isinstance(recipe.cycles, tuple)
-    test = read_test(path, toml, recipe.cycles, cycles=recipe.history)
-    result = fit(test, model=recipe.model, params=recipe.params(test), **recipe.options)
-    row = row_of(task.name, str(task.path), result)
+def _results(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write]:
+    """One row, or one for each of several cycles, whose folders are in the folder of the test."""
+    recipe, file = task.recipe, str(task.path)
     pictures: dict[str, Any] = {"pages": recipe.pages, "width": recipe.width}
-    return (row,), lambda folder: write_result(result, folder, **pictures)
-
-
-def _several(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write]:
-    """Each cycle is a row, and its folder is one in the folder of the test."""
-    recipe = task.recipe
-    assert isinstance(recipe.cycles, tuple)
-    found = fit_cycles(
-        path,
-        toml,
-        cycles=recipe.cycles or None,
-        model=recipe.model,
-        params=recipe.params,
-        **recipe.options,
-    )
-
-    def row(number: int, result: Fit | None) -> Row:
+    if not isinstance(recipe.cycles, tuple):
+        test = read_test(path, toml, recipe.cycles, cycles=recipe.history)
+        result = fit(test, model=recipe.model, params=recipe.params(test), **recipe.options)
+        return (row_of(task.name, file, result),), partial(write_result, result, **pictures)
+    options = {"model": recipe.model, "params": recipe.params, **recipe.options}
+    found = fit_cycles(path, toml, cycles=recipe.cycles or None, **options)
+    rows = list[Row]()
+    for number in sorted({*found.results, *found.refused}):
         name = f"{task.name}/cycle-{number}"
-        if result is None:
-            return Row(name, str(task.path), REFUSED, " ".join(found.refused[number].split()))
-        return row_of(name, str(task.path), result)
-
-    rows = (row(n, found.results.get(n)) for n in sorted({*found.results, *found.refused}))
-    pictures: dict[str, Any] = {"pages": recipe.pages, "width": recipe.width}
-    return tuple(rows), lambda folder: write_cycles(found, folder, **pictures)
+        if number in found.results:
+            rows.append(row_of(name, file, found.results[number]))
+        else:
+            rows.append(Row(name, file, REFUSED, " ".join(found.refused[number].split())))
+    return tuple(rows), partial(write_cycles, found, **pictures)
 
 
 @contextmanager

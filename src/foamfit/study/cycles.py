@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Unpack
 import lmfit
 
 from foamfit.api import fit
+from foamfit.arrays import single_threaded
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
@@ -69,6 +70,7 @@ class CycleFits(FittedCycles):
         return save_cycles(self, folder, report=report, width=figure_width)
 
 
+@single_threaded
 def fit_cycles(
     path: str | Path,
     specimen: str | Path | None = None,

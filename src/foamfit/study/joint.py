@@ -12,7 +12,7 @@ from typing import NoReturn
 import lmfit
 import numpy as np
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, single_threaded
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate, rate_error
@@ -20,6 +20,7 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import Tracker, descend
+from foamfit.fitting.together import Together
 from foamfit.one_model import Options, Progress, identify, weigh_motion
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import check_target, try_target
@@ -27,13 +28,11 @@ from foamfit.report.shown import JointViews
 from foamfit.report.studies.joint import save_joint
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
-from foamfit.study.joint_estimates import common_covariance, parameters_of
-from foamfit.study.joint_fit import JointFit, Map, fit_jointly
-from foamfit.study.joint_result import Alone, JointData
-from foamfit.study.joint_words import with_words
-from foamfit.study.shared import Group
+from foamfit.study.joint_estimates import common_covariance, parameters_of, with_words
+from foamfit.study.joint_fit import Map, fit_jointly
+from foamfit.study.joint_result import JointData
+from foamfit.study.processes import begin, workers
 from foamfit.study.study_file import AUTO, Study, read_study
-from foamfit.study.workers import begin, workers
 from foamfit.text import counted
 
 # Tests that are searched as a fit of their own is; the others start at what these have found.
@@ -88,6 +87,7 @@ class _Test:
     rate_error: float = 0.0  # Of its logarithm
 
 
+@single_threaded
 def joint(
     path: str | Path | Study,
     *,
@@ -141,9 +141,12 @@ def joint(
     with workers(jobs, len(tests), FEW) as each:
         tests, alone = _own_fits(study, options, tests, refused, each, tell)
         links, starts = _links(study, tests), alone.starts(ONE_FOR_ALL)
-        kinds, free = _choices(tests), {n for one in alone.problems for n in one.free()}
+        names, rates = tuple(test.name for test in tests), tuple(test.rate for test in tests)
+        # There is no evidence for a law of rate but from several rates, nor for a scatter.
+        kinds = [kind for kind in KINDS if kind not in ("scatter", *RATES)]
+        kinds += RATES if None not in rates and _several(rates) else ()
         tell(0.5, "together")
-        auto = [name for name, kind in study.kinds.items() if kind == AUTO and name in free]
+        auto = [name for name, kind in study.kinds.items() if kind == AUTO and name in alone.own]
         if auto:
             links = joint_fit.choose_kinds(alone.problems, links, auto, starts, alone.n_eff, kinds)
         fit = fit_jointly(alone.problems, links, starts, each=each)
@@ -153,16 +156,27 @@ def joint(
             for name in (*fit.found.shared, *fit.found.own)
             if fit.found.links.kind(name) in RATES or name in auto
         ]
-        tried = joint_fit.evidence(fit.found, asked, alone.n_eff, kinds, [alone.vectors])
-        result = _conclude(study, tests, fit, alone, tried, refused)
-        result = replace(result, runtime_s=time.perf_counter() - began)
+        tried = joint_fit.evidence(fit.found, asked, alone.n_eff, kinds, [alone.values])
+        result = JointResult(
+            study=study,
+            tests=names,
+            files=tuple(test.file for test in tests),
+            rates=rates,
+            rate0=_median_rate(rates),
+            fit=fit,
+            parameters=parameters_of(fit, names),
+            covariance=common_covariance(fit),
+            evidence=tried[0],
+            open_slopes=tried[1],
+            alone=alone,
+            refused=refused,
+            runtime_s=time.perf_counter() - began,
+        )
+        result = with_words(result)
     tell(1.0, "done")
     if out is not None:
         result.save(out, jobs=jobs, report=report)
     return result
-
-
-# ------------------------------------------------------------------------------- reading
 
 
 def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], dict[str, str]]:
@@ -268,9 +282,6 @@ def _several(rates: Sequence[float | None]) -> bool:
     return len(known) > 1 and max(known) > (1.0 + SAME_RATE) * min(known)
 
 
-# ------------------------------------------------------------------------------- own fits
-
-
 def _own_fits(
     study: Study,
     options: Options,
@@ -278,7 +289,7 @@ def _own_fits(
     refused: dict[str, str],
     each: Map,
     tell: Progress,
-) -> tuple[list[_Test], Group]:
+) -> tuple[list[_Test], Together]:
     """Tests that can be fitted, and what a fit of each alone finds.
 
     A few, spread over the rates, are searched; the others descend from what these have found, and
@@ -320,7 +331,7 @@ def _own_fits(
             rate = loading_rate(tests[t].problem.measurement, moved)
             tests[t] = replace(tests[t], rate=rate, rate_error=0.0)
     kept = [tests[t] for t in there]
-    return kept, Group(tuple(test.problem for test in kept), vectors)
+    return kept, Together.of_own_fits([test.problem for test in kept], vectors)
 
 
 def _own_fit(
@@ -345,42 +356,3 @@ def _own_fit(
         return _own_fit(measurement, model, params, options, ())
     weigh_motion(problem, tracker)
     return tracker.best_values, tracker.best_cost / problem.objective.n_data
-
-
-# ------------------------------------------------------------------------------- the result
-
-
-def _choices(tests: Sequence[_Test]) -> tuple[str, ...]:
-    """Kinds between which there can be evidence: laws of rate only where there are several."""
-    rates = [test.rate for test in tests]
-    rated = None not in rates and _several(rates)
-    return tuple(kind for kind in KINDS if kind != "scatter" and (rated or kind not in RATES))
-
-
-def _conclude(
-    study: Study,
-    tests: Sequence[_Test],
-    fit: JointFit,
-    alone: Group,
-    tried: tuple[tuple[joint_fit.Alternative, ...], dict[str, float]],
-    refused: Mapping[str, str],
-) -> JointResult:
-    """Assemble the result."""
-    names = tuple(test.name for test in tests)
-    rates = tuple(test.rate for test in tests)
-    result = JointResult(
-        study=study,
-        tests=names,
-        files=tuple(test.file for test in tests),
-        rates=rates,
-        rate0=_median_rate(rates),
-        fit=fit,
-        parameters=parameters_of(fit, names),
-        covariance=common_covariance(fit),
-        evidence=tried[0],
-        open_slopes=tried[1],
-        n_eff=alone.n_eff,
-        alone=Alone(alone.alone, alone.n_alone, alone.bic_alone, alone.misfits),
-        refused=refused,
-    )
-    return with_words(result)

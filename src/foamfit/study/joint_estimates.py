@@ -1,22 +1,30 @@
-"""The parameters of a joint fit: values, intervals and states, in common and in each test."""
+"""What is said of a joint fit: values, intervals, states, warnings and sentences."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.fitting.box import scale_in_words
+from foamfit.fitting.links import RATES
+from foamfit.report import render
 from foamfit.springs.parameters import NUISANCE, unit_of
 from foamfit.study.joint_fit import JointFit
-from foamfit.study.joint_result import JointParameter, TestValue
-from foamfit.text import counted
+from foamfit.study.joint_result import JointData, JointParameter, TestValue
+from foamfit.text import counted, listed, percent
 from foamfit.trust import covariance
+from foamfit.trust.checklist import POOR, UNACCEPTABLE
 
 # Logarithms of what tests leave open by any number of orders of magnitude end here.
 LARGEST = 300.0
+# Share of χ² from which on one test of many is named.
+DOMINANT = 0.5
+Joint = TypeVar("Joint", bound=JointData)
 
 
 def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
@@ -30,7 +38,9 @@ def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
             scale *= one.stderr / before if one and before > 0.0 else 1.0
         scales.append(scale)
     count = len(scales)
-    return point.names, point.covariance.matrix[:count, :count] * np.outer(scales, scales)
+    return point.names, point.uncertainty.covariance.matrix[:count, :count] * np.outer(
+        scales, scales
+    )
 
 
 def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, JointParameter]:
@@ -79,7 +89,6 @@ def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParam
 
 
 def _scattering(fit: JointFit, name: str, tests: dict[str, TestValue]) -> JointParameter:
-    """One parameter that scatters between specimens."""
     unit, spread, kind = unit_of(name), fit.spreads.get(name), "scatter"
     if spread is None:
         why = "too few tests determine it to tell its common value"
@@ -87,15 +96,16 @@ def _scattering(fit: JointFit, name: str, tests: dict[str, TestValue]) -> JointP
         return JointParameter(kind, value, unit, state="not determined", why=why, tests=tests)
     sign = -1.0 if next(iter(tests.values())).value < 0.0 else 1.0
     value, *ends = (sign * np.exp(np.minimum([spread.mean, *spread.ci95], LARGEST))).tolist()
-    half = 0.5 * abs(ends[1] - ends[0])
-    state, why = covariance.state(value, half, abs(value), -math.inf, math.inf)
+    known_to = (min(ends), max(ends))
+    limits = (-math.inf, math.inf)
+    state, why = covariance.state(name, value, covariance.wider(known_to, None), abs(value), limits)
     known = state != "not determined"
     return JointParameter(
         kind,
         value,
         unit,
         abs(value) * spread.stderr if known else None,
-        (min(ends), max(ends)) if known else None,
+        known_to if known else None,
         state,
         f"common value of {counted(spread.count, 'test')}: {why}",
         tests,
@@ -115,17 +125,14 @@ def _judged(
 ) -> TestValue:
     """Judge a value by its interval, or by its range if that is wider (`trust.covariance.RULE`)."""
     problem, (stderr, freedom) = fit.found.problems[test], known
-    low, high = fit.point.bests[test].limits(name)
+    limits = fit.point.bests[test].limits(name)
     size = float(problem.sizes((name,), fit.found.values[test])[0])
     half = covariance.half_width(stderr, freedom)
-    wider, what = half, "95 % interval"
-    if span is not None and 0.5 * (span[1] - span[0]) > half:
-        wider, what = 0.5 * (span[1] - span[0]), "range"
-    of = scale_in_words(name, value, size)
-    state, why = covariance.state(value, wider, size, low, high, of, what)
+    ends = (value - half, value + half)
+    judged = covariance.state(name, value, covariance.wider(ends, span), size, limits)
     if not half <= covariance.NOTHING * size:
-        return TestValue(value, None, None, state, why)
-    return TestValue(value, stderr, (max(value - half, low), min(value + half, high)), state, why)
+        return TestValue(value, None, None, *judged)
+    return TestValue(value, stderr, (max(ends[0], limits[0]), min(ends[1], limits[1])), *judged)
 
 
 def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestValue]:
@@ -147,3 +154,71 @@ def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestV
         ends = one.ci95 and (one.ci95[0] + zero, one.ci95[1] + zero)
         out[test] = replace(one, value=value + zero, ci95=ends)
     return out
+
+
+def with_words(result: Joint) -> Joint:
+    """Give a joint fit its status, warnings and sentences."""
+    lost, large = dict[str, None](), list[str]()
+    for t, (test, problem) in enumerate(zip(result.tests, result.problems, strict=True)):
+        for curve in problem.objective.counted:
+            off, measured = result.fit.found.misfits[t][curve], problem.objective.measured[curve]
+            if off is None or not off <= UNACCEPTABLE * np.std(measured) / np.ptp(measured):
+                lost[test] = None
+            elif off > POOR:
+                large.append(f"{test} ({curve} {percent(off)})")
+    share, top = max(zip(result.shares, result.tests, strict=True))
+    known = [rate for rate in result.rates if rate is not None]
+    shown = {
+        "parameters": list(result.parameters.items()),
+        "laws": RATES,
+        "rates": f"{min(known):.3g} to {max(known):.3g} 1/s" if known else "",
+        "slopes": [
+            (name, result.parameters[name].kind, half) for name, half in result.open_slopes.items()
+        ],
+    }
+    warnings = render.sentences(
+        "joint_warnings",
+        refused=[(Path(file).name, why.rstrip(".")) for file, why in result.refused.items()],
+        lost=list(lost),
+        large=large,
+        top=(top, share) if len(result.tests) > 3 and share > DOMINANT else None,
+        gap=result.bic - result.alone.bic(result.alone.n_eff),
+        together=span_of(result.fit.found.misfits),
+        alone=span_of(result.alone.misfits),
+        evidence=_evidence(result),
+        **shown,
+    )
+    kinds = dict[str, list[str]]()
+    for name, one in result.parameters.items():
+        kinds.setdefault(one.kind, []).append(name)
+    sentences = render.sentences(
+        "joint_sentences",
+        tests=len(result.tests),
+        n_vary=result.fit.found.n_vary,
+        kinds=[f"{listed(names)} {kind}" for kind, names in kinds.items() if kind != "fixed"],
+        scatter=[
+            f"{name} {percent(one.scatter)} ({' to '.join(map(percent, one.scatter_ci95))})"
+            for name, one in result.parameters.items()
+            if one.scatter is not None and one.scatter_ci95 is not None
+        ],
+        **shown,
+    )
+    status = "failed" if lost else "warnings" if warnings else "ok"
+    return replace(result, status=status, warnings=warnings, sentences=sentences)
+
+
+def _evidence(result: JointData) -> list[tuple[str, str, str, float]]:
+    """Of each parameter that was tried: the best kind, its own, and how much lower BIC is."""
+    out = list[tuple[str, str, str, float]]()
+    for name, tried in result.tried.items():
+        mine, best = next(o for o in tried if o.chosen), min(tried, key=lambda one: one.bic)
+        out.append((name, best.kind, mine.kind, mine.bic - best.bic))
+    return out
+
+
+def span_of(found: Sequence[dict[str, float | None]]) -> tuple[float, float] | None:
+    """Smallest and largest misfit of some fits, of the loop or else of the stress; None if none."""
+    names = ("stress_strain", "stress_time", "displacement_time")
+    each = (next((one[n] for n in names if one.get(n) is not None), None) for one in found)
+    known = [one for one in each if one is not None]
+    return (min(known), max(known)) if known else None

@@ -23,12 +23,10 @@ from foamfit.fitting.links import RATES, Links
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together, fit_linked
 from foamfit.springs.parameters import NUISANCE, split_name
-from foamfit.study.shared import bic
 from foamfit.trust import covariance
-from foamfit.trust.joint_covariance import JointPoint
-from foamfit.trust.ranges import ALIKE, ITERATIONS, TRIALS
+from foamfit.trust.best_point import JointPoint
+from foamfit.trust.ranges import ITERATIONS, TRIALS, nearer, tolerance
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
-from foamfit.trust.residuals.noise_process import noise_processes
 from foamfit.trust.scatter import Spread, common_and_spread, correlation
 
 # Rounds between the best values and the spreads at most, and the change of the logarithm of a
@@ -157,20 +155,8 @@ def correlation_of(
 def errors_of(found: Together, each: Map = map) -> tuple[tuple[CurveError, ...], ...]:
     """What the residual of each curve of each test is made of; see `BestPoint.errors`."""
     point = JointPoint(found)
-    work = [
-        (best.residual, best.jacobian * best.sizes, best.problem.objective.sizes, point.taken(t))
-        for t, best in enumerate(point.bests)
-    ]
-    driven = [best.problem.objective.drive == "stress" for best in point.bests]
-    plain = [items for items, by_stress in zip(work, driven, strict=True) if not by_stress]
-    made = iter(each(curve_errors, *zip(*plain, strict=True)) if plain else ())
-    return tuple(
-        tuple(map(CurveError, noise_processes(*items)) if by_stress else next(made))
-        for items, by_stress in zip(work, driven, strict=True)
-    )
-
-
-# ------------------------------------------------------------------------------- ranges
+    work = [best.to_judge(point.taken(t)) for t, best in enumerate(point.bests)]
+    return tuple(each(curve_errors, *zip(*work, strict=True)))
 
 
 def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, float]]:
@@ -182,7 +168,7 @@ def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, floa
     one less than their number). And a shared value can be held off its best one while all tests are
     followed about as well, as for one test (`trust.ranges`).
     """
-    if not point.errs:
+    if not point.uncertainty.errs:
         return {}
     out = _over_specimens(point.found, each)
     shared = [name for name in point.found.shared if point.found.links.kind(name) == "shared"]
@@ -229,11 +215,7 @@ def _without(found: Together, kept: list[int]) -> Mapping[str, tuple[float, ...]
 def _held(point: JointPoint, name: str, sign: float) -> float:
     """How far a shared value can be held off while the tests are followed about as well."""
     found, (value,) = point.found, point.found.common[name]
-    rise = (ALIKE**2 - 1.0) * sum(
-        size * error.law**2
-        for best, errors in zip(point.bests, point.errors, strict=True)
-        for size, error in zip(best.problem.objective.sizes, errors, strict=True)
-    )
+    rise = sum(map(tolerance, point.bests, point.errors))
     low, high = next(best for best in point.bests if name in best.problem.free()).limits(name)
     off = math.sqrt(rise) * point.reach(name)
     for _ in range(TRIALS):
@@ -249,11 +231,8 @@ def _held(point: JointPoint, name: str, sign: float) -> float:
             continue
         if missed - found.cost <= rise:
             return end
-        off = abs(end - value) * min(max(math.sqrt(rise / (missed - found.cost)), 0.3), 0.8)
+        off = abs(end - value) * nearer(rise, missed - found.cost, 0.8)
     return value
-
-
-# ------------------------------------------------------------------------------- evidence
 
 
 @dataclass(frozen=True)
@@ -280,7 +259,7 @@ def evidence(
     for name in names:
         mine = fit.links.kind(name)
         for kind, one in _kinds_of(fit, name, (mine, *kinds), [fit.values, *near], wide):
-            score = bic(one.cost, one.n_data, one.n_vary, n_eff)
+            score = one.bic(n_eff)
             found.append(Alternative(name, kind, kind == mine, score, one.n_vary, one.cost))
     return tuple(found), wide
 
@@ -298,10 +277,6 @@ def choose_kinds(
     All are shared at first; in each round the change of one kind that lowers BIC most is taken. A
     law of rate is not offered where the tests leave its slope open (`open_slope`).
     """
-
-    def score(one: Together) -> float:
-        return bic(one.cost, one.n_data, one.n_vary, n_eff)
-
     now = fit_linked(problems, links.having(**dict.fromkeys(names, "shared")), starts)
     while True:
         trials = [
@@ -310,8 +285,8 @@ def choose_kinds(
             for kind, one in _kinds_of(now, name, kinds, [now.values, *starts[:1]], {})
             if kind != now.links.kind(name)
         ]
-        found = min(trials, key=score, default=now)
-        if score(found) >= score(now):
+        found = min(trials, key=lambda one: one.bic(n_eff), default=now)
+        if found.bic(n_eff) >= now.bic(n_eff):
             return now.links
         now = found
 

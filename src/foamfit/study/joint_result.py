@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.measurement import Measurement
+from foamfit.fitting.links import RATES
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
+from foamfit.fitting.together import Together
 from foamfit.results import SCHEMA, Fit, Loop, ParameterEstimate, loop_of, plain
 from foamfit.springs.model import Model
 from foamfit.study.joint_fit import Alternative, JointFit
-from foamfit.study.shared import bic
 from foamfit.study.study_file import Study
 from foamfit.text import counted
 from foamfit.trust.best_point import BestPoint
@@ -27,10 +27,10 @@ from foamfit.trust.checklist import status_of, warnings_of
 from foamfit.trust.conclude import conclude, noise_of
 
 # Keys of a parameter that only some kinds have.
-_SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
+_OF_SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
+_OF_RATE = ("b", "b_stderr", "b_ci95", "b_range")
 # Questions to a search of one test.
 _OF_A_SEARCH = ("ended", "agree")
-_RATE = ("b", "b_stderr", "b_ci95", "b_range")
 
 
 @dataclass(frozen=True)
@@ -87,58 +87,35 @@ class JointParameter:
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return its part of joint.json."""
-        gone = {
-            *(() if self.kind == "scatter" else _SCATTER),
-            *(() if self.kind.endswith("rate") else _RATE),
-            *(() if self.tests is not None else ("tests",)),
-        }
+        gone = ["tests"] if self.tests is None else []
+        gone += [key for key in _OF_SCATTER if self.kind != "scatter"]
+        gone += [key for key in _OF_RATE if self.kind not in RATES]
         return {key: value for key, value in asdict(self).items() if key not in gone}
 
 
-@dataclass(frozen=True, eq=False)
-class Alone:
-    """What the fits of the tests one by one come to, all together."""
+def fit_of_test(
+    problem: Problem, values: Array, parameters: dict[str, ParameterEstimate], note: str, seed: int
+) -> Fit:
+    """The result of a test: its curves at the joint fit, its parameters as that has them.
 
-    chi2: float
-    n_vary: int
-    bic: float
-    misfits: tuple[dict[str, float | None], ...]  # As `Together.misfits`
-
-
-@dataclass(frozen=True, eq=False)
-class TestFit:
-    """One test of a joint fit, and what its result is made of."""
-
-    __test__ = False
-
-    problem: Problem
-    values: Array
-    parameters: dict[str, ParameterEstimate]
-    note: str
-    seed: int
-
-    def fit(self) -> Fit:
-        """The result of the test: its curves at the joint fit, its parameters as that has them.
-
-        `systematic` is what the ± of this test's own TOML do to a fit of it alone.
-        """
-        self.problem.put(self.values)
-        record = SearchRecord(self.seed, 0, time.perf_counter())
-        made = conclude(BestPoint(self.problem, self.values), record)
-        checklist = tuple(check for check in made.checklist if check.key not in _OF_A_SEARCH)
-        own = {
-            name: replace(one, systematic=made.parameters.get(name, one).systematic)
-            for name, one in self.parameters.items()
-        }
-        return replace(
-            made,
-            parameters=own,
-            notes=(self.note, *made.notes),
-            checklist=checklist,
-            status=status_of(checklist),
-            warnings=warnings_of(checklist),
-            budget=None,
-        )
+    `systematic` is what the ± of this test's own TOML do to a fit of it alone.
+    """
+    problem.put(values)
+    made = conclude(BestPoint(problem, values), SearchRecord(seed, 0, time.perf_counter()))
+    checklist = tuple(check for check in made.checklist if check.key not in _OF_A_SEARCH)
+    own = {
+        name: replace(one, systematic=made.parameters.get(name, one).systematic)
+        for name, one in parameters.items()
+    }
+    return replace(
+        made,
+        parameters=own,
+        notes=(note, *made.notes),
+        checklist=checklist,
+        status=status_of(checklist),
+        warnings=warnings_of(checklist),
+        budget=None,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +131,7 @@ class JointData:
     parameters: Mapping[str, JointParameter]
     covariance: tuple[tuple[str, ...], Array]  # Names and matrix, SI; see `to_json_dict`
     evidence: tuple[Alternative, ...]
-    n_eff: int  # Effective samples that the evidence counts
-    alone: Alone
+    alone: Together  # The fits of the tests one by one
     refused: Mapping[str, str]  # File and sentence
     # Parameters whose slope by rate the tests leave open, and by how much; see `open_slope`.
     open_slopes: Mapping[str, float] = field(default_factory=dict)
@@ -178,12 +154,10 @@ class JointData:
     def loops(self) -> tuple[Loop, ...]:
         """The loop of each test, measured and fitted."""
         out = list[Loop]()
-        for name, problem, values in zip(
-            self.tests, self.problems, self.fit.found.values, strict=True
-        ):
-            curves = problem.objective.simulate(values, everything=True).curves
+        for name, best in zip(self.tests, self.fit.point.bests, strict=True):
+            curves, test = best.simulated.curves, best.problem.measurement
             fitted = curves.get("stress_strain"), curves.get("stress_time")
-            if (loop := loop_of(problem.measurement, *fitted)) is not None:
+            if (loop := loop_of(test, *fitted)) is not None:
                 out.append(loop._replace(name=name))
         return tuple(out)
 
@@ -191,11 +165,6 @@ class JointData:
     def problems(self) -> tuple[Problem, ...]:
         """What was fitted, for each test."""
         return self.fit.found.problems
-
-    @property
-    def measurements(self) -> tuple[Measurement, ...]:
-        """The tests."""
-        return tuple(problem.measurement for problem in self.problems)
 
     @property
     def drive(self) -> str | None:
@@ -206,8 +175,7 @@ class JointData:
     @property
     def bic(self) -> float:
         """Bayesian information criterion, counted as that of the tests one by one in `alone`."""
-        found = self.fit.found
-        return bic(found.cost, found.n_data, found.n_vary, self.n_eff)
+        return self.fit.found.bic(self.alone.n_eff)
 
     @property
     def shares(self) -> tuple[float, ...]:
@@ -219,9 +187,7 @@ class JointData:
     @cached_property
     def noise(self) -> tuple[dict[str, dict[str, Any]], ...]:
         """Noise of each counted curve of each test, by which it is weighted; as in fit.json."""
-        point = self.fit.point
-        errors = point.errors or ((),) * len(point.bests)
-        return tuple(noise_of(*pair) for pair in zip(point.bests, errors, strict=True))
+        return tuple(map(noise_of, self.fit.point.bests, self.fit.point.errors))
 
     @property
     def tried(self) -> dict[str, list[Alternative]]:
@@ -237,13 +203,13 @@ class JointData:
             if problem.is_exact(name):
                 continue
             one, param = self.parameters[name], problem.params[name]
-            if not param.vary:
+            if param.vary:
+                at = one.estimate(self.tests[test])
+                method = at.ci95 and "local covariance"
+                out[name] = replace(at, value=value, ci95_method=method, range=None)
+            else:
                 why = "held fixed" if param.expr is None else f"tied by {param.expr}"
                 out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
-                continue
-            at = one if one.tests is None else one.tests[self.tests[test]]
-            judged = (at.state or "fixed", at.why or "", at.ci95 and "local covariance")
-            out[name] = ParameterEstimate(value, at.stderr, at.ci95, one.unit, True, *judged)
         return out
 
     def to_json_dict(self) -> dict[str, Any]:
@@ -273,7 +239,7 @@ class JointData:
                     "chi2_share": self.shares[t],
                     "noise": self.noise[t],
                     "n_data": self.problems[t].objective.n_data,
-                    "data_sha256": self.measurements[t].data_sha256,
+                    "data_sha256": self.problems[t].measurement.data_sha256,
                     "values": {name: one.value for name, one in self.estimates(t).items()},
                 }
                 for t, name in enumerate(self.tests)
@@ -286,13 +252,13 @@ class JointData:
         }
         return dict(plain(content))
 
-    def test_fits(self) -> Iterator[TestFit]:
-        """What the result folder of each test is made of."""
+    def test_fits(self) -> Iterator[Callable[[], Fit]]:
+        """What makes the result of each test, in any process."""
         others = counted(len(self.tests) - 1, "other test")
         note = f"Fitted together with {others} ({self.study.name}): intervals are those of all."
         pairs = zip(self.problems, self.fit.found.values, strict=True)
         for t, (problem, values) in enumerate(pairs):
-            yield TestFit(problem, values, self.estimates(t), note, self.study.seed)
+            yield partial(fit_of_test, problem, values, self.estimates(t), note, self.study.seed)
 
     @property
     def statistics(self) -> dict[str, float | int]:
@@ -304,10 +270,10 @@ class JointData:
             "n_vary": found.n_vary,
             "chisqr": found.cost,
             "redchi": found.cost / max(found.n_data - found.n_vary, 1),
-            "n_effective": self.fit.point.covariance.effective,
-            "n_eff": self.n_eff,
+            "n_effective": self.fit.point.uncertainty.covariance.effective,
+            "n_eff": self.alone.n_eff,
             "bic": self.bic,
-            "bic_alone": self.alone.bic,
+            "bic_alone": self.alone.bic(self.alone.n_eff),
             "n_vary_alone": self.alone.n_vary,
-            "chisqr_alone": self.alone.chi2,
+            "chisqr_alone": self.alone.cost,
         }

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, single_threaded
 from foamfit.data.csv_file import read_test
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
@@ -59,6 +59,7 @@ class Prediction(PredictedTest):
         return save_prediction(self, folder, report=report, width=figure_width)
 
 
+@single_threaded
 def predict(
     result: HasContent | str | Path,
     test: Measurement | str | Path,
@@ -191,9 +192,6 @@ def predict(
     )
 
 
-# ------------------------------------------------------------------------------- the test
-
-
 def _outside(source: Source, rate: float | None) -> str | None:
     """Say how the rate of a test lies outside the fitted ones; None if it does not."""
     if rate is None or not source.rates:
@@ -225,22 +223,12 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
             check_time_shift(measurement, chosen)
         except InputError:  # it was that of another record
             late = False
+    law, terms = source.model.name, source.model.relaxation
     problem = make_problem(
-        measurement,
-        source.model.name,
-        chosen,
-        None,
-        None,
-        inside,
-        time_shift=late,
-        relaxation=source.model.relaxation,
+        measurement, law, chosen, None, None, inside, time_shift=late, relaxation=terms
     )
-    objective = problem.objective
-    if (
-        source.sha256 != measurement.data_sha256
-        or source.smoothed is None
-        or chosen != "displacement"
-    ):
+    objective, same = problem.objective, source.sha256 == measurement.data_sha256
+    if not same or source.smoothed is None or chosen != "displacement":
         return problem
     # More or other cycles of the record that was fitted: its motion is what it was then.
     motion = driving_motion(objective.measurement, objective.time, always=source.smoothed)
@@ -255,10 +243,8 @@ def _before(problem: Problem, source: Source) -> Problem:
     if not ends or ends[-1] == objective.time.size:
         return problem
     before = np.arange(objective.time.size) < ends[-1]
-    sampled = {
-        channel: before & test.sampled.get(channel, True)
-        for channel in map(objective.channel, objective.counted)
-    }
+    channels = map(objective.channel, objective.counted)
+    sampled = {one: before & test.sampled.get(one, True) for one in channels}
     test = replace(test, sampled=test.sampled | sampled)
     followed = (objective.motion,)
     return replace(problem, objective=replace(objective, measurement=test, followed=followed))
@@ -266,16 +252,13 @@ def _before(problem: Problem, source: Source) -> Problem:
 
 def _point(population: Population, problem: Problem) -> Array:
     """The common values; where they are not admissible together, those of the nearest test."""
-    point = population.point
-    if _admissible(problem, point):
-        return point
-    nearest = population.nearest(lambda values: _admissible(problem, values))
-    if nearest is None:
-        raise SimulationError(
-            f"{population.source.where}: its common values are no admissible spring, nor are those "
-            "of a test; give the result of a fit as foamfit wrote it"
-        )
-    return nearest
+    for values in population.candidates():
+        if _admissible(problem, values):
+            return values
+    raise SimulationError(
+        f"{population.source.where}: its common values are no admissible spring, nor are those of "
+        "a test; give the result of a fit as foamfit wrote it"
+    )
 
 
 def _aligned(
@@ -315,13 +298,8 @@ def _admissible(problem: Problem, values: Array) -> bool:
     return problem.model.rows(own) is not None
 
 
-# ------------------------------------------------------------------------------- the band
-
-
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """Draws of specimens and their curves."""
-
     values: list[Array]
     curves: list[dict[str, Array]]
     redrawn: int
@@ -331,17 +309,12 @@ def _draw(population: Population, problem: Problem, point: Array, draws: int, se
     """Draw and simulate until there are so many; what is not admissible is drawn again."""
     # What lies beyond the limits of a fit of the test is moved there, as a fit does: to draw it
     # again would leave one side of all other parameters out.
-    rng, other = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
-    objective, tried = problem.objective, 0
+    objective, specimens, tried = problem.objective, population.draws(seed), 0
     values, curves = list[Array](), list[dict[str, Array]]()
-    params = [problem.params[name] for name in problem.model.names]
-    common = point[: len(params)]
-    low = np.minimum([one.min for one in params], common)
-    high = np.maximum([one.max for one in params], common)
+    limits = _limits(population, point[: len(population.names)])
     while len(values) < draws and tried < TRIES * draws:
         tried += 1
-        uncertain = population.root @ other.standard_normal(len(params))
-        one = np.clip(population.draw(rng) + uncertain, low, high)
+        one = np.clip(next(specimens), *limits)
         try:
             simulated = objective.simulate(np.append(one, point[one.size :]))
         except SimulationError:
@@ -445,13 +418,16 @@ def _parameters(
 ) -> dict[str, PredictedParameter]:
     """Each parameter at the test and its 95 % interval, within its limits."""
     half = population.quantile * np.sqrt(np.maximum(np.diag(population.covariance), 0.0))
-    ends = (point - half, point + half)
+    ends = np.array([point - half, point + half])
     if drawn is not None:
-        ends = tuple(np.quantile(drawn.values, BAND, axis=0))
-    out = {}
-    for name, value, *pair in zip(population.names, point, *ends, strict=True):
-        limits = population.limits[name]
-        lo, hi = (float(np.clip(end, min(limits[0], value), max(limits[1], value))) for end in pair)
-        kind = population.source.parameters[name].kind
-        out[name] = PredictedParameter(kind, float(value), lo, hi)
-    return out
+        ends = np.quantile(drawn.values, BAND, axis=0)
+    ends = np.clip(ends, *_limits(population, point))
+    rows = zip(population.names, point.tolist(), *ends.tolist(), strict=True)
+    known = population.source.parameters
+    return {name: PredictedParameter(known[name].kind, *row) for name, *row in rows}
+
+
+def _limits(population: Population, point: Array) -> tuple[Array, Array]:
+    """Limits of the parameters in a fit of the test, which hold the point."""
+    low, high = np.array([population.limits[name] for name in population.names]).T
+    return np.minimum(low, point), np.maximum(high, point)

@@ -39,6 +39,8 @@ ONE_THREAD = {
     f"{name}_NUM_THREADS": "1"
     for name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "NUMEXPR", "VECLIB", "BLIS")
 }
+# Modules that every process of a joint fit needs, and by which most of its start is gone.
+_JOINT = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
 _STARTING, _SCRIPT = threading.Lock(), ModuleType("__main__")
 
 
@@ -149,6 +151,31 @@ class Processes(Executor):
         self._pools.append(pool)
         with _starting():
             return pool.submit(work)
+
+
+def begin(jobs: int | None, count: int, few: int) -> None:
+    """Have imported what `workers` with these arguments will need, beside what goes on here."""
+    if _wanted(jobs, count, few) > 1:
+        prepare(_JOINT)
+
+
+def _wanted(jobs: int | None, count: int, few: int) -> int:
+    check_jobs(jobs)
+    return 1 if count <= few else min(cores() if jobs is None else jobs, count)
+
+
+@contextmanager
+def workers(jobs: int | None, count: int, few: int) -> Iterator[Callable[..., Iterable[Any]]]:
+    """Give a `map` over up to `count` pieces of work in `jobs` processes (None: one per core).
+
+    With one job, or up to `few` pieces of work, it is the built-in one: to start a process takes
+    some seconds.
+    """
+    if (wanted := _wanted(jobs, count, few)) < 2:
+        yield map
+        return
+    with Processes(wanted, _JOINT) as pool:
+        yield pool.map
 
 
 @contextmanager

@@ -64,28 +64,26 @@ def read_study(path: str | Path) -> Study:
 
 
 def _read(path: Path, content: Mapping[str, Any]) -> Study:
-    """Check the content of a study; InputError names the key."""
     for key in ("tests", "model"):
         if key not in content:
             raise InputError(f"{key} is missing; give it like {_EXAMPLES[key]}")
-    for key in ("name", "specimen"):
-        value = content.get(key)
-        if value is not None and (not isinstance(value, str) or not value.strip()):
-            raise InputError(f"{key} = {value!r} is no text; give it like {_EXAMPLES[key]}")
-    for key, least in _LEAST.items():
-        value = content.get(key)
-        if value is not None and (type(value) is not int or value < least):
-            raise InputError(f"{key} = {value!r} must be a whole number from {least} up")
-    if content.get("drive") not in (None, *DRIVES):
-        raise InputError(f"drive = {content['drive']!r} must be one of {', '.join(DRIVES)}")
-    if "cycles" in content and ("cycle" in content or not is_range(content["cycles"])):
-        raise InputError(
-            f"cycles = {content['cycles']!r} must be the numbers of the first and the last one, "
-            "like [1, 3], without cycle beside it"
-        )
-    for key in OPTIONS:
-        if content.get(key) not in (None, True, False):
-            raise InputError(f"{key} = {content[key]!r} must be true or false")
+    for key, value in content.items():
+        admissible, wanted = True, ""
+        if key in ("name", "specimen"):
+            admissible = isinstance(value, str) and bool(value.strip())
+            wanted = f"text, like {_EXAMPLES[key]}"
+        elif key in _LEAST:
+            admissible = type(value) is int and value >= _LEAST[key]
+            wanted = f"a whole number from {_LEAST[key]} up"
+        elif key == "drive":
+            admissible, wanted = value in DRIVES, f"one of {', '.join(DRIVES)}"
+        elif key in OPTIONS:
+            admissible, wanted = isinstance(value, bool), "true or false"
+        elif key == "cycles":
+            admissible = is_range(value) and "cycle" not in content
+            wanted = "the numbers of the first and the last one, like [1, 3], without cycle"
+        if not admissible:
+            raise InputError(f"{key} = {value!r} must be {wanted}")
     model = Model.of_result(content)
     tests = _tests(path, content["tests"])
     kinds, held = _parameters(content.get("parameters", {}), model)
@@ -107,7 +105,6 @@ def _read(path: Path, content: Mapping[str, Any]) -> Study:
 
 
 def _tests(path: Path, patterns: Any) -> tuple[tuple[str, Path], ...]:
-    """Names and files of the tests."""
     patterns = [patterns] if isinstance(patterns, str) else patterns
     if not isinstance(patterns, list) or not all(isinstance(p, str) for p in patterns):
         raise InputError(f"tests must be a list like {_EXAMPLES['tests']}")

@@ -74,34 +74,23 @@ def _whole(path: Path) -> Path:
 def _matches(pattern: str | Path, base: Path) -> list[Path]:
     """The files of one pattern."""
     path = base / pattern
-    if path.is_dir():
-        there = _tests_in(path)
-        if not there:
-            raise InputError(f"{pattern}: the folder has no test; {WANTED}")
-        return there
-    if path.exists() or not glob.has_magic(str(pattern)):
+    if folder := path.is_dir():
+        hits = list(path.iterdir())
+    elif path.exists() or not glob.has_magic(str(pattern)):
         # One that is not there is refused where it is read. A shell's glob also names the TOMLs.
         return [] if path.suffix.lower() == ".toml" else [path]
-    hits = [Path(hit) for hit in glob.glob(str(path), recursive=True)]
-    motions = {path for folder in {hit.parent for hit in hits} for path in _motions(folder)}
-    there = [hit for hit in hits if _is_test(hit) and _whole(hit) not in motions]
-    there += [inner for hit in hits if hit.is_dir() for inner in _tests_in(hit)]
+    else:
+        hits = [Path(hit) for hit in glob.glob(str(path), recursive=True)]
+        hits += [inner for hit in hits if hit.is_dir() for inner in hit.iterdir()]
+    files = [hit for hit in hits if _is_test(hit)]
+    tomls = (toml for place in {file.parent for file in files} for toml in place.glob("*.toml"))
+    motions = {_whole(motion) for motion in map(motion_file, tomls) if motion is not None}
+    there = [file for file in files if _whole(file) not in motions]
     if not there:
-        why = "matches no file" if not hits else "matches no test"
-        raise InputError(f"{pattern}: the glob {why}; {WANTED}")
+        matched = f"the glob matches no {'test' if hits else 'file'}"
+        why = "the folder has no test" if folder else matched
+        raise InputError(f"{pattern}: {why}; {WANTED}")
     return there
-
-
-def _tests_in(folder: Path) -> list[Path]:
-    files = [path for path in folder.iterdir() if _is_test(path)]
-    motions = _motions(folder) if files else set()
-    return [path for path in files if _whole(path) not in motions]
-
-
-def _motions(folder: Path) -> set[Path]:
-    """Files that TOMLs in a folder name as the motion of a test."""
-    found = map(motion_file, folder.glob("*.toml"))
-    return {_whole(path) for path in found if path is not None}
 
 
 def _is_test(path: Path) -> bool:
@@ -113,10 +102,8 @@ def _is_test(path: Path) -> bool:
         return False
     if path.name.startswith((".", "~$")):
         return False
-    is_result = path.name in _WRITTEN and any(
-        (path.parent / mark).is_file() for mark in (*MARKS, "summary.html")
-    )
-    return not is_result
+    marks = ((path.parent / mark).is_file() for mark in (*MARKS, "summary.html"))
+    return not (path.name in _WRITTEN and any(marks))
 
 
 def _names(paths: list[Path]) -> Iterator[str]:

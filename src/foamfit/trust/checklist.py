@@ -23,9 +23,9 @@ from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, Intervals, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, split_name
 from foamfit.text import engineering, listed, percent
+from foamfit.trust import SENTENCES, say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK, covariance
-from foamfit.trust.sentences import SENTENCES, say
 
 # Misfit over the standard deviation of a curve above which the curve was not fitted at all, and
 # over its range above which it was fitted poorly.
@@ -181,11 +181,10 @@ def _determined(e: Findings) -> Check:
     A nuisance parameter that is not determined shows in the intervals of the others.
     """
     own = {name: item for name, item in e.estimates.items() if name not in NUISANCE}
-    vanishing = [name for name in own if _vanishes(e, name)]
-    warnings = []
+    vanishing, warnings = [name for name in own if _vanishes(e, name)], list[str]()
+    named = [(name, item) for name, item in own.items() if name not in vanishing]
     for state in ("not determined", "weak"):
-        of = {name: item.why for name, item in own.items() if item.state == state}
-        of = {name: why for name, why in of.items() if name not in vanishing}
+        of = {name: item.why for name, item in named if item.state == state}
         groups = [(", ".join(names), why) for why, names in groupby(of, key=of.__getitem__)]
         told = "; ".join(f"{names} ({why})" for names, why in groups)
         if len(groups) > REASONS:
@@ -295,9 +294,6 @@ def _time_shift(e: Findings) -> Check:
     late = _shift_hint(e.best, e.known) or 0.0
     told = f"{'late' if late > 0.0 else 'early'} by {engineering(abs(late), 's')}"
     return _check("time_shift", late == 0.0, late=told)
-
-
-# ---------------------------------------------------------------- what was left out
 
 
 def _shift_hint(best: BestPoint, determined: Sequence[str]) -> float | None:

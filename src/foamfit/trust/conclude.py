@@ -15,7 +15,6 @@ from foamfit.data.describe import noise_sentences
 from foamfit.data.energy import audit
 from foamfit.data.measurement import INTEGRATED, interior_channel
 from foamfit.errors import SimulationError
-from foamfit.fitting.box import scale_in_words
 from foamfit.fitting.branches import visited
 from foamfit.fitting.curves import MOTION_CURVES
 from foamfit.fitting.losses import LOSSES
@@ -25,7 +24,7 @@ from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstima
 from foamfit.springs import laws
 from foamfit.springs.parameters import any_param, split_name, unit_of
 from foamfit.text import engineering, listed, percent
-from foamfit.trust import covariance
+from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
 from foamfit.trust.budget import make_budget
 from foamfit.trust.checklist import (
@@ -38,7 +37,6 @@ from foamfit.trust.checklist import (
 )
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
-from foamfit.trust.sentences import say
 
 # Factor between an interval and the local one from which on the local standard error is given up.
 ASTRAY = 2.0
@@ -107,12 +105,11 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
 
 
 def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[str, Any]]:
-    """Noise of each counted curve, how it is known, its scale, and the residuals over it.
+    """Noise of each counted curve, how it is known, its scale, and the residuals over it, SI.
 
     `errors` are those of the counted curves, or none if nothing varies. `law_error` is the RMS of
-    the law's error beside the noise, SI, None if there is none; `law_error_evidence` is by how much
-    the Bayesian information criterion favours it. `motion_smoothed` tells whether the driving
-    motion was followed without its noise. 95 % of the residuals are below `residual_q95`, SI.
+    the law's error beside the noise, None if there is none; `law_error_evidence` is by how much the
+    Bayesian information criterion favours it. 95 % of the residuals are below `residual_q95`.
     """
     objective, found = best.problem.objective, {}
     known = dict(zip(objective.counted, errors, strict=True)) if errors else {}
@@ -224,15 +221,13 @@ def _estimates(
 ) -> dict[str, ParameterEstimate]:
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
     problem, out = best.problem, {}
-    objective = problem.objective
-    missed = max((objective.off(best.simulated, c) or 0.0, c) for c in objective.counted)
     for name, value in zip(problem.names, best.values.tolist(), strict=True):
         if problem.is_exact(name):
             continue
         parameter = problem.params[name]
         if name in best.names:
             assert insight is not None
-            one = _followed(_varied(best, name, insight, intervals), missed)
+            one = _varied(best, name, insight, intervals)
         else:
             vary, spring = bool(parameter.vary), split_name(name)[0] + 1
             state, key = ("not determined", "unreached") if vary else ("fixed", "held")
@@ -242,15 +237,6 @@ def _estimates(
         parameter.stderr = one.stderr
         out[name] = one.counted_from(-problem.measurement.origins.get(name, 0.0))
     return out
-
-
-def _followed(one: ParameterEstimate, missed: tuple[float, str]) -> ParameterEstimate:
-    """Call a parameter weak at best where the fit misses a curve by more than `POOR`."""
-    off, curve = missed
-    if off <= POOR or one.state != "determined":
-        return one
-    told = say("why", "poor", off=off, curve=curve.replace("_", "-"), why=one.why)
-    return replace(one, state="weak", why=told)
 
 
 def _varied(
@@ -273,12 +259,17 @@ def _varied(
     if span is not None:  # it may be that of the point before the last improvement
         span = min(span[0], value), max(span[1], value)
     state, why = state_of(name, value, ends, insight, (low, high), span)
-    if state == "determined" and problem.objective.interior_mass:
+    objective = problem.objective
+    off, curve = max((objective.off(best.simulated, one) or 0.0, one) for one in objective.counted)
+    if state == "determined" and objective.interior_mass:
         state, why = "weak", say("why", "vibration", why=why)
     elif state == "determined" and name in intervals.elsewhere:
         there = intervals.elsewhere[name] + problem.measurement.origins.get(name, 0.0)
         told = engineering(there, unit) if unit else f"{there:.3g}"
         state, why = "weak", say("why", "elsewhere", there=told, why=why)
+    elif state == "determined" and off > POOR:
+        told = curve.replace("_", "-")
+        state, why = "weak", say("why", "poor", off=off, curve=told, why=why)
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
     if name in intervals.doubtful:
@@ -304,16 +295,11 @@ def state_of(
     `ends` are those of its 95 % interval, not cut at its `limits`; NaN or infinite where the data
     fix only a combination. `span` is its range, if there is one; the wider of the two counts.
     """
-    what = "95 % interval"
-    if span is not None and span[1] - span[0] > ends[1] - ends[0]:
-        ends, what = span, "range"
-    size = float(insight.sizes[insight.names.index(name)])
-    unit, half = unit_of(name), 0.5 * (ends[1] - ends[0])
-    half = half if math.isfinite(half) else math.nan
-    of = scale_in_words(name, value, size)
-    state, why = covariance.state(value, half, size, *limits, of, what)
+    ends, what = covariance.wider(ends, span)
+    size, unit = float(insight.sizes[insight.names.index(name)]), unit_of(name)
+    state, why = covariance.state(name, value, (ends, what), size, limits)
     if state == "not determined":
-        reason = why if math.isfinite(half) else say("why", "independent")
+        reason = why if math.isfinite(ends[1] - ends[0]) else say("why", "independent")
         return state, insight.combination(name, covariance.NOTHING / 1.96) or reason
     at_bound = value in limits and value != 0.0
     if may_vanish(name) and ends[0] <= 0.0 <= ends[1] and not at_bound:

@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from foamfit.arrays import Array
+from foamfit.fitting.box import scale_in_words
 from foamfit.text import percent
 from foamfit.trust.residuals.noise_process import NoiseProcess, noise_processes, parts
 
+Ends = tuple[float, float]
 # Half widths of the 95 % interval, over the scale of a parameter (`fitting.box.Scales`), past which
 # it is weak, and past which the test does not determine it.
 WEAK, NOTHING = 0.5, 3.0
@@ -53,11 +55,6 @@ class Covariance:
     freedom: Array
     effective: float  # Effective number of samples
     noise: tuple[NoiseProcess, ...]  # Noise of each curve, in units of the residual
-
-    @property
-    def tau(self) -> tuple[float, ...]:
-        """Autocorrelation time of each curve, samples."""
-        return tuple(process.tau for process in self.noise)
 
     @property
     def stderr(self) -> Array:
@@ -173,14 +170,20 @@ class Block:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """Directions of m unknowns along which the residuals of all tests together have unit slopes.
+class Sandwich:
+    """Covariance H⁻¹ JᵀΣJ H⁻¹ of m unknowns with Σ the noise of the curves of all tests, scaled.
 
-    `drawn` (d, m) are the slopes of further residuals, of so much variance each (d,).
+    H is JᵀJ, or with `curvatures` (of each test, along its `Block.axes`) that of half the cost,
+    which a residual that is no noise changes (White 1982, Econometrica 50, 1). `bend` (m, m) is
+    what the bend of `Block.through` adds to H. `drawn` (d, m) are the slopes of further residuals,
+    of so much variance each (d,). All is computed along s directions of the unknowns along which
+    the residuals of all tests together have unit slopes.
     """
 
     blocks: tuple[Block, ...]
     drawn: tuple[Array, Array] | None = None
+    curvatures: tuple[Array, ...] | None = None
+    bend: Array | None = None
 
     @cached_property
     def _solved(self) -> tuple[Array, Array]:
@@ -203,104 +206,85 @@ class Frame:
 
     @cached_property
     def lefts(self) -> list[Array]:
-        """The directions along the orthonormal columns of each test, (r, s)."""
-        ends = np.cumsum([len(block.axes[1]) for block in self.blocks])
-        return np.split(self._solved[0], ends)[: len(self.blocks)]
+        """The directions along the orthonormal columns of each test (r, s), then of `drawn`."""
+        return np.split(self._solved[0], np.cumsum([len(block.axes[1]) for block in self.blocks]))
+
+    @property
+    def _pairs(self) -> list[tuple[Array, Block]]:
+        return list(zip(self.lefts, self.blocks, strict=False))
 
     @cached_property
     def axes(self) -> Array:
         """Principal axes of the covariance of the noise, one deviation long, (s, s)."""
-        pairs = zip(self.lefts, self.blocks, strict=True)
-        rows = [block.meat @ left for left, block in pairs]
-        rows += [] if self.drawn is None else [self.drawn[1][:, None] * self.pulled]
+        rows = [block.meat @ left for left, block in self._pairs]
+        rows += [] if self.drawn is None else [self.drawn[1][:, None] * self.lefts[-1]]
         meat = self._solved[0].T @ np.concatenate(rows)
         power, axes = np.linalg.eigh(0.5 * (meat + meat.T))
         least = 1e-12 * power.max(initial=0.0)  # no variance is negative
         return np.asarray(axes * np.sqrt(np.maximum(power, least)))
 
-    @property
-    def pulled(self) -> Array:
-        """The directions along what is drawn, (d, s)."""
-        return self._solved[0][sum(map(len, self.lefts)) :]
-
-    @cached_property
-    def curvatures(self) -> tuple[Array, ...]:
-        """`Block.curvature` of each test."""
+    def curved(self, bend: Array | None) -> Sandwich:
+        """The same with the curvature of the cost of each test (`Block.curvature`)."""
         spreads = [left @ self.axes for left in self.lefts]
-        pairs = zip(self.blocks, spreads, strict=True)
-        return tuple(block.curvature(one @ one.T) for block, one in pairs)
-
-
-@dataclass(frozen=True, eq=False)
-class Sandwich:
-    """Covariance H⁻¹ JᵀΣJ H⁻¹ of m unknowns with Σ the noise of the curves of all tests, scaled.
-
-    H is JᵀJ, or with `curvatures` (of each test, along its `Block.axes`) that of half the cost,
-    which a residual that is no noise changes (White 1982, Econometrica 50, 1). `bend` (m, m) is
-    what the bend of `Block.through` adds to H.
-    """
-
-    frame: Frame
-    bend: Array | None = None
-    curvatures: tuple[Array, ...] | None = None
+        pairs = zip(self.blocks, spreads, strict=False)
+        curvatures = tuple(block.curvature(one @ one.T) for block, one in pairs)
+        return replace(self, curvatures=curvatures, bend=bend)
 
     @cached_property
     def _bread(self) -> Array:
         """H⁻¹ along the directions; where there is no curvature, that of JᵀJ."""
-        root = self.frame.root
-        out = np.eye(root.shape[1])
+        out = np.eye(self.root.shape[1])
         if self.curvatures is None:
             return out
-        pairs = zip(self.frame.lefts, self.curvatures, strict=True)
+        pairs = list(zip(self.lefts, self.curvatures, strict=False))
         more = [(curved - np.eye(len(curved))) @ left for left, curved in pairs]
-        out += np.concatenate(self.frame.lefts).T @ np.concatenate(more)
-        out += 0.0 if self.bend is None else root.T @ self.bend @ root
+        out += np.concatenate([left for left, _ in pairs]).T @ np.concatenate(more)
+        out += 0.0 if self.bend is None else self.root.T @ self.bend @ self.root
         values, vectors = np.linalg.eigh(0.5 * (out + out.T))
         return np.asarray((vectors / np.where(values > FLATTEST, values, 1.0)) @ vectors.T)
 
     @cached_property
     def inverse(self) -> Array:
         """H⁻¹, (m, m); zero where the tests say nothing."""
-        root = self.frame.root
-        return root @ self._bread @ root.T
+        return self.root @ self._bread @ self.root.T
 
     @cached_property
     def matrix(self) -> Array:
         """The covariance, (m, m); NaN where the tests say nothing."""
-        spread = self.frame.root @ self._bread @ self.frame.axes
+        spread = self.root @ self._bread @ self.axes
         out = spread @ spread.T
-        for t, (left, block) in enumerate(zip(self.frame.lefts, self.frame.blocks, strict=True)):
+        for t, (left, block) in enumerate(self._pairs):
             if block.given is not None and block.given.any():
                 moved = block.axes[1] @ block.given
                 moved = moved if self.curvatures is None else self.curvatures[t] @ moved
-                pull = self.frame.root @ self._bread @ left.T @ moved
+                pull = self.root @ self._bread @ left.T @ moved
                 out = out + np.outer(pull, pull)
-        out[self.frame.lost, :] = out[:, self.frame.lost] = np.nan
+        out[self.lost, :] = out[:, self.lost] = np.nan
         return out
 
     def covariance(self, scales: Array) -> Covariance:
         """Covariance of the unknowns in SI, by their scales (m,)."""
-        back, m = self._bread @ self.frame.root.T, scales.size
+        back, m = self._bread @ self.root.T, scales.size
         variance, doubt, most = np.zeros((3, m))
-        there = np.array([(block.through != 0.0).any(axis=0) for block in self.frame.blocks])
+        there = np.array([(block.through != 0.0).any(axis=0) for block in self.blocks])
         own = there & (there.sum(axis=0) == 1)
-        effective = sum(block.effective for block in self.frame.blocks)
-        for left, block, mine in zip(self.frame.lefts, self.frame.blocks, own, strict=True):
+        effective = sum(block.effective for block in self.blocks)
+        for (left, block), mine in zip(self._pairs, own, strict=True):
             mix = left @ back
             variance += np.einsum("ij,ij->j", mix, block.meat @ mix)
             doubt += block.doubt(mix)
             most[mine] = block.effective - np.count_nonzero(mine)
         most[~own.any(axis=0)] = effective - m
-        if self.frame.drawn is not None:
-            mix = self.frame.pulled @ back
-            variance += self.frame.drawn[1] @ mix**2
+        if self.drawn is not None:
+            mix = self.lefts[-1] @ back
+            variance += self.drawn[1] @ mix**2
         known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
         return Covariance(
             self.matrix * np.outer(scales, scales),
-            np.diag(self.matrix) / np.where(self.frame.lost, np.nan, np.diag(self.inverse)),
+            np.diag(self.matrix) / np.where(self.lost, np.nan, np.diag(self.inverse)),
             np.minimum(known, np.maximum(most, 1.0)),
             effective,
-            tuple(one for block in self.frame.blocks for one in block.noise),
+            tuple(one for block in self.blocks for one in block.noise),
         )
 
 
@@ -321,7 +305,7 @@ class Uncertainty:
     @cached_property
     def plain(self) -> Sandwich:
         """As if the law had no error."""
-        return Sandwich(Frame(self.blocks, self.drawn))
+        return Sandwich(self.blocks, self.drawn)
 
     @cached_property
     def held(self) -> NDArray[np.bool_]:
@@ -340,12 +324,13 @@ class Uncertainty:
     @cached_property
     def bent(self) -> Sandwich:
         """With the curvature of the cost, what is pressed to a limit held."""
-        free, frame = ~self.held, self.plain.frame
-        if self.held.any():
-            drawn = None if self.drawn is None else (self.drawn[0][:, free], self.drawn[1])
-            frame = Frame(tuple(block.without(self.held) for block in self.blocks), drawn)
+        if not self.held.any():
+            return self.plain.curved(self.bend)
+        free = ~self.held
+        drawn = None if self.drawn is None else (self.drawn[0][:, free], self.drawn[1])
         bend = None if self.bend is None else self.bend[np.ix_(free, free)]
-        return Sandwich(frame, bend, frame.curvatures)
+        blocks = tuple(block.without(self.held) for block in self.blocks)
+        return Sandwich(blocks, drawn).curved(bend)
 
     @cached_property
     def covariance(self) -> Covariance:
@@ -377,30 +362,33 @@ def half_width(stderr: float, freedom: float) -> float:
     return float(stats.t.ppf(0.975, max(freedom, 1.0))) * stderr
 
 
+def wider(ends: Ends, span: Ends | None) -> tuple[Ends, str]:
+    """The wider of a 95 % interval and of a range, and which it is."""
+    if span is not None and span[1] - span[0] > ends[1] - ends[0]:
+        return span, "range"
+    return ends, "95 % interval"
+
+
 def state(
-    value: float,
-    half: float,
-    size: float,
-    low: float,
-    high: float,
-    of: str = "its value",
-    what: str = "95 % interval",
+    name: str, value: float, known: tuple[Ends, str], size: float, limits: Ends
 ) -> tuple[str, str]:
     """State of a parameter that was varied and whose branch was reached, and why.
 
     The rule (`RULE`): determined if its 95 % interval and its range are within ±`WEAK` of its
-    scale, not determined if one of them is wider than ±`NOTHING`, weak between. `half` is half of
-    the wider of the two, in words `what`, not cut at the limits, NaN where the data fix only a
-    combination; `size` is its scale, in words `of`; `low` and `high` are its limits.
+    scale, not determined if one of them is wider than ±`NOTHING`, weak between. `known` is the
+    wider of the two (`wider`), not cut at the limits, NaN where the data fix only a combination;
+    `size` is its scale.
     """
+    ((low, high), what), of = known, scale_in_words(name, value, size)
+    half = 0.5 * (high - low)
     if not math.isfinite(half):
         return "not determined", "the data fix only a combination of it with other parameters"
-    ratio, edge = half / size, AT_LIMIT * size
-    width = f"its {what} is ±{percent(ratio)} of {of}"
+    ratio = half / size
     if half > NOTHING * size:
         wide = "more than 100 times" if ratio > 100.0 else f"±{ratio:.2g} times"
         return "not determined", f"its {what} is {wide} {of}"
-    if value - low <= edge or high - value <= edge:
-        limit = low if value - low <= edge else high
-        return "weak", f"it lies at its limit {limit:g}; its interval is open on that side"
+    for limit in limits:
+        if abs(value - limit) <= AT_LIMIT * size:
+            return "weak", f"it lies at its limit {limit:g}; its interval is open on that side"
+    width = f"its {what} is ±{percent(ratio)} of {of}"
     return "weak" if half > WEAK * size else "determined", width

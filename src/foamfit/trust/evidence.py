@@ -26,6 +26,7 @@ from foamfit.arrays import Array
 from foamfit.fitting import levenberg
 from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.losses import soften, softness
+from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import Tracker
 from foamfit.results import Fit, rung_name
 from foamfit.trust.best_point import BestPoint
@@ -56,9 +57,8 @@ BLOCKS = 24
 STEPS, ENOUGH = 20, 1e-3
 
 
-def misfit_of(best: BestPoint, residual: Array) -> float:
+def misfit_of(objective: Objective, residual: Array) -> float:
     """RMS over the measured ranges of all counted curves, of a residual as the objective has it."""
-    objective = best.problem.objective
     spans = np.repeat([objective.span(name) for name in objective.counted], objective.sizes)
     return math.sqrt(float(np.mean((residual / spans) ** 2)))
 
@@ -92,7 +92,7 @@ def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
         end = levenberg.descend(residual, jacobian, start, space.box, STEPS, enough=ENOUGH)
         there = objective.residual(space.decode(end.point))
         predicted[~rest] = there[~rest]
-    return misfit_of(best, predicted[: objective.n_data])
+    return misfit_of(objective, predicted[: objective.n_data])
 
 
 @dataclass(eq=False)
@@ -128,7 +128,7 @@ class Tried:
         pairs = zip(self.sizes, self.spans, strict=True)
         floor = sum(n * (EXACT * span) ** 2 for n, span in pairs)
         self.chisqr = max(float(self.residual @ self.residual), floor)
-        self.misfit = max(misfit_of(best, self.residual), EXACT)
+        self.misfit = max(misfit_of(objective, self.residual), EXACT)
         # p-values of all curves together (Bonferroni)
         self.runs_p, self.neighbours_p = (
             min(1.0, len(self.sizes) * min(map(test, self.curves)))

@@ -19,7 +19,7 @@ from foamfit.fitting.box import scale_in_words
 from foamfit.fitting.branches import Section, sections
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import listed, percent
-from foamfit.trust.sentences import say
+from foamfit.trust import say
 
 if TYPE_CHECKING:
     from foamfit.trust.best_point import BestPoint
@@ -39,8 +39,6 @@ class Insight:
     values: Array  # (k,), SI
     sizes: Array  # (k,): their scales, SI
     curves: tuple[str, ...]  # in the order of the rows of `scaled`
-    clock: Array  # (n_samples,): time of the samples, s; their number where the test has no time
-    timed: bool  # whether the clock is a time
     # (n_curves * n_samples, k): by how many standard deviations of its noise a curve moves, sample
     # by sample, if a parameter changes by its scale; zero at samples that are not counted.
     scaled: Array
@@ -62,35 +60,20 @@ class Insight:
             return np.where(singular > tiny, 1.0 / singular, np.inf), vt
 
     @cached_property
-    def _variance(self) -> Array:
-        """Variance of each relative value, (k,); infinite where the curves do not tell it."""
+    def covariance(self) -> Array:
+        """Covariance of the relative values, (k, k); NaN for what the curves do not tell."""
         errors, vt = self._directions
         seen = np.isfinite(errors)
-        out = (vt[seen] ** 2 * errors[seen, None] ** 2).sum(axis=0)
-        out[np.any(np.abs(vt[~seen]) > 1e-3, axis=0)] = np.inf
+        out = (vt[seen].T * errors[seen] ** 2) @ vt[seen]
+        lost = np.any(np.abs(vt[~seen]) > 1e-3, axis=0)
+        out[lost, :] = out[:, lost] = np.nan
         return np.asarray(out)
-
-    @property
-    def stderr(self) -> Array:
-        """Standard errors due to the noise alone, SI, (k,); infinite if undetermined."""
-        return np.sqrt(self._variance) * self.sizes
 
     @property
     def correlation(self) -> Array:
         """Correlation of the estimates, (k, k); NaN for what the curves do not tell."""
-        errors, vt = self._directions
-        seen = np.isfinite(errors)
-        covariance = (vt[seen].T * errors[seen] ** 2) @ vt[seen]
-        scale = np.sqrt(np.where(np.isfinite(self._variance), self._variance, np.nan))
-        return np.asarray(covariance / np.outer(scale, scale))
-
-    def along(self, name: str, curve: str) -> Array:
-        """Sensitivity of one curve to one parameter, (n_samples,)."""
-        return np.asarray(self.scaled[self._rows(curve), self.names.index(name)])
-
-    def _rows(self, curve: str) -> slice:
-        at = self.curves.index(curve) * self.clock.size
-        return slice(at, at + self.clock.size)
+        scale = np.sqrt(np.diag(self.covariance))
+        return np.asarray(self.covariance / np.outer(scale, scale))
 
     def shares(self) -> tuple[tuple[tuple[str, str], ...], Array]:
         """Parts (curve, branches), and the share of each in the information on a parameter.
@@ -102,18 +85,16 @@ class Insight:
         """
         columns, parts = [], []
         squares = np.linalg.pinv(self.scaled, rcond=1e-12) ** 2  # (k, n): own parts, rescaled
-        for curve in self.curves:
-            own = squares[:, self._rows(curve)]
+        each = np.split(squares, len(self.curves), axis=1)
+        for curve, own in zip(self.curves, each, strict=True):
             for label in dict.fromkeys(section.branches for section in self.sections):
                 spans = [slice(s.start, s.stop) for s in self.sections if s.branches == label]
                 columns.append(np.sum([own[:, span].sum(axis=1) for span in spans], axis=0))
                 parts.append((curve, label))
         shares = np.array(columns).T
-        shares[~np.isfinite(self._variance)] = np.nan
+        shares[np.isnan(np.diag(self.covariance))] = np.nan
         with np.errstate(invalid="ignore"):
             return tuple(parts), shares / shares.sum(axis=1, keepdims=True)
-
-    # ------------------------------------------------------------ in words
 
     def weakest(self) -> tuple[float, dict[str, float]]:
         """Relative standard error along the weakest direction, and its parts over the largest."""
@@ -202,11 +183,9 @@ def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
         at += kept.size
     return Insight(
         names=best.names,
-        values=np.array([best.values[problem.index[name]] for name in best.names]),
+        values=best.values[best.places],
         sizes=best.sizes,
         curves=objective.counted,
-        clock=objective.time,
-        timed=problem.measurement.time is not None,
         scaled=scaled,
         sections=sections(problem, best.simulated),
         silent=tuple(name for name in problem.free() if name in best.unreached),

@@ -17,11 +17,11 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import Tracker
 from foamfit.results import Intervals
+from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import PLACED, Tracing, departures
 from foamfit.trust.resample import bootstrap, check_emcee, mcmc, walkers
 from foamfit.trust.residuals.noise_process import parts
-from foamfit.trust.sentences import say
 
 # The default profiles a parameter if the root of the cost departs from a straight line by this
 # share at the end of its local interval.
@@ -29,8 +29,8 @@ BENT = 0.15
 METHODS = ("auto", "local", "profile", "bootstrap", "mcmc")
 # Refits of an average profile, for the announcement; draws that percentiles need, and at most.
 REFITS, ENOUGH_DRAWS, MOST_DRAWS = 9, 40, 100_000
-# Evaluations of a refit, and its slopes.
-EVALUATIONS, SLOPES = 6.0, 0.6
+# Evaluations of a refit; there is a set of slopes to ten of them.
+EVALUATIONS = 6.0
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
 # noise makes that much difference in one test of ten thousand, but there are many minima.
 HARDLY_WORSE = 2.0
@@ -88,13 +88,14 @@ def assess(
     if not known:
         none = say("interval", "nothing")
         return Intervals(warnings=() if choice.method == "auto" else (none,))
-    if choice.method in ("bootstrap", "mcmc"):
-        made = _by_bootstrap if choice.method == "bootstrap" else _by_mcmc
-        return made(best, choice, tracker, announce)
+    if choice.method != "auto":
+        count, by = evaluations_of(best, choice), choice.method
+        announce(say("interval", "cost", by=by, count=count, seconds=_seconds(best, count)))
+    if choice.method == "bootstrap":
+        return _by_bootstrap(best, choice, tracker)
+    if choice.method == "mcmc":
+        return _by_mcmc(best, choice, tracker)
     if choice.method == "profile":
-        count = REFITS * len(known)
-        told = _seconds(best, count)
-        announce(say("interval", "refits", what="profile likelihood", count=count, seconds=told))
         return _by_profiles(best, known, minima, tracker, math.inf)
     others = [(point, tracker.consider(point)) for point in minima]
     far = np.abs(departures(best)).max(axis=1, initial=0.0)
@@ -216,25 +217,17 @@ def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]
     return [points[0], points[-1]] if points else []
 
 
-def _by_bootstrap(
-    best: BestPoint, choice: Choice, tracker: Tracker, announce: Announce
-) -> Intervals:
-    what, count = "block bootstrap", choice.draws
-    seconds = _seconds(best, count)
-    announce(say("interval", "refits", what=what, count=count, seconds=seconds))
-    drawn, stopped = bootstrap(best, count, choice.seed, tracker)
-    note = say("interval", "bootstrap", done=len(drawn), count=count)
+def _by_bootstrap(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
+    drawn, stopped = bootstrap(best, choice.draws, choice.seed, tracker)
+    note = say("interval", "bootstrap", done=len(drawn), count=choice.draws)
     if stopped:
         note = say("interval", "stopped", told=note, by=stopped)
     if len(drawn) < ENOUGH_DRAWS:
         return Intervals(warnings=(say("interval", "few", told=note),))
-    return _percentiles(best, drawn, what, note, stopped is None)
+    return _percentiles(best, drawn, "block bootstrap", note, stopped is None)
 
 
-def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker, announce: Announce) -> Intervals:
-    count = (choice.draws + 1) * walkers(best)
-    seconds = _seconds(best, count, evaluations=1.0, slopes=0.0)
-    announce(say("interval", "simulations", count=count, seconds=seconds))
+def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
     chain = mcmc(best, choice.draws, choice.seed, tracker)
     note = chain.sentence()
     if len(chain.samples) < ENOUGH_DRAWS:
@@ -258,13 +251,10 @@ def _percentiles(best: BestPoint, drawn: Array, method: str, note: str, fine: bo
     return Intervals(ends, dict.fromkeys(ends, method), notes=notes, warnings=warnings)
 
 
-def _seconds(
-    best: BestPoint, count: int, *, evaluations: float = EVALUATIONS, slopes: float = SLOPES
-) -> float:
-    """Expected run time of refits, s, from three evaluations and one set of slopes."""
-    problem, began = best.problem, time.perf_counter()
-    for _ in range(3):
-        problem.objective.residual(best.values)
-    middle = time.perf_counter()
-    problem.slopes(best.values, best.names)
-    return count * (evaluations * (middle - began) / 3 + slopes * (time.perf_counter() - middle))
+def _seconds(best: BestPoint, evaluations: float) -> float:
+    """Expected run time of refits, s, from ten evaluations and one set of slopes."""
+    began = time.perf_counter()
+    for _ in range(10):
+        best.problem.objective.residual(best.values)
+    best.problem.slopes(best.values, best.names)
+    return evaluations * (time.perf_counter() - began) / 10.0

@@ -16,8 +16,8 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.fitting.search import Tracker
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.profile import BETTER
-from foamfit.trust.refit import ENOUGH, Refit
+from foamfit.trust.profile import BETTER, ENOUGH, Refit
+from foamfit.trust.residuals.law_error import CurveError
 
 # A description follows the curves about as well if the RMS of what it misses of them, the noise
 # taken off, is larger by this factor at most.
@@ -30,9 +30,11 @@ ITERATIONS, TRIALS = 6, 4
 DESCENT = 15
 
 
-def tolerance(best: BestPoint) -> float:
+def tolerance(best: BestPoint, errors: Sequence[CurveError] | None = None) -> float:
     """Rise of the cost up to which a description follows the curves about as well."""
-    pairs = zip(best.errors, best.problem.objective.sizes, strict=True)
+    pairs = zip(
+        best.errors if errors is None else errors, best.problem.objective.sizes, strict=True
+    )
     return (ALIKE**2 - 1.0) * sum(size * error.law**2 for error, size in pairs)
 
 
@@ -126,7 +128,7 @@ def _towards(refit: Refit, weights: Array, most: float) -> list[Array]:
         missed = refit.rise(point)
         if missed <= most:
             return [point]
-        share *= _nearer(most, missed, 0.9)
+        share *= nearer(most, missed, 0.9)
     return []
 
 
@@ -146,10 +148,10 @@ def _held(
         missed = math.inf if found is None else found.cost - best.cost
         if found is not None and missed <= most:
             return [found.point]
-        off *= _nearer(most, missed, 0.8)
+        off *= nearer(most, missed, 0.8)
     return []
 
 
-def _nearer(most: float, missed: float, largest: float) -> float:
+def nearer(most: float, missed: float, largest: float) -> float:
     """Factor of a step whose rise was too large; the rise is about the square of the step."""
     return min(max(math.sqrt(most / missed), 0.3), largest) if math.isfinite(missed) else 0.5

@@ -7,22 +7,20 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
+from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.refit import Refit
+from foamfit.trust.profile import Refit
 from foamfit.trust.residuals.noise_process import NoiseProcess, parts
-from foamfit.trust.sentences import say
 
 # Farthest that a walker of a Markov chain begins from the best point along a direction that the
-# test does not fix, over the scales of the parameters; and how often its way there is halved where
-# nothing can be simulated.
-FARTHEST, HALVINGS = 0.1, 10
+# test does not fix, over the scales of the parameters.
+FARTHEST = 0.1
 
 
 def block_length(process: NoiseProcess, n: int) -> int:
@@ -60,15 +58,12 @@ def _source(
     return partial(process.draw, n) if law else blocks
 
 
-class Refits(NamedTuple):
-    """Parameters refitted to resampled data: (m, k) values (SI), and what ended them early."""
+def bootstrap(
+    best: BestPoint, draws: int, seed: int, tracker: Tracker | None = None
+) -> tuple[Array, str | None]:
+    """Refit data remade from the fitted curves and blocks of the residuals.
 
-    values: Array
-    stopped: str | None
-
-
-def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = None) -> Refits:
-    """Refits to data remade from the fitted curves and blocks of the residuals.
+    Returned are the parameters of each, (m, k), SI, and what ended the refits early.
 
     Where a residual holds an error of the law, that stays, and noise of the kind that is in it is
     added to the measured curve.
@@ -98,7 +93,7 @@ def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = 
             out.append(end.point[best.places])
     except STOPPING as error:
         stopped = what_stopped(error)
-    return Refits(np.array(out).reshape(-1, len(best.names)), stopped)
+    return np.array(out).reshape(-1, len(best.names)), stopped
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,16 +164,23 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     sampler.log_prob_fn = log_probability
     bits = np.random.MT19937(np.random.SeedSequence([seed, 3]))  # of a seed of any size
     sampler.random_state = np.random.RandomState(bits).get_state()
+    # Walkers begin half a standard error off the best point along what the test fixes, no more than
+    # `FARTHEST` along the rest.
+    _, singular, axes = np.linalg.svd(best.jacobian * best.sizes, full_matrices=False)
+    reach = 0.5 * math.sqrt(max(variances)) / np.maximum(singular, 1e-300)
+    away = np.random.default_rng([seed, 2]).standard_normal((count, singular.size))
+    begin = best.values[best.places] / best.sizes + np.minimum(reach, FARTHEST) * away @ axes
+    begin = np.clip(begin, low / best.sizes, high / best.sizes)
     steps_done: list[Array] = []  # emcee would allocate all of them at once
     stopped = None
     try:
-        begin = _begin(best, log_probability, count, np.random.default_rng([seed, 2]))
-        if begin is None:
-            stopped = "the best point, next to which nothing can be simulated"
-        else:
+        with np.errstate(invalid="ignore"):  # of walkers at which nothing can be simulated
             for state in sampler.sample(
                 begin, iterations=steps, skip_initial_state_check=True, store=False
             ):
+                if not np.isfinite(state.log_prob).any():
+                    stopped = "the best point, next to which nothing can be simulated"
+                    break
                 steps_done.append(state.coords.copy())
     except STOPPING as error:
         stopped = what_stopped(error)
@@ -188,31 +190,3 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
         times = emcee.autocorr.integrated_time(chain, tol=0, quiet=True) if done > 10 else [np.inf]
     slowest = float(np.max(np.nan_to_num(times, nan=np.inf)))
     return MarkovChain(chain.reshape(-1, k) * best.sizes, done, done // 5, count, slowest, stopped)
-
-
-def _begin(
-    best: BestPoint,
-    log_probability: Callable[[Array], float],
-    count: int,
-    rng: np.random.Generator,
-) -> Array | None:
-    """Points about the best one at which walkers begin, scaled, (count, k); None if there are none.
-
-    Half a standard error away along what the test fixes, no more than `FARTHEST` along the rest.
-    """
-    noise = max(process.variance * process.tau for process in best.spread.noise)
-    _, singular, axes = np.linalg.svd(best.jacobian * best.sizes, full_matrices=False)
-    reach = np.minimum(0.5 * math.sqrt(noise) / np.maximum(singular, 1e-300), FARTHEST)
-    low, high = best.box / best.sizes
-    begin = []
-    for _ in range(count):
-        away = (reach * rng.standard_normal(reach.size)) @ axes
-        for halving in range(HALVINGS):
-            middle = best.values[best.places] / best.sizes
-            drawn = np.clip(middle + 0.5**halving * away, low, high)
-            if np.isfinite(log_probability(drawn)):
-                begin.append(drawn)
-                break
-        else:
-            return None
-    return np.array(begin)

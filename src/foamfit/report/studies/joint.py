@@ -19,7 +19,7 @@ from foamfit.report.render import page, words
 from foamfit.report.shown import Joint
 from foamfit.report.studies.parameters import Compared, plot_parameters
 from foamfit.report.tables import parameters_tex
-from foamfit.results import law_in_words
+from foamfit.results import Fit, law_in_words
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import percent
 from foamfit.trust.covariance import RULE
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.study.joint_result import JointData, JointParameter, TestFit
+    from foamfit.study.joint_result import JointData, JointParameter
 
 CURVES = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
 DPI = 180  # of the picture
@@ -110,9 +110,9 @@ def _of_springs(found: Joint) -> dict[str, JointParameter]:
     return {n: p for n, p in every if n not in NUISANCE and (p.kind != "fixed" or p.value)}
 
 
-def _write_test(one: TestFit, folder: Path, reports: bool, width: str) -> None:
+def _write_test(one: Callable[[], Fit], folder: Path, reports: bool, width: str) -> None:
     folder.mkdir()
-    write_result(one.fit(), folder, pages=reports, width=width)
+    write_result(one(), folder, pages=reports, width=width)
 
 
 def joint_text(found: JointData) -> str:

@@ -6,7 +6,7 @@ A result in memory is read by the content of its file, so that both give the sam
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.codec import build
 from foamfit.errors import InputError
 from foamfit.fitting.curves import DRIVES
 from foamfit.fitting.links import RATES
@@ -44,7 +45,8 @@ class HasContent(Protocol):
 class Identified:
     """One parameter of a result, SI; `kind` is as in joint.json, "shared" for that of one test.
 
-    `tests` has the values of an own or scattering parameter, one for each test.
+    `tests` has the values of an own or scattering parameter, one for each test, and `rates` the
+    rates of these tests (1/s). Raises ValueError if a number is missing or inadmissible.
     """
 
     kind: str
@@ -59,12 +61,23 @@ class Identified:
     b_ci95: Pair | None = None
     scatter: float = 0.0
     tests: tuple[float, ...] = ()
-    rates: tuple[float | None, ...] = ()  # of these tests, 1/s
+    rates: tuple[float | None, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse what is no number."""
+        numbers = {name: getattr(self, name) for name in ("value", "b", "scatter")}
+        errors = {name: getattr(self, name) or 0.0 for name in ("stderr", "local", "b_stderr")}
+        numbers |= {f"value of test {i + 1}": value for i, value in enumerate(self.tests)}
+        for name, value in (numbers | errors).items():
+            if not math.isfinite(value) or (name in errors and value < 0.0):
+                raise ValueError(f"{name} is {value}")
+        if self.kind not in KINDS:
+            raise ValueError(f"kind is {self.kind!r}")
 
     @property
     def error(self) -> float | None:
         """Its standard error, that of the local covariance where it is not determined."""
-        return self.stderr or self.local
+        return self.stderr or self.local or None
 
     @property
     def span(self) -> Pair | None:
@@ -100,7 +113,7 @@ class Source:
     # Correlation of what is named: a parameter, or its slope by rate as "s1_k0:b".
     names: tuple[str, ...]
     correlation: Array
-    misses: dict[str, tuple[Miss, ...]]  # Of the fitted tests, by channel
+    misses: dict[str, list[Miss]]  # Of the fitted tests, by channel
     time_shift: bool = False  # Whether a time shift of the motion was fitted
     # Correlation between specimens of own and scattering parameters, as far as the result has it.
     changing: tuple[str, ...] = ()
@@ -136,16 +149,23 @@ def read_source(result: HasContent | str | Path) -> Source:
     Raises
     ------
     InputError
-        If there is no result, or it lacks what a prediction needs; the message names the key.
+        If there is no result, or it lacks what a prediction needs; the message names it.
     """
     if isinstance(result, str | Path):
-        return _source(_Item(load_result(_file(Path(result))), str(result)))
-    if not hasattr(result, "to_json_dict"):
+        content, where = load_result(_file(Path(result))), str(result)
+    elif hasattr(result, "to_json_dict"):
+        content = result.to_json_dict()
+        where = str(content.get("test") or content.get("name") or "the result")
+    else:
         told = f"not from a {type(result).__name__}"
         raise InputError(f"a prediction is made from a result of fit or joint or its path, {told}")
-    content = result.to_json_dict()
-    where = content.get("test") or content.get("name") or "the result"
-    return _source(_Item(content, str(where)))
+    if not isinstance(content.get("parameters"), Mapping) or "model" not in content:
+        raise InputError(f"{where} is not the result of a fit or joint fit (fit.json, joint.json)")
+    try:
+        return _source(content, where)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:  # InputError among them
+        told = f"has no {error}" if isinstance(error, KeyError) else f"cannot be read: {error}"
+        raise InputError(f"{where} {told}; give the result as foamfit wrote it") from None
 
 
 def _file(path: Path) -> Path:
@@ -159,81 +179,19 @@ def _file(path: Path) -> Path:
     return path / "fit.json"
 
 
-@dataclass(frozen=True)
-class _Item:
-    """An object of a JSON file, and what messages call it."""
-
-    content: Any
-    where: str
-
-    def get(self, key: str) -> Any:
-        """Value of a key; None if the item is no object, or does not have it."""
-        return self.content.get(key) if isinstance(self.content, Mapping) else None
-
-    def item(self, key: str) -> _Item:
-        """What stands under a key."""
-        return _Item(self.get(key), f"{self.where}: {key}")
-
-    def items(self, key: str) -> dict[str, _Item]:
-        """The items of an object that must be there."""
-        found = self.get(key)
-        if not isinstance(found, Mapping):
-            raise InputError(f"{self.where} has no object '{key}', which a prediction needs")
-        return {name: _Item(value, f"{self.where}: {name}") for name, value in found.items()}
-
-    @property
-    def number(self) -> float:
-        """The item as a finite number."""
-        value = self.content
-        known = isinstance(value, int | float) and not isinstance(value, bool)
-        if not (known and math.isfinite(value)):
-            raise InputError(f"{self.where} is {value!r}; it must be a number")
-        return float(value)
-
-    @property
-    def maybe(self) -> float | None:
-        """The item as a number, if there is one."""
-        return None if self.content is None else self.number
-
-    @property
-    def error(self) -> float | None:
-        """The item as a standard error; None if there is none, or it is zero."""
-        if (number := self.maybe or 0.0) < 0.0:
-            raise InputError(f"{self.where} is {self.content!r}; it must not be negative")
-        return number or None
-
-    @property
-    def pair(self) -> Pair | None:
-        """The item as the ends of an interval; None if there is none, or a side is open."""
-        if self.content is None:
-            return None
-        if not isinstance(self.content, list | tuple) or len(self.content) != 2:
-            raise InputError(f"{self.where} is {self.content!r}; it must be two numbers")
-        low, high = (_Item(end, self.where).maybe for end in self.content)
-        return None if low is None or high is None else (low, high)
-
-
-def _source(given: _Item) -> Source:
-    """What the content of fit.json or joint.json says."""
-    where, content = given.where, given.content
-    if not isinstance(content.get("parameters"), Mapping) or "model" not in content:
-        raise InputError(f"{where} is not the result of a fit or joint fit (fit.json, joint.json)")
-    joint, drive = "tests" in content, content.get("drive")
-    try:
-        model = Model.of_result(content)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+def _source(content: Mapping[str, Any], where: str) -> Source:
+    """What the content of fit.json or joint.json says; KeyError, TypeError… where it is damaged."""
+    joint, drive, model = "tests" in content, content.get("drive"), Model.of_result(content)
     if drive not in (*DRIVES, None) or (drive is None and not joint):
-        raise InputError(f"{where}: drive is {drive!r}; it must be one of {', '.join(DRIVES)}")
-    tests = given.items("tests") if joint else {"": given}
-    rates = {
-        name: (one if joint else one.item("data")).item("rate").maybe for name, one in tests.items()
-    }
-    parameters = _parameters(given, model, joint, rates)
+        raise ValueError(f"drive is {drive!r}, not one of {', '.join(DRIVES)}")
+    tests = content["tests"] if joint else {"": content}
+    data, noise = content.get("data") or {}, content.get("noise") or {}
+    told = [one if joint else data for one in tests.values()]
+    rates = {name: one.get("rate") for name, one in zip(tests, told, strict=True)}
+    parameters = dict(_parameters(content, model, joint, rates))
     key = "covariance" if joint else "correlation"
-    names, correlation = _correlation(given, key, "matrix", parameters)
-    changing, together = _correlation(given, "specimens", "correlation", parameters)
-    noise = given.items("noise") if content.get("noise") else {}
+    names, correlation = _correlation(content, key, "matrix", parameters)
+    changing, together = _correlation(content, "specimens", "correlation", parameters)
     return Source(
         name=str(content.get("name" if joint else "test") or where),
         where=where,
@@ -243,7 +201,7 @@ def _source(given: _Item) -> Source:
         interior_mass=bool(content.get("interior_mass", False)),
         status=str(content.get("status")),
         rates=tuple(rate for rate in rates.values() if rate),
-        rate0=given.item("rate0").maybe,
+        rate0=content.get("rate0"),
         parameters=parameters,
         names=names,
         correlation=correlation,
@@ -253,82 +211,59 @@ def _source(given: _Item) -> Source:
         together=together,
         sha256=content.get("data_sha256"),
         smoothed=next((one.get("motion_smoothed") for one in noise.values()), None),
-        last_cycle=given.item("data").item("last_cycle").maybe,
-        growth=given.item("statistics").item("cycle_growth").maybe or 0.0,
+        last_cycle=data.get("last_cycle"),
+        growth=(content.get("statistics") or {}).get("cycle_growth") or 0.0,
     )
 
 
 def _parameters(
-    given: _Item, model: Model, joint: bool, rates: Mapping[str, float | None]
-) -> dict[str, Identified]:
+    content: Mapping[str, Any], model: Model, joint: bool, rates: Mapping[str, float | None]
+) -> Iterator[tuple[str, Identified]]:
     """The parameters of the springs: nuisance parameters are those of one record."""
-    told = given.item("correlation")
+    told = content.get("correlation") or {}
     errors = dict(zip(told.get("names") or (), told.get("stderr") or (), strict=False))
-    found = {
-        name: _parameter(item, _Item(errors.get(name), item.where).error, joint, rates)
-        for name, item in given.items("parameters").items()
-        if name not in NUISANCE
-    }
-    needed = (name for name in model.names if split_name(name)[1] != "eta")
-    if lost := [name for name in needed if name not in found]:
-        raise InputError(f"{given.where} has no parameter {lost[0]} of its model {model.name}")
-    if unknown := [name for name in found if name not in model.names]:
-        raise InputError(f"{given.where}: {unknown[0]} is no parameter of its model {model.name}")
-    return {name: Identified("fixed", 0.0) for name in model.names} | found
+    given = {name: one for name, one in content["parameters"].items() if name not in NUISANCE}
+    if unknown := given.keys() - set(model.names):
+        raise ValueError(f"{min(unknown)} is no parameter of its model {model.name}")
+    for name in model.names:
+        if name not in given and split_name(name)[1] != "eta":
+            raise ValueError(f"it has no parameter {name} of its model {model.name}")
+        one = given.get(name, {"value": 0.0, "kind": "fixed"})
+        try:
+            kind = one["kind"] if joint else "shared" if one.get("vary") else "fixed"
+            yield name, _identified(kind, {"local": errors.get(name)} | one, rates)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ValueError(f"parameter {name}: {error}") from None
 
 
-def _parameter(
-    item: _Item, local: float | None, joint: bool, rates: Mapping[str, float | None]
-) -> Identified:
+def _identified(kind: str, one: Any, rates: Mapping[str, float | None]) -> Identified:
     """One parameter of fit.json or joint.json; `rates` are those of the tests."""
-    if not isinstance(item.content, Mapping):
-        raise InputError(f"{item.where} is {item.content!r}; it must be an object with a value")
-    kind = item.get("kind") if joint else "shared" if item.get("vary") else "fixed"
-    if kind not in KINDS:
-        raise InputError(f"{item.where}: kind is {kind!r}; it must be one of {', '.join(KINDS)}")
-    tests = dict[str, _Item]()
-    if kind in ("own", "scatter"):
-        tests = item.items("tests")
-        # the spread is that of the tests that determine it
-        sure = {name: one for name, one in tests.items() if one.get("stderr") is not None}
-        tests = sure if kind == "scatter" and len(sure) > 1 else tests
-    return Identified(
-        kind,
-        item.item("value").number,
-        item.item("stderr").error,
-        local,
-        item.item("ci95").pair,
-        item.item("range").pair,
-        item.get("state"),
-        item.item("b").number if kind in RATES else 0.0,
-        item.item("b_stderr").error,
-        item.item("b_ci95").pair,
-        item.item("scatter").number if kind == "scatter" else 0.0,
-        tuple(one.item("value").number for one in tests.values()),
-        tuple(rates.get(name) for name in tests),
-    )
+    needed = {"b": math.nan if kind in RATES else 0.0}
+    needed |= {"scatter": math.nan if kind == "scatter" else 0.0}
+    tests = one["tests"] if kind in ("own", "scatter") else {}
+    if kind == "scatter":  # the spread is that of the tests that determine it
+        sure = {test: each for test, each in tests.items() if each.get("stderr") is not None}
+        tests = sure if len(sure) > 1 else tests
+    made = needed | one | {"kind": kind, "rates": [rates.get(test) for test in tests]}
+    made["tests"] = [each["value"] for each in tests.values()]
+    for key in ("ci95", "range", "b_ci95"):  # null at a side that is open
+        made[key] = None if None in (made.get(key) or ()) else made.get(key)
+    for key in ("stderr", "local", "b_stderr"):
+        made[key] = made.get(key) or None
+    found: Identified = build(Identified, made, {})
+    return found
 
 
 def _correlation(
-    given: _Item, key: str, of: str, parameters: Mapping[str, Identified]
+    content: Mapping[str, Any], key: str, of: str, parameters: Mapping[str, Identified]
 ) -> tuple[tuple[str, ...], Array]:
     """Correlation of the parameters that are named, from that or a covariance; 0 if unknown."""
-    if given.get(key) is None:
+    if content.get(key) is None:
         return (), np.empty((0, 0))
-    given.items(key)  # refuses what is no object
-    names = given.item(key).get("names")
-    names = names if isinstance(names, list) else [None]
-    known = {*parameters, *NUISANCE}
-    try:
-        matrix = np.reshape(np.array(given.item(key).get(of), dtype=float), (len(names),) * 2)
-        there = all(str(name).removesuffix(":b") in known for name in names)
-    except (TypeError, ValueError):
-        there = False
-    if not there:
-        raise InputError(
-            f"{given.where}: {key} must have the names of parameters and a square matrix of as "
-            "many rows"
-        )
+    names = content[key]["names"]
+    matrix = np.reshape(np.array(content[key][of], dtype=float), (len(names),) * 2)
+    if unknown := {name.removesuffix(":b") for name in names} - {*parameters, *NUISANCE}:
+        raise ValueError(f"{key} has {min(unknown)}, which is no parameter")
     kept = [i for i, name in enumerate(names) if name not in NUISANCE]
     matrix = matrix[np.ix_(kept, kept)]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -339,18 +274,16 @@ def _correlation(
     return tuple(names[i] for i in kept), 0.5 * (matrix + matrix.T)
 
 
-def _misses(tests: list[_Item]) -> dict[str, tuple[Miss, ...]]:
+def _misses(tests: list[Mapping[str, Any]]) -> dict[str, list[Miss]]:
     """By how much the counted curves of each channel were missed, test by test."""
     found = dict[str, list[Miss]]()
     for test in tests:
-        misfits = test.items("misfit") if test.get("misfit") else {}
-        for curve, misfit in misfits.items():
-            if misfit.content is None or curve in _UNCOUNTED.get(str(test.get("drive")), ()):
+        for curve, misfit in (test.get("misfit") or {}).items():
+            if misfit is None or curve in _UNCOUNTED.get(str(test.get("drive")), ()):
                 continue
-            noise, share, most = test.item("noise").item(curve), None, 0.0
-            if noise.get("range"):
-                share = noise.item("sigma").number / noise.item("range").number
-                most = (noise.item("residual_q95").maybe or 0.0) / noise.item("range").number
+            noise, share, most = (test.get("noise") or {}).get(curve) or {}, None, 0.0
+            if span := noise.get("range"):
+                share, most = noise["sigma"] / span, (noise.get("residual_q95") or 0.0) / span
             channel = "stress" if curve.startswith("stress") else curve.removesuffix("_time")
-            found.setdefault(channel, []).append(Miss(misfit.number, share, most))
-    return {channel: tuple(each) for channel, each in found.items()}
+            found.setdefault(channel, []).append(Miss(misfit, share, most))
+    return found

@@ -7,7 +7,7 @@ What the result leaves uncertain of them is a covariance; what changes from spec
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -70,8 +70,6 @@ class Population:
             if parameters[name].error is None and parameters[name].span is None
         )
 
-    # ------------------------------------------------------------------ what the result leaves open
-
     @cached_property
     def _open(self) -> tuple[tuple[str, ...], Array]:
         """Uncertain quantities and their covariance given those that are held.
@@ -132,14 +130,9 @@ class Population:
         for column, name in zip(slopes.T, free, strict=True):
             one = self.source.parameters[name.removesuffix(":b")]
             at, step = one.b if name.endswith(":b") else one.value, 1e-4 * self._error(name)
-            sides = [self._vector(self._means, {name: at + side * step}) for side in (-1.0, 1.0)]
+            sides = [self._vector(self._means | {name: at + way * step}) for way in (-1.0, 1.0)]
             column[:] = (sides[1] - sides[0]) / (2.0 * step)
         return slopes @ matrix @ slopes.T
-
-    @cached_property
-    def root(self) -> Array:
-        """Matrix square root of `covariance`."""
-        return _root(self.covariance)
 
     @cached_property
     def quantile(self) -> float:
@@ -154,8 +147,6 @@ class Population:
             if one.ci95 is not None and one.stderr is not None and not self.source.joint
         ]
         return max(NORMAL, float(np.median(ratios))) if ratios else NORMAL
-
-    # ------------------------------------------------------------------ from specimen to specimen
 
     @cached_property
     def scattering(self) -> tuple[str, ...]:
@@ -187,11 +178,6 @@ class Population:
         return min(len(self.source.parameters[name].tests) for name in self.scattering)
 
     @cached_property
-    def _changed(self) -> Array:
-        """Root of the correlation of the scattering parameters."""
-        return _root(self._correlation)
-
-    @cached_property
     def _own(self) -> _Own:
         """Own parameters of the tests, in logarithms where `_in_logarithms`."""
         names = [name for name in self.scattering if self.source.parameters[name].kind == "own"]
@@ -216,63 +202,60 @@ class Population:
         tests = self.source.parameters[name].tests
         return is_logarithmic(split_name(name)[1]) and min(tests) > 0.0
 
-    # ------------------------------------------------------------------ values of one test
+    def _own_values(self, of: Array) -> dict[str, float]:
+        """Own parameters of their logarithms, where these vary, or themselves."""
+        pairs = zip(self._own.names, of.tolist(), strict=True)
+        return {name: _exp(u) if self._in_logarithms(name) else u for name, u in pairs}
 
     @property
     def _means(self) -> dict[str, float]:
         """Own parameters that have a trend: the median over the tests is that of no rate."""
-        pairs = zip(self.trends.items(), self._own.mean, strict=True)
-        return {name: float(mean) for (name, slope), mean in pairs if slope}
+        means = self._own_values(self._own.mean)
+        return {name: means[name] for name, slope in self.trends.items() if slope}
 
     @property
     def point(self) -> Array:
         """The common values, at the rate of the test."""
         return self._vector(self._means)
 
-    def nearest(self, admissible: Callable[[Array], bool]) -> Array | None:
-        """Values with the own parameters of the admissible test nearest to their means."""
+    def candidates(self) -> Iterator[Array]:
+        """The common values, then those with the own parameters of a test, the nearest first."""
+        yield self.point
         own = self._own
-        if not own.names:
-            return None
-        scale = np.maximum(np.sqrt(np.mean(own.off**2, axis=0)), 1e-300)
+        scale = np.maximum(np.sqrt(np.sum(own.off**2, axis=0)), 1e-300)
         for row in own.off[np.argsort(np.sum((own.off / scale) ** 2, axis=1))]:
-            found = self._vector(dict(zip(own.names, own.mean + row, strict=True)))
-            if admissible(found):
-                return found
-        return None
+            yield self._vector(self._own_values(own.mean + row))
 
-    def draw(self, rng: np.random.Generator) -> Array:
-        """Draw the scatter between specimens.
+    def draws(self, seed: int) -> Iterator[Array]:
+        """Draw specimens: their scatter, and what the result leaves uncertain.
 
         Parameters change together from specimen to specimen. Their spreads are known from n tests:
         the deviates are Student's t with n - 1 degrees of freedom.
         """
-        values, own = dict[str, float](), dict[str, float]()
-        freedom = max(self.fewest - 1 - bool(self._own.slopes.any()), 1)
-        tail = math.sqrt(freedom / rng.chisquare(freedom))
-        drawn = tail * (self._changed @ rng.standard_normal(len(self.scattering)))
-        for name, z in zip(self.scattering, drawn.tolist(), strict=True):
-            one = self.source.parameters[name]
-            if one.kind == "scatter":
-                values[name] = one.value * _exp(one.scatter * z)
-            else:
-                own[name] = self._own.at(name, z)
-        return self._vector(own, values)
+        rng, other = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
+        changed, uncertain = _root(self._correlation), _root(self.covariance)
+        own, freedom = self._own, max(self.fewest - 1 - bool(self._own.slopes.any()), 1)
+        while True:
+            tail = math.sqrt(freedom / rng.chisquare(freedom))
+            drawn = tail * (changed @ rng.standard_normal(len(self.scattering)))
+            of = dict(zip(self.scattering, drawn.tolist(), strict=True))
+            known = {name: self.source.parameters[name] for name in of if name not in own.names}
+            values = {name: one.value * _exp(one.scatter * of[name]) for name, one in known.items()}
+            values |= self._own_values(own.mean + own.spread * [of[name] for name in own.names])
+            yield self._vector(values) + uncertain @ other.standard_normal(len(self.names))
 
-    def _vector(self, own: dict[str, float], drawn: dict[str, float] | None = None) -> Array:
+    def _vector(self, given: Mapping[str, float]) -> Array:
         """Values in their order, at the rate and the height of the test.
 
-        `own` are those of own parameters as `_Own` has them, `drawn` other values and slopes by
-        rate. The heights of a chain are those of the specimen, or keep their shares of its height.
+        `given` are those that are not the common ones, and slopes by rate. The heights of a chain
+        are those of the specimen, or keep their shares of its height.
         """
-        drawn, values = drawn or {}, dict[str, float]()
+        values = dict[str, float]()
         for name, one in self._known.items():
-            value = drawn.get(name, one.value)
-            if name in own:
-                value = _exp(own[name]) if self._in_logarithms(name) else float(own[name])
+            value = given.get(name, one.value)
             if one.kind in RATES and self.rate is not None and self.source.rate0:
                 x = math.log(self.rate / self.source.rate0)
-                value *= factor(one.kind, drawn.get(f"{name}:b", one.b), x)[0]
+                value *= factor(one.kind, given.get(f"{name}:b", one.b), x)[0]
             values[name] = value
         heights = [name for name in self.names if name.endswith("_height")]
         if heights and self.specimen.heights is not None:
@@ -299,8 +282,7 @@ class _Own:
     mean: Array  # (k,): at the rate of the test that is predicted
     slopes: Array  # (k,): by the logarithm of the rate; 0 where there is no evidence
     off: Array  # (n, k): what the tests are off their means
-    wider: Array  # (k,): √(1 + leverage), for the mean is not known exactly
-    freedom: int
+    spread: Array  # (k,): standard deviation of a specimen about the mean, known from n tests
 
     @classmethod
     def of(
@@ -312,7 +294,7 @@ class _Own:
     ) -> _Own:
         """Means and deviations of the columns (n,), one for each name."""
         if not names:
-            return cls((), np.empty(0), np.empty(0), np.empty((0, 0)), np.empty(0), 1)
+            return cls((), np.empty(0), np.empty(0), np.empty((0, 0)), np.empty(0))
         values = np.array(columns).T
         n, k = values.shape
         mean, off = values.mean(axis=0), values - values.mean(axis=0)
@@ -331,13 +313,8 @@ class _Own:
             mean, off = mean + slopes * at, np.where(sure, left, off)
             leverage = leverage + np.where(sure, at**2 / max(square, 1e-300), 0.0)
         freedom = max(n - 1 - bool(np.any(slopes)), 1)
-        return cls(names, mean, slopes, off, np.sqrt(1.0 + leverage), freedom)
-
-    def at(self, name: str, z: float) -> float:
-        """Value of a specimen that is z standard deviations off the mean."""
-        i = self.names.index(name)
-        spread = math.sqrt(float(np.sum(self.off[:, i] ** 2)) / self.freedom)
-        return float(self.mean[i] + self.wider[i] * spread * z)
+        spread = np.sqrt((1.0 + leverage) * np.sum(off**2, axis=0) / freedom)
+        return cls(names, mean, slopes, off, spread)
 
 
 def _places(

@@ -150,8 +150,12 @@ class _Spectrum:
 
 
 def curve_errors(
-    residual: Array, jacobian: Array, sizes: tuple[int, ...], taken: Array | None = None
-) -> list[CurveError]:
+    residual: Array,
+    jacobian: Array,
+    sizes: tuple[int, ...],
+    taken: Array | None = None,
+    driven: bool = False,
+) -> tuple[CurveError, ...]:
     """Tell noise from an error of the law in the residual of each curve, whichever is likelier.
 
     Arguments as of `noise_processes`, whose noise is taken where the residual holds no error of the
@@ -159,14 +163,16 @@ def curve_errors(
     first or second order with a corner above `FAST` on top of white noise. With an error of the
     law, a peak at low frequencies comes to white noise or to noise of first order. The Bayesian
     information criterion decides; one of 1200 records of white noise and of noise of first order
-    (up to 0.95 from sample to sample, 120 to 5000 samples) was taken for an error of the law.
+    (up to 0.95 from sample to sample, 120 to 5000 samples) was taken for an error of the law. Where
+    the test is `driven` by a stress all is noise: that of the stress comes through the springs as
+    slow waves of the displacement, which look like an error of the law.
     """
     basis = basis_of(jacobian) if taken is None else taken
     own = noise_processes(residual, jacobian, sizes, taken)
-    return [
-        _curve_error(residual[part], basis[part], process)
+    return tuple(
+        CurveError(process) if driven else _curve_error(residual[part], basis[part], process)
         for part, process in zip(parts(sizes), own, strict=True)
-    ]
+    )
 
 
 def _curve_error(residual: Array, basis: Array, own: NoiseProcess) -> CurveError:

@@ -132,12 +132,6 @@ def _lag_sums(one: Array, other: Array, order: int) -> Array:
     return 0.5 * np.array(sums)
 
 
-def noise_process(residual: Array, jacobian: Array | None = None) -> NoiseProcess:
-    """Noise of one curve alone; see `noise_processes`."""
-    none = np.empty((residual.size, 0))
-    return noise_processes(residual, none if jacobian is None else jacobian, (residual.size,))[0]
-
-
 def noise_processes(
     residual: Array, jacobian: Array, sizes: tuple[int, ...], taken: Array | None = None
 ) -> list[NoiseProcess]:
@@ -232,4 +226,4 @@ def autocorrelation_time(residual: Array) -> float:
     """Autocorrelation time τ = 1 + 2 Σ ρ_k >= 1 of a residual, in samples; 1 of white noise."""
     if residual.size < 8 or not residual.any():
         return 1.0
-    return noise_process(residual).tau
+    return noise_processes(residual, np.empty((residual.size, 0)), (residual.size,))[0].tau
