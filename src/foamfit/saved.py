@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +23,7 @@ from foamfit.report.shown import JointViews
 from foamfit.report.studies.batch import read_table
 from foamfit.results import KEPT, Loop
 from foamfit.study.cycles import CycleFits
+from foamfit.study.joint import JointResult
 from foamfit.study.joint_result import JointParameter
 from foamfit.trust.identifiability import Insight
 
@@ -41,8 +42,8 @@ def load(folder: str | Path) -> FitResult | SavedJoint | CycleFits | pd.DataFram
     Returns
     -------
     FitResult, SavedJoint, CycleFits or pandas.DataFrame
-        The same as was saved; of a batch its summary, as `foamfit.batch` returns it. A fit has no
-        `insight`, so that a report that is saved anew has no section on the information.
+        The same as was saved, and saved again to the same; of a batch its summary, as
+        `foamfit.batch` returns it.
 
     Raises
     ------
@@ -138,9 +139,15 @@ class SavedJoint(JointViews):
         found = ((name, one.loop) for name, one in self.results.items())
         return tuple(loop._replace(name=name) for name, loop in found if loop is not None)
 
+    save = JointResult.save
+
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of joint.json."""
         return self.content
+
+    def test_fits(self) -> Iterator[FitResult]:
+        """Give the result of each test, in the order of `tests`."""
+        return map(self.results.__getitem__, self.tests)
 
 
 def _joint(folder: Path) -> SavedJoint:

@@ -19,12 +19,13 @@ from foamfit.text import wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
     from foamfit.arrays import Array
 
 GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # by Okabe and Ito
 INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of interior masses, from the base up
+MEASURED = "0.65"  # of wide lines below what is simulated, which is darker in grey too
 STYLE: Any = {  # matplotlib types its keys one by one
     "font.family": "DejaVu Sans",  # one upright font: each further font costs 0.1 s per PDF
     "font.size": 7.5,
@@ -51,7 +52,7 @@ DPI = 250  # of a PNG
 TWO = "two"
 COLUMNS = {"one": 3.25, TWO: 7.0}
 NARROWEST, WIDEST = 2.5, 20.0
-UNTITLED = "untitled"  # after a width and a comma: no title
+UNTITLED, PDF = "untitled", "pdf"  # after a width and a comma: no title; all figures as PDF
 # Lines with more points are drawn through the first, last and extreme samples of this many
 # stretches, which looks the same in print.
 MOST_POINTS, STRETCHES = 3000, 500
@@ -59,24 +60,36 @@ MOST_POINTS, STRETCHES = 3000, 500
 
 def inches(width: str) -> float:
     """Return the width of a figure that "one" or "two" columns or a length ("85 mm") name."""
-    width = width.rpartition(",")[0] if not is_titled(width) else width
-    if (known := COLUMNS.get(width.strip().lower())) is not None:
-        return known
     from foamfit.data.units import parse_quantity
 
-    wide = round(parse_quantity(width, "m", "the width of figures", "85 mm") / 0.0254, 6)
-    if not NARROWEST <= wide <= WIDEST:
+    length, words = _parted(width)
+    wide = COLUMNS.get(length)
+    if wide is None:
+        metres = parse_quantity(length, "m", "the width of figures", "85 mm")
+        wide = round(metres / 0.0254, 6)
+    if not NARROWEST <= wide <= WIDEST or words - {UNTITLED, PDF}:
         low, high = (f"{25.4 * end:.0f}" for end in (NARROWEST, WIDEST))
         raise InputError(
             f"the width of figures = {width!r} is not admissible; it must be one, two (columns) or "
-            f"a length from {low} to {high} mm"
+            f"a length from {low} to {high} mm, and behind a comma may stand untitled or pdf"
         )
     return wide
 
 
+def _parted(width: str) -> tuple[str, set[str]]:
+    """Split "two, untitled" into the width and the words behind it."""
+    length, *words = (part.strip().lower() for part in width.split(","))
+    return length, set(words)
+
+
 def is_titled(width: str) -> bool:
     """Whether a figure of such a width has a title: all but "two, untitled" and its like."""
-    return width.rpartition(",")[2].strip().lower() != UNTITLED
+    return UNTITLED not in _parted(width)[1]
+
+
+def all_as_pdf(width: str) -> bool:
+    """Whether all figures of a report are written as PDF too, as by "two, pdf"."""
+    return PDF in _parted(width)[1]
 
 
 def abreast(width: float, panels: int, least: float = 2.1) -> int:
@@ -87,6 +100,21 @@ def abreast(width: float, panels: int, least: float = 2.1) -> int:
 def title_lines(wide: float, *parts: str, titled: bool = True) -> list[str]:
     """Break the parts of a title into lines for a figure of `wide` inches; none if not `titled`."""
     return [line for part in parts if titled for line in wrapped(part, 0, int(16 * wide))]
+
+
+def tail(name: str, most: int) -> str:
+    """Return a name, or the end of one that has more letters than there is room for."""
+    return name if len(name) <= most else f"…{name[1 - most :]}"
+
+
+def grid_of(
+    part: Figure | SubFigure, rows: int, columns: int, count: int, **more: Any
+) -> list[Axes]:
+    """Return so many panels, row by row; the other places of the grid stay empty."""
+    every = part.subplots(rows, columns, squeeze=False, **more).ravel().tolist()
+    for ax in every[count:]:
+        ax.set_axis_off()
+    return every[:count]
 
 
 @contextmanager

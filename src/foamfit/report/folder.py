@@ -27,7 +27,7 @@ from foamfit.results import SCHEMA, Fit, Intervals, ParameterEstimate, plain
 RESULT_FILES = {
     *("fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png"),
     *("fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "budget.csv", "report.html"),
-    *("table.tex", SAMPLES),
+    *("table.tex", SAMPLES, "residuals.pdf", "information.pdf", "snapping.pdf", "profiles.pdf"),
 }
 CYCLES_FILES = {f"cycles.{kind}" for kind in ("json", "csv", "png", "pdf")}
 CYCLES_FILES |= {"cycles-plotted.csv", "table.tex"}
@@ -234,8 +234,10 @@ def write_result(
         write_table(folder / "ladder.csv", result.ladder.rows())
     drawn = dict(figures)
     for name, images in drawn.items():
-        for form, content in () if images is None else images.files():
-            (folder / f"{name}.{form}").write_bytes(content)
+        if images is not None and images.pdf is not None:
+            (folder / f"{name}.pdf").write_bytes(images.pdf)
+    if (fit := drawn.get("fit")) is not None:
+        (folder / "fit.png").write_bytes(fit.png)
     if pages:
         write_text(folder / "report.html", render_report(result, drawn))
 

@@ -8,7 +8,7 @@ from importlib.metadata import version
 
 from foamfit.fitting.branches import covered
 from foamfit.report.plots import origin_word
-from foamfit.report.readable import in_unit, quantity, readable
+from foamfit.report.readable import quantity, readable
 from foamfit.report.render import page
 from foamfit.report.result_figures import Images, draw_all
 from foamfit.report.summary import (
@@ -27,7 +27,7 @@ from foamfit.trust.covariance import RULE
 def render_report(result: Fit, figures: Mapping[str, Images | None] | None = None) -> str:
     """Return the report as one HTML page that needs nothing else.
 
-    `figures` are those of `draw_all`, if they are drawn already and kept as files beside it.
+    `figures` are those of `draw_all`, if they are drawn already.
     """
     drawn = dict(draw_all(result)) if figures is None else figures
     plain = result.to_json_dict()
@@ -51,14 +51,12 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
         ranged=any(p.range for p in result.parameters.values()),
         rule=RULE,
         quantity=quantity,
-        in_unit=in_unit,
         energy={k: x for k, x in plain["energy"].items() if type(x) in (int, float)},
         energy_sentences=plain["energy"].get("sentences") or [],
         ladder=result.ladder,
         ladder_header=LADDER,
         ladder_rows=[] if result.ladder is None else list(ladder_cells(result.ladder)),
         answers=ANSWERS,
-        kept=figures is not None,
         figures={name: images and _figure(images) for name, images in drawn.items()},
     )
 

@@ -7,7 +7,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from foamfit import text
-from foamfit.report.readable import number
+from foamfit.report.readable import in_unit, number
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -26,8 +26,8 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters = (text.percent, text.engineering, text.significant, text.counted, text.listed, number)
-    made.filters.update({one.__name__: one for one in filters})
+    filters = (text.percent, text.engineering, text.significant, text.counted, text.listed)
+    made.filters.update({one.__name__: one for one in (*filters, number, in_unit)})
     made.filters.update(paragraphs=_paragraphs, aligned=_aligned, exp=math.exp)
     made.filters["spoken"] = lambda name: name.replace("_", "-")
     return made

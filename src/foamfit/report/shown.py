@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import Readable, readable, readable_unit
-from foamfit.report.render import environment
+from foamfit.report.render import page
 from foamfit.report.summary import misfits
 from foamfit.report.tables import by_test, frame, stacked
-from foamfit.results import Fit, Loop
+from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent, wrapped
 
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from foamfit.study.cycle_fits import FittedCycles
-    from foamfit.study.joint_result import JointParameter
+
+Joint = Any  # `foamfit.study.joint_result.JointData`, or `foamfit.saved.SavedJoint`, read back
 
 
 def fit_shown(result: Fit, *, html: bool = False) -> str:
@@ -41,7 +42,7 @@ def cycles_shown(found: FittedCycles, *, html: bool = False) -> str:
         line += f" · misfit {percent(min(known))} to {percent(max(known))}"
     if html:
         head = {"first": "cycle", **cycles_by_test(found)}
-        return _render("shown", title=found.test, line=line, rows=[], by_test=head)
+        return page("shown", title=found.test, line=line, rows=[], by_test=head)
     rows = [
         Readable(name, ("", ""), f"{low.value} to {high.value}", "", "", low.unit, "", "")
         for name, (low, high) in _spans(found)
@@ -65,42 +66,10 @@ def _spans(found: FittedCycles) -> Iterator[tuple[str, tuple[Readable, Readable]
 
 def _shown(title: str, line: str, rows: Sequence[Readable], html: bool) -> str:
     if html:
-        return _render("shown", title=title, line=line, rows=rows, by_test=None)
+        return page("shown", title=title, line=line, rows=rows, by_test=None)
     marks = {"weak": " (weak)", "not determined": " (not determined)"}
     told = (f"{p.label} {p.with_unit(p.with_error)}{marks.get(p.state, '')}" for p in rows)
     return "\n".join([*wrapped(f"{title}: {line}", 2), *wrapped(", ".join(told), 2)])
-
-
-def _render(name: str, **values: Any) -> str:
-    return environment().get_template(f"{name}.html").render(**values)
-
-
-class Joint(Protocol):
-    """A joint fit, made or read back."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-
-    @property
-    def model(self) -> str:
-        """Its model."""
-
-    @property
-    def status(self) -> str:
-        """Its status."""
-
-    @property
-    def tests(self) -> tuple[str, ...]:
-        """Names of its tests."""
-
-    @property
-    def parameters(self) -> Mapping[str, JointParameter]:
-        """Its parameters."""
-
-    @property
-    def loops(self) -> tuple[Loop, ...]:
-        """The loops of its tests."""
 
 
 class JointViews:
