@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from foamfit.errors import InputError
 from foamfit.files import write_file
+from foamfit.report.readable import readable_unit
 from foamfit.text import wrapped
 
 if TYPE_CHECKING:
@@ -105,6 +106,14 @@ def title_lines(wide: float, *parts: str, titled: bool = True) -> list[str]:
 def tail(name: str, most: int) -> str:
     """Return a name, or the end of one that has more letters than there is room for."""
     return name if len(name) <= most else f"…{name[1 - most :]}"
+
+
+def over_time(time: Array | None, size: int) -> tuple[Array, str]:
+    """Return what a curve is drawn over, and the label of that: its time, or its samples."""
+    if time is None:
+        return np.arange(size, dtype=float), "sample"
+    factor, unit = readable_unit(float(np.nanmax(np.abs(time))), "s")
+    return time / factor, f"time ({unit})"
 
 
 def grid_of(

@@ -11,15 +11,7 @@ from foamfit.report.plots import origin_word
 from foamfit.report.readable import quantity, readable
 from foamfit.report.render import page
 from foamfit.report.result_figures import Images, draw_all
-from foamfit.report.summary import (
-    ANSWERS,
-    LADDER,
-    conclusions,
-    cycle_rows,
-    determined,
-    ladder_cells,
-    misfits,
-)
+from foamfit.report.summary import ANSWERS, conclusions, determined, misfits, tables
 from foamfit.results import Fit
 from foamfit.trust.covariance import RULE
 
@@ -40,7 +32,6 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
         conclusions=conclusions(result),
         determined=determined(result),
         misfits=misfits(result),
-        cycles=cycle_rows(result),
         statistics=plain["statistics"],
         springs=springs,
         hysteretic={name: spring for name, spring in springs.items() if spring.law.hysteretic},
@@ -54,9 +45,8 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
         energy={k: x for k, x in plain["energy"].items() if type(x) in (int, float)},
         energy_sentences=plain["energy"].get("sentences") or [],
         ladder=result.ladder,
-        ladder_header=LADDER,
-        ladder_rows=[] if result.ladder is None else list(ladder_cells(result.ladder)),
         answers=ANSWERS,
+        **tables(result),
         figures={name: images and _figure(images) for name, images in drawn.items()},
     )
 

@@ -118,18 +118,16 @@ def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
     One strip above the other, 7 in wide, over time, or over the sample where there is no time; a
     curve that has nothing to compare is left out. Saved at `path`, if one is given.
     """
-    strips = list(_residuals(result))
+    strips = dict(_residuals(result))
     with figures.drawing(7.0, 0.45 + 0.85 * max(len(strips), 1)) as figure:
-        column = figure.subplots(max(len(strips), 1), 1, sharex=True, squeeze=False)[:, 0]
-        time = result.curves.time
-        for ax, (name, residual) in zip(column, strips, strict=False):
-            factor, unit = readable_unit(_size(time), "s") if time is not None else (1.0, "")
-            x = np.arange(residual.size) if time is None else time / factor
+        column = figures.grid_of(figure, max(len(strips), 1), 1, max(len(strips), 1), sharex=True)
+        for ax, (name, residual) in zip(column, strips.items(), strict=False):
+            x, label = figures.over_time(result.curves.time, residual.size)
             ax.axhline(0.0, color=GREY, lw=0.6)
             ax.plot(x, 100.0 * residual, color=VERMILION, lw=0.9, label="fitted − measured")
             ax.set_ylabel("% of range")
             ax.set_title(f"{name}: fitted − measured", loc="left", fontsize=7.5, pad=3)
-            column[-1].set_xlabel(f"time ({unit})" if unit else "sample")
+            column[-1].set_xlabel(label)
         if not strips:
             figures.say_nothing_there(column[0])
     return figures.save(figure, path)

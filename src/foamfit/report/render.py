@@ -48,6 +48,11 @@ def sentences(name: str, **values: Any) -> tuple[str, ...]:
     return tuple(words(name, **values).splitlines())
 
 
+def table(name: str, **values: Any) -> list[list[str]]:
+    """Return the cells of a table whose rows are the lines of a text, parted by "¦"."""
+    return [line.split("¦") for line in words(name, **values).splitlines()]
+
+
 def _paragraphs(told: str, indent: int = 2) -> str:
     """Wrap each line of a text as a paragraph of its own; empty lines stay."""
     lines = (text.wrapped(one, indent) or [""] for one in told.split("\n"))

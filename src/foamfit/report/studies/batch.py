@@ -141,27 +141,23 @@ def counts_in_words(rows: Sequence[Row]) -> str:
 
 
 def summary_words(rows: Sequence[Row]) -> str:
-    """Return what the command prints of a batch."""
-    wrong = [row for row in rows if not row.has_fit]
-    fitted = [row for row in rows if row.has_fit]
+    """Return what the command prints of a batch.
+
+    Its table has median and quartiles over the tests of each parameter that any test varied.
+    """
+    wrong, known = [row for row in rows if not row.has_fit], list[Any]()
+    for name, each in varied([row.parameters for row in rows if row.has_fit]).items():
+        there = [p for p in each if p is not None]
+        factor, unit = unit_of_all(there)
+        middle = np.quantile([p.value / factor for p in there], [0.5, 0.25, 0.75])
+        known.append((name, middle, unit, [p.state for p in there]))
     return words(
         "batch",
         counts=counts_in_words(rows),
         wrong=wrong[:_MOST_REFUSALS],
         more=max(len(wrong) - _MOST_REFUSALS, 0),
-        parameters=list(_parameter_rows(fitted)) if fitted else [],
+        parameters=known,
     )
-
-
-def _parameter_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    """Median and quartiles over the tests of each parameter that any test varied."""
-    yield ["parameter", "median", "quartile", "quartile", "determined in", ""]
-    for name, each in varied([row.parameters for row in rows]).items():
-        known = [p for p in each if p is not None]
-        factor, unit = unit_of_all(known)
-        middle = np.quantile([p.value / factor for p in known], [0.5, 0.25, 0.75])
-        sure = sum(p.state == "determined" for p in known)
-        yield [name, *(f"{v:.4g}" for v in middle), f"{sure} of {len(known)}", unit]
 
 
 # ------------------------------------------------------------------------------- the page
