@@ -18,7 +18,7 @@ from foamfit.errors import InputError
 from foamfit.report.figures import MOST_POINTS, STYLE, drawing, image, laid_out
 from foamfit.report.plots import origin_word, plot_fit, plot_residuals, plot_response
 from foamfit.report.readable import readable_unit
-from foamfit.report.snapping_plots import plot_snapping
+from foamfit.report.report_plots import plot_snapping
 from foamfit.results import Switch
 
 

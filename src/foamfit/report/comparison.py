@@ -213,10 +213,12 @@ def side_of(result: Result) -> Side:
             test=given["test"],
             sha=str(given.get("data_sha256", "")),
         )
+    except InputError as error:
+        fault = str(error)
     except KeyError as error:
         fault = f"{error} is missing"
-    except (TypeError, ValueError, AttributeError) as error:
-        fault = str(error)
+    except (TypeError, ValueError, AttributeError):
+        fault = "a value of it is of the wrong kind"
     raise InputError(f"{where} is no whole result of a fit: {fault}; fit again")
 
 

@@ -8,9 +8,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from foamfit.report.figures import DPI, TWO, UNTITLED, all_as_pdf, image, laid_out
-from foamfit.report.identifiability_plots import plot_insight, plot_profiles
 from foamfit.report.plots import is_known, plot_fit, plot_residuals
-from foamfit.report.snapping_plots import plot_snapping
+from foamfit.report.report_plots import plot_insight, plot_profiles, plot_snapping
 from foamfit.results import Fit
 
 if TYPE_CHECKING:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from foamfit.report.plots import draw_loops
-from foamfit.report.readable import Readable, readable, readable_unit
+from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page
 from foamfit.report.summary import misfits
 from foamfit.report.tables import by_test, frame, stacked
@@ -35,19 +35,13 @@ def fit_shown(result: Fit, *, html: bool = False) -> str:
 
 
 def cycles_shown(found: FittedCycles, *, html: bool = False) -> str:
-    """Return how many cycles were fitted, their misfits, and the parameters by cycle."""
+    """Return how many cycles were fitted and their misfits; as HTML the parameters by cycle too."""
     line = f"{found.model} · {len(found.results)} of {counted(len(found.recorded), 'cycle')} fitted"
     each = (one.misfit.get("stress_strain") for one in found.results.values())
     if known := [off for off in each if off is not None]:
         line += f" · misfit {percent(min(known))} to {percent(max(known))}"
-    if html:
-        head = {"first": "cycle", **cycles_by_test(found)}
-        return page("shown", title=found.test, line=line, rows=[], by_test=head)
-    rows = [
-        Readable(name, ("", ""), f"{low.value} to {high.value}", "", "", low.unit, "", "")
-        for name, (low, high) in _spans(found)
-    ]
-    return _shown(found.test, line, rows, html)
+    table = {"first": "cycle", **cycles_by_test(found)} if html else None
+    return _shown(found.test, line, [], html, table)
 
 
 def cycles_by_test(found: FittedCycles) -> dict[str, Any]:
@@ -55,18 +49,9 @@ def cycles_by_test(found: FittedCycles) -> dict[str, Any]:
     return by_test(list(map(str, sorted(found.results))), found.varied)
 
 
-def _spans(found: FittedCycles) -> Iterator[tuple[str, tuple[Readable, Readable]]]:
-    """Smallest and largest value of each parameter over the cycles, in one unit."""
-    for name, every in found.varied.items():
-        each = [one for one in every if one is not None]
-        ends = min(each, key=lambda one: one.value), max(each, key=lambda one: one.value)
-        unit = readable_unit(abs(ends[1].value), ends[1].unit)
-        yield name, (readable(name, ends[0], unit), readable(name, ends[1], unit))
-
-
-def _shown(title: str, line: str, rows: Sequence[Readable], html: bool) -> str:
+def _shown(title: str, line: str, rows: Sequence[Readable], html: bool, table: Any = None) -> str:
     if html:
-        return page("shown", title=title, line=line, rows=rows, by_test=None)
+        return page("shown", title=title, line=line, rows=rows, by_test=table)
     marks = {"weak": " (weak)", "not determined": " (not determined)"}
     told = (f"{p.label} {p.with_unit(p.with_error)}{marks.get(p.state, '')}" for p in rows)
     return "\n".join([*wrapped(f"{title}: {line}", 2), *wrapped(", ".join(told), 2)])
@@ -97,18 +82,15 @@ class JointViews:
 
     def __repr__(self: Joint) -> str:
         """Return name, model, status and the common values."""
-        return joint_shown(self)
+        return _joint_shown(self)
 
     def _repr_html_(self: Joint) -> str:
-        return joint_shown(self, html=True)
+        return _joint_shown(self, html=True)
 
 
-def joint_shown(found: Joint, *, html: bool = False) -> str:
+def _joint_shown(found: Joint, *, html: bool = False) -> str:
     """Return model, tests, status and the common values of a joint fit."""
     line = f"{found.model} · {counted(len(found.tests), 'test')} together · status {found.status}"
-    rows = [
-        readable(name, p.estimate())
-        for name, p in found.parameters.items()
-        if p.kind != "fixed" and name not in NUISANCE
-    ]
+    common = {n: p for n, p in found.parameters.items() if p.kind != "fixed" and n not in NUISANCE}
+    rows = [readable(name, p.estimate()) for name, p in common.items()]
     return _shown(found.name, line, rows, html)
