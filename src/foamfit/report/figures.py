@@ -183,6 +183,12 @@ def key_of(axes: Iterable[Axes]) -> dict[str, Any]:
     return found
 
 
+def named_in(axes: Iterable[Axes]) -> dict[str, Any]:
+    """Return what is drawn by its label, as a legend of all axes has it."""
+    each = (zip(*reversed(ax.get_legend_handles_labels()), strict=True) for ax in axes)
+    return {name: artist for pairs in each for name, artist in pairs}
+
+
 def legend_below(figure: Figure, entries: dict[str, Any]) -> int:
     """Draw a legend below all panels; returns its number of lines."""
     if not entries:

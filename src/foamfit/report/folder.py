@@ -20,7 +20,7 @@ from foamfit.report.result_figures import Mapped, draw_all
 from foamfit.report.samples import FILE as SAMPLES
 from foamfit.report.samples import write_samples
 from foamfit.report.tables import parameters_tex
-from foamfit.results import SCHEMA, Fit, Intervals, ParameterEstimate, plain
+from foamfit.results import SCHEMA, Fit, ParameterEstimate, plain
 
 # All that `save_result` may write, and what `studies` write beside the folders of cycles and tests.
 # Older versions wrote tables of what was plotted: their folders are replaced as well.
@@ -225,7 +225,13 @@ def write_result(
     samples = zip(*(column.tolist() for column in result.columns.values()), strict=True)
     write_table(folder / "curves.csv", [result.columns.keys(), *samples])
     if result.intervals is not None and result.intervals.profiles:
-        write_table(folder / "profiles.csv", _profile_rows(result.intervals))
+        head = ["name", "value", "chi2", "chi2 of the 95 % cut", "complete"]
+        rows = (
+            [one.name, value, rise, one.cut, one.complete]
+            for one in result.intervals.profiles
+            for value, rise in zip(one.values.tolist(), one.rises.tolist(), strict=True)
+        )
+        write_table(folder / "profiles.csv", [head, *rows])
     if result.draws:
         write_samples(folder / SAMPLES, result.draws)
     if pages and result.budget is not None and result.budget.telling:
@@ -272,10 +278,3 @@ def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[lis
         spans = (*(p.ci95 or (None, None)), *(p.range or (None, None)))
         numbers = plain([p.value, p.stderr, *spans, p.systematic])
         yield [name, *numbers, p.unit, p.state, p.why, p.ci95_method]
-
-
-def _profile_rows(intervals: Intervals) -> Iterator[Iterable[object]]:
-    yield ["name", "value", "chi2", "chi2 of the 95 % cut", "complete"]
-    for profile in intervals.profiles:
-        for value, rise in zip(profile.values.tolist(), profile.rises.tolist(), strict=True):
-            yield [profile.name, value, rise, profile.cut, profile.complete]

@@ -582,10 +582,7 @@ def _head(figure: Figure, result: Fit, *, titled: bool) -> None:
     # A name may hold a dollar sign: it is no formula.
     if titled:
         figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, parse_math=False)
-    entries: dict[str, Any] = {}
-    for ax in figure.axes:
-        entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
-    lines = figures.legend_below(figure, entries)
+    lines = figures.legend_below(figure, figures.named_in(figure.axes))
     extra = 11.0 * max(lines - 1, 0) + (11.0 * title.count("\n") if titled else -13.0)
     figure.set_figheight(figure.get_figheight() + extra / 72.0)
 

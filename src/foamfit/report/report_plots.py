@@ -161,8 +161,7 @@ def plot_snapping(result: Fit, path: str | Path | None = None) -> Figure | None:
             below.axvline(time[sample] / factor, color=GREY, lw=0.5, ls=":", zorder=0)
             below.annotate(f"{number}", (time[sample] / factor, 104.0), ha="center", fontsize=7)
         below.set(xlabel=f"time ({unit})", ylabel="micro-springs (%)", ylim=(0.0, 115.0))
-        handles, labels = below.get_legend_handles_labels()
-        figures.legend_below(figure, dict(zip(labels, handles, strict=True)))
+        figures.legend_below(figure, figures.named_in([below]))
     return figures.save(figure, path)
 
 

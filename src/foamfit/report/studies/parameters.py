@@ -69,16 +69,15 @@ def plot_parameters(
     lines = figures.title_lines(wide, title, titled=figures.is_titled(width))
     with figures.drawing(wide, rows * tall + 0.16 * len(lines) + 0.3, lines) as figure:
         axes = figures.grid_of(figure, rows, across, max(len(compared), 1), sharey=True)
-        entries, size = dict[str, Any](), min(6.5, 0.62 * 72.0 * (tall - 0.55) / max(count, 1))
+        size = min(6.5, 0.62 * 72.0 * (tall - 0.55) / max(count, 1))
         for ax, one in zip(axes, compared, strict=False):
             _panel(ax, one, tests, (wide - margin) / across > ROOMY)
-            entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
             ax.tick_params(axis="y", length=0, labelsize=size)
         axes[0].set_ylim(count - 0.4, -0.6)
         axes[0].set_yticks(range(count) if named else [], names, parse_math=False)
         for ax in [] if named else axes[::across]:
             ax.set_ylabel(f"{count} tests")
-        order = [label for *_, label in _MARKS.values()]
+        entries, order = figures.named_in(axes), [label for *_, label in _MARKS.values()]
         known = sorted(entries, key=lambda label: order.index(label) if label in order else 9)
         lines_below = figures.legend_below(figure, {label: entries[label] for label in known})
         figure.set_figheight(figure.get_figheight() + 0.15 * max(lines_below - 1, 0))
