@@ -13,7 +13,7 @@ import numpy as np
 
 from foamfit.api import FitResult
 from foamfit.arrays import Array
-from foamfit.codec import build, decode
+from foamfit.codec import build, decode, reading
 from foamfit.errors import InputError
 from foamfit.files import read_whole, reason
 from foamfit.report.folder import load_result
@@ -72,17 +72,12 @@ def _fit(folder: Path) -> FitResult:
         )
     kept = content | content["load"]
     columns = _columns(folder / "curves.csv", kept.get("samples"))
-    try:
+    with reading(f"{folder}: fit.json"):
         kept["measurement"] = content | content["data"] | kept["measurement"]
         given = {name: kept[name] for name in KEPT if name in kept}
         result: FitResult = build(FitResult, given, columns, lmfit=lmfit, Insight=Insight)
-        result.draws.update(read_samples(folder / SAMPLES))
-        return result
-    except KeyError as error:
-        why = f"{error} is missing"
-    except (TypeError, ValueError, AttributeError) as error:
-        why = str(error)
-    raise InputError(f"{folder}: fit.json and curves.csv cannot be read back: {why}")
+    result.draws.update(read_samples(folder / SAMPLES))
+    return result
 
 
 def _columns(path: Path, samples: object) -> dict[str, Array]:
@@ -153,17 +148,11 @@ class SavedJoint(JointViews):
 def _joint(folder: Path) -> SavedJoint:
     """Read joint.json and the folders of its tests."""
     content = load_result(folder / "joint.json")
-    try:
+    with reading(f"{folder / 'joint.json'}"):
         tests = content["tests"]
-        given = content | {
-            "tests": list(tests),
-            "rates": [one["rate"] for one in tests.values()],
-            "content": content,
-            "results": {},
-        }
+        given = content | {"content": content, "results": {}, "tests": list(tests)}
+        given["rates"] = [one["rate"] for one in tests.values()]
         made: SavedJoint = build(SavedJoint, given, {})
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{folder / 'joint.json'} is damaged: {error!r}") from None
     made.results.update({name: _fit(folder / name) for name in made.tests})
     return made
 
@@ -171,10 +160,8 @@ def _joint(folder: Path) -> SavedJoint:
 def _cycles(folder: Path) -> CycleFits:
     """Read cycles.json and the folders of its cycles."""
     content = load_result(folder / "cycles.json")
-    try:
+    with reading(f"{folder / 'cycles.json'}"):
         names = content["fitted"]
         refused = decode(dict[int, str], content["refused"], {})
         given = content["test"], content["model"], tuple(content["recorded"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{folder / 'cycles.json'} is damaged: {error!r}") from None
     return CycleFits(*given, {n: _fit(folder / f"cycle-{n}") for n in names}, refused)

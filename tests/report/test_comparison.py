@@ -246,7 +246,7 @@ def test_what_cannot_be_compared_is_refused() -> None:
         compare([published_fit()], published="foam-3")
     with pytest.raises(ff.InputError, match="at least one"):
         compare([])
-    with pytest.raises(ff.InputError, match="no whole result"):
+    with pytest.raises(ff.InputError, match="cannot be read back"):
         compare([{"schema": 1, "test": "foam-2"}])
 
 
@@ -260,8 +260,8 @@ def test_an_unknown_published_set_says_which_there_are() -> None:
 @pytest.mark.parametrize(
     ("place", "change", "words"),
     [
-        (("parameters",), None, "the result is no whole result of a fit: 'parameters' is missing"),
-        (("parameters",), [1], "a value of it is of the wrong kind; fit again"),
+        (("parameters",), None, "the result cannot be read back: 'parameters' is missing"),
+        (("parameters",), [1], "a value is of the wrong kind; fit again"),
         (("parameters", "s1_k0", "state"), None, "'state' is missing"),
         (("parameters", "s1_k0", "value"), "soft", "of the wrong kind"),
         (("correlation",), {"names": ["s1_k0"]}, "'matrix' is missing"),

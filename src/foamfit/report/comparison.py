@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from foamfit.codec import build
+from foamfit.codec import build, reading
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, write_file
 from foamfit.report import figures
@@ -194,8 +194,7 @@ def side_of(result: Result) -> Side:
         given = result.to_json_dict()
     else:
         given = result if isinstance(result, Mapping) else load_result(result)
-    where = str(result) if isinstance(result, str | Path) else "the result"
-    try:
+    with reading(str(result) if isinstance(result, str | Path) else "the result"):
         model, drive = Model.of_result(given), str(given["drive"])
         found = given.get("correlation") or {"names": (), "matrix": ()}
         pairs = itertools.product(found["names"], repeat=2)
@@ -213,13 +212,6 @@ def side_of(result: Result) -> Side:
             test=given["test"],
             sha=str(given.get("data_sha256", "")),
         )
-    except InputError as error:
-        fault = str(error)
-    except KeyError as error:
-        fault = f"{error} is missing"
-    except (TypeError, ValueError, AttributeError):
-        fault = "a value of it is of the wrong kind"
-    raise InputError(f"{where} is no whole result of a fit: {fault}; fit again")
 
 
 def published_side(name: str) -> Side:

@@ -120,7 +120,7 @@ def grid_of(
     part: Figure | SubFigure, rows: int, columns: int, count: int, **more: Any
 ) -> list[Axes]:
     """Return so many panels, row by row; the other places of the grid stay empty."""
-    every = part.subplots(rows, columns, squeeze=False, **more).ravel().tolist()
+    every: list[Axes] = part.subplots(rows, columns, squeeze=False, **more).ravel().tolist()
     for ax in every[count:]:
         ax.set_axis_off()
     return every[:count]
