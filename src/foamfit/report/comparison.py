@@ -42,10 +42,6 @@ Result = Fit | Mapping[str, Any] | str | Path
 MARKS = ((BLUE, "o"), (VERMILION, "s"), ("black", "^"), (GREY, "D"))  # of the results
 NOTHING = 3.0  # standard error over value beyond which a difference is meaningless
 WORST_FIRST = ("not determined", "weak", "determined", "fixed")
-ETA_PUBLISHED = (
-    "the published η is numerical, it sets how the paper's relaxation under a held stress "
-    "converges; an identified η is a viscosity in real time"
-)
 VAGUE = "its standard error is many times its value, so the test does not determine it"
 
 
@@ -304,18 +300,9 @@ def _pair(side: Side, other: Side) -> Pair:
 
 def _incomparable(side: Side, other: Side) -> str:
     """Return why no parameter can be compared, "" if some can."""
-    if other.source is not None and (kind := _unpublished(side)):
-        return (
-            f"the published sets have no {kind} springs, so there is nothing to compare these "
-            "parameters with"
-        )
-    if [*map(_family, side.kinds)] != [*map(_family, other.kinds)]:
-        return (
-            f"the springs differ ({'+'.join(side.kinds)} and {'+'.join(other.kinds)}), so their "
-            "parameters do not mean the same"
-        )
-    failed = next((one.label for one in (side, other) if one.status == "failed"), None)
-    return f"{failed} found no acceptable fit, so its numbers mean nothing" if failed else ""
+    unpublished = _unpublished(side) if other.source is not None else ""
+    differ = [*map(_family, side.kinds)] != [*map(_family, other.kinds)]
+    return words("incomparable", side=side, other=other, unpublished=unpublished, differ=differ)
 
 
 def _family(kind: str) -> str:
@@ -375,21 +362,10 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
 
 def _remark(value: _Value, reference: _Value | None, eta: bool, side: Side, other: Side) -> str:
     """Return why two numbers are not compared, "" if they are."""
-    if value.state == "not determined":
-        return f"not determined: {value.why}"
-    if reference is not None and reference.state == "not determined":
-        return f"not determined in {other.label}: {reference.why}"
-    if eta and other.source is not None:
-        return ETA_PUBLISHED if other.source.eta is not None else "the published model has no η"
-    if eta and side.drive != other.drive:
-        return "η means something else in another drive"
-    if value.state == "fixed":
-        return f"not identified, {value.why or 'held fixed'}"
-    if value.stderr is not None and reference is not None:
-        size = max(abs(value.value or 0.0), abs(reference.value or 0.0))
-        if value.stderr > NOTHING * size:
-            return VAGUE
-    return ""
+    size = max(abs(one.value or 0.0) for one in (value, reference or _Value()))
+    vague = reference is not None and (value.stderr or 0.0) > NOTHING * size
+    given = {"value": value, "reference": reference, "side": side, "other": other}
+    return words("remark", eta=eta, vague=VAGUE if vague else "", **given)
 
 
 # ---------------------------------------------------------------- as a text and as a CSV

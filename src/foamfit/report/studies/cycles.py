@@ -29,6 +29,12 @@ LEAST = 1.55  # in, of a panel
 MOST_LOOPS = 12
 MOST_NAMES = 12  # of parameters on the terminal; those of a chain are in cycles.csv
 DPI = 200
+# Panels beside the parameters: columns of cycles.csv (SI), and what these are multiplied with.
+BY_CYCLE = {
+    "start strain (%)": ("start_strain", 100.0),
+    "dissipated (kJ/m³)": ("dissipated_energy", 1e-3),
+    "misfit of the loop (%)": ("misfit_stress_strain", 100.0),
+}
 FAR = 20  # a last cycle that is so many times the first is drawn on a logarithmic axis
 
 
@@ -77,16 +83,8 @@ def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
     `width` is "one" or "two" columns, or a length such as "85 mm".
     """
     results, varied = dict(sorted(found.results.items())), found.varied
-    by_cycle: dict[str, dict[int, float | None]] = {
-        "start strain (%)": {n: 100 * r.measurement.start_strain for n, r in results.items()},
-        "dissipated (kJ/m³)": {
-            n: _scaled(r.energy.get("dissipated_energy"), 1e-3) for n, r in results.items()
-        },
-        "misfit of the loop (%)": {
-            n: _scaled(r.misfit.get("stress_strain"), 100.0) for n, r in results.items()
-        },
-    }
-    panels, wide = len(by_cycle) + len(varied), figures.inches(width)
+    head, *table = map(list, found.rows())
+    panels, wide = len(BY_CYCLE) + len(varied), figures.inches(width)
     columns = max(figures.abreast(wide, COLUMNS, LEAST), 2)
     rows = 2 + max(0, -(-(panels - 2 * (columns - 2)) // columns))
     told = f"{found.test} · {found.model}"
@@ -96,13 +94,14 @@ def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
         _loops(figure.add_subplot(grid[:2, :2]), results)
         places = [(i, j) for i in range(rows) for j in range(columns) if i > 1 or j > 1]
         axes = [figure.add_subplot(grid[place]) for place in places[:panels]]
-        for ax, (title, values) in zip(axes, by_cycle.items(), strict=False):
-            there = [(n, value) for n, value in values.items() if value is not None]
+        for ax, (title, (column, factor)) in zip(axes, BY_CYCLE.items(), strict=False):
+            pairs = ((row[0], row[head.index(column)]) for row in table)
+            there = [(number, factor * value) for number, value in pairs if value is not None]
             style: dict[str, Any] = {"color": BLUE, "markersize": 3, "linewidth": 0.8}
             if there:
                 ax.plot(*np.array(there).T, "o-", label="_each cycle alone", **style)
             ax.set_title(title)
-        for ax, (name, each) in zip(axes[len(by_cycle) :], varied.items(), strict=True):
+        for ax, (name, each) in zip(axes[len(BY_CYCLE) :], varied.items(), strict=True):
             points = [(n, p) for n, p in zip(results, each, strict=True) if p is not None]
             factor, unit = readable_unit(max(abs(p.value) for _, p in points), points[0][1].unit)
             ax.set_title(own_name(name, found.model) + (f" ({unit})" if unit else ""))
@@ -116,10 +115,6 @@ def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
                 ax.set_xticks(numbers)
         figures.legend_below(figure, figures.key_of(figure.axes))
     return figure
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else factor * value
 
 
 def _loops(ax: Axes, results: Mapping[int, Fit]) -> None:
