@@ -6,12 +6,10 @@ import io
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from foamfit.errors import InputError
 from foamfit.files import write_file
@@ -54,9 +52,6 @@ TWO = "two"
 COLUMNS = {"one": 3.25, TWO: 7.0}
 NARROWEST, WIDEST = 2.5, 20.0
 UNTITLED, PDF = "untitled", "pdf"  # after a width and a comma: no title; all figures as PDF
-# Lines with more points are drawn through the first, last and extreme samples of this many
-# stretches, which looks the same in print.
-MOST_POINTS, STRETCHES = 3000, 500
 
 
 def inches(width: str) -> float:
@@ -130,7 +125,7 @@ def grid_of(
 def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[Figure]:
     """Give an empty figure of a size in inches, and the style of all figures to draw it in.
 
-    Long lines are thinned at the end without a visible change. `title` is a list of lines.
+    `title` is a list of lines.
     """
     import matplotlib
     from matplotlib.figure import Figure
@@ -141,11 +136,6 @@ def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[
             style: Any = {"fontsize": 8, "parse_math": False}
             figure.suptitle("\n".join(title), x=0.01, ha="left", **style)
         yield figure
-        for line in (line for ax in figure.axes for line in ax.lines):
-            x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
-            if x.size > MOST_POINTS:
-                kept = _seen(x, y)
-                line.set_data(x[kept], y[kept])
 
 
 @contextmanager
@@ -159,17 +149,6 @@ def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
 
     with matplotlib.rc_context(STYLE):
         yield pyplot.subplots(figsize=(4.5, 3.2), layout="constrained")[1]
-
-
-def _seen(x: Array, y: Array) -> NDArray[np.intp]:
-    """Return samples of a long line through which it looks the same as through all."""
-    ends = np.linspace(0, x.size, STRETCHES + 1).astype(np.intp)
-    kept = [ends[:-1], ends[1:] - 1]
-    for values in (x, y):
-        low, high = (np.where(np.isfinite(values), values, fill) for fill in (np.inf, -np.inf))
-        for start, stop in pairwise(ends):
-            kept.append(start + np.array([low[start:stop].argmin(), high[start:stop].argmax()]))
-    return np.unique(np.concatenate(kept))
 
 
 def key_of(axes: Iterable[Axes]) -> dict[str, Any]:

@@ -34,6 +34,8 @@ _TEXT |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasci
 _TEXT |= {"–": "--", "…": r"\dots{}"} | {letter: f"${letter}$" for letter in "<>|"}
 _TEXT |= {letter: f"{{{letter}}}" for letter in "[]*"}  # at the start of a row they are options
 _LAST_LETTER = "ſ"  # that pdfLaTeX sets without further packages
+# Misfits in a table with a row for each test.
+MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
 PARTS = ("", "_stderr", "_lo", "_hi", "_state")  # of a parameter, in a row for each test
 Parameters = Mapping[str, ParameterEstimate]
 

@@ -21,7 +21,9 @@ from foamfit.report.figures import image
 from foamfit.report.render import page, words
 from foamfit.report.studies.parameters import DPI as SUMMARY_DPI
 from foamfit.report.studies.parameters import Compared, plot_parameters
+from foamfit.report.summary import CURVES
 from foamfit.report.tables import (
+    MISFITS,
     by_test,
     by_test_tex,
     names_of,
@@ -37,7 +39,6 @@ from foamfit.text import counted, listed
 if TYPE_CHECKING:
     import pandas as pd
 
-CURVES = ("stress_time", "displacement_time", "stress_strain")
 # What a row says of a test without a result.
 REFUSED, OPEN = "refused", "not fitted"
 _STATUS = {
@@ -47,7 +48,6 @@ _STATUS = {
     REFUSED: "refused",
     OPEN: "not fitted yet",
 }
-_MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
 MOST_ON_PAGE = 5000
 _MOST_REFUSALS = 20  # that the terminal names
 
@@ -207,7 +207,7 @@ def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | N
         links=[f"{quote(row.test)}/report.html" for row in shown],
         reports=[(folder / row.test / "report.html").is_file() for row in shown],
         parameters=by_test([row.test for row in shown], varied([row.parameters for row in shown])),
-        misfits={curve: told for curve, told in _MISFITS.items() if curve in measured},
+        misfits={curve: told for curve, told in MISFITS.items() if curve in measured},
         picture=picture and base64.b64encode(picture).decode("ascii"),
     )
     write_file(folder / "summary.html", text.encode("utf-8", "replace"))

@@ -83,7 +83,7 @@ def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
     `width` is "one" or "two" columns, or a length such as "85 mm".
     """
     results, varied = dict(sorted(found.results.items())), found.varied
-    head, *table = map(list, found.rows())
+    head, *table = map(list[Any], found.rows())
     panels, wide = len(BY_CYCLE) + len(varied), figures.inches(width)
     columns = max(figures.abreast(wide, COLUMNS, LEAST), 2)
     rows = 2 + max(0, -(-(panels - 2 * (columns - 2)) // columns))

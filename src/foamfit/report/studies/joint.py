@@ -18,7 +18,7 @@ from foamfit.report.readable import in_unit, own_name, readable, readable_unit, 
 from foamfit.report.render import page, words
 from foamfit.report.shown import Joint
 from foamfit.report.studies.parameters import Compared, plot_parameters
-from foamfit.report.tables import parameters_tex
+from foamfit.report.tables import MISFITS, parameters_tex
 from foamfit.results import Fit, law_in_words
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from foamfit.study.joint_result import JointParameter, TestFit
 
-CURVES = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
 DPI = 180  # of the picture
 MOST_ROWS = 60  # of the table of tests on the terminal
 # Columns of the picture, and inches of a loop and of a parameter.
@@ -109,7 +108,7 @@ def _told(found: Joint) -> dict[str, Any]:
         "found": content,
         "law": law_in_words(Model.of_result(content).name, content["relaxation"]),
         "evidence": evidence,
-        "curves": {name: told for name, told in CURVES.items() if name in known},
+        "curves": {name: told for name, told in MISFITS.items() if name in known},
         "ranged": any(one.range for one in found.parameters.values()),
     }
 
@@ -136,7 +135,7 @@ def joint_page(found: Joint, loops: bytes, compared: bytes) -> str:
             size = max(abs(at.value) for at in one.tests.values())
             each.append((one, "".join(symbol(name)), *readable_unit(size, one.unit)))
     noise, known = {}, [one["noise"] for one in told["found"]["tests"].values()]
-    for name in CURVES:
+    for name in MISFITS:
         if levels := [one[name]["sigma"] for one in known if name in one]:
             noise[name] = readable_unit(max(levels), "m" if name.startswith("displ") else "Pa")
     return page(
@@ -149,7 +148,7 @@ def joint_page(found: Joint, loops: bytes, compared: bytes) -> str:
             for name, one in _of_springs(found).items()
         ],
         rule=RULE,
-        of_curve=CURVES,
+        of_curve=MISFITS,
         noise=noise,
         each=each,
         **told,
