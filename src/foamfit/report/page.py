@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
-from importlib.metadata import version
 
 from foamfit.fitting.branches import covered
 from foamfit.report.plots import origin_word
@@ -27,7 +25,6 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
     return page(
         "report",
         result=result,
-        version=version("foamfit"),
         origin=origin_word(result),
         conclusions=conclusions(result),
         determined=determined(result),
@@ -42,11 +39,5 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
         energy_sentences=plain["energy"].get("sentences") or [],
         answers=ANSWERS,
         **tables(result),
-        figures={name: images and _figure(images) for name, images in drawn.items()},
+        figures=drawn,
     )
-
-
-def _figure(images: Images) -> tuple[str, float]:
-    """Return a PNG in base64, and its width in inches (the width in pixels is in its header)."""
-    width = int.from_bytes(images.png[16:20])
-    return base64.b64encode(images.png).decode("ascii"), width / images.dpi

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import functools
 import math
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from foamfit import text
@@ -29,6 +31,8 @@ def environment() -> Environment:
     filters = (text.percent, text.engineering, text.significant, text.counted, text.listed)
     made.filters.update({one.__name__: one for one in (*filters, number, in_unit)})
     made.filters.update(paragraphs=_paragraphs, aligned=_aligned, exp=math.exp)
+    made.filters["png"] = lambda png: "data:image/png;base64," + base64.b64encode(png).decode()
+    made.globals["version"] = version("foamfit")
     made.filters["spoken"] = lambda name: name.replace("_", "-")
     return made
 

@@ -31,6 +31,11 @@ class Images:
     dpi: int  # of the PNG
     pdf: bytes | None = None
 
+    @property
+    def width(self) -> float:
+        """Its width in inches; that in pixels stands in the header of the PNG."""
+        return int.from_bytes(self.png[16:20]) / self.dpi
+
 
 def draw_all(
     result: Fit, width: str = TWO, mapped: Mapped = map

@@ -6,7 +6,6 @@ import functools
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -143,7 +142,7 @@ def unit_of_all(each: Iterable[ParameterEstimate | None]) -> tuple[float, str]:
 
 
 def _tex(name: str, **values: Any) -> str:
-    values |= {"version": version("foamfit"), "tex": escaped, "formula": formula}
+    values |= {"tex": escaped, "formula": formula}
     return environment().get_template(f"{name}.tex").render(numbers=numbers, **values)
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -200,7 +198,6 @@ def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | N
     text = page(
         "summary",
         title=title,
-        version=version("foamfit"),
         counts=counts_in_words(rows),
         rows=shown,
         total=len(rows),
@@ -208,6 +205,6 @@ def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | N
         reports=[(folder / row.test / "report.html").is_file() for row in shown],
         parameters=by_test([row.test for row in shown], varied([row.parameters for row in shown])),
         misfits={curve: told for curve, told in MISFITS.items() if curve in measured},
-        picture=picture and base64.b64encode(picture).decode("ascii"),
+        picture=picture,
     )
     write_file(folder / "summary.html", text.encode("utf-8", "replace"))

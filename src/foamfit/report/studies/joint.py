@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Iterable, Mapping
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -140,9 +138,8 @@ def joint_page(found: Joint, loops: bytes, compared: bytes) -> str:
             noise[name] = readable_unit(max(levels), "m" if name.startswith("displ") else "Pa")
     return page(
         "joint",
-        version=version("foamfit"),
-        loops=base64.b64encode(loops).decode("ascii"),
-        compared=base64.b64encode(compared).decode("ascii"),
+        loops=loops,
+        compared=compared,
         parameters=[
             (one, readable(name, one.estimate()), between(one))
             for name, one in _of_springs(found).items()
