@@ -15,8 +15,8 @@ import foamfit as ff
 from conftest import synthetic_impact
 from foamfit.data.measurement import Outliers
 from foamfit.report.comparison import compare, plot_comparison
-from foamfit.report.identifiability_plots import plot_insight
 from foamfit.report.plots import plot_fit, plot_response
+from foamfit.report.report_plots import plot_insight
 from foamfit.trust.identifiability import Insight
 
 

@@ -72,6 +72,18 @@ def test_a_folder_gives_the_same_result_back(fitted: ff.FitResult, tmp_path: Pat
     assert (limits.min, limits.max) == (fitted.params["s1_k0"].min, fitted.params["s1_k0"].max)
 
 
+def test_what_the_test_determines_is_read_back(fitted: ff.FitResult, tmp_path: Path) -> None:
+    read = ff.load(fitted.save(tmp_path / "x", report=False))
+    assert isinstance(read, ff.FitResult)
+    assert fitted.insight is not None
+    assert read.insight is not None
+    assert read.insight.sentence() == fitted.insight.sentence()
+    np.testing.assert_allclose(read.insight.correlation, fitted.insight.correlation, atol=1e-9)
+    (parts, shares), (kept, of_kept) = fitted.insight.shares(), read.insight.shares()
+    assert kept == parts
+    np.testing.assert_allclose(of_kept, shares, atol=1e-9)
+
+
 def test_cycles_and_batches_are_read_back(tmp_path: Path) -> None:
     results = {n: fabricated.result(seed=n) for n in (1, 3)}
     cycles = ff.CycleFits("foam", "bistable", (1, 2, 3), results, {2: "no rows"})

@@ -61,7 +61,8 @@ class FitResult(Fit):
         """Write the result folder whole, as `report.folder.save_result` does; returns it.
 
         Without `report` it has neither report.html nor figures. Its figure is "one" or "two"
-        columns wide, or as wide as a length ("85 mm").
+        columns wide, or as wide as a length ("85 mm"); with ", pdf" behind that all figures of the
+        report are written as PDF too, with ", untitled" they have no title.
         """
         inches(figure_width)  # refuses what is no width
         return save_result(self, folder, report=report, width=figure_width)

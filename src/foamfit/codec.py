@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import types
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import PurePath
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -15,11 +16,27 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.errors import InputError
 from foamfit.springs.spring import Spring
 
 Columns = Mapping[str, Array]
 _PARAMETER = ("value", "vary", "min", "max", "stderr", "expr")
 _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+
+
+@contextmanager
+def reading(what: str) -> Iterator[None]:
+    """Say in one sentence what is wrong with a result that is read in the body, as InputError."""
+    try:
+        yield
+        return
+    except InputError as error:
+        fault = str(error)
+    except KeyError as error:
+        fault = f"{error} is missing"
+    except (TypeError, ValueError, AttributeError):
+        fault = "a value is of the wrong kind"
+    raise InputError(f"{what} cannot be read back: {fault}; fit again")
 
 
 def encode(value: Any, columns: Columns) -> Any:

@@ -530,7 +530,8 @@ class Fit:
         }
         made: dict[str, Any] = plain(content)
         columns = self.columns
-        fields = {name: encode(vars(self)[name], columns) for name in KEPT}
+        kept = vars(self) | {"insight": self.insight and self.insight.compact()}
+        fields = {name: encode(kept[name], columns) for name in KEPT}
         rest = _without(made, fields)
         rest["measurement"] = _without(made | made["data"], fields["measurement"])
         length = max((column.size for column in columns.values()), default=0)
@@ -573,9 +574,8 @@ class Fit:
         return found
 
 
-# What fit.json and curves.csv keep of a fit; its insight is all derivatives of the curves, and
-# samples have a file of their own.
-KEPT = tuple(name for name in Fit.__dataclass_fields__ if name not in ("insight", "draws"))
+# What fit.json and curves.csv keep of a fit; samples have a file of their own.
+KEPT = tuple(name for name in Fit.__dataclass_fields__ if name != "draws")
 
 
 def _without(told: Mapping[str, Any], fields: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ import numpy as np
 
 from foamfit.api import FitResult
 from foamfit.arrays import Array
-from foamfit.codec import build, decode
+from foamfit.codec import build, decode, reading
 from foamfit.errors import InputError
 from foamfit.files import read_whole, reason
 from foamfit.report.folder import load_result
@@ -23,6 +23,7 @@ from foamfit.report.shown import JointViews
 from foamfit.report.studies.batch import read_table
 from foamfit.results import KEPT, Loop
 from foamfit.study.cycles import CycleFits
+from foamfit.study.joint import JointResult
 from foamfit.study.joint_result import JointParameter
 from foamfit.trust.identifiability import Insight
 
@@ -41,8 +42,8 @@ def load(folder: str | Path) -> FitResult | SavedJoint | CycleFits | pd.DataFram
     Returns
     -------
     FitResult, SavedJoint, CycleFits or pandas.DataFrame
-        The same as was saved; of a batch its summary, as `foamfit.batch` returns it. A fit has no
-        `insight`, so that a report that is saved anew has no section on the information.
+        The same as was saved, and saved again to the same; of a batch its summary, as
+        `foamfit.batch` returns it.
 
     Raises
     ------
@@ -71,17 +72,12 @@ def _fit(folder: Path) -> FitResult:
         )
     kept = content | content["load"]
     columns = _columns(folder / "curves.csv", kept.get("samples"))
-    try:
+    with reading(f"{folder}: fit.json"):
         kept["measurement"] = content | content["data"] | kept["measurement"]
         given = {name: kept[name] for name in KEPT if name in kept}
         result: FitResult = build(FitResult, given, columns, lmfit=lmfit, Insight=Insight)
-        result.draws.update(read_samples(folder / SAMPLES))
-        return result
-    except KeyError as error:
-        why = f"{error} is missing"
-    except (TypeError, ValueError, AttributeError) as error:
-        why = str(error)
-    raise InputError(f"{folder}: fit.json and curves.csv cannot be read back: {why}")
+    result.draws.update(read_samples(folder / SAMPLES))
+    return result
 
 
 def _columns(path: Path, samples: object) -> dict[str, Array]:
@@ -138,25 +134,25 @@ class SavedJoint(JointViews):
         found = ((name, one.loop) for name, one in self.results.items())
         return tuple(loop._replace(name=name) for name, loop in found if loop is not None)
 
+    save = JointResult.save
+
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of joint.json."""
         return self.content
+
+    def test_fits(self) -> Iterator[FitResult]:
+        """Give the result of each test, in the order of `tests`."""
+        return map(self.results.__getitem__, self.tests)
 
 
 def _joint(folder: Path) -> SavedJoint:
     """Read joint.json and the folders of its tests."""
     content = load_result(folder / "joint.json")
-    try:
+    with reading(f"{folder / 'joint.json'}"):
         tests = content["tests"]
-        given = content | {
-            "tests": list(tests),
-            "rates": [one["rate"] for one in tests.values()],
-            "content": content,
-            "results": {},
-        }
+        given = content | {"content": content, "results": {}, "tests": list(tests)}
+        given["rates"] = [one["rate"] for one in tests.values()]
         made: SavedJoint = build(SavedJoint, given, {})
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{folder / 'joint.json'} is damaged: {error!r}") from None
     made.results.update({name: _fit(folder / name) for name in made.tests})
     return made
 
@@ -164,10 +160,8 @@ def _joint(folder: Path) -> SavedJoint:
 def _cycles(folder: Path) -> CycleFits:
     """Read cycles.json and the folders of its cycles."""
     content = load_result(folder / "cycles.json")
-    try:
+    with reading(f"{folder / 'cycles.json'}"):
         names = content["fitted"]
         refused = decode(dict[int, str], content["refused"], {})
         given = content["test"], content["model"], tuple(content["recorded"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{folder / 'cycles.json'} is damaged: {error!r}") from None
     return CycleFits(*given, {n: _fit(folder / f"cycle-{n}") for n in names}, refused)

@@ -152,7 +152,9 @@ def test_the_zero_at_the_end_of_a_record_is_as_far_off_as_it_says(tmp_path, tau,
         if "stress" in test.zeros:
             off.append(test.origins["stress_zero"] / test.zeros["stress"])
     assert len(off) > 12
-    off = np.sort(np.abs(off))[:-1]  # one soft end of contact in 120 is taken for rest
+    off = np.sort(np.abs(off))
+    if (tau, samples) == (8.0, 300):  # of 20 a soft beginning is taken for rest once, 10.8 off
+        off = off[:-1]
     assert off[-1] < 3.5
     assert np.sqrt(np.mean(np.square(off))) < 1.4
 

@@ -21,8 +21,7 @@ from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Specimen
 from foamfit.errors import InputError
 from foamfit.page import desk as desk_module
-from foamfit.page import first_use as first_use_module
-from foamfit.page import turning as turning_module
+from foamfit.page import worker as worker_module
 from foamfit.page.desk import Desk, join_toml, safe_name, split_toml
 from foamfit.page.turning import Turning
 from foamfit.page.worker import Worker
@@ -251,9 +250,9 @@ def test_a_worker_that_dies_while_it_is_stopped_says_what_it_was(code, errors, t
 
 
 def test_what_compiles_at_first_use_is_waited_for_and_ends_with_the_page(monkeypatch):
-    monkeypatch.setattr(first_use_module.cache, "compiled", lambda _: False)
-    monkeypatch.setattr(first_use_module, "COMPILE", "import time; time.sleep(60)  # {} {}")
-    first_use = first_use_module.FirstUse()
+    monkeypatch.setattr(worker_module.cache, "compiled", lambda _: False)
+    monkeypatch.setattr(worker_module, "COMPILE", "import time; time.sleep(60)  # {} {}")
+    first_use = worker_module.FirstUse()
     integrator, memory = first_use.parts
     assert first_use.needed("linear+bistable", 0) is integrator
     needing = [("auto", 0), ("microscale", 0), ("bistable", 1)]
@@ -330,14 +329,6 @@ def test_the_heights_of_a_chain_keep_their_sum():
     drawn = Turning(ff.read_test(TEST), "linear+bistable").turn({"s1_height": 0.4e-3})
     assert drawn.values["s1_height"] == 0.4e-3
     assert drawn.values["s2_height"] == pytest.approx(0.79e-3)
-
-
-def test_a_long_record_is_thinned_to_be_drawn(monkeypatch):
-    monkeypatch.setattr(turning_module, "MOST_SAMPLES", 200)
-    measurement = ff.read_test(TEST)
-    turning = Turning(measurement, "bistable")
-    assert turning.samples == (measurement.rows.used, 200)
-    assert len(turning.turn({}).curves["stress_strain"][0]) == 200
 
 
 @pytest.mark.parametrize("make", [synthetic_impact, synthetic_loop])

@@ -9,16 +9,15 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pytest
-from matplotlib.image import imread
 
 import fabricated
 import foamfit as ff
 from foamfit.api import FitResult
 from foamfit.errors import InputError
-from foamfit.report.figures import MOST_POINTS, STYLE, drawing, image, laid_out
+from foamfit.report.figures import STYLE, image, laid_out
 from foamfit.report.plots import origin_word, plot_fit, plot_residuals, plot_response
 from foamfit.report.readable import readable_unit
-from foamfit.report.snapping_plots import plot_snapping
+from foamfit.report.report_plots import plot_snapping
 from foamfit.results import Switch
 
 
@@ -339,26 +338,6 @@ def test_names_of_branches_stay_in_their_panel(k0: float) -> None:
     loop = figure.axes[0]
     (name,) = (text for text in loop.texts if text.get_text() == "snap-through")
     assert name.get_window_extent().x0 >= loop.get_window_extent().x0
-
-
-def test_a_long_line_is_drawn_through_what_can_be_seen() -> None:
-    n = 100_000
-    x = np.linspace(0.0, 1.0, n)
-    y = np.sin(40.0 * x)
-    y[[33_333, 77_777]] = 3.0, -2.0
-    pictures = []
-    for limit in (MOST_POINTS, n):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("foamfit.report.figures.MOST_POINTS", limit)
-            with drawing(3.0, 2.0) as figure:
-                ax = figure.subplots()
-                (line,) = ax.plot(x, y, lw=0.9, label="y")
-        pictures.append(image(figure, "png", 100))
-        kept = line.get_xydata()
-        assert len(kept) == (n if limit == n else pytest.approx(2000, abs=1000))
-        assert {3.0, -2.0} <= set(kept[:, 1])
-    thin, whole = (imread(io.BytesIO(png))[..., :3] for png in pictures)
-    assert np.mean(np.abs(thin - whole) > 0.1) < 0.002
 
 
 def test_the_fraction_snapped_is_drawn_over_time_and_in_pictures_of_the_foam() -> None:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ import fabricated
 import foamfit.study.processes
 from conftest import EXPERIMENTS
 from foamfit.cli.options import drawing_beside
+from foamfit.errors import InputError
 from foamfit.report.result_figures import Images, draw_all
 from foamfit.study.processes import EndedError
 
@@ -33,6 +35,17 @@ def test_other_processes_draw_the_same(drawn_here: dict[str, Images | None]) -> 
     assert fit is not None
     assert fit.png.startswith(b"\x89PNG")
     assert fit.pdf is not None
+
+
+def test_all_figures_of_the_report_are_pdf_where_that_is_asked_for(tmp_path: Path) -> None:
+    result = fabricated.result()
+    folder = result.save(tmp_path / "r", figure_width="one, untitled, pdf")
+    assert {path.name for path in folder.glob("*.pdf")} == {"fit.pdf", "residuals.pdf"}
+    assert (folder / "residuals.pdf").read_bytes().startswith(b"%PDF")
+    result.save(folder)  # and may be replaced
+    assert {path.name for path in folder.glob("*.pdf")} == {"fit.pdf"}
+    with pytest.raises(InputError, match="behind a comma may stand untitled or pdf"):
+        result.save(folder, figure_width="two, png")
 
 
 @pytest.mark.parametrize(

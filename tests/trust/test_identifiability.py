@@ -18,10 +18,10 @@ from foamfit.fitting.branches import FLIGHT, Section
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.report.comparison import published_side
-from foamfit.report.identifiability_plots import (
+from foamfit.report.page import render_report
+from foamfit.report.report_plots import (
     plot_insight,
 )
-from foamfit.report.page import render_report
 from foamfit.report.summary import summary_text
 from foamfit.results import Intervals
 from foamfit.springs.chain import Impact

@@ -29,7 +29,7 @@ from foamfit.fitting.losses import soften
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord, Tracker
 from foamfit.one_model import Found, judge
-from foamfit.report.identifiability_plots import plot_profiles
+from foamfit.report.report_plots import plot_profiles
 from foamfit.results import Profile
 from foamfit.trust import intervals, resample
 from foamfit.trust.best_point import BestPoint

@@ -44,7 +44,7 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
         s1_eps_star = 0.3                       # held at a number (SI)
     Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
     """
-    output.check()
+    output.check(without_report=False)
     folder = output.folder(Path("fits", study.stem), [study])
     from foamfit.study.study_file import read_study
 

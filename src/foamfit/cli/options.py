@@ -92,8 +92,8 @@ MORE = tuple(option(f"--{name}", freed.told) for name, freed in OPTIONS.items())
 PLOT = option("--plot", "Also draw a PNG, PDF or SVG.", FILE)
 WIDTH = option(
     "--figure-width",
-    'Width of figures: one column (3.25 in), two (7 in), or a length as "85 mm"; "two, untitled" '
-    "leaves titles out.",
+    'Width of figures: one column (3.25 in), two (7 in), or a length as "85 mm". "two, untitled" '
+    'leaves titles out, "two, pdf" writes all figures of the report as PDF too.',
     default="two",
     metavar="one|two|LENGTH",
     callback=_width,

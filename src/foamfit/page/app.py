@@ -20,11 +20,9 @@ import panel as pn
 from foamfit.errors import InputError, SimulationError
 from foamfit.page.curves import Curves, grid, misfits_text
 from foamfit.page.desk import BUSY, FIRST, LARGEST, QUANTITIES, Checked, Desk
-from foamfit.page.fields import RELAXATIONS, Field
-from foamfit.page.first_use import FirstUse
 from foamfit.page.turning import Turning
-from foamfit.page.widgets import TEMPLATES, Upload, message, piece, style
-from foamfit.page.worker import News, parsed
+from foamfit.page.widgets import RELAXATIONS, TEMPLATES, Field, Upload, message, piece, style
+from foamfit.page.worker import FirstUse, News, parsed
 from foamfit.report.folder import load_result
 from foamfit.results import law_in_words
 from foamfit.springs import laws

@@ -206,8 +206,6 @@ class Curves:
         told = f"{self.turning.law}, {self.turning.drive} drive"
         told += f", cycle {test.cycle}" if len(test.cycles) > 1 else ""
         told += f": misfit {misfits_text(drawn.misfit)}"
-        used, shown = self.turning.samples
-        told += f"; {shown} of {used} samples are drawn" if shown < used else ""
         self.sliders.tell(drawn.error or told, wrong=bool(drawn.error))
 
     def _draw_points(self, drawn: Drawn) -> None:

@@ -33,10 +33,6 @@ LARGEST = 64 * 1024 * 1024  # bytes of a file that is dropped
 LONGEST = 80  # characters of the name of a file
 BUSY = "A fit is running; stop it before anything of the test is changed."
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
-# Rows on each side, columns, and characters of a cell shown around a wrong cell.
-AROUND, ACROSS, CELL = 2, 8, 24
-
-
 # Quantities to fill in, by their names in messages: label and example.
 QUANTITIES = {
     "[specimen] height": ("Specimen height", "1.19 mm"),
@@ -87,9 +83,12 @@ class Desk:
         """
         if self.running:
             raise InputError(BUSY)
-        if len(content) > LARGEST:
-            raise InputError(too_large(name))
         name = safe_name(name)
+        if len(content) > LARGEST:
+            raise InputError(
+                f"{name} is larger than {LARGEST // 2**20} MB, which the page takes; "
+                "use foamfit fit in a terminal."
+            )
         suffix = Path(name).suffix.lower()
         if suffix == ".toml":
             self.dropped = content
@@ -111,8 +110,6 @@ class Desk:
 
         Only the command and the list of reconstructions name such a file, never the browser.
         """
-        if csv.stat().st_size > LARGEST:
-            raise InputError(too_large(csv.name))
         known = csv.suffix.lower() in TABLES
         self.receive(csv.name if known else f"{csv.stem}.csv", csv.read_bytes())
         toml = toml_beside(csv)
@@ -242,14 +239,6 @@ class Desk:
                 archive.write(path, path.relative_to(self.result))
             archive.write(self.result.with_suffix(".toml"), "test.toml")
         return content.getvalue()
-
-
-def too_large(name: str) -> str:
-    """Say that a file is too large."""
-    return (
-        f"{safe_name(name)} is larger than {LARGEST // 2**20} MB, which the page takes; "
-        "use foamfit fit in a terminal."
-    )
 
 
 def safe_name(name: str) -> str:

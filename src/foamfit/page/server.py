@@ -27,76 +27,50 @@ from tornado.websocket import WebSocketClosedError
 
 from foamfit.errors import InputError
 from foamfit.page.app import Window
-from foamfit.page.desk import LARGEST, Desk, too_large
-from foamfit.page.first_use import FirstUse
+from foamfit.page.desk import LARGEST, Desk
+from foamfit.page.worker import FirstUse
 from foamfit.terminal import say
 
 HOST = "127.0.0.1"
 UNUSED = 20_000  # ms until the desk of a closed window is removed
-HEADERS = {
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-    "Cache-Control": "no-store",
-}
 REFUSED = "This page is for the address that foamfit page has printed; open that."
 
 
-@web.stream_request_body
 class Handler(web.RequestHandler):
-    """Refuses every request without reading its body."""
-
-    def set_default_headers(self) -> None:
-        """Forbid sniffing, caching and framing."""
-        for name, value in HEADERS.items():
-            self.set_header(name, value)
+    """Refuses every request."""
 
     def prepare(self) -> None:
-        """Answer before the body is read."""
-        self.refuse(403, REFUSED)
+        """Answer that the request is refused."""
+        self.answer(403, REFUSED)
 
-    def data_received(self, chunk: bytes) -> None:
-        """Ignore a part of the body."""
-
-    def refuse(self, code: int, sentence: str) -> None:
-        """Answer with a sentence, and close the connection."""
+    def answer(self, code: int, sentence: str) -> None:
+        """Answer with a plain text, which no browser takes for a page."""
         self.set_status(code)
         self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.set_header("Connection", "close")
-        self.finish(sentence + "\n")
+        self.set_header("X-Content-Type-Options", "nosniff")
+        self.finish(sentence)
 
 
 class Receive(Handler):
-    """Takes a file that was dropped in a window onto its desk, if it is not too large."""
+    """Takes a file that was dropped in a window onto its desk."""
 
     def initialize(self, desks: dict[str, Desk]) -> None:
         """Take the desks of all windows by their random names."""
         self.desks = desks
-        self.content = bytearray()
 
     def prepare(self) -> None:
-        """Refuse what is too large before it is sent."""
-        length = self.request.headers.get("Content-Length", "")
-        if self.request.method == "POST" and (not length.isdecimal() or int(length) > LARGEST):
-            self.refuse(413, too_large(self.get_query_argument("name", "The file")))
-
-    def data_received(self, chunk: bytes) -> None:
-        """Take a part of the file."""
-        if len(self.content) + len(chunk) <= LARGEST and not self._finished:
-            self.content += chunk
+        """Refuse nothing yet."""
 
     def post(self, window: str) -> None:
         """Keep the file."""
-        desk = self.desks.get(window)
-        if desk is None:
-            return self.refuse(404, "This window is closed; load the page again.")
+        if window not in self.desks:
+            self.answer(404, "This window is closed; load the page again.")
+            return
+        name = self.get_query_argument("name", "test.csv")
         try:
-            name = desk.receive(self.get_query_argument("name", "test.csv"), bytes(self.content))
+            self.answer(200, self.desks[window].receive(name, self.request.body))
         except InputError as error:
-            return self.refuse(400, str(error))
-        self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.finish(name)
-        return None
+            self.answer(400, str(error))
 
 
 class Guard(routing.Router):
@@ -141,7 +115,7 @@ class Page:
             extra_patterns=[("/receive/([A-Za-z0-9_-]+)", Receive, {"desks": self.desks})],
             unused_session_lifetime_milliseconds=UNUSED,
             check_unused_sessions_milliseconds=UNUSED // 4,
-            http_server_kwargs={"max_body_size": 2 * LARGEST},
+            http_server_kwargs={"max_body_size": LARGEST},
         )
         # In front of Bokeh's own application, which has no public way for that.
         self.server._http.request_callback = Guard(self.server._tornado, self.port, self.token)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Unpack
+from typing import Unpack
 
 import numpy as np
 
@@ -18,13 +18,12 @@ from foamfit.fitting.search import Tracker, rank
 from foamfit.fitting.starts import curve_starts, smooth_loop
 from foamfit.one_model import Keywords, Options
 from foamfit.report.readable import readable_unit
+from foamfit.report.summary import CURVES
 from foamfit.results import law_in_words
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 
-MOST_SAMPLES = 1500  # of a curve that every move of a slider draws again
 WIDE = 4.0  # a slider reaches to so many times the value
-# The panels, in their order.
-PANELS = ("stress_time", "displacement_time", "stress_strain")
+PANELS = tuple(CURVES)
 
 
 @dataclass(frozen=True)
@@ -67,9 +66,7 @@ class Turning:
         **options: Unpack[Keywords],
     ) -> None:
         """Start at these values (SI), or at those read off the loop; options as of a fit."""
-        thin = thinned(measurement)
-        self.samples = thin.rows.used, _size(thin)
-        self.problem: Problem = Options(**options).problem(thin, model)
+        self.problem: Problem = Options(**options).problem(measurement, model)
         self.values = self._guess() if not values else self._at(self.problem.vector(), values)
         self.rows = [self._row(name) for name in self.problem.names if self._own(name)]
 
@@ -182,25 +179,3 @@ class Turning:
             one / factor for one in (value, low, high, parameter.min, parameter.max)
         )
         return Row(name, shown, factor, value, low, high, least, most, held=not parameter.vary)
-
-
-def thinned(measurement: Measurement) -> Measurement:
-    """Return the test with no more samples than can be drawn at once, evenly chosen."""
-    count = _size(measurement)
-    if count <= MOST_SAMPLES:
-        return measurement
-    keep = np.unique(np.linspace(0, count - 1, MOST_SAMPLES).astype(int))
-    outliers = measurement.outliers.items()
-    thin: dict[str, Any] = {
-        "outliers": {name: replace(one, left_out=one.left_out[keep]) for name, one in outliers}
-    }
-    for name in ("interior", "sampled"):
-        thin[name] = {key: values[keep] for key, values in getattr(measurement, name).items()}
-    for name in ("time", "stress", "displacement", "acceleration"):
-        values = getattr(measurement, name)
-        thin[name] = None if values is None else values[keep]
-    return replace(measurement, block=1, **thin)
-
-
-def _size(measurement: Measurement) -> int:
-    return max(map(len, measurement.channels().values()))

@@ -1,7 +1,7 @@
-"""A fit in a process of its own, which the page starts, watches and stops.
+"""Processes beside the page: a fit, which it starts, watches and stops, and the compiler.
 
-The process reads a job as one line of JSON and answers in lines of JSON; SIGINT stops its search,
-which keeps the best point, as Ctrl-C does in a terminal.
+The process of a fit reads a job as one line of JSON and answers in lines of JSON; SIGINT stops its
+search, which keeps the best point, as Ctrl-C does in a terminal.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import sys
 import tempfile
 import threading
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,8 @@ from typing import TYPE_CHECKING, Any
 
 from foamfit.cli.progress import APART, Progress, Watcher
 from foamfit.errors import InputError, SimulationError, as_signalled
+from foamfit.solve import cache
+from foamfit.springs.model import Model
 
 if TYPE_CHECKING:
     from foamfit.arrays import Array
@@ -29,6 +32,12 @@ if TYPE_CHECKING:
 
 PACKAGE = Path(__file__).parent.parent
 COMPILING = "compiling the solver, once after installation"
+# Compiled one after the other, for springs without memory and with it: a model, its relaxation, and
+# the loop that is cached last.
+COMPILED = (("bistable", 0, "integrate"), ("microscale", 1, "relaxed_along"))
+COMPILE = """from foamfit.solve.precompile import at_first_use
+with at_first_use({!r}, {}, lambda: None) as compile_rest:
+    compile_rest()"""
 STOPPED_EARLY = "The fit was stopped before anything was found; start it again."
 
 
@@ -130,6 +139,39 @@ class Worker:
         last = f" ({last})" if last else ""
         how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
         return f"The process of the fit has died {how}{last}; start the fit again."
+
+
+class FirstUse:
+    """Compiles what curves and fits need, once after installation, in other processes.
+
+    The page answers meanwhile.
+    """
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._closed = False
+        pool = ThreadPoolExecutor(1, thread_name_prefix="foamfit-compiling")
+        self.parts = [pool.submit(self._compile, *part) for part in COMPILED]
+
+    def needed(self, model: str, relaxation: int) -> Future[None]:
+        """Return what must be done before a model is simulated."""
+        memory = (
+            model == "auto" or relaxation or any(one.remembers for one in Model.parse(model).laws)
+        )
+        return self.parts[-1 if memory else 0]
+
+    def _compile(self, model: str, relaxation: int, loop: str) -> None:
+        if self._closed or cache.compiled(loop):
+            return
+        command = [sys.executable, "-c", COMPILE.format(model, relaxation)]
+        self._process = subprocess.Popen(command, env=with_package(), start_new_session=True)
+        self._process.wait()
+
+    def close(self) -> None:
+        """End it."""
+        self._closed = True
+        if self._process is not None:
+            end_all(self._process)
 
 
 # --------------------------------------------------------------------- in the process of the fit

@@ -6,6 +6,7 @@ ratios to it, the stress drop as a ratio to σ_a.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 import textwrap
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from foamfit.codec import build, reading
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, write_file
 from foamfit.report import figures
@@ -40,16 +42,7 @@ Result = Fit | Mapping[str, Any] | str | Path
 MARKS = ((BLUE, "o"), (VERMILION, "s"), ("black", "^"), (GREY, "D"))  # of the results
 NOTHING = 3.0  # standard error over value beyond which a difference is meaningless
 WORST_FIRST = ("not determined", "weak", "determined", "fixed")
-ETA_PUBLISHED = (
-    "the published η is numerical, it sets how the paper's relaxation under a held stress "
-    "converges; an identified η is a viscosity in real time"
-)
 VAGUE = "its standard error is many times its value, so the test does not determine it"
-# What is read of a result, and of each of its parameters.
-_NUMBER = int | float | None
-CONTENT = {"test": str, "model": str, "drive": str, "status": str, "parameters": Mapping}
-ESTIMATE: dict[str, Any] = {"value": _NUMBER, "stderr": _NUMBER}
-ESTIMATE |= {"unit": str, "vary": bool, "state": str, "why": str}
 
 
 @dataclass(frozen=True)
@@ -82,19 +75,16 @@ class Row:
         nothing = self.state == "not determined" or self.remark == VAGUE
         return nothing and self.reference is not None
 
-    @property
-    def difference(self) -> float | None:
-        """Fitted minus reference, in the row's unit; None where it means nothing."""
-        if self.remark or self.value is None or self.reference is None:
+    def difference_over(self, unit: float) -> float | None:
+        """Fitted minus reference over a unit; None where it means nothing."""
+        if self.remark or self.value is None or self.reference is None or not unit:
             return None
-        return self.value - self.reference
+        return (self.value - self.reference) / unit
 
     @property
     def percent(self) -> float | None:
         """The difference in percent of the reference."""
-        if self.difference is None or not self.reference:
-            return None
-        return 100.0 * self.difference / abs(self.reference)
+        return self.difference_over(abs(self.reference or 0.0) / 100.0)
 
     @property
     def spread(self) -> float:
@@ -104,9 +94,12 @@ class Row:
     @property
     def standard_errors(self) -> float | None:
         """The difference in standard errors."""
-        return (
-            self.difference / self.spread if self.spread and self.difference is not None else None
-        )
+        return self.difference_over(self.spread)
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether a figure has something to show of it."""
+        return self.standard_errors is not None or self.lost
 
 
 @dataclass(frozen=True)
@@ -192,65 +185,29 @@ class Side:
 
 def side_of(result: Result) -> Side:
     """Return the parameters of a fit; InputError if the result is not whole."""
+    given: Mapping[str, Any]
     if isinstance(result, Fit):
-        content: Mapping[str, Any] = result.to_json_dict()
+        given = result.to_json_dict()
     else:
-        content = result if isinstance(result, Mapping) else load_result(result)
-    where = str(result) if isinstance(result, str | Path) else "the result"
-    given = _whole(content, CONTENT, where)
-    terms = given.get("relaxation", 0)
-    if type(terms) is not int or terms < 0:
-        raise _broken(where, f"'relaxation' cannot be {str(terms)[:40]!r}")
-    model = Model.of_result(given)
-    return Side(
-        label=f"{given['test']}: {law_in_words(model.name, terms)}, {given['drive']} drive",
-        kinds=model.kinds,
-        relaxation=terms,
-        estimates={name: _estimate(p, where, name) for name, p in given["parameters"].items()},
-        correlation=_correlation(given.get("correlation"), where),
-        drive=given["drive"],
-        status=given["status"],
-        stopped=given.get("stopped"),
-        test=given["test"],
-        sha=str(given.get("data_sha256", "")),
-    )
-
-
-def _broken(where: str, fault: str) -> InputError:
-    return InputError(f"{where} is no whole result of a fit: {fault}; fit again")
-
-
-def _whole(content: Any, wanted: Mapping[str, Any], where: str) -> Mapping[str, Any]:
-    """Return the content of a result; InputError if a key is missing or of the wrong type."""
-    given = content if isinstance(content, Mapping) else {}
-    for key, kind in wanted.items():
-        fine = key in given and isinstance(given[key], kind)
-        if not fine or (kind is _NUMBER and isinstance(given[key], bool)):
-            fault = f"cannot be {str(given[key])[:40]!r}" if key in given else "is missing"
-            raise _broken(where, f"'{key}' {fault}")
-    return given
-
-
-def _estimate(content: Mapping[str, Any], where: str, name: str) -> ParameterEstimate:
-    """Read one parameter of a result."""
-    p = _whole(content, ESTIMATE, f"{where}: {name}")
-    value = math.nan if p["value"] is None else float(p["value"])
-    return ParameterEstimate(value, p["stderr"], None, p["unit"], p["vary"], p["state"], p["why"])
-
-
-def _correlation(content: Any, where: str) -> dict[tuple[str, str], float]:
-    if content is None:
-        return {}
-    try:
-        return {
-            (one, other): float(value)
-            for one, row in zip(content["names"], content["matrix"], strict=True)
-            for other, value in zip(content["names"], row, strict=True)
-            if value is not None
-        }
-    except (KeyError, TypeError, ValueError):
-        fault = "'correlation' must have names and a square matrix of numbers"
-        raise _broken(where, fault) from None
+        given = result if isinstance(result, Mapping) else load_result(result)
+    with reading(str(result) if isinstance(result, str | Path) else "the result"):
+        model, drive = Model.of_result(given), str(given["drive"])
+        found = given.get("correlation") or {"names": (), "matrix": ()}
+        pairs = itertools.product(found["names"], repeat=2)
+        flat = zip(pairs, itertools.chain(*found["matrix"]), strict=True)
+        law_name = law_in_words(model.name, model.relaxation)
+        return Side(
+            label=f"{given['test']}: {law_name}, {drive} drive",
+            kinds=model.kinds,
+            relaxation=model.relaxation,
+            estimates={n: build(ParameterEstimate, p, {}) for n, p in given["parameters"].items()},
+            correlation={pair: float(value) for pair, value in flat if value is not None},
+            drive=drive,
+            status=given["status"],
+            stopped=given.get("stopped"),
+            test=given["test"],
+            sha=str(given.get("data_sha256", "")),
+        )
 
 
 def published_side(name: str) -> Side:
@@ -280,6 +237,10 @@ def _unpublished(side: Side) -> str:
 # ---------------------------------------------------------------- the quantities of the tables
 
 
+def _total(*parts: Any) -> Any:
+    return sum(parts)
+
+
 def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
     """Give the rows of a kind of spring."""
     yield from law(kind).compared or map(_as_it_is, law(kind).params)
@@ -292,10 +253,6 @@ def _as_it_is(param: Param) -> Compared:
     factor, unit = (1e6, "MPa") if param.unit == "Pa" else (1.0, param.unit)
     label = "_".join(filter(None, param.symbol)) or param.name
     return Compared(label, unit, (param.name,), lambda value: value / factor)
-
-
-def _total(*parts: Any) -> Any:
-    return sum(parts)
 
 
 class _Value(NamedTuple):
@@ -343,18 +300,9 @@ def _pair(side: Side, other: Side) -> Pair:
 
 def _incomparable(side: Side, other: Side) -> str:
     """Return why no parameter can be compared, "" if some can."""
-    if other.source is not None and (kind := _unpublished(side)):
-        return (
-            f"the published sets have no {kind} springs, so there is nothing to compare these "
-            "parameters with"
-        )
-    if [*map(_family, side.kinds)] != [*map(_family, other.kinds)]:
-        return (
-            f"the springs differ ({'+'.join(side.kinds)} and {'+'.join(other.kinds)}), so their "
-            "parameters do not mean the same"
-        )
-    failed = next((one.label for one in (side, other) if one.status == "failed"), None)
-    return f"{failed} found no acceptable fit, so its numbers mean nothing" if failed else ""
+    unpublished = _unpublished(side) if other.source is not None else ""
+    differ = [*map(_family, side.kinds)] != [*map(_family, other.kinds)]
+    return words("incomparable", side=side, other=other, unpublished=unpublished, differ=differ)
 
 
 def _family(kind: str) -> str:
@@ -414,21 +362,10 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
 
 def _remark(value: _Value, reference: _Value | None, eta: bool, side: Side, other: Side) -> str:
     """Return why two numbers are not compared, "" if they are."""
-    if value.state == "not determined":
-        return f"not determined: {value.why}"
-    if reference is not None and reference.state == "not determined":
-        return f"not determined in {other.label}: {reference.why}"
-    if eta and other.source is not None:
-        return ETA_PUBLISHED if other.source.eta is not None else "the published model has no η"
-    if eta and side.drive != other.drive:
-        return "η means something else in another drive"
-    if value.state == "fixed":
-        return f"not identified, {value.why or 'held fixed'}"
-    if value.stderr is not None and reference is not None:
-        size = max(abs(value.value or 0.0), abs(reference.value or 0.0))
-        if value.stderr > NOTHING * size:
-            return VAGUE
-    return ""
+    size = max(abs(one.value or 0.0) for one in (value, reference or _Value()))
+    vague = reference is not None and (value.stderr or 0.0) > NOTHING * size
+    given = {"value": value, "reference": reference, "side": side, "other": other}
+    return words("remark", eta=eta, vague=VAGUE if vague else "", **given)
 
 
 # ---------------------------------------------------------------- as a text and as a CSV
@@ -445,11 +382,9 @@ def comparison_text(comparison: Comparison) -> str:
         for row in pair.rows:
             if row.remark and row.remark.casefold() not in whole:
                 apart.setdefault(row.remark, []).append(row.label)
-        zeta = None
-        if any(row.name == "ζ" for row in pair.rows):  # then it stands beside a published set
-            item = published_sets[pair.reference.removeprefix("published ")]
-            zeta = item.damping_ratio_by_formula(), item.damping_ratio
-        pairs.append((pair, [titles, *map(_cells, pair.rows)], apart, zeta))
+        ratio = any(row.name == "ζ" for row in pair.rows)  # then a published set is beside it
+        item = published_sets[pair.reference.removeprefix("published ")] if ratio else None
+        pairs.append((pair, [titles, *map(_cells, pair.rows)], apart, item))
     return words("comparison", pairs=pairs, with_published=comparison.with_published)
 
 
@@ -478,15 +413,14 @@ def _with_error(value: float | None, stderr: float | None) -> str:
 def write_csv(comparison: Comparison, path: str | Path) -> None:
     """Write a comparison as a table, one parameter of one result per line."""
     of_pair = ("test", "model", "drive", "reference")
-    of_row = {"spring": "spring", "parameter": "name"}
-    of_row |= {name: name for name in ("unit", "value", "stderr", "state")}
-    of_row |= {"reference_value": "reference", "reference_stderr": "reference_stderr"}
-    of_row |= {name: name for name in ("percent", "standard_errors", "remark")}
-    rows: list[list[Any]] = [[*of_pair, *of_row]]
+    of_row = {"parameter": "name", "unit": "unit", "value": "value", "stderr": "stderr"}
+    of_row |= {"state": "state", "reference_value": "reference"}
+    of_row |= {name: name for name in ("reference_stderr", "percent", "standard_errors", "remark")}
+    rows: list[list[Any]] = [[*of_pair, "spring", *of_row]]
     for pair in comparison.pairs:
         for row in pair.rows:
-            cells = [getattr(row, name) for name in of_row.values()]
-            rows.append([*(getattr(pair, name) for name in of_pair), cells[0] or "", *cells[1:]])
+            told = [getattr(pair, name) for name in of_pair]
+            rows.append([*told, row.spring or "", *(getattr(row, n) for n in of_row.values())])
     write_file(path, csv_bytes(rows))
 
 
@@ -510,33 +444,27 @@ def plot_comparison(
     rows = [max(lines[i : i + columns]) for i in range(0, len(lines), columns)]
     with figures.drawing(wide, 0.5 + sum(0.6 + 0.12 * n for n in rows)) as figure:
         ratios = [n + 2 for n in rows]
-        axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=ratios).ravel()
-        for ax in axes[len(groups) :]:
-            ax.remove()
-        for ax, (reference, pairs) in zip(axes, groups.items(), strict=False):
+        axes = figures.grid_of(figure, len(rows), columns, len(groups), height_ratios=ratios)
+        for ax, (reference, pairs) in zip(axes, groups.items(), strict=True):
             _draw_comparison(ax, pairs)
             title = textwrap.fill(f"beside {reference}", int(16 * wide / columns))
             ax.set_title(title, loc="left", fontsize=7.5, pad=4, weight="bold", parse_math=False)
-        for ax in figure.axes[-columns:]:  # the lowest ones
+        for ax in axes[-columns:]:  # the lowest ones
             ax.set_xlabel("deviation (standard errors)")
         _name_results(figure, list(groups.values()))
     return figures.save(figure, path)
 
 
-def _is_shown(row: Row) -> bool:
-    return row.standard_errors is not None or row.lost
-
-
 def _shown(pairs: list[Pair]) -> list[str]:
     """Return the parameters that at least one result can show, in order."""
     rows = [row for pair in pairs for row in pair.rows]
-    there = {row.label for row in rows if _is_shown(row)}
+    there = {row.label for row in rows if row.is_shown}
     return [label for label in dict.fromkeys(row.label for row in rows) if label in there]
 
 
 def _lanes(pairs: list[Pair]) -> list[int]:
     """Return the indices of the results that have something to show; each gets a lane."""
-    return [k for k, pair in enumerate(pairs) if any(map(_is_shown, pair.rows))]
+    return [k for k, pair in enumerate(pairs) if any(row.is_shown for row in pair.rows)]
 
 
 def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:

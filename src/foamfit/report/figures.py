@@ -6,25 +6,25 @@ import io
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from foamfit.errors import InputError
 from foamfit.files import write_file
+from foamfit.report.readable import readable_unit
 from foamfit.text import wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
     from foamfit.arrays import Array
 
 GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # by Okabe and Ito
 INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of interior masses, from the base up
+MEASURED = "0.65"  # of wide lines below what is simulated, which is darker in grey too
 STYLE: Any = {  # matplotlib types its keys one by one
     "font.family": "DejaVu Sans",  # one upright font: each further font costs 0.1 s per PDF
     "font.size": 7.5,
@@ -51,32 +51,41 @@ DPI = 250  # of a PNG
 TWO = "two"
 COLUMNS = {"one": 3.25, TWO: 7.0}
 NARROWEST, WIDEST = 2.5, 20.0
-UNTITLED = "untitled"  # after a width and a comma: no title
-# Lines with more points are drawn through the first, last and extreme samples of this many
-# stretches, which looks the same in print.
-MOST_POINTS, STRETCHES = 3000, 500
+UNTITLED, PDF = "untitled", "pdf"  # after a width and a comma: no title; all figures as PDF
 
 
 def inches(width: str) -> float:
     """Return the width of a figure that "one" or "two" columns or a length ("85 mm") name."""
-    width = width.rpartition(",")[0] if not is_titled(width) else width
-    if (known := COLUMNS.get(width.strip().lower())) is not None:
-        return known
     from foamfit.data.units import parse_quantity
 
-    wide = round(parse_quantity(width, "m", "the width of figures", "85 mm") / 0.0254, 6)
-    if not NARROWEST <= wide <= WIDEST:
+    length, words = _parted(width)
+    wide = COLUMNS.get(length)
+    if wide is None:
+        metres = parse_quantity(length, "m", "the width of figures", "85 mm")
+        wide = round(metres / 0.0254, 6)
+    if not NARROWEST <= wide <= WIDEST or words - {UNTITLED, PDF}:
         low, high = (f"{25.4 * end:.0f}" for end in (NARROWEST, WIDEST))
         raise InputError(
             f"the width of figures = {width!r} is not admissible; it must be one, two (columns) or "
-            f"a length from {low} to {high} mm"
+            f"a length from {low} to {high} mm, and behind a comma may stand untitled or pdf"
         )
     return wide
 
 
+def _parted(width: str) -> tuple[str, set[str]]:
+    """Split "two, untitled" into the width and the words behind it."""
+    length, *words = (part.strip().lower() for part in width.split(","))
+    return length, set(words)
+
+
 def is_titled(width: str) -> bool:
     """Whether a figure of such a width has a title: all but "two, untitled" and its like."""
-    return width.rpartition(",")[2].strip().lower() != UNTITLED
+    return UNTITLED not in _parted(width)[1]
+
+
+def all_as_pdf(width: str) -> bool:
+    """Whether all figures of a report are written as PDF too, as by "two, pdf"."""
+    return PDF in _parted(width)[1]
 
 
 def abreast(width: float, panels: int, least: float = 2.1) -> int:
@@ -89,11 +98,34 @@ def title_lines(wide: float, *parts: str, titled: bool = True) -> list[str]:
     return [line for part in parts if titled for line in wrapped(part, 0, int(16 * wide))]
 
 
+def tail(name: str, most: int) -> str:
+    """Return a name, or the end of one that has more letters than there is room for."""
+    return name if len(name) <= most else f"…{name[1 - most :]}"
+
+
+def over_time(time: Array | None, size: int) -> tuple[Array, str]:
+    """Return what a curve is drawn over, and the label of that: its time, or its samples."""
+    if time is None:
+        return np.arange(size, dtype=float), "sample"
+    factor, unit = readable_unit(float(np.nanmax(np.abs(time))), "s")
+    return time / factor, f"time ({unit})"
+
+
+def grid_of(
+    part: Figure | SubFigure, rows: int, columns: int, count: int, **more: Any
+) -> list[Axes]:
+    """Return so many panels, row by row; the other places of the grid stay empty."""
+    every: list[Axes] = part.subplots(rows, columns, squeeze=False, **more).ravel().tolist()
+    for ax in every[count:]:
+        ax.set_axis_off()
+    return every[:count]
+
+
 @contextmanager
 def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[Figure]:
     """Give an empty figure of a size in inches, and the style of all figures to draw it in.
 
-    Long lines are thinned at the end without a visible change. `title` is a list of lines.
+    `title` is a list of lines.
     """
     import matplotlib
     from matplotlib.figure import Figure
@@ -104,11 +136,6 @@ def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[
             style: Any = {"fontsize": 8, "parse_math": False}
             figure.suptitle("\n".join(title), x=0.01, ha="left", **style)
         yield figure
-        for line in (line for ax in figure.axes for line in ax.lines):
-            x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
-            if x.size > MOST_POINTS:
-                kept = _seen(x, y)
-                line.set_data(x[kept], y[kept])
 
 
 @contextmanager
@@ -124,17 +151,6 @@ def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
         yield pyplot.subplots(figsize=(4.5, 3.2), layout="constrained")[1]
 
 
-def _seen(x: Array, y: Array) -> NDArray[np.intp]:
-    """Return samples of a long line through which it looks the same as through all."""
-    ends = np.linspace(0, x.size, STRETCHES + 1).astype(np.intp)
-    kept = [ends[:-1], ends[1:] - 1]
-    for values in (x, y):
-        low, high = (np.where(np.isfinite(values), values, fill) for fill in (np.inf, -np.inf))
-        for start, stop in pairwise(ends):
-            kept.append(start + np.array([low[start:stop].argmin(), high[start:stop].argmax()]))
-    return np.unique(np.concatenate(kept))
-
-
 def key_of(axes: Iterable[Axes]) -> dict[str, Any]:
     """Return what is drawn by its label, less the "_" that keeps it off other legends."""
     found: dict[str, Any] = {}
@@ -144,6 +160,12 @@ def key_of(axes: Iterable[Axes]) -> dict[str, Any]:
         if label.startswith("_") and not label.startswith("_child") and not empty:
             found.setdefault(label[1:], artist)
     return found
+
+
+def named_in(axes: Iterable[Axes]) -> dict[str, Any]:
+    """Return what is drawn by its label, as a legend of all axes has it."""
+    each = (zip(*reversed(ax.get_legend_handles_labels()), strict=True) for ax in axes)
+    return {name: artist for pairs in each for name, artist in pairs}
 
 
 def legend_below(figure: Figure, entries: dict[str, Any]) -> int:

@@ -20,14 +20,14 @@ from foamfit.report.result_figures import Mapped, draw_all
 from foamfit.report.samples import FILE as SAMPLES
 from foamfit.report.samples import write_samples
 from foamfit.report.tables import parameters_tex
-from foamfit.results import SCHEMA, Fit, Intervals, ParameterEstimate, plain
+from foamfit.results import SCHEMA, Fit, ParameterEstimate, plain
 
 # All that `save_result` may write, and what `studies` write beside the folders of cycles and tests.
 # Older versions wrote tables of what was plotted: their folders are replaced as well.
 RESULT_FILES = {
     *("fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png"),
     *("fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "budget.csv", "report.html"),
-    *("table.tex", SAMPLES),
+    *("table.tex", SAMPLES, "residuals.pdf", "information.pdf", "snapping.pdf", "profiles.pdf"),
 }
 CYCLES_FILES = {f"cycles.{kind}" for kind in ("json", "csv", "png", "pdf")}
 CYCLES_FILES |= {"cycles-plotted.csv", "table.tex"}
@@ -225,7 +225,13 @@ def write_result(
     samples = zip(*(column.tolist() for column in result.columns.values()), strict=True)
     write_table(folder / "curves.csv", [result.columns.keys(), *samples])
     if result.intervals is not None and result.intervals.profiles:
-        write_table(folder / "profiles.csv", _profile_rows(result.intervals))
+        head = ["name", "value", "chi2", "chi2 of the 95 % cut", "complete"]
+        rows = (
+            [one.name, value, rise, one.cut, one.complete]
+            for one in result.intervals.profiles
+            for value, rise in zip(one.values.tolist(), one.rises.tolist(), strict=True)
+        )
+        write_table(folder / "profiles.csv", [head, *rows])
     if result.draws:
         write_samples(folder / SAMPLES, result.draws)
     if pages and result.budget is not None and result.budget.telling:
@@ -234,8 +240,10 @@ def write_result(
         write_table(folder / "ladder.csv", result.ladder.rows())
     drawn = dict(figures)
     for name, images in drawn.items():
-        for form, content in () if images is None else images.files():
-            (folder / f"{name}.{form}").write_bytes(content)
+        if images is not None and images.pdf is not None:
+            (folder / f"{name}.pdf").write_bytes(images.pdf)
+    if (fit := drawn.get("fit")) is not None:
+        (folder / "fit.png").write_bytes(fit.png)
     if pages:
         write_text(folder / "report.html", render_report(result, drawn))
 
@@ -270,10 +278,3 @@ def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[lis
         spans = (*(p.ci95 or (None, None)), *(p.range or (None, None)))
         numbers = plain([p.value, p.stderr, *spans, p.systematic])
         yield [name, *numbers, p.unit, p.state, p.why, p.ci95_method]
-
-
-def _profile_rows(intervals: Intervals) -> Iterator[Iterable[object]]:
-    yield ["name", "value", "chi2", "chi2 of the 95 % cut", "complete"]
-    for profile in intervals.profiles:
-        for value, rise in zip(profile.values.tolist(), profile.rises.tolist(), strict=True):
-            yield [profile.name, value, rise, profile.cut, profile.complete]

@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
-from importlib.metadata import version
 
 from foamfit.fitting.branches import covered
 from foamfit.report.plots import origin_word
-from foamfit.report.readable import in_unit, quantity, readable
+from foamfit.report.readable import quantity, readable
 from foamfit.report.render import page
 from foamfit.report.result_figures import Images, draw_all
-from foamfit.report.summary import (
-    ANSWERS,
-    LADDER,
-    conclusions,
-    cycle_rows,
-    determined,
-    ladder_cells,
-    misfits,
-)
+from foamfit.report.summary import ANSWERS, conclusions, determined, misfits, tables
 from foamfit.results import Fit
 from foamfit.trust.covariance import RULE
 
@@ -27,7 +17,7 @@ from foamfit.trust.covariance import RULE
 def render_report(result: Fit, figures: Mapping[str, Images | None] | None = None) -> str:
     """Return the report as one HTML page that needs nothing else.
 
-    `figures` are those of `draw_all`, if they are drawn already and kept as files beside it.
+    `figures` are those of `draw_all`, if they are drawn already.
     """
     drawn = dict(draw_all(result)) if figures is None else figures
     plain = result.to_json_dict()
@@ -35,35 +25,19 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
     return page(
         "report",
         result=result,
-        version=version("foamfit"),
         origin=origin_word(result),
         conclusions=conclusions(result),
         determined=determined(result),
         misfits=misfits(result),
-        cycles=cycle_rows(result),
         statistics=plain["statistics"],
         springs=springs,
-        hysteretic={name: spring for name, spring in springs.items() if spring.law.hysteretic},
         seen={name: covered(result.visited.get(name, ())) for name in springs},
-        marks=list(dict.fromkeys(filter(None, (one.law.note for one in springs.values())))),
         parameters=[readable(name, p) for name, p in result.parameters.items()],
-        systematic=any(p.systematic > 0.0 for p in result.parameters.values()),
-        ranged=any(p.range for p in result.parameters.values()),
         rule=RULE,
         quantity=quantity,
-        in_unit=in_unit,
         energy={k: x for k, x in plain["energy"].items() if type(x) in (int, float)},
         energy_sentences=plain["energy"].get("sentences") or [],
-        ladder=result.ladder,
-        ladder_header=LADDER,
-        ladder_rows=[] if result.ladder is None else list(ladder_cells(result.ladder)),
         answers=ANSWERS,
-        kept=figures is not None,
-        figures={name: images and _figure(images) for name, images in drawn.items()},
+        **tables(result),
+        figures=drawn,
     )
-
-
-def _figure(images: Images) -> tuple[str, float]:
-    """Return a PNG in base64, and its width in inches (the width in pixels is in its header)."""
-    width = int.from_bytes(images.png[16:20])
-    return base64.b64encode(images.png).decode("ascii"), width / images.dpi

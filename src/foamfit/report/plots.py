@@ -118,18 +118,16 @@ def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
     One strip above the other, 7 in wide, over time, or over the sample where there is no time; a
     curve that has nothing to compare is left out. Saved at `path`, if one is given.
     """
-    strips = list(_residuals(result))
+    strips = dict(_residuals(result))
     with figures.drawing(7.0, 0.45 + 0.85 * max(len(strips), 1)) as figure:
-        column = figure.subplots(max(len(strips), 1), 1, sharex=True, squeeze=False)[:, 0]
-        time = result.curves.time
-        for ax, (name, residual) in zip(column, strips, strict=False):
-            factor, unit = readable_unit(_size(time), "s") if time is not None else (1.0, "")
-            x = np.arange(residual.size) if time is None else time / factor
+        column = figures.grid_of(figure, max(len(strips), 1), 1, max(len(strips), 1), sharex=True)
+        for ax, (name, residual) in zip(column, strips.items(), strict=False):
+            x, label = figures.over_time(result.curves.time, residual.size)
             ax.axhline(0.0, color=GREY, lw=0.6)
             ax.plot(x, 100.0 * residual, color=VERMILION, lw=0.9, label="fitted − measured")
             ax.set_ylabel("% of range")
             ax.set_title(f"{name}: fitted − measured", loc="left", fontsize=7.5, pad=3)
-            column[-1].set_xlabel(f"time ({unit})" if unit else "sample")
+            column[-1].set_xlabel(label)
         if not strips:
             figures.say_nothing_there(column[0])
     return figures.save(figure, path)
@@ -584,10 +582,7 @@ def _head(figure: Figure, result: Fit, *, titled: bool) -> None:
     # A name may hold a dollar sign: it is no formula.
     if titled:
         figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, parse_math=False)
-    entries: dict[str, Any] = {}
-    for ax in figure.axes:
-        entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
-    lines = figures.legend_below(figure, entries)
+    lines = figures.legend_below(figure, figures.named_in(figure.axes))
     extra = 11.0 * max(lines - 1, 0) + (11.0 * title.count("\n") if titled else -13.0)
     figure.set_figheight(figure.get_figheight() + extra / 72.0)
 

@@ -8,30 +8,20 @@ from dataclasses import dataclass
 
 from foamfit import text
 from foamfit.results import ParameterEstimate
-from foamfit.springs.parameters import any_param, family, split_name
+from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
 
-# Symbols of parameters that belong to no spring; those of springs are in the records of laws.
-SYMBOLS = {
-    "site_eta": ("η", "site"),
-    "contact_time": ("t", "0"),
-    "displacement_zero": ("w", "0"),
-    "stress_zero": ("σ", "0"),
-    "acceleration_zero": ("a", "0"),
-    "velocity": ("v", "0"),
-    "striker_mass": ("m", ""),
-    "time_shift": ("Δt", ""),
+# Parameters that belong to no spring: symbol and index, and the name in reports, if it is another.
+# Those of springs are in the records of laws.
+_OTHERS = {
+    "site_eta": ("η", "site", ""),
+    "contact_time": ("t", "0", "contact time t₀"),
+    "displacement_zero": ("w", "0", "motion zero w₀"),
+    "stress_zero": ("σ", "0", "stress zero σ₀"),
+    "acceleration_zero": ("a", "0", "acceleration zero a₀"),
+    "velocity": ("v", "0", "velocity v₀"),
+    "striker_mass": ("m", "", "striker mass m"),
+    "time_shift": ("Δt", "", "time shift Δt"),
 }
-# Names of nuisance parameters in reports.
-LABELS = {
-    "contact_time": "contact time t₀",
-    "displacement_zero": "motion zero w₀",
-    "stress_zero": "stress zero σ₀",
-    "acceleration_zero": "acceleration zero a₀",
-    "velocity": "velocity v₀",
-    "striker_mass": "striker mass m",
-    "time_shift": "time shift Δt",
-}
-
 UNITS = {
     "Pa": ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa")),
     "s": ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")),
@@ -69,7 +59,7 @@ class Readable:
     @property
     def label(self) -> str:
         """Its name in reports; for a parameter of a spring its own name."""
-        return LABELS.get(self.name, self.name)
+        return _OTHERS.get(self.name, ("", "", ""))[2] or self.name
 
     @property
     def with_error(self) -> str:
@@ -92,7 +82,7 @@ def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = 
     It is shown with the digits that its standard error leaves (two of the error), or with four.
     """
     size = p.value or p.stderr or 0.0
-    if name in LABELS:  # its value may be far below its error
+    if name in NUISANCE:  # its value may be far below its error
         size = max(abs(p.value), p.stderr or 0.0)
     factor, unit = given or readable_unit(size, p.unit)
     value = p.value / factor
@@ -139,8 +129,9 @@ def number(value: float | None) -> str:
 def symbol(name: str) -> tuple[str, str]:
     """Return the symbol of a parameter and its index: k and "c,2" of s2_kc."""
     spring, short = split_name(name)
-    if name in SYMBOLS or spring < 0:
-        return SYMBOLS.get(name, (name, ""))
+    if name in _OTHERS or spring < 0:
+        stem, index, _ = _OTHERS.get(name, (name, "", ""))
+        return stem, index
     stem, index = any_param(short).symbol
     term = short.removeprefix(family(short))  # of relaxation
     return stem, ",".join(filter(None, (index, term, str(spring + 1))))

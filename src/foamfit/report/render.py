@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import functools
 import math
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from foamfit import text
-from foamfit.report.readable import number
+from foamfit.report.readable import in_unit, number
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -26,9 +28,11 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters = (text.percent, text.engineering, text.significant, text.counted, text.listed, number)
-    made.filters.update({one.__name__: one for one in filters})
+    filters = (text.percent, text.engineering, text.significant, text.counted, text.listed)
+    made.filters.update({one.__name__: one for one in (*filters, number, in_unit)})
     made.filters.update(paragraphs=_paragraphs, aligned=_aligned, exp=math.exp)
+    made.filters["png"] = lambda png: "data:image/png;base64," + base64.b64encode(png).decode()
+    made.globals["version"] = version("foamfit")
     made.filters["spoken"] = lambda name: name.replace("_", "-")
     return made
 
@@ -46,6 +50,11 @@ def words(name: str, **values: Any) -> str:
 def sentences(name: str, **values: Any) -> tuple[str, ...]:
     """Return the lines of a text, a sentence each."""
     return tuple(words(name, **values).splitlines())
+
+
+def table(name: str, **values: Any) -> list[list[str]]:
+    """Return the cells of a table whose rows are the lines of a text, parted by "¦"."""
+    return [line.split("¦") for line in words(name, **values).splitlines()]
 
 
 def _paragraphs(told: str, indent: int = 2) -> str:

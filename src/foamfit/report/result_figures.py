@@ -7,10 +7,9 @@ from dataclasses import dataclass, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from foamfit.report.figures import DPI, TWO, UNTITLED, image, laid_out
-from foamfit.report.identifiability_plots import plot_insight, plot_profiles
+from foamfit.report.figures import DPI, TWO, UNTITLED, all_as_pdf, image, laid_out
 from foamfit.report.plots import is_known, plot_fit, plot_residuals
-from foamfit.report.snapping_plots import plot_snapping
+from foamfit.report.report_plots import plot_insight, plot_profiles, plot_snapping
 from foamfit.results import Fit
 
 if TYPE_CHECKING:
@@ -18,9 +17,10 @@ if TYPE_CHECKING:
 
 Mapped = Callable[..., Iterable[Any]]  # as the built-in `map`
 SHOWN, COARSE = 200, 160  # dots per inch of figures that are only on the page, to save time
-# In the order in which they are begun: what takes longest first. "shown" and "narrow" are the fit
-# on the page, which has its title in the text, on a screen and on a phone.
-_NAMES = ("fit", "shown", "narrow", "information", "residuals", "snapping", "profiles")
+# In the order in which they are begun: what takes longest first. Those on the screen are the fit on
+# the page, which has its title in the text, also on a phone.
+_ON_SCREEN = ("shown", "narrow")
+_NAMES = ("fit", *_ON_SCREEN, "information", "residuals", "snapping", "profiles")
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class Images:
     dpi: int  # of the PNG
     pdf: bytes | None = None
 
-    def files(self) -> Iterator[tuple[str, bytes]]:
-        """Suffix and content of the files that are kept beside the report."""
-        if self.pdf is not None:
-            yield from (("png", self.png), ("pdf", self.pdf))
+    @property
+    def width(self) -> float:
+        """Its width in inches; that in pixels stands in the header of the PNG."""
+        return int.from_bytes(self.png[16:20]) / self.dpi
 
 
 def draw_all(
@@ -43,7 +43,8 @@ def draw_all(
     """Draw all figures of a result by a `map`; one that the result does not have is None.
 
     A `map` of an executor draws them in its processes: it begins at once, and what is given is
-    waited for when it is asked for. `width` is that of "fit" (`foamfit.report.plots.plot_fit`).
+    waited for when it is asked for. `width` is that of "fit" (`foamfit.report.plots.plot_fit`);
+    with ", pdf" behind it all but those on the screen are made as PDF too.
     """
     drawn: dict[str, Any] = {field.name: getattr(result, field.name) for field in fields(Fit)}
     # No figure needs them, and unpickling them would import lmfit, the slowest import.
@@ -58,7 +59,8 @@ def _draw(result: Fit, width: str, name: str) -> Images | None:
         return None
     dpi = DPI if name == "fit" else COARSE if name == "information" else SHOWN
     with laid_out(figure, dpi):
-        pdf = image(figure, "pdf") if name == "fit" else None
+        printed = name == "fit" or (all_as_pdf(width) and name not in _ON_SCREEN)
+        pdf = image(figure, "pdf") if printed else None
         png = image(figure, "png", dpi)
     return Images(png, dpi, pdf)
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from foamfit.report.plots import draw_loops
-from foamfit.report.readable import Readable, readable, readable_unit
-from foamfit.report.render import environment
+from foamfit.report.readable import Readable, readable
+from foamfit.report.render import page
 from foamfit.report.summary import misfits
 from foamfit.report.tables import by_test, frame, stacked
-from foamfit.results import Fit, Loop
+from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent, wrapped
 
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from foamfit.study.cycle_fits import FittedCycles
-    from foamfit.study.joint_result import JointParameter
+
+Joint = Any  # `foamfit.study.joint_result.JointData`, or `foamfit.saved.SavedJoint`, read back
 
 
 def fit_shown(result: Fit, *, html: bool = False) -> str:
@@ -34,19 +35,13 @@ def fit_shown(result: Fit, *, html: bool = False) -> str:
 
 
 def cycles_shown(found: FittedCycles, *, html: bool = False) -> str:
-    """Return how many cycles were fitted, their misfits, and the parameters by cycle."""
+    """Return how many cycles were fitted and their misfits; as HTML the parameters by cycle too."""
     line = f"{found.model} · {len(found.results)} of {counted(len(found.recorded), 'cycle')} fitted"
     each = (one.misfit.get("stress_strain") for one in found.results.values())
     if known := [off for off in each if off is not None]:
         line += f" · misfit {percent(min(known))} to {percent(max(known))}"
-    if html:
-        head = {"first": "cycle", **cycles_by_test(found)}
-        return _render("shown", title=found.test, line=line, rows=[], by_test=head)
-    rows = [
-        Readable(name, ("", ""), f"{low.value} to {high.value}", "", "", low.unit, "", "")
-        for name, (low, high) in _spans(found)
-    ]
-    return _shown(found.test, line, rows, html)
+    table = {"first": "cycle", **cycles_by_test(found)} if html else None
+    return _shown(found.test, line, [], html, table)
 
 
 def cycles_by_test(found: FittedCycles) -> dict[str, Any]:
@@ -54,53 +49,12 @@ def cycles_by_test(found: FittedCycles) -> dict[str, Any]:
     return by_test(list(map(str, sorted(found.results))), found.varied)
 
 
-def _spans(found: FittedCycles) -> Iterator[tuple[str, tuple[Readable, Readable]]]:
-    """Smallest and largest value of each parameter over the cycles, in one unit."""
-    for name, every in found.varied.items():
-        each = [one for one in every if one is not None]
-        ends = min(each, key=lambda one: one.value), max(each, key=lambda one: one.value)
-        unit = readable_unit(abs(ends[1].value), ends[1].unit)
-        yield name, (readable(name, ends[0], unit), readable(name, ends[1], unit))
-
-
-def _shown(title: str, line: str, rows: Sequence[Readable], html: bool) -> str:
+def _shown(title: str, line: str, rows: Sequence[Readable], html: bool, table: Any = None) -> str:
     if html:
-        return _render("shown", title=title, line=line, rows=rows, by_test=None)
+        return page("shown", title=title, line=line, rows=rows, by_test=table)
     marks = {"weak": " (weak)", "not determined": " (not determined)"}
     told = (f"{p.label} {p.with_unit(p.with_error)}{marks.get(p.state, '')}" for p in rows)
     return "\n".join([*wrapped(f"{title}: {line}", 2), *wrapped(", ".join(told), 2)])
-
-
-def _render(name: str, **values: Any) -> str:
-    return environment().get_template(f"{name}.html").render(**values)
-
-
-class Joint(Protocol):
-    """A joint fit, made or read back."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-
-    @property
-    def model(self) -> str:
-        """Its model."""
-
-    @property
-    def status(self) -> str:
-        """Its status."""
-
-    @property
-    def tests(self) -> tuple[str, ...]:
-        """Names of its tests."""
-
-    @property
-    def parameters(self) -> Mapping[str, JointParameter]:
-        """Its parameters."""
-
-    @property
-    def loops(self) -> tuple[Loop, ...]:
-        """The loops of its tests."""
 
 
 class JointViews:
@@ -128,18 +82,15 @@ class JointViews:
 
     def __repr__(self: Joint) -> str:
         """Return name, model, status and the common values."""
-        return joint_shown(self)
+        return _joint_shown(self)
 
     def _repr_html_(self: Joint) -> str:
-        return joint_shown(self, html=True)
+        return _joint_shown(self, html=True)
 
 
-def joint_shown(found: Joint, *, html: bool = False) -> str:
+def _joint_shown(found: Joint, *, html: bool = False) -> str:
     """Return model, tests, status and the common values of a joint fit."""
     line = f"{found.model} · {counted(len(found.tests), 'test')} together · status {found.status}"
-    rows = [
-        readable(name, p.estimate())
-        for name, p in found.parameters.items()
-        if p.kind != "fixed" and name not in NUISANCE
-    ]
+    common = {n: p for n, p in found.parameters.items() if p.kind != "fixed" and n not in NUISANCE}
+    rows = [readable(name, p.estimate()) for name, p in common.items()]
     return _shown(found.name, line, rows, html)

@@ -8,8 +8,8 @@ from typing import Any
 
 from foamfit.data.measurement import interior_channel
 from foamfit.report.readable import Readable, readable
-from foamfit.report.render import sentences, words
-from foamfit.results import STATED, Fit, Ladder, ParameterEstimate
+from foamfit.report.render import sentences, table, words
+from foamfit.results import STATED, Fit, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, counted, percent, wrapped
 
@@ -19,8 +19,6 @@ CURVES = {
     "stress_strain": "stress-strain",
 }
 ANSWERS = {True: "yes", False: "no", None: "–"}
-LADDER = ["", "model", "with", "misfit %", "pred. %", "gain %", "rank", "AICc", "BIC"]
-LADDER += ["p", "n.d.", "s"]
 # The screen of a fit, of which two lines say where the result is; lines kept for its warnings.
 LINES, COLUMNS, WARNING_LINES = 22, 80, 3
 LONGEST = 180  # characters of the reasons for a state; longer ones are left to the report
@@ -46,9 +44,12 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     }
     *lines, following = _screen(result, rows, given, verbose=verbose)
     if verbose:
-        ladder_rows = [] if ladder is None else [LADDER, *ladder_cells(ladder)]
-        more = {"cycles": cycle_rows(result), "ladder_rows": ladder_rows, "rows": rows}
-        more |= {"conclusions": conclusions(result), "answers": ANSWERS}
+        more = {
+            "rows": rows,
+            "conclusions": conclusions(result),
+            "answers": ANSWERS,
+            **tables(result),
+        }
         lines.append("\n" + words("summary", **more, **given) + "\n")
     return "\n".join([*lines, following])
 
@@ -189,57 +190,10 @@ def _moved(result: Fit) -> tuple[str, float] | None:
     return (most, shares[most]) if shares[most] > 0.0 else None
 
 
-def cycle_rows(result: Fit) -> list[list[str]]:
-    """Table of several cycles that are one history, its head first; [] of one cycle."""
-    if not (found := result.by_cycle):
-        return []
-    springs = next(iter(found.values()))["ever_snapped"]
-    several = len(springs) > 1
-    ever = ["ever snapped" + (f", {name}" if several else "") for name in springs]
-    head = ["cycle", "misfit", "dissipated (kJ/m³)", "measured", *ever]
-    rows = [
-        [
-            str(number),
-            percent(one["misfit"]),
-            f"{one['dissipated_fitted'] / 1e3:.4g}",
-            f"{one['dissipated_measured'] / 1e3:.4g}",
-            *(percent(share) for share in one["ever_snapped"].values()),
-        ]
-        for number, one in found.items()
-    ]
-    return [head, *rows]
-
-
-def ladder_cells(ladder: Ladder) -> Iterator[list[str]]:
-    """Give the models of a ladder as text, in the columns of `LADDER`.
-
-    The misfits are those of the curves in time where there are any, else that of stress-strain;
-    "pred." is the predicted misfit, "gain" by how much it is below that of the best model with no
-    more parameters; "rank" is rank over parameters varied, "p" the smaller p-value of the two tests
-    of the residuals, "n.d." parameters not determined over weak ones, by the 95 % intervals alone
-    where a model was not chosen.
-    """
-
-    def whole(value: float | None) -> str:
-        known = value is not None and math.isfinite(value)
-        return f"{value:.0f}".replace("-", "−") if known else "–"
-
-    for one in ladder.rungs:
-        known = {key: off for key, off in one.misfit.items() if off is not None}
-        timed = [off for key, off in known.items() if key != "stress_strain"]
-        has = ["relaxation"] * bool(one.relaxation) + ["damping"] * (one.damping == "with")
-        predicted, p = one.predicted_misfit, min(one.runs_p, one.neighbours_p)
-        yield [
-            "→" if one.chosen else "",
-            one.model,
-            "both" if len(has) == 2 else "".join(has) or "–",
-            " ".join(percent(off).removesuffix(" %") for off in timed or known.values()),
-            "–" if predicted is None else percent(predicted).removesuffix(" %"),
-            whole(None if one.gain is None else 100.0 * one.gain),
-            f"{one.rank}/{one.n_vary}",
-            whole(one.aicc),
-            whole(one.bic),
-            "<1e−6" if p < 1e-6 else f"{p:.1g}".replace("-", "−"),
-            f"{len(one.not_determined)}/{len(one.weak)}",
-            f"{one.seconds:.1f}",
-        ]
+def tables(result: Fit) -> dict[str, list[list[str]]]:
+    """Return the cells of the tables of cycles and of compared models; [] where there are none."""
+    found, ladder = result.by_cycle, result.ladder
+    return {
+        "cycles": table("by_cycle", found=found) if found else [],
+        "ladder_rows": table("ladder", ladder=ladder) if ladder else [],
+    }

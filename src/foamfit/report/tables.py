@@ -6,7 +6,6 @@ import functools
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,6 +33,8 @@ _TEXT |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasci
 _TEXT |= {"–": "--", "…": r"\dots{}"} | {letter: f"${letter}$" for letter in "<>|"}
 _TEXT |= {letter: f"{{{letter}}}" for letter in "[]*"}  # at the start of a row they are options
 _LAST_LETTER = "ſ"  # that pdfLaTeX sets without further packages
+# Misfits in a table with a row for each test.
+MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
 PARTS = ("", "_stderr", "_lo", "_hi", "_state")  # of a parameter, in a row for each test
 Parameters = Mapping[str, ParameterEstimate]
 
@@ -141,7 +142,7 @@ def unit_of_all(each: Iterable[ParameterEstimate | None]) -> tuple[float, str]:
 
 
 def _tex(name: str, **values: Any) -> str:
-    values |= {"version": version("foamfit"), "tex": escaped, "formula": formula}
+    values |= {"tex": escaped, "formula": formula}
     return environment().get_template(f"{name}.tex").render(numbers=numbers, **values)
 
 

@@ -24,7 +24,7 @@ from foamfit.fitting.together import Together
 from foamfit.one_model import Options, Progress, identify, weigh_motion
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import check_target, try_target
-from foamfit.report.shown import JointViews
+from foamfit.report.shown import Joint, JointViews
 from foamfit.report.studies.joint import save_joint
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
@@ -55,7 +55,7 @@ class JointResult(JointViews, JointData):
     """Everything that a joint fit found, and how it is written; its fields are `JointData`'s."""
 
     def save(
-        self,
+        self: Joint,
         folder: str | Path,
         *,
         jobs: int | None = None,
@@ -65,14 +65,14 @@ class JointResult(JointViews, JointData):
         """Write joint.json, its page, pictures and table.tex, and a result folder per test.
 
         An older result there is replaced as a whole, at the end. The folders of the tests are made
-        by `jobs` processes (by default one for each core), without `report` with tables alone.
+        by `jobs` processes (by default one for each core). Without `report` there are tables alone.
         Figures are "one" or "two" columns wide, or as wide as a length ("85 mm"). Returns the
         folder.
         """
         inches(figure_width)  # refuses what is no width
         check_target(folder)
         with workers(jobs, len(self.tests), FEW_FOLDERS) as each:
-            return save_joint(self, folder, each, reports=report, width=figure_width)
+            return save_joint(self, folder, each, report=report, width=figure_width)
 
 
 @dataclass(frozen=True, eq=False)

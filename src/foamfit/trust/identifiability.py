@@ -8,7 +8,7 @@ scale, `fitting.box.Scales.of_parameter`), so that parameters and curves can be 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -95,6 +95,23 @@ class Insight:
         shares[np.isnan(np.diag(self.covariance))] = np.nan
         with np.errstate(invalid="ignore"):
             return tuple(parts), shares / shares.sum(axis=1, keepdims=True)
+
+    def compact(self) -> Insight:
+        """Return the same in few numbers: along each part of a curve, a triangle of as many rows.
+
+        What is told of the parameters follows from the products of the columns part by part, which
+        the triangle of a QR factorization keeps. A compact one gives itself back.
+        """
+        k = len(self.names)
+        labels = list(dict.fromkeys(section.branches for section in self.sections))
+        rows = np.zeros((len(self.curves), len(labels), k, k))
+        for c, own in enumerate(np.split(self.scaled, len(self.curves))):
+            for place, label in enumerate(labels):
+                at = [np.arange(s.start, s.stop) for s in self.sections if s.branches == label]
+                triangle = np.linalg.qr(own[np.concatenate(at)], mode="r")
+                rows[c, place, : len(triangle)] = triangle
+        parts = (Section(label, i * k, (i + 1) * k) for i, label in enumerate(labels))
+        return replace(self, scaled=rows.reshape(-1, k), sections=tuple(parts))
 
     def weakest(self) -> tuple[float, dict[str, float]]:
         """Relative standard error along the weakest direction, and its parts over the largest."""

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -21,7 +19,9 @@ from foamfit.report.figures import image
 from foamfit.report.render import page, words
 from foamfit.report.studies.parameters import DPI as SUMMARY_DPI
 from foamfit.report.studies.parameters import Compared, plot_parameters
+from foamfit.report.summary import CURVES
 from foamfit.report.tables import (
+    MISFITS,
     by_test,
     by_test_tex,
     names_of,
@@ -37,7 +37,6 @@ from foamfit.text import counted, listed
 if TYPE_CHECKING:
     import pandas as pd
 
-CURVES = ("stress_time", "displacement_time", "stress_strain")
 # What a row says of a test without a result.
 REFUSED, OPEN = "refused", "not fitted"
 _STATUS = {
@@ -47,7 +46,6 @@ _STATUS = {
     REFUSED: "refused",
     OPEN: "not fitted yet",
 }
-_MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
 MOST_ON_PAGE = 5000
 _MOST_REFUSALS = 20  # that the terminal names
 
@@ -141,27 +139,23 @@ def counts_in_words(rows: Sequence[Row]) -> str:
 
 
 def summary_words(rows: Sequence[Row]) -> str:
-    """Return what the command prints of a batch."""
-    wrong = [row for row in rows if not row.has_fit]
-    fitted = [row for row in rows if row.has_fit]
+    """Return what the command prints of a batch.
+
+    Its table has median and quartiles over the tests of each parameter that any test varied.
+    """
+    wrong, known = [row for row in rows if not row.has_fit], list[Any]()
+    for name, each in varied([row.parameters for row in rows if row.has_fit]).items():
+        there = [p for p in each if p is not None]
+        factor, unit = unit_of_all(there)
+        middle = np.quantile([p.value / factor for p in there], [0.5, 0.25, 0.75])
+        known.append((name, middle, unit, [p.state for p in there]))
     return words(
         "batch",
         counts=counts_in_words(rows),
         wrong=wrong[:_MOST_REFUSALS],
         more=max(len(wrong) - _MOST_REFUSALS, 0),
-        parameters=list(_parameter_rows(fitted)) if fitted else [],
+        parameters=known,
     )
-
-
-def _parameter_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    """Median and quartiles over the tests of each parameter that any test varied."""
-    yield ["parameter", "median", "quartile", "quartile", "determined in", ""]
-    for name, each in varied([row.parameters for row in rows]).items():
-        known = [p for p in each if p is not None]
-        factor, unit = unit_of_all(known)
-        middle = np.quantile([p.value / factor for p in known], [0.5, 0.25, 0.75])
-        sure = sum(p.state == "determined" for p in known)
-        yield [name, *(f"{v:.4g}" for v in middle), f"{sure} of {len(known)}", unit]
 
 
 # ------------------------------------------------------------------------------- the page
@@ -204,14 +198,13 @@ def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | N
     text = page(
         "summary",
         title=title,
-        version=version("foamfit"),
         counts=counts_in_words(rows),
         rows=shown,
         total=len(rows),
         links=[f"{quote(row.test)}/report.html" for row in shown],
         reports=[(folder / row.test / "report.html").is_file() for row in shown],
         parameters=by_test([row.test for row in shown], varied([row.parameters for row in shown])),
-        misfits={curve: told for curve, told in _MISFITS.items() if curve in measured},
-        picture=picture and base64.b64encode(picture).decode("ascii"),
+        misfits={curve: told for curve, told in MISFITS.items() if curve in measured},
+        picture=picture,
     )
     write_file(folder / "summary.html", text.encode("utf-8", "replace"))

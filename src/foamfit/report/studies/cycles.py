@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +15,13 @@ from foamfit.report.readable import own_name, readable_unit
 from foamfit.report.render import words
 from foamfit.report.shown import cycles_by_test
 from foamfit.report.tables import by_test_tex
-from foamfit.text import percent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from foamfit.report.result_figures import Mapped
+    from foamfit.results import Fit
     from foamfit.study.cycle_fits import FittedCycles
 
 COLUMNS, PANEL = 4, (1.85, 1.5)  # of the picture; inches
@@ -28,6 +29,12 @@ LEAST = 1.55  # in, of a panel
 MOST_LOOPS = 12
 MOST_NAMES = 12  # of parameters on the terminal; those of a chain are in cycles.csv
 DPI = 200
+# Panels beside the parameters: columns of cycles.csv (SI), and what these are multiplied with.
+BY_CYCLE = {
+    "start strain (%)": ("start_strain", 100.0),
+    "dissipated (kJ/m³)": ("dissipated_energy", 1e-3),
+    "misfit of the loop (%)": ("misfit_stress_strain", 100.0),
+}
 FAR = 20  # a last cycle that is so many times the first is drawn on a logarithmic axis
 
 
@@ -65,13 +72,8 @@ def write_cycles(
 
 def cycles_text(found: FittedCycles) -> str:
     """Return what the command prints of the cycles of a record."""
-    names = found.varied if len(found.varied) <= MOST_NAMES else {}
-    rows = [["cycle", "start strain", "misfit", *(own_name(name, found.model) for name in names)]]
-    for number, one in sorted(found.results.items()):
-        off = one.misfit.get("stress_strain") or one.misfit.get("stress_time")
-        shown = [percent(one.measurement.start_strain), "–" if off is None else percent(off)]
-        rows.append([str(number), *shown, *(f"{one.parameters[n].value:.3g}" for n in names)])
-    return words("cycles", found=found, table=rows)
+    names = list(found.varied) if len(found.varied) <= MOST_NAMES else []
+    return words("cycles", found=found, names={name: own_name(name, found.model) for name in names})
 
 
 def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
@@ -80,38 +82,33 @@ def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
     Bars are 95 % intervals; a hollow mark is a parameter that its cycle does not determine well.
     `width` is "one" or "two" columns, or a length such as "85 mm".
     """
-    results = dict(sorted(found.results.items()))
-    varied = found.varied
-    panels, wide = 3 + len(varied), figures.inches(width)
+    results, varied = dict(sorted(found.results.items())), found.varied
+    head, *table = map(list[Any], found.rows())
+    panels, wide = len(BY_CYCLE) + len(varied), figures.inches(width)
     columns = max(figures.abreast(wide, COLUMNS, LEAST), 2)
     rows = 2 + max(0, -(-(panels - 2 * (columns - 2)) // columns))
     told = f"{found.test} · {found.model}"
     lines = figures.title_lines(wide, told, titled=figures.is_titled(width))
     with figures.drawing(wide, rows * PANEL[1] + 0.13 * len(lines) + 0.4, lines) as figure:
         grid = figure.add_gridspec(rows, columns)
-        _loops(figure.add_subplot(grid[:2, :2]), found)
+        _loops(figure.add_subplot(grid[:2, :2]), results)
         places = [(i, j) for i in range(rows) for j in range(columns) if i > 1 or j > 1]
         axes = [figure.add_subplot(grid[place]) for place in places[:panels]]
-        by_cycle: dict[str, dict[int, float | None]] = {
-            "start strain (%)": {n: 100 * r.measurement.start_strain for n, r in results.items()},
-            "dissipated (kJ/m³)": {
-                n: _scaled(r.energy.get("dissipated_energy"), 1e-3) for n, r in results.items()
-            },
-            "misfit of the loop (%)": {
-                n: _scaled(r.misfit.get("stress_strain"), 100.0) for n, r in results.items()
-            },
-        }
-        for ax, (title, values) in zip(axes, by_cycle.items(), strict=False):
-            there = [(n, value) for n, value in values.items() if value is not None]
+        for ax, (title, (column, factor)) in zip(axes, BY_CYCLE.items(), strict=False):
+            pairs = ((row[0], row[head.index(column)]) for row in table)
+            there = [(number, factor * value) for number, value in pairs if value is not None]
             style: dict[str, Any] = {"color": BLUE, "markersize": 3, "linewidth": 0.8}
             if there:
                 ax.plot(*np.array(there).T, "o-", label="_each cycle alone", **style)
             ax.set_title(title)
-        for ax, name in zip(axes[3:], varied, strict=True):
-            _parameter(ax, found, name)
+        for ax, (name, each) in zip(axes[len(BY_CYCLE) :], varied.items(), strict=True):
+            points = [(n, p) for n, p in zip(results, each, strict=True) if p is not None]
+            factor, unit = readable_unit(max(abs(p.value) for _, p in points), points[0][1].unit)
+            ax.set_title(own_name(name, found.model) + (f" ({unit})" if unit else ""))
+            ax.set_ylim(figures.limits(*figures.draw_estimates(ax, points, factor)))
+        numbers = list(results)
         for ax in axes:
             ax.set_xlabel("cycle")
-            numbers = list(results)
             if numbers and numbers[-1] >= FAR * numbers[0]:
                 ax.set_xscale("log")
             elif len(numbers) <= 8:
@@ -120,42 +117,22 @@ def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
     return figure
 
 
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else factor * value
-
-
-def _loops(ax: Axes, found: FittedCycles) -> None:
+def _loops(ax: Axes, results: Mapping[int, Fit]) -> None:
     """Measured loops over each other, from light to dark; the first and the last one fitted."""
     import matplotlib
 
-    there = [
-        n for n, r in sorted(found.results.items()) if r.curves.measured_displacement is not None
-    ]
+    there = [n for n, one in results.items() if one.curves.measured_displacement is not None]
     keep = np.unique(np.geomspace(1, max(len(there), 1), MOST_LOOPS).astype(int)) - 1
     shown = [there[i] for i in keep if i < len(there)]
     colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, max(len(shown), 1)))
     for number, colour in zip(shown, colours, strict=False):
-        result = found.results[number]
-        curves, height = result.curves, result.measurement.specimen.height
-        assert curves.measured_displacement is not None
-        strain = curves.measured_displacement / height + result.measurement.start_strain
-        measured, fitted = curves.measured_stress, curves.stress_along
-        if measured is not None:
-            label = f"cycle {number}"
-            ax.plot(strain, measured / 1e3, color=colour, linewidth=0.9, label=label)
-        if fitted is not None and number in (shown[0], shown[-1]):
+        if (one := results[number].loop) is None:
+            continue
+        strain, label = one.along + results[number].measurement.start_strain, f"cycle {number}"
+        ax.plot(strain, one.measured / 1e3, color=colour, linewidth=0.9, label=label)
+        if one.fitted is not None and number in (shown[0], shown[-1]):
             label = "_fitted, first and last cycle"
-            ax.plot(strain, fitted / 1e3, ":", color="black", linewidth=0.8, label=label)
+            ax.plot(strain, one.fitted / 1e3, ":", color="black", linewidth=0.8, label=label)
     ax.set(xlabel="strain from the first contact", ylabel="stress (kPa)")
     if shown:
         ax.legend(loc="upper left", fontsize=6.5, handlelength=1.2, labelspacing=0.25)
-
-
-def _parameter(ax: Axes, found: FittedCycles, name: str) -> None:
-    """One parameter with its 95 % intervals against the cycle."""
-    results = sorted(found.results.items())
-    points = [(n, r.parameters[name]) for n, r in results if name in r.parameters]
-    factor, unit = readable_unit(max(abs(p.value) for _, p in points), points[0][1].unit)
-    ax.set_title(own_name(name, found.model) + (f" ({unit})" if unit else ""))
-    values, ends = figures.draw_estimates(ax, points, factor)
-    ax.set_ylim(figures.limits(values, ends))

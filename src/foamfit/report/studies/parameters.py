@@ -68,22 +68,16 @@ def plot_parameters(
     tall = min(max(ROW * count, 0.5), max(TALLEST / rows, 0.1 * count if named else 1.5)) + 0.55
     lines = figures.title_lines(wide, title, titled=figures.is_titled(width))
     with figures.drawing(wide, rows * tall + 0.16 * len(lines) + 0.3, lines) as figure:
-        axes = figure.subplots(rows, across, sharey=True, squeeze=False)
-        for ax in axes.ravel()[len(compared) :]:
-            ax.set_axis_off()
-        entries = dict[str, Any]()
-        for ax, one in zip(axes.ravel(), compared, strict=False):
-            _panel(ax, one, tests, (wide - margin) / across > ROOMY)
-            entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
-        first = axes[0, 0]
-        first.set_ylim(count - 0.4, -0.6)
+        axes = figures.grid_of(figure, rows, across, max(len(compared), 1), sharey=True)
         size = min(6.5, 0.62 * 72.0 * (tall - 0.55) / max(count, 1))
-        first.set_yticks(range(count) if named else [], names, parse_math=False)
-        for ax in axes.ravel():
+        for ax, one in zip(axes, compared, strict=False):
+            _panel(ax, one, tests, (wide - margin) / across > ROOMY)
             ax.tick_params(axis="y", length=0, labelsize=size)
-        for ax in [] if named else axes[:, 0]:
+        axes[0].set_ylim(count - 0.4, -0.6)
+        axes[0].set_yticks(range(count) if named else [], names, parse_math=False)
+        for ax in [] if named else axes[::across]:
             ax.set_ylabel(f"{count} tests")
-        order = [label for *_, label in _MARKS.values()]
+        entries, order = figures.named_in(axes), [label for *_, label in _MARKS.values()]
         known = sorted(entries, key=lambda label: order.index(label) if label in order else 9)
         lines_below = figures.legend_below(figure, {label: entries[label] for label in known})
         figure.set_figheight(figure.get_figheight() + 0.15 * max(lines_below - 1, 0))
@@ -96,7 +90,7 @@ def _short(tests: Sequence[str], most: int) -> list[str]:
         return list(tests)
     end = len(commonprefix([name[::-1] for name in tests])) if len(tests) > 1 else 0  # noqa: RUF071
     cut = [name[: len(name) - end] or name for name in tests]
-    return [name if len(name) <= most else f"…{name[1 - most :]}" for name in cut]
+    return [figures.tail(name, most) for name in cut]
 
 
 def _panel(ax: Axes, one: Compared, tests: Sequence[str], roomy: bool) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from foamfit.errors import InputError
 from foamfit.report import figures
 from foamfit.report import folder as results
-from foamfit.report.figures import BLUE, INSIDE, TWO, VERMILION
+from foamfit.report.figures import BLUE, INSIDE, MEASURED, TWO, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import words
 from foamfit.text import percent
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from foamfit.study.prediction.predicted import PredictedCurve, PredictedTest
 
 PANEL = (2.6, 2.2)  # inches
-MEASURED = "0.65"  # wide and light below what is predicted, which is darker in grey too
 # Colour of each part of the band, and its dashes, for who sees or prints grey.
 COLOURS: dict[str, tuple[str, Any]] = {
     "parameters": (BLUE, "-"),
@@ -32,13 +31,13 @@ COLOURS: dict[str, tuple[str, Any]] = {
     "motion": (VERMILION, (0, (1, 1.2))),
     "law_error": (INSIDE[0], (0, (5, 1.2, 1, 1.2))),
 }
-# Styles of the lines and of the band.
-LINES: dict[str, dict[str, Any]] = {
-    "measured": {"color": MEASURED, "linewidth": 1.4},
-    "predicted": {"color": VERMILION, "linewidth": 0.9},
-    "half width: all": {"color": "black", "linestyle": ":", "linewidth": 0.9},
+# Styles of the lines and of the band; the key of the figure takes their labels.
+LINES: dict[str, Any] = {
+    "measured": {"color": MEASURED, "linewidth": 1.4, "label": "_measured"},
+    "predicted": {"color": VERMILION, "linewidth": 0.9, "label": "_predicted"},
+    "all": {"color": "black", "ls": ":", "lw": 0.9, "zorder": 3, "label": "_half width: all"},
 }
-BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0}
+BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0, "label": "_95 % band"}
 
 
 def save_prediction(
@@ -52,9 +51,8 @@ def save_prediction(
     def write(fresh: Path) -> None:
         results.write_json(fresh / "prediction.json", found.to_json_dict())
         results.write_table(fresh / "prediction.csv", found.rows())
-        if not report:
-            return
-        figures.write_both(plot_prediction(found, width=width), fresh / "prediction")
+        if report:
+            figures.write_both(plot_prediction(found, width=width), fresh / "prediction")
 
     check_replaceable(folder)
     return results.save_whole(folder, write)
@@ -81,23 +79,7 @@ def prediction_text(found: PredictedTest) -> str:
     Its table has misfit, share inside and half widths of each curve, over its measured range.
     """
     there = [part for part in COLOURS if any(part in one.parts for one in found.curves.values())]
-    rows = [["curve", "misfit", "inside", "band", *(part.replace("_", " ") for part in there)]]
-    for name, curve in found.curves.items():
-        off = found.misfit.get(name)
-        shown = ["–" if off is None else percent(off), percent(curve.inside, 3)]
-        widths = [curve.half_width, *map(curve.half_width_of, there)]
-        rows.append([name, *shown, *(f"±{percent(width / curve.range)}" for width in widths)])
-    source, rates = repr(found.source), _rates(found)
-    return words("prediction", found=found, source=source, rates=rates, table=rows)
-
-
-def _rates(found: PredictedTest) -> str:
-    rates = found.fitted_rates
-    if found.rate is None:
-        return "rate not known"
-    ends = dict.fromkeys(f"{choose(rates):.3g}" for choose in (min, max)) if rates else ()
-    fitted = f", fitted at {' to '.join(ends)} 1/s" if ends else ""
-    return f"rate {found.rate:.3g} 1/s{fitted}"
+    return words("prediction", found=found, parts=there)
 
 
 def plot_prediction(found: PredictedTest, *, width: str = TWO) -> Figure:
@@ -114,7 +96,7 @@ def plot_prediction(found: PredictedTest, *, width: str = TWO) -> Figure:
     inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in curves)
     lines = figures.title_lines(
         wide,
-        f"{found.measurement.name}, predicted from {found.source}; {_rates(found)}",
+        f"{found.measurement.name}, predicted from {found.source}; {words('rates', found=found)}",
         f"inside the 95 % band: {inside}",
         titled=figures.is_titled(width),
     )
@@ -122,14 +104,16 @@ def plot_prediction(found: PredictedTest, *, width: str = TWO) -> Figure:
     with figures.drawing(wide, tall, lines) as figure:
         grid = {"hspace": 0.06, "height_ratios": (1.0, 0.6) * bands}
         axes = figure.subplots(2 * bands, across, squeeze=False, gridspec_kw=grid)
-        # Each place has a panel above and one below it.
-        places = [axes[i : i + 2, j] for i in range(0, 2 * bands, 2) for j in range(across)]
-        _loop(places[0][0], found)
-        for (above, below), curve in zip(places[1:], curves, strict=False):
-            _in_time(above, below, found, curve)
-        for ax in [ax for place in places[1 + len(curves) :] for ax in place]:
+        loop, *above = axes[::2].ravel()
+        key, *below = axes[1::2].ravel()
+        _loop(loop, found)
+        for (upper, lower), curve in zip(zip(above, below, strict=True), curves, strict=False):
+            _in_time(upper, lower, found, curve)
+        for ax in (key, *above[len(curves) :], *below[len(curves) :]):
             ax.set_axis_off()
-        _legend(places[0][1], found)
+        told = figures.key_of(figure.axes)
+        style: Any = {"loc": "upper left", "fontsize": 7, "borderaxespad": 0.0}
+        key.legend(list(told.values()), list(told), **style)
         figure.align_ylabels()
     return figure
 
@@ -160,37 +144,17 @@ def _band(ax: Axes, x: Array, curve: PredictedCurve, factor: float, part: slice)
 
 def _in_time(above: Axes, below: Axes, found: PredictedTest, curve: PredictedCurve) -> None:
     """One curve with its band, and the half width of each part."""
-    time = found.measurement.time
-    if time is None:
-        x, label = np.arange(curve.measured.size, dtype=float), "sample"
-    else:
-        scale, unit = readable_unit(float(time[-1]), "s")
-        x, label = time / scale, f"time ({unit})"
+    x, label = figures.over_time(found.measurement.time, curve.measured.size)
     factor, unit = readable_unit(float(np.max(np.abs(curve.measured))), curve.unit)
     _band(above, x, curve, factor, slice(None))
     above.plot(x, curve.measured / factor, **LINES["measured"])
     above.plot(x, curve.predicted / factor, **LINES["predicted"])
     above.set_ylabel(f"{curve.channel.replace('_', ' ')} ({unit})")
+    below.plot(x, 0.5 * (curve.hi - curve.lo) / factor, **LINES["all"])
     for part, (colour, dashes) in COLOURS.items():
         if part in curve.parts and np.any(curve.parts[part]):
             style: Any = {"color": colour, "linestyle": dashes, "linewidth": 0.9}
-            below.plot(x, curve.parts[part] / factor, **style)
-    below.plot(x, 0.5 * (curve.hi - curve.lo) / factor, **LINES["half width: all"])
+            told = f"_half width: {part.replace('_', ' ')}"
+            below.plot(x, curve.parts[part] / factor, label=told, **style)
     below.set_ylim(bottom=0.0)
     below.set(xlabel=label, ylabel=f"half width ({unit})")
-
-
-def _legend(ax: Axes, found: PredictedTest) -> None:
-    """Explain the lines in a panel of its own."""
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    ax.set_axis_off()
-    shown = LINES | {
-        f"half width: {part.replace('_', ' ')}": {"color": colour, "linestyle": dashes}
-        for part, (colour, dashes) in COLOURS.items()
-        if any(np.any(curve.parts.get(part, 0.0)) for curve in found.curves.values())
-    }
-    handles: list[Any] = [Line2D([], [], label=name, **style) for name, style in shown.items()]
-    handles.insert(2, Patch(label="95 % band", **BAND))
-    ax.legend(handles=handles, loc="upper left", fontsize=7, borderaxespad=0.0)
