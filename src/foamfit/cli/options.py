@@ -126,12 +126,10 @@ class Output:
 
     def check(self, *, without_report: bool = True) -> None:
         """Refuse --open beside --json (a browser may print too), or where no page is made."""
-        for flag, given in (
-            ("json", self.as_json),
-            ("no-report", self.no_report and not without_report),
-        ):
-            if self.opening and given:
-                raise InputError(f"--open and --{flag} exclude each other; leave one of them out")
+        given = "no-report" if self.no_report and not without_report else ""
+        given = "json" if self.as_json else given
+        if self.opening and given:
+            raise InputError(f"--open and --{given} exclude each other; leave one of them out")
 
     def folder(self, default: Path, inputs: Iterable[Path]) -> Path:
         """Return the result folder; InputError if it cannot be written or holds an input."""
@@ -277,7 +275,7 @@ class Drawers:
         begun = [(name, self._pool.submit(draw, name)) for name in names]
         return (_drawn(one, draw, name) for name, one in begun)
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """End the processes."""
         if self._pool is not None:
             self._pool.stop()
@@ -288,13 +286,3 @@ def _drawn(begun: Future[Any], draw: Callable[[str], Any], name: str) -> Any:
         return begun.result()
     except Exception:  # drawing here says what is wrong with the figure, if that is why
         return draw(name)
-
-
-@contextmanager
-def drawing_beside() -> Iterator[Drawers]:
-    """Give drawers, which are stopped at the end."""
-    drawers = Drawers()
-    try:
-        yield drawers
-    finally:
-        drawers.stop()

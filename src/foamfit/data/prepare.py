@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -17,14 +16,12 @@ from foamfit.data import outliers as spoilt
 from foamfit.data import zeros
 from foamfit.data.contact import (
     STILL_MOTION,
-    Levels,
     Start,
     leave_rest,
     start_of_impact,
     start_of_slow_test,
 )
 from foamfit.data.cycles import (
-    Cycle,
     choose_cycles,
     cut_to_cycle,
     cut_to_reload,
@@ -100,15 +97,21 @@ def condition(
     curves = first.curves("acceleration")
     levels = {c: estimated_noise(v) for c, v in curves.items()} | held
     if impact:
-        start, span, more = _impact(first, levels, known, spread)
-        notes += more
-    else:
-        start, span = _slow_test(record, first, cycles, chosen, levels)
+        start = start_of_impact(first, levels)
+        start = replace(start, gauge=zeros.gauge_before(first, start, levels, known))
+        span = zeros.Span.of_impact(first, start, levels)
+        notes += zeros.flight_notes(first, start, span, levels, known, spread)
+    else:  # its first cycle shows the start
+        start = start_of_slow_test(first, levels)
+        begun = chosen is not None and not chosen.place
+        kept = cut_to_cycle(record, cycles, chosen)[0] if chosen and begun else first
+        resting = max(0, start.first - 2) if start.free else 0
+        span = zeros.Span(start.first, len(kept), resting, len(kept))
     record, found = zeros.take_zeros(record, first, start, span, levels, impact=impact)
     notes += found.notes
     later = chosen if chosen is not None and chosen.place else None  # with a contact of its own
     if later:
-        record = done(_later_cycle(record, cycles, later, specimen, found.origins))
+        record = done(cut_to_reload(record, cycles, later, specimen.height, found.origins))
     else:
         record = done(cut_to_cycle(record, cycles, chosen)) if chosen else record
         record = done(cut_to_contact(record, start, span, found.origins))
@@ -139,7 +142,9 @@ def condition(
         outliers=outliers,
         contact="stress" if later else start.by,
         count=count_rows(whole, outliers, block),
-        **_numbers(cycles, chosen),
+        cycle=chosen.number if chosen else 1,
+        cycles=tuple(cycle.number for cycle in cycles) or (1,),
+        last_cycle=chosen.last if chosen else None,
         start_strain=found.origins.pop("start_strain", 0.0),
         sampled=record.sampled,
         zeros=found.errors,
@@ -150,48 +155,6 @@ def condition(
         block=block,
         standstills=spoilt.standstill_spans(whole, block),
     )
-
-
-def _impact(
-    record: Record, levels: Levels, striker: Striker, spread: float
-) -> tuple[Start, zeros.Span, list[str]]:
-    """Start of an impact, the rows around it, and what its free flight says."""
-    start = start_of_impact(record, levels)
-    start = replace(start, gauge=zeros.gauge_before(record, start, levels, striker))
-    span = zeros.Span.of_impact(record, start, levels)
-    return start, span, zeros.flight_notes(record, start, span, levels, striker, spread)
-
-
-def _slow_test(
-    record: Record, first: Record, cycles: list[Cycle], chosen: Cycle | None, levels: Levels
-) -> tuple[Start, zeros.Span]:
-    """Start of a slow test, which its first cycle shows, and the rows around it."""
-    start = start_of_slow_test(first, levels)
-    begun = chosen is not None and not chosen.place  # with the first contact
-    kept = cut_to_cycle(record, cycles, chosen)[0] if chosen and begun else first
-    return start, zeros.Span.of_slow_test(kept, start)
-
-
-def _numbers(cycles: list[Cycle], chosen: Cycle | None) -> dict[str, Any]:
-    """Numbers of the cycles of a record, and of those that are used."""
-    if chosen is None:
-        return {}
-    numbers = tuple(cycle.number for cycle in cycles)
-    return {"cycle": chosen.number, "cycles": numbers, "last_cycle": chosen.last}
-
-
-def _later_cycle(
-    record: Record, cycles: list[Cycle], cycle: Cycle, specimen: Specimen, origins: dict[str, float]
-) -> tuple[Record, list[str]]:
-    """Cut a later cycle to its own contact; what is taken off there joins the `origins`."""
-    notes = cut_to_cycle(record, cycles, cycle)[1]
-    cut, at, more = cut_to_reload(record, cycles, cycle, specimen.height)
-    origins["start_strain"] = at.displacement / specimen.height
-    origins["stress_zero"] += at.offset
-    origins["displacement_zero"] += at.displacement
-    if record.time is not None:
-        origins["contact_time"] = at.time
-    return cut, notes + more
 
 
 def cut_to_contact(
@@ -263,10 +226,9 @@ def check_signs(record: Record, advice: Callable[[str], str] | None) -> None:
 
 
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tuple[Record, str]:
-    """Integrate a displacement that was not measured: from acceleration, velocity or force.
+    """Integrate a motion that was not measured: w(0) = 0, w'(0) = v, and w'' = −a or −σA/m.
 
-    w(0) = 0, w'(0) is the striker's velocity, w'' = −a or −σA/m; a channel is linear between
-    samples.
+    A channel is linear between samples.
     """
     if record.displacement is not None:
         return replace(record, acceleration=None), MEASURED

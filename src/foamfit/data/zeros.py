@@ -35,12 +35,6 @@ class Span:
     returned: bool = True
 
     @classmethod
-    def of_slow_test(cls, record: Record, start: Start) -> Span:
-        """Keep a slow test from its contact on; nothing else shows that the specimen was free."""
-        n = len(record)
-        return cls(start.first, n, max(0, start.first - 2) if start.free else 0, n)
-
-    @classmethod
     def of_impact(cls, record: Record, start: Start, levels: Levels) -> Span:
         """Keep a tenth of the rows of contact before it, a fiftieth after it.
 

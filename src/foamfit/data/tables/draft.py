@@ -74,7 +74,7 @@ def _columns(text: Text) -> list[str]:
     """Lines of [columns]: those that the headers answer, and the others as questions."""
     try:
         table = find_table(text, set())
-        found = assign_columns(table, {}, None)
+        found = assign_columns(table, {})
     except InputError as error:
         told = f"# {printable(' '.join(str(error).split()))}"
         entries = (f'{n[0]} = {{ column = "…", unit = "{CHANNELS[n[0]].unit}" }}' for n in _WANTED)
@@ -87,7 +87,7 @@ def _columns(text: Text) -> list[str]:
             si_factor(table, channel, k, None)
             lines.append(f"{name} }}")
         except InputError as error:
-            why = str(error).partition(": column ")[2].partition(";")[0]
+            why = str(error).removeprefix("column ").partition(";")[0]
             lines.append(f'# {name}, unit = "{channel_of(channel).unit}" }}  # needed: {why}')
     others = [k for k in range(len(table.headers)) if k not in found.values()]
     for names, what in _WANTED.items():
