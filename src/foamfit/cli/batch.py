@@ -80,17 +80,16 @@ def batch(
     from foamfit.study.batch_work import Recipe
 
     cycles = alone if several is None else several
-    pages, fix = not output.no_report, asked["fix"] or None
     if asked["cycles"] is not None and asked["cycle"] is not None:
         raise InputError("give either --cycle or --cycles, not both")
     recipe = Recipe(
-        asked["model"],
-        {},
-        cycles,
-        fix,
-        asked["vary"],
-        pages,
-        output.figure_width,
+        model=asked["model"],
+        options={},
+        cycles=cycles,
+        fix=asked["fix"] or None,
+        vary=asked["vary"],
+        pages=not output.no_report,
+        width=output.figure_width,
         history=asked["cycles"],
     )
     if scheduler is None:

@@ -105,9 +105,6 @@ def together(*options: Callable[[Command], Command]) -> Callable[[Command], Comm
     return lambda command: functools.reduce(lambda f, add: add(f), reversed(options), command)
 
 
-# ---------------------------------------------------------------- what a command writes and prints
-
-
 @dataclass(frozen=True)
 class Output:
     """Where a command writes its folder, and what it prints of it."""
@@ -153,10 +150,7 @@ class Output:
         text: Callable[[], str],
         **drawn: Any,
     ) -> None:
-        """Save a result in the folder of `page`, print it, and say where it is.
-
-        It is printed even if it cannot be saved, so that the numbers are not lost.
-        """
+        """Save a result in the folder of `page`; print it, even if that fails, and where it is."""
         from foamfit.report.folder import save_somewhere
 
         try:
@@ -191,10 +185,7 @@ class Output:
 
 
 def output(folder: str, printed: str) -> Callable[[Command], Command]:
-    """Add the options of `Output` to a command, which takes them as `output`.
-
-    `folder` is its default folder and `printed` what --json prints, for the help.
-    """
+    """Add the options of `Output` to a command; `folder` and `printed` are for its help."""
     options = together(
         option("--out", f"Result folder. Default: {folder}.", FILE),
         option("--no-report", "Tables alone: no report and no figures of each fit."),
@@ -230,9 +221,6 @@ def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -
         figure_format(plot)
 
 
-# ---------------------------------------------------------------- what runs beside a command
-
-
 @contextmanager
 def compiling(
     quiet: bool, model: str = "bistable", relaxation: int = 0
@@ -252,11 +240,7 @@ def compiling(
 
 
 class Drawers:
-    """Two processes that draw figures, once begun and where there are two cores.
-
-    They import matplotlib while this process fits. Where they are not available or fail, this
-    process draws.
-    """
+    """Two processes that draw figures, once begun; without a second core this process draws."""
 
     _pool: Processes | None = None
 

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,21 +115,21 @@ def read_test(
         table, columns = _table(text, settings.columns)
         record, notes = _record(table, columns, settings)
     sha256, spreads = text.sha256, named.scale_spreads(columns, settings.columns)
-    advice = partial(named.sign_advice, table, columns, settings.columns)
+    of_force: Callable[[str], str] = partial(named.sign_advice, table, columns, settings.columns)
+    of_motion = of_force
     if settings.motion is not None:
-        moved = _read_motion(path, toml, settings)
+        frames, told, scales, digest, of_motion = _read_motion(path, toml, settings)
         with naming(toml):
-            record, more = join(record, moved.frames)
-        notes, spreads = [*notes, *moved.notes, *more], spreads | moved.spreads
-        sha256 = hashlib.sha256(f"{sha256} {moved.sha256}".encode()).hexdigest()
-        advice = partial(_advice_of, advice, moved.advice)
+            record, more = join(record, frames)
+        notes, spreads = [*notes, *told, *more], spreads | scales
+        sha256 = hashlib.sha256(f"{sha256} {digest}".encode()).hexdigest()
     with naming(path):
         test = condition(
             record,
             settings.specimen,
             striker=settings.striker,
             window=window,
-            advice=advice,
+            advice=lambda c: (of_motion if c.startswith("displacement") else of_force)(c),
             spread=settings.uncertainties.get("velocity", 0.0),
         )
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
@@ -179,18 +178,10 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
     return numbers["time"], numbers[channel]
 
 
-class _Moved(NamedTuple):
-    """What the file of [motion] holds; `advice` is that of `sign_advice`."""
-
-    frames: Frames
-    notes: list[str]
-    spreads: dict[str, float]
-    sha256: str
-    advice: Callable[[str], str]
-
-
-def _read_motion(path: Path, toml: Path, settings: Settings) -> _Moved:
-    """Read the motion from the file that [motion] names; `path` is that of the force."""
+def _read_motion(
+    path: Path, toml: Path, settings: Settings
+) -> tuple[Frames, list[str], dict[str, float], str, Callable[[str], str]]:
+    """Read the file that [motion] names: frames, notes, spreads, digest, advice on signs."""
     motion = settings.motion
     assert motion is not None  # else there is nothing to read
     name = motion.file.name
@@ -211,7 +202,7 @@ def _read_motion(path: Path, toml: Path, settings: Settings) -> _Moved:
     assert top is not None  # see motion_columns
     inside = {interior_channel(k): w for k, w in _inside(numbers, top, notes).items()}
     spread, moved = settings.uncertainties.get("delay"), {"displacement": top} | inside
-    return _Moved(
+    return (
         Frames(name, numbers["time"], moved, motion.delay, spread),
         [f"{name}: {note}" for note in notes],
         named.scale_spreads(needed, motion.columns),
@@ -222,11 +213,6 @@ def _read_motion(path: Path, toml: Path, settings: Settings) -> _Moved:
 
 def _of_motion(text: str) -> str:
     return text.replace("[columns]", "[motion.columns]")
-
-
-def _advice_of(force: Callable[[str], str], motion: Callable[[str], str], channel: str) -> str:
-    """Advice on a channel by the file that it was read from."""
-    return (motion if channel.startswith("displacement") else force)(channel)
 
 
 def _record(table: Table, columns: dict[str, int], settings: Settings) -> tuple[Record, list[str]]:

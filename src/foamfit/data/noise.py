@@ -127,10 +127,9 @@ def estimated_noise(values: Array, what: str = "samples") -> NoiseLevel:
 def noise_before_contact(
     whole: dict[str, Array], n: int, curves: dict[str, Array], block: int
 ) -> dict[str, NoiseLevel]:
-    """Noise of channels from their `n` samples before contact, about a line or a cubic, if so many.
+    """Noise of channels from their `n` samples before contact, about a line or a cubic.
 
-    The `curves` during contact are means of `block` samples; where the noise that they show
-    contradicts, it is the answer.
+    The `curves` during contact, means of `block` samples, decide where their noise contradicts.
     """
     found = dict[str, NoiseLevel]()
     for name, values in ((c, v[:n]) for c, v in whole.items() if n >= MIN_REST):

@@ -22,6 +22,7 @@ from foamfit.data.contact import (
     start_of_slow_test,
 )
 from foamfit.data.cycles import (
+    Cycle,
     choose_cycles,
     cut_to_cycle,
     cut_to_reload,
@@ -96,6 +97,7 @@ def condition(
     first = cut_to_cycle(record, cycles, cycles[0])[0] if cycles else record
     curves = first.curves("acceleration")
     levels = {c: estimated_noise(v) for c, v in curves.items()} | held
+    used = chosen or Cycle(number=1, place=0, first=0, top=0, end=len(record))
     if impact:
         start = start_of_impact(first, levels)
         start = replace(start, gauge=zeros.gauge_before(first, start, levels, known))
@@ -103,15 +105,12 @@ def condition(
         notes += zeros.flight_notes(first, start, span, levels, known, spread)
     else:  # its first cycle shows the start
         start = start_of_slow_test(first, levels)
-        begun = chosen is not None and not chosen.place
-        kept = cut_to_cycle(record, cycles, chosen)[0] if chosen and begun else first
-        resting = max(0, start.first - 2) if start.free else 0
-        span = zeros.Span(start.first, len(kept), resting, len(kept))
+        end = len(first) if used.place else used.end - used.first
+        span = zeros.Span(start.first, end, start.resting, end)
     record, found = zeros.take_zeros(record, first, start, span, levels, impact=impact)
     notes += found.notes
-    later = chosen if chosen is not None and chosen.place else None  # with a contact of its own
-    if later:
-        record = done(cut_to_reload(record, cycles, later, specimen.height, found.origins))
+    if used.place:  # with a contact of its own
+        record = done(cut_to_reload(record, cycles, used, specimen.height, found.origins))
     else:
         record = done(cut_to_cycle(record, cycles, chosen)) if chosen else record
         record = done(cut_to_contact(record, start, span, found.origins))
@@ -120,13 +119,10 @@ def condition(
     record, motion = integrate_motion(record, specimen, known)
     if impact:
         record = done(start_within_height(record, specimen, known, motion, found.origins))
-    notes += checks(
-        record, specimen, known, motion, several=chosen is not None and chosen.last is not None
-    )
+    notes += checks(record, specimen, known, motion, several=used.last is not None)
     whole, record = record, done(thin(record))
     block = -(-len(whole) // len(record))
-    resting = max(0, start.first - 2) if start.free else 0
-    noise = noise_before_contact(curves, resting, record.curves("acceleration"), block)
+    noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
     outliers = spoilt.outliers_of_blocks(whole, block)
     timed = record.time is not None
@@ -140,11 +136,11 @@ def condition(
         notes=tuple(notes),
         interior=record.interior,
         outliers=outliers,
-        contact="stress" if later else start.by,
+        contact="stress" if used.place else start.by,
         count=count_rows(whole, outliers, block),
-        cycle=chosen.number if chosen else 1,
+        cycle=used.number,
         cycles=tuple(cycle.number for cycle in cycles) or (1,),
-        last_cycle=chosen.last if chosen else None,
+        last_cycle=used.last,
         start_strain=found.origins.pop("start_strain", 0.0),
         sampled=record.sampled,
         zeros=found.errors,
@@ -306,10 +302,7 @@ def stress_of_motion(
 def start_within_height(
     record: Record, specimen: Specimen, striker: Striker, motion: str, origins: dict[str, float]
 ) -> tuple[Record, list[str]]:
-    """Move the start of an impact if its motion goes a little farther than the height.
-
-    It started too early by then: contact is as much later as the motion goes too far.
-    """
+    """Move the start of an impact that was too early: its motion goes farther than the height."""
     w, most = record.displacement, 0.97 * specimen.height
     assert w is not None  # measured or integrated by now
     assert record.time is not None  # it is an impact

@@ -211,10 +211,10 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         )
 
 
-def _table(document: dict[str, Any], name: str) -> dict[str, Any]:
+def _table(document: dict[str, Any], name: str, within: str = "") -> dict[str, Any]:
     table = document.get(name, {})
     if not isinstance(table, dict):
-        raise InputError(f"{name} must be a table, [{name}].")
+        raise InputError(f"{within}{name} must be a table, [{within}{name}].")
     return table
 
 
@@ -284,16 +284,16 @@ def _motion(path: Path, document: dict[str, Any], spreads: dict[str, float]) -> 
         check_keys("[motion]", table, ["file", "delay", "columns"])
     if file is None:
         raise InputError('[motion] must name a file, like file = "camera.csv".')
-    columns = _columns(table.get("columns", {}), MOTION_CHANNELS, "motion.columns")
+    columns = _columns(_table(table, "columns", "motion."), MOTION_CHANNELS, "motion.columns")
     given = table.get("delay", "0 s")
     delay, sigma = parse_uncertain(given, "s", "[motion] delay", "0 ± 50 us", zero=True)
     spreads |= {"delay": sigma} if sigma else {}
     return Motion(file, columns, delay)
 
 
-def _columns(table: Any, channels: Iterable[str], name: str = "columns") -> dict[str, Column]:
-    if not isinstance(table, dict):
-        raise InputError(f"{name} must be a table, [{name}].")
+def _columns(
+    table: dict[str, Any], channels: Iterable[str], name: str = "columns"
+) -> dict[str, Column]:
     check_keys(f"[{name}]", table, [*channels, *filter(interior_node, table)])
     columns: dict[str, Column] = {}
     for channel, spec in table.items():

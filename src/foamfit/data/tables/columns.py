@@ -167,17 +167,7 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
             "acceleration or a velocity will do, and with its velocity a displacement."
         )
     if motion is not None:
-        own = [c for c in columns if c in _MOTIONS or interior_node(c)]
-        if own:
-            raise InputError(
-                f"column {table.headers[columns[own[0]]].text!r} is a {own[0]}, but [motion] file "
-                f"= {motion.file.name!r} has the motion; leave one of them out."
-            )
-        if "time" not in columns:
-            raise InputError(
-                f"no column is a time (there are {table.listed}); with [motion] it needs one like "
-                "'time (ms)'."
-            )
+        _check_motion(table, columns, motion.file.name)
     helping = {"velocity"} if moved or "acceleration" in has else set[str]()
     helping = {"velocity", "acceleration"} if forced else helping
     if moved or motion is not None:
@@ -196,6 +186,19 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
             f"or give {timed}the [striker] mass and velocity to integrate the motion."
         )
     return {c: k for c, k in columns.items() if c in has}
+
+
+def _check_motion(table: Table, columns: dict[str, int], name: str) -> None:
+    """Refuse a test with [motion] that has a displacement of its own, or no time."""
+    own = [c for c in columns if c in _MOTIONS or interior_node(c)]
+    if own:
+        raise InputError(
+            f"column {table.headers[columns[own[0]]].text!r} is a {own[0]}, but [motion] file = "
+            f"{name!r} has the motion; leave one of them out."
+        )
+    if "time" not in columns:
+        told = f"no column is a time (there are {table.listed})"
+        raise InputError(f"{told}; with [motion] it needs one like 'time (ms)'.")
 
 
 def motion_columns(table: Table, columns: dict[str, int]) -> dict[str, int]:
