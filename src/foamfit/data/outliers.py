@@ -227,15 +227,15 @@ def outliers_of_blocks(record: Record, block: int) -> dict[str, Outliers]:
         if values is not None and at.size:
             file = values[at] + excess[at]
             found[name] = Outliers(share(excess != 0.0) > 0.5, record.instants[at], file)
-    still, clipped, top = record.stood_still, record.clipped, float(record.stress.max())
-    for name, left_out, clipped_at in (
-        ("displacement", share(still) > 0.5, None),
-        *([] if clipped is None else [("stress", share(clipped) > 0.0, top)]),
-    ):
-        if left_out.any() or (clipped_at is None and still.any()):
-            spikes = found.get(name) or Outliers(np.zeros_like(left_out), none, none)
-            wrong = spikes.left_out | left_out
-            found[name] = replace(spikes, left_out=wrong, clipped_at=clipped_at)
+    left_out, clipped_at = dict[str, NDArray[np.bool_]](), None
+    if record.stood_still.any():
+        left_out["displacement"] = share(record.stood_still) > 0.5
+    if record.clipped is not None and record.clipped.any():
+        left_out["stress"], clipped_at = share(record.clipped) > 0.0, float(record.stress.max())
+    for name, wrong in left_out.items():
+        spikes = found.get(name) or Outliers(np.zeros_like(wrong), none, none)
+        top = clipped_at if name == "stress" else None
+        found[name] = replace(spikes, left_out=spikes.left_out | wrong, clipped_at=top)
     return found
 
 

@@ -290,6 +290,8 @@ def read_numbers(
     rows = table.first_row + 1 + np.arange(len(frame))
     if table.body().rstrip().count(b"\n") + 1 != len(frame):  # there are blank lines
         rows = np.fromiter((number for number, _ in table.rows()), np.int64)
+        if rows.size != len(frame):
+            raise InputError("is no regular table; a row must have a cell for each column.")
     numbers = {channel: one[~empty] for channel, one in values.items()}
     too_many = frame[str(len(table.headers))].notna().any()
     if too_many or not all(np.isfinite(one).all() for one in numbers.values()):
