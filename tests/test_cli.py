@@ -444,7 +444,7 @@ def test_refuses_values(here: Path, factors: tuple[float, float], words: tuple[s
     [
         ("[specimen\n", (), ("test.toml", "no valid TOML", "line 1")),
         ('[specimen]\narea = "1 mm^2"\n', (), ("test.toml", "height is missing", '"1.19 mm"')),
-        ("[specimen]\n", (), ("height is missing", "diameter or area", '"1.19 mm"', '"5 mm"')),
+        ("[specimen]\n", (), ("height is missing", "diameter", "area", '"1.19 mm"', '"5 mm"')),
         (SPECIMEN.replace('"10', '"-10'), (), ("test.toml", "height", "must be positive")),
         (SPECIMEN.replace("100 mm", "1e300 mm"), (), ("test.toml", "area", "1e-30 and 1e+30")),
         (

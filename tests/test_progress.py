@@ -249,7 +249,7 @@ def test_simulations_for_the_line_take_a_small_share_of_the_time(
     problem.objective.look = look
     while now[0] < 10.0:
         now[0] += 0.001
-        line._watch(problem, np.zeros(8))
+        line.watch(problem, np.zeros(8))
         line.progress(0.1, "loop")
     # What the first one took does not count: it loads the solver.
     assert np.diff(looks)[1:11] == pytest.approx([took + apart] * 10, abs=0.002)

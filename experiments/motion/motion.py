@@ -210,7 +210,7 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
                      "height_z": sign * error / np.linalg.norm(found.modes(here))}  # fmt: skip
             if not motion.holds:
                 late = float(here[0] - at)
-                turn |= {"late": late * rows, "late_z": late / found.turns_stderr[j]}
+                turn |= {"late": late * rows}
         yield turn
 
 
@@ -237,7 +237,6 @@ def table(data: pd.DataFrame, by: str) -> pd.DataFrame:
         "height: RMS (σ)": f.height.apply(rms),
         "height held (%)": f.height_z.apply(held),
         "instant: RMS (samples)": f.late.apply(rms),
-        "instant held (%)": f.late_z.apply(held),
         "invented turns (%)": 100.0 * m.invented.apply(lambda v: np.mean(v > 0)),
         "largest reversal (σ)": m.back.max(),
         "modes": m.modes.median(),

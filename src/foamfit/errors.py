@@ -18,6 +18,15 @@ class InputError(ValueError):
         self.lines = lines
 
 
+@contextmanager
+def naming(path: object) -> Iterator[None]:
+    """Name the file that is wrong at the beginning of an InputError of the body."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}", error.lines) from None
+
+
 class SimulationError(RuntimeError):
     """A simulation cannot go on; the message says why. A simulation never returns NaN instead."""
 

@@ -303,7 +303,7 @@ def test_a_motion_is_no_test_of_its_own(tmp_path):
         ),
         (
             MOTION + '[motion.columns]\ndisplacement = { column = "x" }\n',
-            ["[motion.columns] displacement: column 'x' is nowhere in camera.csv"],
+            ["camera.csv: [motion.columns] displacement: column 'x' is nowhere"],
         ),
     ],
 )

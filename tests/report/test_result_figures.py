@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import Future
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 import fabricated
 import foamfit.study.processes
 from conftest import EXPERIMENTS
-from foamfit.cli.options import drawing_beside
+from foamfit.cli.options import Drawers
 from foamfit.errors import InputError
 from foamfit.report.result_figures import Images, draw_all
 from foamfit.study.processes import EndedError
@@ -28,7 +29,7 @@ def drawn_here() -> dict[str, Images | None]:
 
 
 def test_other_processes_draw_the_same(drawn_here: dict[str, Images | None]) -> None:
-    with drawing_beside() as drawers:
+    with closing(Drawers()) as drawers:
         drawers.begin()
         assert dict(draw_all(fabricated.result(), mapped=drawers.map)) == drawn_here
     fit = drawn_here["fit"]
@@ -61,7 +62,7 @@ def test_where_processes_end_this_one_draws(
 
     monkeypatch.setattr(foamfit.study.processes.Processes, "submit", ended)
     monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
-    with drawing_beside() as drawers:
+    with closing(Drawers()) as drawers:
         drawers.begin()
         assert dict(draw_all(fabricated.result(), mapped=drawers.map)) == drawn_here
 
@@ -72,7 +73,7 @@ def test_where_no_process_can_be_had_this_one_draws(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(foamfit.study.processes, "Processes", refused)
     monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
-    with drawing_beside() as drawers:
+    with closing(Drawers()) as drawers:
         drawers.begin()
         assert list(drawers.map(str.upper, ["fit"])) == ["FIT"]
 
@@ -80,7 +81,7 @@ def test_where_no_process_can_be_had_this_one_draws(monkeypatch: pytest.MonkeyPa
 def test_one_core_draws_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 1)
     monkeypatch.delattr(foamfit.study.processes, "Processes")
-    with drawing_beside() as drawers:
+    with closing(Drawers()) as drawers:
         drawers.begin()
         assert list(drawers.map(str.upper, ["fit", "residuals"])) == ["FIT", "RESIDUALS"]
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from foamfit.arrays import Array, single_threaded
 from foamfit.cards.curves import Curves, fitted_rates, follow, guessed, loading_curves
-from foamfit.cards.figure import draw
-from foamfit.cards.records import Record, read_records
+from foamfit.cards.records import Record, draw, read_records
 from foamfit.cards.replay import REPLAYS, Motion, Unloading, fit_unloading, unloading_curve
 from foamfit.data.units import factor
 from foamfit.errors import InputError
@@ -142,15 +141,13 @@ class Card:
             pictures = (image(figure, "png"), image(figure, "pdf"))
         told = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
         contents = (self.text.encode(), told.encode(), *pictures)
-        written = list[Path]()
-        try:
-            for one, content in zip(files, contents, strict=True):
+        for done, (one, content) in enumerate(zip(files, contents, strict=True)):
+            try:
                 write_file(one, content)
-                written.append(one)
-        except InputError:
-            for one in written:
-                one.unlink()
-            raise
+            except InputError:
+                for written in files[:done]:
+                    written.unlink()
+                raise
         return path
 
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from foamfit.cli import fitting, options
+from foamfit.cli import options
+from foamfit.cli.fit import cycles_of, fit_options, keywords_of
 from foamfit.cli.group import NOT_ACCEPTABLE, main
 from foamfit.cli.options import Output
 from foamfit.cli.progress import progress_line
@@ -40,7 +41,7 @@ PATIENCE = 10  # s in which a scheduler must answer
     "--scheduler", "A running Dask scheduler, as tcp://127.0.0.1:8786.", metavar="ADDRESS"
 )
 @options.option("--fresh", "Fit everything again, including what is already done.")
-@fitting.fit_options
+@fit_options
 @options.output("fits/batch/<model>", "the rows as JSON")
 def batch(
     tests: tuple[str, ...],
@@ -69,7 +70,7 @@ def batch(
     if jobs is not None and scheduler is not None:
         raise InputError("--jobs and --scheduler exclude each other; leave one of them out")
     output.check()
-    search, (alone, several) = fitting.keywords_of(asked), fitting.cycles_of(asked["cycle"])
+    search, (alone, several) = keywords_of(asked), cycles_of(asked["cycle"])
     from foamfit.study import processes
 
     if scheduler is None:
@@ -79,17 +80,16 @@ def batch(
     from foamfit.study.batch_work import Recipe
 
     cycles = alone if several is None else several
-    pages, fix = not output.no_report, asked["fix"] or None
     if asked["cycles"] is not None and asked["cycle"] is not None:
         raise InputError("give either --cycle or --cycles, not both")
     recipe = Recipe(
-        asked["model"],
-        {},
-        cycles,
-        fix,
-        asked["vary"],
-        pages,
-        output.figure_width,
+        model=asked["model"],
+        options={},
+        cycles=cycles,
+        fix=asked["fix"] or None,
+        vary=asked["vary"],
+        pages=not output.no_report,
+        width=output.figure_width,
         history=asked["cycles"],
     )
     if scheduler is None:

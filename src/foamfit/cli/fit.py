@@ -1,21 +1,169 @@
-"""`foamfit fit`: identify the parameters of a test, or of the cycles of a record."""
+"""`foamfit fit`: its options, which batch and page share, and the fit that they ask for."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+import math
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from foamfit.cli import fitting, options
+import click
+
+from foamfit.cli import options
 from foamfit.cli.group import NOT_ACCEPTABLE, main
-from foamfit.cli.options import Output
+from foamfit.cli.options import COUNT, Output, option
 from foamfit.cli.progress import Progress, progress_line
+from foamfit.errors import InputError
+from foamfit.springs.options import OPTIONS
 from foamfit.terminal import say
 
 if TYPE_CHECKING:
+    import lmfit
+
+    from foamfit.api import FitResult
+    from foamfit.data.measurement import Measurement
     from foamfit.study.cycles import CycleFits
+
+# Options that `foamfit.fit` does not take as keywords, and those that become its `intervals`.
+OF_ONE_MODEL, WAYS = ("cycle", "cycles", "model", "fix", "vary"), ("profile", "bootstrap", "mcmc")
+
+
+def _fixes(
+    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+) -> dict[str, float]:
+    fixed = {}
+    for text in values:
+        name, _, number = text.partition("=")
+        try:
+            fixed[name.strip()] = value = float(number)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise click.BadParameter(f"'{text}' is not NAME=VALUE in SI, as s1_eta=0.")
+    return fixed
+
+
+fit_options = options.together(
+    option(
+        "--model",
+        "Springs from the base up; auto compares models and takes the simplest that holds.",
+        default="bistable",
+    ),
+    options.DRIVE,
+    option("--seed", "The same test and seed give the same numbers.", options.WHOLE, default=0),
+    option(
+        "--starts",
+        "Descents of the search. Default: 16 per spring, 48 if several are hysteretic.",
+        COUNT,
+    ),
+    option("--max-time", "Then the best so far is taken.", float, metavar="SECONDS"),
+    option("--fix", "Hold a parameter (SI).", multiple=True, metavar="NAME=VALUE", callback=_fixes),
+    option("--vary", "Vary a parameter that is held by default.", multiple=True, metavar="NAME"),
+    option("--interior-mass", "Put the specimen's mass between the springs."),
+    option("--time-shift", "Fit the delay of the motion against the force."),
+    options.RELAXATION,
+    *options.MORE,
+    option(
+        "--loss",
+        "All but linear weigh large residuals less.",
+        click.Choice(["linear", "soft_l1", "huber", "cauchy"]),
+        default="linear",
+    ),
+    option("--profile", "95 % intervals by profile likelihood."),
+    option(
+        "--bootstrap", "95 % intervals by N >= 40 refits to resampled blocks.", int, metavar="N"
+    ),
+    option("--mcmc", "95 % intervals by N steps of emcee.", int, metavar="N"),
+)
+
+
+def model_name(asked: Mapping[str, Any]) -> str:
+    """Return a model's name without spaces; InputError if there is no such model."""
+    from foamfit.springs.model import Model, with_options
+
+    model = asked["model"].strip()
+    with_options(model, **{name: asked[name] for name in OPTIONS})
+    return "auto" if model == "auto" else Model.parse(model, asked["relaxation"]).words
+
+
+def cycles_of(text: str | None) -> tuple[int | None, tuple[int, ...] | None]:
+    """Read --cycle: the one cycle that is named, or the several that are ("all" names none)."""
+    if text is None or text.strip().lower() == "all":
+        return None, None if text is None else ()
+    parts = text.split(",")
+    if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
+        raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
+    numbers = tuple(int(part) for part in parts)
+    return (None, numbers) if len(numbers) > 1 else (numbers[0], None)
+
+
+def keywords_of(asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keywords of `foamfit.fit` among the options of a command."""
+    given = {way: asked[way] for way in WAYS if asked[way] not in (None, False)}
+    if len(given) > 1:
+        names = " and ".join(f"--{way}" for way in given)
+        raise InputError(f"{names} exclude each other; choose one way to make the intervals")
+    search = {name: one for name, one in asked.items() if name not in (*OF_ONE_MODEL, *WAYS)}
+    way, draws = next(iter(given.items()), ("auto", None))
+    return search | {"intervals": way, "draws": None if draws is True else draws}
+
+
+def fit_as_asked(
+    test: Path,
+    specimen: Path | None,
+    asked: Mapping[str, Any],
+    begin: Callable[[float | None], AbstractContextManager[Progress]],
+) -> FitResult | CycleFits:
+    """Fit a test, or cycles of a record, as the options of the command say.
+
+    `begin` is called when everything is read, before anything is simulated, with the time limit of
+    the whole (s) if there is one; the fit reports to the `Progress` that it gives.
+    """
+    from foamfit.data.csv_file import read_test
+
+    search = keywords_of(asked)
+    model = model_name(asked)
+    alone, several = cycles_of(asked["cycle"])
+    together = asked.get("cycles")
+    if together is not None and asked["cycle"] is not None:
+        raise InputError("give either --cycle or --cycles, not both")
+    measurement = read_test(test, specimen, alone, cycles=together)
+    for number in set(several or ()).difference(measurement.cycles):
+        last = f"its cycles are {min(measurement.cycles)} to {max(measurement.cycles)}"
+        raise InputError(f"--cycle {asked['cycle']}: {test} has no cycle {number}; {last}")
+    from foamfit import api
+    from foamfit.one_model import Options
+
+    Options(**search)  # refuses what is not admissible before anything is compiled
+    params = _params(measurement, model, asked)
+    with begin(search["max_time"] if several is None else None) as news:  # it limits each cycle
+        search |= {"progress": news.progress, "watch": news.watch, "tell": news.tell}
+        if several is None:
+            return api.fit(measurement, model=model, params=params, **search)
+        from foamfit.study import cycles as study
+
+        search["params"] = lambda one: _params(one, model, asked)
+        return study.fit_cycles(test, specimen, cycles=several or None, model=model, **search)
+
+
+def _params(
+    measurement: Measurement, model: str, asked: Mapping[str, Any]
+) -> lmfit.Parameters | None:
+    """Return the parameters of a model as --fix and --vary want them; None for auto."""
+    from foamfit.fitting.curves import check_time_shift, choose_drive
+    from foamfit.fitting.problem import fix_and_vary, make_params
+
+    drive, fix, vary = (asked[name] for name in ("drive", "fix", "vary"))
+    more = {name: asked[name] for name in ("time_shift", "relaxation", *OPTIONS)}
+    if asked["time_shift"]:
+        check_time_shift(measurement, drive or choose_drive(measurement))
+    if model != "auto":
+        return fix_and_vary(make_params(measurement, model, drive, **more), model, fix, vary)
+    if fix or vary:
+        raise InputError("--fix and --vary belong to one model; name it instead of --model auto")
+    return None
 
 
 @main.command()
@@ -23,7 +171,7 @@ if TYPE_CHECKING:
 @options.SPECIMEN
 @options.CYCLE
 @options.CYCLES
-@fitting.fit_options
+@fit_options
 @options.output("fits/<test>/<model>", "fit.json")
 @options.option("--verbose", "Print the checklist, reasons, notes and all models too.")
 def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **asked: Any) -> int:
@@ -47,10 +195,10 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
     output.check(without_report=False)
-    model = asked["model"] = fitting.model_name(asked)
+    model = asked["model"] = model_name(asked)
     with (
         options.compiling(output.silent, model, asked["relaxation"]) as compile_rest,
-        options.drawing_beside() as drawers,
+        closing(options.Drawers()) as drawers,
     ):
         from foamfit.data.toml_file import toml_beside
 
@@ -63,7 +211,7 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
                 drawers.begin()
             return progress_line(output.silent, "fit", limit, says=not output.quiet)
 
-        found = fitting.fit_as_asked(test, specimen, asked, begin)
+        found = fit_as_asked(test, specimen, asked, begin)
         from foamfit.report import folder as result_folder
         from foamfit.report.studies import cycles
         from foamfit.report.summary import summary_text
@@ -77,7 +225,7 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
         else:
             page, which = "cycles.png", " of any cycle"
             failed = all(one.status == "failed" for one in found.results.values())
-            save, content = partial(cycles.save_cycles, found), partial(_content, found)
+            save, content = partial(cycles.save_cycles, found), partial(_content_of, found)
             text = partial(cycles.cycles_text, found)
         drawn = {"width": output.figure_width, "mapped": drawers.map}
         output.finish(save, folder / page, content, text, **drawn)
@@ -86,7 +234,7 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
     return NOT_ACCEPTABLE if failed else 0
 
 
-def _content(found: CycleFits) -> dict[str, Any]:
+def _content_of(found: CycleFits) -> dict[str, Any]:
     """Return the fits of several cycles as JSON has them."""
     each = {n: one.to_json_dict() for n, one in sorted(found.results.items())}
     return found.to_json_dict() | {"cycles": each}

@@ -78,10 +78,7 @@ class _Group(click.Group):
 
 @functools.cache
 def _spare_the_collector() -> None:
-    """Keep the garbage collector from going through what the imports have made.
-
-    These are some hundred thousand objects that all stay; to collect them took a quarter of a fit.
-    """
+    """Keep the garbage collector from the objects of imports: that took a quarter of a fit."""
     gc.set_threshold(100_000, 20, 10)
     atexit.register(gc.freeze)
 

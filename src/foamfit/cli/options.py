@@ -105,9 +105,6 @@ def together(*options: Callable[[Command], Command]) -> Callable[[Command], Comm
     return lambda command: functools.reduce(lambda f, add: add(f), reversed(options), command)
 
 
-# ---------------------------------------------------------------- what a command writes and prints
-
-
 @dataclass(frozen=True)
 class Output:
     """Where a command writes its folder, and what it prints of it."""
@@ -126,12 +123,10 @@ class Output:
 
     def check(self, *, without_report: bool = True) -> None:
         """Refuse --open beside --json (a browser may print too), or where no page is made."""
-        for flag, given in (
-            ("json", self.as_json),
-            ("no-report", self.no_report and not without_report),
-        ):
-            if self.opening and given:
-                raise InputError(f"--open and --{flag} exclude each other; leave one of them out")
+        given = "no-report" if self.no_report and not without_report else ""
+        given = "json" if self.as_json else given
+        if self.opening and given:
+            raise InputError(f"--open and --{given} exclude each other; leave one of them out")
 
     def folder(self, default: Path, inputs: Iterable[Path]) -> Path:
         """Return the result folder; InputError if it cannot be written or holds an input."""
@@ -155,10 +150,7 @@ class Output:
         text: Callable[[], str],
         **drawn: Any,
     ) -> None:
-        """Save a result in the folder of `page`, print it, and say where it is.
-
-        It is printed even if it cannot be saved, so that the numbers are not lost.
-        """
+        """Save a result in the folder of `page`; print it, even if that fails, and where it is."""
         from foamfit.report.folder import save_somewhere
 
         try:
@@ -193,10 +185,7 @@ class Output:
 
 
 def output(folder: str, printed: str) -> Callable[[Command], Command]:
-    """Add the options of `Output` to a command, which takes them as `output`.
-
-    `folder` is its default folder and `printed` what --json prints, for the help.
-    """
+    """Add the options of `Output` to a command; `folder` and `printed` are for its help."""
     options = together(
         option("--out", f"Result folder. Default: {folder}.", FILE),
         option("--no-report", "Tables alone: no report and no figures of each fit."),
@@ -232,9 +221,6 @@ def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -
         figure_format(plot)
 
 
-# ---------------------------------------------------------------- what runs beside a command
-
-
 @contextmanager
 def compiling(
     quiet: bool, model: str = "bistable", relaxation: int = 0
@@ -254,11 +240,7 @@ def compiling(
 
 
 class Drawers:
-    """Two processes that draw figures, once begun and where there are two cores.
-
-    They import matplotlib while this process fits. Where they are not available or fail, this
-    process draws.
-    """
+    """Two processes that draw figures, once begun; without a second core this process draws."""
 
     _pool: Processes | None = None
 
@@ -277,7 +259,7 @@ class Drawers:
         begun = [(name, self._pool.submit(draw, name)) for name in names]
         return (_drawn(one, draw, name) for name, one in begun)
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """End the processes."""
         if self._pool is not None:
             self._pool.stop()
@@ -288,13 +270,3 @@ def _drawn(begun: Future[Any], draw: Callable[[str], Any], name: str) -> Any:
         return begun.result()
     except Exception:  # drawing here says what is wrong with the figure, if that is why
         return draw(name)
-
-
-@contextmanager
-def drawing_beside() -> Iterator[Drawers]:
-    """Give drawers, which are stopped at the end."""
-    drawers = Drawers()
-    try:
-        yield drawers
-    finally:
-        drawers.stop()

@@ -46,13 +46,11 @@ class Progress:
 class Watcher(Progress):
     """Looks at the best point so far a few times a second, for a small share of the time."""
 
-    def __init__(self, says: bool = True) -> None:
-        super().__init__(says)
-        self.watch = self._watch
-        self._best: tuple[Problem, Array] | None = None
-        self._next, self._looked = 0.0, False
+    _best: tuple[Problem, Array] | None = None
+    _next, _looked = 0.0, False
 
-    def _watch(self, problem: Problem, values: Array) -> None:
+    def watch(self, problem: Problem, values: Array) -> None:
+        """Take the best point so far."""
         self._best = problem, values
         self.look()
 
@@ -71,10 +69,10 @@ class Watcher(Progress):
 
 
 class ProgressLine(Watcher):
-    """Keeps one line of a terminal up to date, from a thread: a fit may be silent for long.
+    """Keeps one line of a terminal, which `name` begins, up to date from a thread.
 
-    The work ends after `limit` seconds in any case; `name` begins the line. The misfit is the RMS
-    of all fitted curves over their measured ranges.
+    The work ends after `limit` seconds. The misfit is the RMS of all fitted curves over their
+    measured ranges.
     """
 
     def __init__(self, stream: TextIO, name: str, limit: float | None = None) -> None:
@@ -169,10 +167,7 @@ def duration(seconds: float) -> str:
 def progress_line(
     quiet: bool, name: str, limit: float | None = None, *, says: bool = True
 ) -> Iterator[Progress]:
-    """Give a line on stderr that shows progress; nothing is shown where that is no terminal.
-
-    `says` is whether sentences are printed where there is no line.
-    """
+    """Give a line on stderr that shows progress; elsewhere than a terminal it only `says`."""
     if quiet or sys.stderr is None or not sys.stderr.isatty():
         yield Progress(says)
         return

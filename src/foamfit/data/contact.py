@@ -44,6 +44,11 @@ class Start:
     free: bool = False
     gauge: str = ""
 
+    @property
+    def resting(self) -> int:
+        """How many rows certainly show the specimen without load."""
+        return max(0, self.first - 2) if self.free else 0
+
 
 class Kink(NamedTuple):
     """Where a signal starts to rise: time and standard error, s."""
@@ -135,7 +140,7 @@ def leave_rest(
 
 def _at_kink(channel: str, time: Array, at: Kink, by: str, what: str = "rest") -> Start:
     how = f"where the {channel} leaves its {what}"
-    return Start(how, at.time, int(np.searchsorted(time, at.time)), at.error, by, True)
+    return Start(how, at.time, int(np.searchsorted(time, at.time)), at.error, by, free=True)
 
 
 def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool]:

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +36,7 @@ from foamfit.data.prepare import condition, stress_of_motion
 from foamfit.data.tables import columns as named
 from foamfit.data.tables.csv_table import (
     Table,
+    Text,
     find_table,
     read_numbers,
     read_text,
@@ -53,7 +53,7 @@ from foamfit.data.toml_file import (
     toml_beside,
 )
 from foamfit.data.units import LARGEST
-from foamfit.errors import InputError
+from foamfit.errors import InputError, naming
 from foamfit.text import engineering, percent
 
 
@@ -111,31 +111,27 @@ def read_test(
     settings = read_settings(toml, path, channels=CHANNELS)
     text = read_text(path, "the CSV file of a test", settings.sheet)
     window = _chosen(settings.window, cycle, cycles)
-    table = find_table(text, {column.column for column in settings.columns.values()})
-    columns = named.assign_columns(table, settings.columns, toml)
-    record, notes = _record(table, columns, settings)
+    with naming(path):
+        table, columns = _table(text, settings.columns)
+        record, notes = _record(table, columns, settings)
     sha256, spreads = text.sha256, named.scale_spreads(columns, settings.columns)
-    advice = partial(named.sign_advice, table, columns, settings.columns)
+    of_force: Callable[[str], str] = partial(named.sign_advice, table, columns, settings.columns)
+    of_motion = of_force
     if settings.motion is not None:
-        moved = _read_motion(path, toml, settings)
-        try:
-            record, more = join(record, moved.frames)
-        except InputError as error:
-            raise InputError(f"{toml}: {error}") from None
-        notes, spreads = [*notes, *moved.notes, *more], spreads | moved.spreads
-        sha256 = hashlib.sha256(f"{sha256} {moved.sha256}".encode()).hexdigest()
-        advice = partial(_advice_of, advice, moved.advice)
-    try:
+        frames, told, scales, digest, of_motion = _read_motion(path, toml, settings)
+        with naming(toml):
+            record, more = join(record, frames)
+        notes, spreads = [*notes, *told, *more], spreads | scales
+        sha256 = hashlib.sha256(f"{sha256} {digest}".encode()).hexdigest()
+    with naming(path):
         test = condition(
             record,
             settings.specimen,
             striker=settings.striker,
             window=window,
-            advice=advice,
+            advice=lambda c: (of_motion if c.startswith("displacement") else of_force)(c),
             spread=settings.uncertainties.get("velocity", 0.0),
         )
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
         size, sigma = float(np.ptp(test.channels()[channel])), getattr(settings.noise, channel)
         if sigma is not None and sigma > size:
@@ -144,44 +140,48 @@ def read_test(
                 f"{percent(sigma / size, 3)} of the range of the measured {channel}, "
                 f"{engineering(size, unit)}; give one standard deviation."
             )
-    spreads |= settings.uncertainties
-    test = replace(test, name=settings.name, path=path, data_sha256=sha256, uncertainties=spreads)
-    noise = replace(settings.noise, estimated=test.noise.estimated)
-    test = replace(test, noise=noise, priors=settings.priors)
-    return with_noise(replace(test, notes=(*notes, *test.notes)))
+    test = replace(
+        test,
+        name=settings.name,
+        path=path,
+        data_sha256=sha256,
+        uncertainties=spreads | settings.uncertainties,
+        noise=replace(settings.noise, estimated=test.noise.estimated),
+        priors=settings.priors,
+        notes=(*notes, *test.notes),
+    )
+    return with_noise(test)
+
+
+def _table(text: Text, given: dict[str, Column]) -> tuple[Table, dict[str, int]]:
+    """Find the table of a file, and which column each channel is in."""
+    table = find_table(text, {column.column for column in given.values()})
+    return table, named.assign_columns(table, given)
 
 
 def read_history(path: Path, channel: str) -> tuple[Array, Array]:
     """Read time and one other channel of a table in SI; a column without a unit is in SI."""
     wanted = f"a CSV with the columns 'time (ms)' and '{example(channel)}'"
-    table = find_table(read_text(path, wanted), set())
-    found = named.assign_columns(table, {}, None)
-    for name in ("time", channel):
-        if name not in found:
-            raise InputError(f"{path}: has no column for the {name}; it must be {wanted}.")
-    columns = {name: found[name] for name in ("time", channel)}
-    numbers, _ = read_numbers(table, columns)
-    rows = table.row_numbers(len(numbers["time"]))
-    _check_time(table, numbers["time"], table.headers[columns["time"]].text, rows)
-    for name, k in columns.items():
-        header = table.headers[k]
-        in_si = Column(header.text, CHANNELS[name].si) if header.unit is None else None
-        numbers[name] = numbers[name] * named.si_factor(table, name, k, in_si)
+    text = read_text(path, wanted)
+    with naming(path):
+        table, found = _table(text, {})
+        for name in ("time", channel):
+            if name not in found:
+                raise InputError(f"has no column for the {name}; it must be {wanted}.")
+        columns = {name: found[name] for name in ("time", channel)}
+        numbers, rows, _ = read_numbers(table, columns)
+        _check_time(numbers["time"], table.headers[columns["time"]].text, rows)
+        for name, k in columns.items():
+            header = table.headers[k]
+            in_si = Column(header.text, CHANNELS[name].si) if header.unit is None else None
+            numbers[name] = numbers[name] * named.si_factor(table, name, k, in_si)
     return numbers["time"], numbers[channel]
 
 
-class _Moved(NamedTuple):
-    """What the file of [motion] holds; `advice` is that of `sign_advice`."""
-
-    frames: Frames
-    notes: list[str]
-    spreads: dict[str, float]
-    sha256: str
-    advice: Callable[[str], str]
-
-
-def _read_motion(path: Path, toml: Path, settings: Settings) -> _Moved:
-    """Read the motion from the file that [motion] names; `path` is that of the force."""
+def _read_motion(
+    path: Path, toml: Path, settings: Settings
+) -> tuple[Frames, list[str], dict[str, float], str, Callable[[str], str]]:
+    """Read the file that [motion] names: frames, notes, spreads, digest, advice on signs."""
     motion = settings.motion
     assert motion is not None  # else there is nothing to read
     name = motion.file.name
@@ -191,10 +191,10 @@ def _read_motion(path: Path, toml: Path, settings: Settings) -> _Moved:
         )
     text = read_text(motion.file, f"in [motion] file of {toml.name} the CSV file of the motion")
     try:
-        table = find_table(text, {column.column for column in motion.columns.values()})
-        columns = named.assign_columns(table, motion.columns, toml)
-        needed = named.motion_columns(table, columns)
-        numbers, _, dropped, notes = _channels(table, needed, motion.columns, settings)
+        with naming(motion.file):
+            table, columns = _table(text, motion.columns)
+            needed = named.motion_columns(table, columns)
+            numbers, _, dropped, notes = _channels(table, needed, motion.columns, settings)
     except InputError as error:
         raise InputError(_of_motion(str(error))) from None
     notes += [f"Not used: {item}." for item in dropped]
@@ -202,7 +202,7 @@ def _read_motion(path: Path, toml: Path, settings: Settings) -> _Moved:
     assert top is not None  # see motion_columns
     inside = {interior_channel(k): w for k, w in _inside(numbers, top, notes).items()}
     spread, moved = settings.uncertainties.get("delay"), {"displacement": top} | inside
-    return _Moved(
+    return (
         Frames(name, numbers["time"], moved, motion.delay, spread),
         [f"{name}: {note}" for note in notes],
         named.scale_spreads(needed, motion.columns),
@@ -213,11 +213,6 @@ def _read_motion(path: Path, toml: Path, settings: Settings) -> _Moved:
 
 def _of_motion(text: str) -> str:
     return text.replace("[columns]", "[motion.columns]")
-
-
-def _advice_of(force: Callable[[str], str], motion: Callable[[str], str], channel: str) -> str:
-    """Advice on a channel by the file that it was read from."""
-    return (motion if channel.startswith("displacement") else force)(channel)
 
 
 def _record(table: Table, columns: dict[str, int], settings: Settings) -> tuple[Record, list[str]]:
@@ -271,17 +266,16 @@ def _channels(
     """Channels of a table in SI, the numbers of their rows, the rows left out, and notes."""
     table, dropped = without_cut_row(table)
     factors = {c: named.si_factor(table, c, k, given.get(c)) for c, k in needed.items()}
-    numbers, empty = read_numbers(table, needed)
-    count = len(next(iter(numbers.values())))
-    if count < MIN_ROWS:
-        raise InputError(f"{table.path}: has fewer than {MIN_ROWS} rows; a test needs more.")
+    numbers, rows, empty = read_numbers(table, needed)
+    if rows.size < MIN_ROWS:
+        raise InputError(f"has fewer than {MIN_ROWS} rows; a test needs more.")
     notes = [named.read_note(table, needed, given)]
     for channel, values in numbers.items():
         header = table.headers[needed[channel]]
-        column, measure = f"{table.path}: column {header.text!r}", header.measure(channel)
+        column, measure = f"column {header.text!r}", header.measure(channel)
         if np.ptp(values) == 0:
             raise InputError(f"{column} is constant; a {channel} must vary.")
-        numbers[channel] = _nominal(table.path, measure, values * factors[channel])
+        numbers[channel] = _nominal(measure, values * factors[channel])
         if not 1.0 / LARGEST < np.max(np.abs(numbers[channel])) < LARGEST:
             raise InputError(
                 f"{column} is up to {np.max(np.abs(values)):.3g} in the file, which is no "
@@ -292,27 +286,26 @@ def _channels(
     # An instrument's header may announce the number of samples.
     for row, line in enumerate(table.raw.split(b"\n", table.first_row)[: table.first_row], 1):
         match = re.match(rb"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE)
-        if match and int(match[1]) != count:
-            told = f"announces {int(match[1])} samples, the table has {count}"
+        if match and int(match[1]) != rows.size:
+            told = f"announces {int(match[1])} samples, the table has {rows.size}"
             notes.append(f"Check: row {row} {told}.")
             break
-    rows = table.row_numbers(count, empty)
     if empty.size:
         dropped.append(Dropped.of(empty, "nothing in the columns that are read"))
     if "time" in numbers:
         if settings.duplicates == "average":
             numbers, rows = _averaged(numbers, rows, dropped, notes)
-        _check_time(table, numbers["time"], table.headers[needed["time"]].text, rows)
+        _check_time(numbers["time"], table.headers[needed["time"]].text, rows)
     return numbers, rows, dropped, notes
 
 
-def _nominal(path: Path, measure: str, strain: Array) -> Array:
+def _nominal(measure: str, strain: Array) -> Array:
     """Engineering strain of one of another measure, all positive in compression."""
     if measure == "logarithmic":
         return 1.0 - np.exp(-strain)
     if measure and strain.max() >= 0.5:
         raise InputError(
-            f"{path}: the {measure} strain reaches {strain.max():.3g}; in compression it stays "
+            f"the {measure} strain reaches {strain.max():.3g}; in compression it stays "
             "below 0.5, so that the column must hold another strain or have another unit."
         )
     return 1.0 - np.sqrt(1.0 - 2.0 * strain) if measure else strain
@@ -331,7 +324,7 @@ def _compare(
         try:
             values = read_numbers(table, {channel: k})[0][channel]
             values = values * named.si_factor(table, channel, k, None)
-            values = _nominal(table.path, table.headers[k].measure(channel), values)
+            values = _nominal(table.headers[k].measure(channel), values)
         except InputError:  # it could not have been read
             continue
         used = named.TWINS.get(channel, channel)
@@ -350,7 +343,7 @@ def _compare(
             by = engineering(float(np.ptp(values - one)), "s")
             if settings.striker is not None:
                 raise InputError(
-                    f"{table.path}: {both} by {by}; name the right one in [columns], or put a "
+                    f"{both} by {by}; name the right one in [columns], or put a "
                     "motion with its own clock into a file of its own ([motion])."
                 )
             notes.append(f"Check: {both} by {by}; the first is used.")
@@ -388,7 +381,7 @@ def _averaged(
     return means | {"time": time[starts]}, rows[starts]
 
 
-def _check_time(table: Table, time: Array, name: str, rows: NDArray[np.int64]) -> None:
+def _check_time(time: Array, name: str, rows: NDArray[np.int64]) -> None:
     """Refuse a time that does not increase."""
     back = np.flatnonzero(np.diff(time) <= 0)
     if back.size:
@@ -399,7 +392,7 @@ def _check_time(table: Table, time: Array, name: str, rows: NDArray[np.int64]) -
             wrong = "repeats"
         elif len(back) > len(time) / 2:
             more = "; as the record runs backwards, turn the order of its rows round"
-        where = f"{table.path}: row {rows[i]}, column {name!r}"
+        where = f"row {rows[i]}, column {name!r}"
         raise InputError(f"{where}: time {wrong}; it must increase from row to row{more}.")
 
 

@@ -90,10 +90,7 @@ def find_cycles(record: Record) -> list[Cycle]:
 
 
 def choose_cycles(cycles: list[Cycle], number: int | None, last: int | None) -> Cycle | None:
-    """Return a cycle, or several as one history; InputError if they are not there.
-
-    Without a number it is the first one.
-    """
+    """Return a cycle, by default the first, or several as one history; InputError without them."""
     first = _choose(cycles, number)
     if last is None or last == number:
         return first
@@ -156,29 +153,15 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> tuple[Rec
     return record.between(start, end, f"before cycle {number}", after), notes
 
 
-@dataclass(frozen=True)
-class Reload:
-    """Contact of a later cycle: its `time`, s (or sample), and the displacement there, m.
-
-    `offset` (Pa) is what the sensor shows without load.
-    """
-
-    time: float
-    displacement: float
-    offset: float
-
-
 def cut_to_reload(
-    record: Record, cycles: list[Cycle], cycle: Cycle, height: float
-) -> tuple[Record, Reload, list[str]]:
+    record: Record, cycles: list[Cycle], cycle: Cycle, height: float, origins: dict[str, float]
+) -> tuple[Record, list[str]]:
     """Cut a later cycle to its contact, with time, displacement and stress zero where it starts.
 
     The specimen is free or least loaded at the lowest displacements between the cycles. Contact is
-    where a straight line through the early rise meets the level there: the hinge of least squares
-    from the rest up to a small share of the peak, so that noise does not shift it. It ends where
-    the stress is back at that level. A level below zero is the sensor's: a foam does not pull its
-    platen for long. The displacement was zero at the first contact: what the foam has not recovered
-    since is taken off, and said as a strain.
+    where a straight line through the early rise meets the level there; it ends where the stress is
+    back at that level. A level below zero is the sensor's: a foam does not pull its platen long.
+    What is taken off joins the `origins`, the strain that has not recovered as "start_strain".
     """
     w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
     turn, end_of = cycle.last_top, number if cycle.last is None else cycle.last
@@ -204,10 +187,11 @@ def cut_to_reload(
     time = passed(record.instants)
     moment = "" if record.time is None else f" {engineering(time, 's')} in the file,"
     notes = [
+        *cut_to_cycle(record, cycles, cycle)[1],
         f"Contact of cycle {number} starts{moment} where the stress rises from its level between "
         f"the cycles, at a strain of {percent(contact / height)} from the first contact (start "
         f"strain, not recovered), which is taken off; {first - cycle.first} samples before and "
-        f"{cycle.end - end} after, where the stress has gone back to that level, are cut."
+        f"{cycle.end - end} after, where the stress has gone back to that level, are cut.",
     ]
     loaded = (level - offset) / (float(stress[top]) - offset)
     if offset < 0.0:
@@ -230,8 +214,11 @@ def cut_to_reload(
     cut = moved.without(slice(cycle.end, None), f"after cycle {end_of}")
     cut = cut.without(slice(end, None), "after contact ends")
     cut = cut.without(slice(cycle.first, first), "before contact starts")
-    cut = cut.without(slice(0, cycle.first), f"before cycle {number}")
-    return cut, Reload(time, contact, offset), notes
+    origins["start_strain"] = contact / height
+    origins["stress_zero"] += offset
+    origins["displacement_zero"] += contact
+    origins |= {} if record.time is None else {"contact_time": time}
+    return cut.without(slice(0, cycle.first), f"before cycle {number}"), notes
 
 
 def _hinge(w: Array, stress: Array) -> float:
@@ -289,10 +276,7 @@ def cycles_of(test: Measurement) -> dict[int, slice]:
 
 
 def _reversals(displacement: Array) -> list[tuple[int, int, bool]]:
-    """Pairs of turns between which one loading and unloading is reversed, and if while loading.
-
-    Before the peak that is each valley after a peak, after it each peak after a valley.
-    """
+    """Pairs of turns between which one loading and unloading is reversed, and if while loading."""
     turns = find_turns(displacement).tolist()
     peak = int(np.argmax(displacement[turns]))
     places = *range(0, peak, 2), *range(peak + 1, len(turns) - 1, 2)
@@ -300,10 +284,7 @@ def _reversals(displacement: Array) -> list[tuple[int, int, bool]]:
 
 
 def inner_loops(displacement: Array) -> list[tuple[int, int]]:
-    """Samples (first, past the last) in which one loading and unloading is partly reversed.
-
-    A reversal lasts until the motion is past the place again where it turned.
-    """
+    """Samples (first, past the last) from each reversal until the motion is back there."""
     out = list[tuple[int, int]]()
     for start, turn, loading in _reversals(displacement):
         ahead, level = displacement[turn:], displacement[start]

@@ -42,10 +42,7 @@ def describe(test: Measurement, audit: EnergyAudit) -> str:
 
 
 def taken_for_exact(test: Measurement) -> dict[str, str]:
-    """Quantities of the TOML that have no ±, and what 1 % of each does, the most telling first.
-
-    A slow test has no use for a striker, unless its mass made the stress.
-    """
+    """Quantities of the TOML that have no ±, and what 1 % of each does, the most telling first."""
     striker, effects = test.striker or Striker(), dict[str, str]()
     impact = test.time is not None and striker.mass and striker.velocity
     for name, (of_impact, of_slow) in EFFECTS.items():

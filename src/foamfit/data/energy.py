@@ -169,10 +169,9 @@ def audit(measurement: Measurement) -> EnergyAudit:
 
 
 def largest_motion(displacement: Array, time: Array | None = None) -> tuple[int, float]:
-    """Find the turn of a motion: the largest of its samples would be the largest of its noise.
+    """Find the turn of a motion: its sample and the displacement there.
 
-    A quartic is fitted to the samples that the noise could confuse with the turn; where they are
-    few, the largest sample is the turn. Returns that sample and the displacement there.
+    The largest sample has the largest noise: a quartic is fitted to those that may be the turn.
     """
     floor = displacement.max() - 8.0 * noise_level(displacement)
     near = np.flatnonzero(displacement >= floor)

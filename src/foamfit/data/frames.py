@@ -53,14 +53,9 @@ def join(record: Record, frames: Frames) -> tuple[Record, list[str]]:
     """Give a record of a force the motion of frames that have a clock of their own.
 
     Where frames are the rarer ones, a cubic spline through them gives the motion at every sample;
-    the sample nearest to a frame counts as measured, no other does. Else they are averaged or
-    interpolated for each sample, and all count. Frames that stand out as spikes are left out, and
-    so are samples outside of the frames' time.
-
-    Raises
-    ------
-    InputError
-        Where the two do not overlap in time, or the delay is longer than both.
+    only the sample nearest to a frame counts as measured. Else they are averaged or interpolated
+    for each sample, and all count. Spikes and samples outside of the frames' time are left out.
+    InputError if the two do not overlap in time, or the delay is longer than both.
     """
     time = record.time
     assert time is not None  # a force without it is refused
@@ -143,8 +138,8 @@ def _averaged(at: Array, values: Array, time: Array) -> Array:
 def frames_of_blocks(record: Record, thinned: Record, edges: NDArray[np.int64]) -> Record:
     """Put channels that were not taken at every sample into the blocks that begin at `edges`.
 
-    A block has a frame, and the value that is interpolated at its own time, so that no average
-    bends it; where each block has several frames it is their average after all.
+    The value of a block is interpolated at its time, so that no average bends it, or, where each
+    block has several frames, averaged.
     """
     middle = np.add.reduceat(record.instants, edges) / np.diff(np.append(edges, len(record)))
     for name, taken in record.sampled.items():

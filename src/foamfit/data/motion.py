@@ -103,12 +103,12 @@ class _Fit:
 
     samples: _Samples
     instants: Array
-    columns: Array
+    beside: Array | None = None
 
-    @classmethod
-    def of(cls, samples: _Samples, instants: Array) -> _Fit:
-        """Kinks at some instants."""
-        return cls(samples, instants, _kinks(samples.x, instants))
+    @cached_property
+    def columns(self) -> Array:
+        kinks = _kinks(self.samples.x, self.instants)
+        return kinks if self.beside is None else self.beside
 
     @cached_property
     def onto(self) -> Array:
@@ -186,7 +186,7 @@ class _Fit:
         for _ in range(steps if self.instants.size else 0):
             before, step = level, fit.step(penalty)
             for part in (1.0, 0.4, 0.1):
-                trial = _Fit.of(self.samples, np.clip(fit.instants + part * step, x[1], x[-2]))
+                trial = _Fit(self.samples, np.clip(fit.instants + part * step, x[1], x[-2]))
                 if trial.apart and (better := trial.unlikely(at)[0]) < level:
                     level, fit = better, trial
                     break
@@ -244,13 +244,13 @@ def _with_more(fit: _Fit) -> _Fit:
         two = level + 2.0 * s.price - (gain + gain.T - 2.0 * gram * np.outer(q, q)) / det
         if two.min() < best:
             best, more = two.min(), spots[list(np.unravel_index(int(np.argmin(two)), two.shape))]
-    return _Fit.of(s, np.sort(np.append(fit.instants, more)))
+    return _Fit(s, np.sort(np.append(fit.instants, more)))
 
 
 def _find_kinks(samples: _Samples) -> _Fit:
     """Find the kinks, from those at likely turns or from none, then drop needless ones."""
-    none = _Fit.of(samples, np.empty(0))
-    turned = _Fit.of(samples, _likely_turns(samples)).settled(none.best[1])
+    none = _Fit(samples, np.empty(0))
+    turned = _Fit(samples, _likely_turns(samples)).settled(none.best[1])
     fit = min(none, turned, key=lambda f: f.best[0])
     while fit.instants.size < min(_KINKS, samples.x.size // 8):
         trial = _with_more(fit).settled(fit.best[1])
@@ -259,7 +259,7 @@ def _find_kinks(samples: _Samples) -> _Fit:
         fit = trial
     while fit.instants.size:
         rest = [np.delete(fit.instants, i) for i in range(fit.instants.size)]
-        likely = sorted((_Fit.of(samples, r) for r in rest), key=lambda f: f.best[0])[:2]
+        likely = sorted((_Fit(samples, r) for r in rest), key=lambda f: f.best[0])[:2]
         trial = min((f.settled(fit.best[1]) for f in likely), key=lambda f: f.best[0])
         if trial.best[0] > fit.best[0]:
             break
@@ -288,7 +288,7 @@ def _fitted(x: Array, y: Array, pieces: int) -> tuple[_Fit, float]:
     found = _find_kinks(coarse)
     samples = coarse if block == 1 else _Samples.of(x, y, pieces)
     penalty = block * found.best[1]
-    fit = _Fit.of(samples, found.instants).refined(penalty, 20)
+    fit = _Fit(samples, found.instants).refined(penalty, 20)
     finer = penalty * np.geomspace(0.03, 30.0, 21)
     return fit, float(finer[np.argmin(fit.unlikely(finer, restricted=True))])
 
@@ -308,7 +308,6 @@ class _Modes:
     kinks: Array
 
     def __call__(self, x: Array) -> Array:
-        """Return the modes at (n,) places, (n, m), m."""
         where, stderr, jump, before = self.kinks
         late = x[:, None] - where
         # A kink that may lie on either side of a sample moves it by a part of the jump.
@@ -322,8 +321,8 @@ class SmoothMotion:
 
     Attributes
     ----------
-    turns, turns_stderr : (k,) arrays
-        Instants at which the motion turns round and their standard errors, s.
+    turns : (k,) array
+        Instants at which the motion turns round, s.
     sigma : float
         Standard deviation of the noise, m.
     dof : float
@@ -331,7 +330,6 @@ class SmoothMotion:
     """
 
     turns: Array
-    turns_stderr: Array
     sigma: float
     dof: float
     _curve: PPoly
@@ -438,10 +436,9 @@ def _motion(
     x = np.union1d(x, x[back] + part * np.diff(x)[back])
     values, velocities = middle + bend(x) + _kinks(x, instants) @ jumps, velocity(x)
     turns = _turns(x, values, modes, (1e-300, 2.0 * unit))
-    stderr = _turns_stderr(x, turns, velocities, modes)
     curve, (start, duration) = _monotone(x, values, velocities, turns), span
     at = start + duration * x[turns[1:-1]]
-    return SmoothMotion(at, duration * stderr, sigma, dof, curve, modes, start, duration)
+    return SmoothMotion(at, sigma, dof, curve, modes, start, duration)
 
 
 def _exact(times: Array, values: Array, sigma: float) -> SmoothMotion:
@@ -457,10 +454,8 @@ def _exact(times: Array, values: Array, sigma: float) -> SmoothMotion:
         order = np.argsort(np.append(x, more), kind="stable")
         x, values = np.append(x, more)[order], np.append(values, heights)[order]
     turns, slopes = _turns(x, values, modes, bounds), np.gradient(values, x)
-    curve, at = _monotone(x, values, (slopes, slopes), turns), turns[1:-1]
-    gap = 0.5 * duration * (x[at + 1] - x[at - 1])
-    at_times = start + duration * x[at]
-    return SmoothMotion(at_times, gap, sigma, float(x.size), curve, modes, start, duration)
+    curve, at = _monotone(x, values, (slopes, slopes), turns), start + duration * x[turns[1:-1]]
+    return SmoothMotion(at, sigma, float(x.size), curve, modes, start, duration)
 
 
 def _corner(x: Array, y: Array, i: int, off: float) -> tuple[float, float] | None:
@@ -507,22 +502,6 @@ def _turns(
         high = values[at[i]] > values[at[i - 1]]
         at[i] = at[i - 1] + int(np.argmax(part) if high else np.argmin(part))
     return at
-
-
-def _turns_stderr(
-    x: Array, turns: NDArray[np.int64], velocities: tuple[Array, Array], modes: _Modes
-) -> Array:
-    """Standard errors of turns: of a kink's instant, or of where the velocity is zero."""
-    before, after = velocities
-    out = []
-    for i in turns[1:-1]:
-        kinked = np.flatnonzero(modes.kinks[0] == x[i])
-        step = 1e-3
-        bend = abs(before[i + 1] - after[i - 1]) / (x[i + 1] - x[i - 1])
-        slope = np.diff(modes(x[i] + np.array([-step, step])), axis=0) / (2.0 * step)
-        smooth = float(np.linalg.norm(slope)) / max(bend, 1e-300)
-        out.append(modes.kinks[1, kinked[0]] if kinked.size else min(smooth, 1.0))
-    return np.array(out)
 
 
 def _monotone(

@@ -106,12 +106,6 @@ def noise_level(values: Array) -> float:
     return float(1.4826 * np.median(np.abs(np.diff(values, 2))) / np.sqrt(6))
 
 
-def lag_one(residual: Array) -> float:
-    """Autocorrelation from one sample to the next; 0 for no residual at all."""
-    square = float(residual @ residual)
-    return float(residual[1:] @ residual[:-1]) / square if square > 0.0 else 0.0
-
-
 def correlation_time(phi: float) -> float:
     """Autocorrelation time, in samples, of a noise with the autocorrelation φ^k."""
     return (1.0 + phi) / (1.0 - phi)
@@ -127,10 +121,9 @@ def estimated_noise(values: Array, what: str = "samples") -> NoiseLevel:
 def noise_before_contact(
     whole: dict[str, Array], n: int, curves: dict[str, Array], block: int
 ) -> dict[str, NoiseLevel]:
-    """Noise of channels from their `n` samples before contact, about a line or a cubic, if so many.
+    """Noise of channels from their `n` samples before contact, about a line or a cubic.
 
-    The `curves` during contact are means of `block` samples; where the noise that they show
-    contradicts, it is the answer.
+    The `curves` during contact, means of `block` samples, decide where their noise contradicts.
     """
     found = dict[str, NoiseLevel]()
     for name, values in ((c, v[:n]) for c, v in whole.items() if n >= MIN_REST):
@@ -158,7 +151,7 @@ def _noise_about(values: Array, degree: int) -> tuple[float, float]:
 
 def _time_shown(residual: Array) -> float:
     """Correlation time, in samples, if the residual shows a significant one, else 1."""
-    phi = lag_one(residual)
+    phi = float(residual[1:] @ residual[:-1]) / max(float(residual @ residual), 1e-300)
     return correlation_time(phi) if 2 / np.sqrt(residual.size) < phi < 1 else 1.0
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Outliers, Record, Standstill
-from foamfit.data.noise import estimated_noise, noise_level, robust_variance
+from foamfit.data.noise import estimated_noise, noise_level, quantum, robust_variance
 from foamfit.text import counted, engineering, percent
 
 # An outlier is off by this many standard deviations of its leave-one-out residual, and by this
@@ -54,14 +54,10 @@ _FOLLOWS, _SURE, _AROUND = 0.5, 3.0, 3.0
 def find_outliers(values: Array, time: Array | None = None) -> NDArray[np.bool_]:
     """Isolated samples that no smooth signal with this noise can hold: spikes and gaps.
 
-    Gaps are up to five samples between two opposite jumps of ten times the median jump nearby. Then
-    each sample is predicted by the cubic through its eight neighbours: it is an outlier if it is
-    off by four standard deviations of that prediction, as seen over the whole record, while the
-    neighbours agree among themselves and the lines from either side do not lead to it.
-
-    `values` and `time` have the shape (n,); without a time the samples are evenly spaced. Nothing
-    is judged across a pause, and of a channel that is held for some samples at a time only gaps.
-    If more than 2 % of the samples stand out, none is an outlier.
+    Gaps are up to five samples between two opposite jumps of ten times the median jump nearby. A
+    spike is off the cubic through its eight neighbours by four standard deviations, while these
+    agree among themselves and the lines from either side do not lead to it. Nothing is judged
+    across a pause, and of a held channel only gaps. If more than 2 % stand out, none is an outlier.
     """
     n = values.size
     if n < 30:
@@ -143,8 +139,7 @@ def _spikes(
 def _cubics(time: Array, even: bool) -> tuple[Array, Array]:
     """Weights (samples, windows) of "sample minus local cubic", and those of the middle samples.
 
-    They are zero and one where nothing is judged: across a pause, and where the middle sample
-    alone holds the cubic.
+    They are zero and one across a pause, and where the middle sample alone holds the cubic.
     """
     windows = _windows(time)[: 1 if even else None]  # even ones are all the same
     weights = np.empty((_WIDTH, len(windows)))
@@ -232,15 +227,15 @@ def outliers_of_blocks(record: Record, block: int) -> dict[str, Outliers]:
         if values is not None and at.size:
             file = values[at] + excess[at]
             found[name] = Outliers(share(excess != 0.0) > 0.5, record.instants[at], file)
-    still, clipped, top = record.stood_still, record.clipped, float(record.stress.max())
-    for name, left_out, clipped_at in (
-        ("displacement", share(still) > 0.5, None),
-        *([] if clipped is None else [("stress", share(clipped) > 0.0, top)]),
-    ):
-        if left_out.any() or (clipped_at is None and still.any()):
-            spikes = found.get(name) or Outliers(np.zeros_like(left_out), none, none)
-            wrong = spikes.left_out | left_out
-            found[name] = replace(spikes, left_out=wrong, clipped_at=clipped_at)
+    left_out, clipped_at = dict[str, NDArray[np.bool_]](), None
+    if record.stood_still.any():
+        left_out["displacement"] = share(record.stood_still) > 0.5
+    if record.clipped is not None and record.clipped.any():
+        left_out["stress"], clipped_at = share(record.clipped) > 0.0, float(record.stress.max())
+    for name, wrong in left_out.items():
+        spikes = found.get(name) or Outliers(np.zeros_like(wrong), none, none)
+        top = clipped_at if name == "stress" else None
+        found[name] = replace(spikes, left_out=spikes.left_out | wrong, clipped_at=top)
     return found
 
 
@@ -274,21 +269,19 @@ def is_staircase(values: Array) -> bool:
 
 
 def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
-    """Noise of the displacements that are held, from the samples where they are fresh.
-
-    That of a channel with a clock of its own is that of its frames.
-    """
+    """Noise of displacements from their fresh samples, or from the frames of their own clock."""
     levels = {}
     for name, values in record.curves().items():
         if name in record.sampled:
             frames = values[record.sampled[name]]
             level = estimated_noise(frames, "frames on their own clock")
             levels[name] = replace(level, time=level.time * len(values) / len(frames))
-            continue
-        fresh = values[fresh_samples(values)[0]]
-        if name != "stress" and is_staircase(values) and len(fresh) >= MIN_ROWS:
-            level = estimated_noise(fresh, "fresh samples")
-            levels[name] = replace(level, time=len(values) / len(fresh))
+        elif name != "stress" and is_staircase(values):
+            fresh = values[fresh_samples(values)[0]]
+            if len(fresh) >= MIN_ROWS:
+                levels[name] = replace(
+                    estimated_noise(fresh, "fresh samples"), time=len(values) / len(fresh)
+                )
     return levels
 
 
@@ -330,12 +323,9 @@ class _Gauge:
 def find_standstills(record: Record) -> list[tuple[int, int]]:
     """Find where the gauge of a slow test stands still and then jumps.
 
-    Each is the last sample before the stretch and the first after the jump. The displacement stands
-    still, with the specimen in contact and a stress that changes, then jumps by more than the
-    motion goes on with, and the stress does not follow the jump. Nothing is found where the noise
-    or the digitiser's step is too large to tell.
-
-    The displacement is taken as it was recorded: a held one is not yet interpolated.
+    Returns the last sample before each stretch and the first after its jump: the specimen is in
+    contact and its stress changes, but does not follow the jump, with which the motion does not go
+    on. A displacement that is held at each reading is not yet interpolated.
     """
     w = record.displacement
     if w is None or len(w) < 4 * _SAMPLES:
@@ -366,17 +356,7 @@ def _jumps(at: _Gauge, width: int) -> dict[int, int]:
     # The window of sample i ends with it.
     shift: Any = {"size": width, "origin": (width - 1) // 2, "mode": "nearest"}
     range_before = maximum_filter1d(w, **shift) - minimum_filter1d(w, **shift)
-    size = float(np.ptp(w))
-    gaps, digit = (
-        np.diff(np.unique(w)),
-        0.0,
-    )  # of levels, nearly all multiples of a digitiser's step
-    gaps = gaps[gaps > 1e-6 * size]
-    if gaps.size:
-        step = float(np.quantile(gaps, 0.1, method="nearest"))  # below it a few that were bridged
-        off = np.abs(gaps / step - np.rint(gaps / step))
-        digit = step if float(np.mean(off < 0.05)) > 0.8 else 0.0
-    least = max(_LEAP * size, _ABOVE_NOISE * at.noise, _DIGITS * digit)
+    least = max(_LEAP * float(np.ptp(w)), _ABOVE_NOISE * at.noise, _DIGITS * quantum(w))
     found = dict[int, int]()
     for length in range(_LONGEST, 0, -1):  # the shortest counts
         last = np.arange(width - 1, n - length)
@@ -394,27 +374,23 @@ def _stress_goes_on(at: _Gauge, before: int, last: int) -> bool:
     """Whether the specimen is loaded while the gauge stands, by a stress that changes."""
     stress = at.stress[before : last + 1]
     size, low = float(np.ptp(at.stress)), float(np.quantile(at.stress, 0.01))
-    changes, part = _changes(stress)
+    change, part = _change(stress)
     error = noise_level(stress) * np.sqrt(2.0 / part)
-    changed = max(map(abs, changes)) >= max(_CHANGE * size, _SURE * error)
+    changed = abs(change) >= max(_CHANGE * size, _SURE * error)
     return bool(changed and np.median(stress) - low >= _CONTACT * size)
 
 
-def _changes(stress: Array) -> tuple[tuple[float, float], int]:
-    """By how much a stress has risen from its lowest, and fallen from its highest, in the end.
-
-    These are means of so many samples.
-    """
+def _change(stress: Array) -> tuple[float, int]:
+    """Rise of a stress from its lowest, or fall from its highest, by means of so many samples."""
     part = max(stress.size // 4, _SAMPLES // 2)
     mean = np.convolve(stress, np.full(part, 1.0 / part), "valid")
-    return (float(mean[-1] - mean.min()), float(mean[-1] - mean.max())), part
+    return max(float(mean[-1] - mean.min()), float(mean[-1] - mean.max()), key=abs), part
 
 
 def _follows(at: _Gauge, before: int, last: int, after: int) -> bool:
-    """Whether the stress changes as it would by a motion as large as the jump, or this is unknown.
+    """Whether the stress leaves its trend as by a motion as large as the jump, or this is unknown.
 
-    What it does is compared with its trend while the gauge stood; a gauge that is read at steps may
-    show a motion a step late.
+    A gauge that is read at steps may show a motion a step late.
     """
     w, stress = at.w, at.stress
     # As long as the displacement stays where it jumped to.
@@ -454,8 +430,7 @@ def bridge_standstills(record: Record, found: list[tuple[int, int]]) -> Record:
     standstills = []
     for before, after in found:
         stress = record.stress[before:after]
-        (rise, fall), _ = _changes(stress)
-        change = (rise if rise > -fall else fall) / float(np.abs(stress).max())
+        change = _change(stress)[0] / float(np.abs(stress).max())
         first, last = int(numbers[before + 1]), int(numbers[after - 1])
         standstills.append(Standstill(first, last, change, float(w[after] - w[before])))
         inside, ends = slice(before + 1, after), [before, after]
@@ -476,10 +451,7 @@ def standstill_notes(record: Record, height: float) -> list[str]:
 
 
 def standstill_spans(record: Record, block: int) -> tuple[tuple[float, float], ...]:
-    """First and last instant of each stretch in what is left of a record, s or blocks of samples.
-
-    Blocks are what is left of samples where there are many; without a time they are counted.
-    """
+    """First and last instant of each stretch in what is left, s or blocks of samples."""
     instants = record.instants if record.time is not None else record.instants // block
     there = [instants[one.among(record.row_numbers)] for one in record.standstills]
     return tuple((float(at[0]), float(at[-1])) for at in there if at.size)

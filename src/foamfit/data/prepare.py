@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from foamfit.data import outliers as spoilt
 from foamfit.data import zeros
 from foamfit.data.contact import (
     STILL_MOTION,
-    Levels,
     Start,
     leave_rest,
     start_of_impact,
@@ -99,16 +97,20 @@ def condition(
     first = cut_to_cycle(record, cycles, cycles[0])[0] if cycles else record
     curves = first.curves("acceleration")
     levels = {c: estimated_noise(v) for c, v in curves.items()} | held
+    used = chosen or Cycle(number=1, place=0, first=0, top=0, end=len(record))
     if impact:
-        start, span, more = _impact(first, levels, known, spread)
-        notes += more
-    else:
-        start, span = _slow_test(record, first, cycles, chosen, levels)
+        start = start_of_impact(first, levels)
+        start = replace(start, gauge=zeros.gauge_before(first, start, levels, known))
+        span = zeros.Span.of_impact(first, start, levels)
+        notes += zeros.flight_notes(first, start, span, levels, known, spread)
+    else:  # its first cycle shows the start
+        start = start_of_slow_test(first, levels)
+        end = len(first) if used.place else used.end - used.first
+        span = zeros.Span(start.first, end, start.resting, end)
     record, found = zeros.take_zeros(record, first, start, span, levels, impact=impact)
     notes += found.notes
-    later = chosen if chosen is not None and chosen.place else None  # with a contact of its own
-    if later:
-        record = done(_later_cycle(record, cycles, later, specimen, found.origins))
+    if used.place:  # with a contact of its own
+        record = done(cut_to_reload(record, cycles, used, specimen.height, found.origins))
     else:
         record = done(cut_to_cycle(record, cycles, chosen)) if chosen else record
         record = done(cut_to_contact(record, start, span, found.origins))
@@ -117,13 +119,10 @@ def condition(
     record, motion = integrate_motion(record, specimen, known)
     if impact:
         record = done(start_within_height(record, specimen, known, motion, found.origins))
-    notes += checks(
-        record, specimen, known, motion, several=chosen is not None and chosen.last is not None
-    )
+    notes += checks(record, specimen, known, motion, several=used.last is not None)
     whole, record = record, done(thin(record))
     block = -(-len(whole) // len(record))
-    resting = max(0, start.first - 2) if start.free else 0
-    noise = noise_before_contact(curves, resting, record.curves("acceleration"), block)
+    noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
     outliers = spoilt.outliers_of_blocks(whole, block)
     timed = record.time is not None
@@ -137,9 +136,11 @@ def condition(
         notes=tuple(notes),
         interior=record.interior,
         outliers=outliers,
-        contact="stress" if later else start.by,
+        contact="stress" if used.place else start.by,
         count=count_rows(whole, outliers, block),
-        **_numbers(cycles, chosen),
+        cycle=used.number,
+        cycles=tuple(cycle.number for cycle in cycles) or (1,),
+        last_cycle=used.last,
         start_strain=found.origins.pop("start_strain", 0.0),
         sampled=record.sampled,
         zeros=found.errors,
@@ -150,48 +151,6 @@ def condition(
         block=block,
         standstills=spoilt.standstill_spans(whole, block),
     )
-
-
-def _impact(
-    record: Record, levels: Levels, striker: Striker, spread: float
-) -> tuple[Start, zeros.Span, list[str]]:
-    """Start of an impact, the rows around it, and what its free flight says."""
-    start = start_of_impact(record, levels)
-    start = replace(start, gauge=zeros.gauge_before(record, start, levels, striker))
-    span = zeros.Span.of_impact(record, start, levels)
-    return start, span, zeros.flight_notes(record, start, span, levels, striker, spread)
-
-
-def _slow_test(
-    record: Record, first: Record, cycles: list[Cycle], chosen: Cycle | None, levels: Levels
-) -> tuple[Start, zeros.Span]:
-    """Start of a slow test, which its first cycle shows, and the rows around it."""
-    start = start_of_slow_test(first, levels)
-    begun = chosen is not None and not chosen.place  # with the first contact
-    kept = cut_to_cycle(record, cycles, chosen)[0] if chosen and begun else first
-    return start, zeros.Span.of_slow_test(kept, start)
-
-
-def _numbers(cycles: list[Cycle], chosen: Cycle | None) -> dict[str, Any]:
-    """Numbers of the cycles of a record, and of those that are used."""
-    if chosen is None:
-        return {}
-    numbers = tuple(cycle.number for cycle in cycles)
-    return {"cycle": chosen.number, "cycles": numbers, "last_cycle": chosen.last}
-
-
-def _later_cycle(
-    record: Record, cycles: list[Cycle], cycle: Cycle, specimen: Specimen, origins: dict[str, float]
-) -> tuple[Record, list[str]]:
-    """Cut a later cycle to its own contact; what is taken off there joins the `origins`."""
-    notes = cut_to_cycle(record, cycles, cycle)[1]
-    cut, at, more = cut_to_reload(record, cycles, cycle, specimen.height)
-    origins["start_strain"] = at.displacement / specimen.height
-    origins["stress_zero"] += at.offset
-    origins["displacement_zero"] += at.displacement
-    if record.time is not None:
-        origins["contact_time"] = at.time
-    return cut, notes + more
 
 
 def cut_to_contact(
@@ -263,10 +222,9 @@ def check_signs(record: Record, advice: Callable[[str], str] | None) -> None:
 
 
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tuple[Record, str]:
-    """Integrate a displacement that was not measured: from acceleration, velocity or force.
+    """Integrate a motion that was not measured: w(0) = 0, w'(0) = v, and w'' = −a or −σA/m.
 
-    w(0) = 0, w'(0) is the striker's velocity, w'' = −a or −σA/m; a channel is linear between
-    samples.
+    A channel is linear between samples.
     """
     if record.displacement is not None:
         return replace(record, acceleration=None), MEASURED
@@ -344,10 +302,7 @@ def stress_of_motion(
 def start_within_height(
     record: Record, specimen: Specimen, striker: Striker, motion: str, origins: dict[str, float]
 ) -> tuple[Record, list[str]]:
-    """Move the start of an impact if its motion goes a little farther than the height.
-
-    It started too early by then: contact is as much later as the motion goes too far.
-    """
+    """Move the start of an impact that was too early: its motion goes farther than the height."""
     w, most = record.displacement, 0.97 * specimen.height
     assert w is not None  # measured or integrated by now
     assert record.time is not None  # it is an impact

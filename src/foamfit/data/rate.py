@@ -22,10 +22,8 @@ _COPIES, _NORMAL = 30, 0.6745
 def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None:
     """Mean strain rate on loading, from contact to the largest strain, 1/s; None without time.
 
-    The peak is in the middle of the samples that noise alone may keep from being the largest: on a
-    flat top the largest one lies anywhere. Where the motion is held there, loading ends at the
-    start of that. The displacement that was `fitted` (m), where the drive does not prescribe it,
-    has no noise, and is taken instead of the measured one.
+    The peak is in the middle of the samples that noise alone may keep from being the largest, or at
+    the start of a hold. A displacement that was `fitted` (m) has no noise and is taken instead.
     """
     if test.time is None or test.displacement is None:
         return None

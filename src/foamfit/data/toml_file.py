@@ -15,9 +15,8 @@ from __future__ import annotations
 
 import difflib
 import math
-import re
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,19 +24,17 @@ from typing import Any, NamedTuple
 from foamfit.data.measurement import Noise, Specimen, Striker, Window, interior_node
 from foamfit.data.units import (
     is_unit,
-    no_spread,
+    parse_quantity,
     parse_uncertain,
     split_quantity,
     split_uncertain,
 )
-from foamfit.errors import InputError
+from foamfit.errors import InputError, naming
 from foamfit.files import read_whole
 from foamfit.terminal import printable
 
 _LARGEST = 1_000_000  # characters of a TOML
 LONGEST = 200  # characters of a name
-# Many keys that are joined by dots.
-_DOTTED = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
 
 
 class _Quantity(NamedTuple):
@@ -61,13 +58,28 @@ _SECTIONS = {
         "velocity": _Quantity("m/s", "1.75 m/s", "velocity"),
     },
     "noise": {"stress": _Quantity("Pa", "20 kPa"), "displacement": _Quantity("m", "2 um")},
+    "window": {"start": _Quantity("s", "0.5 ms"), "end": _Quantity("s", "2 ms")},
+    "data": {},
+}
+
+
+def is_range(cycles: Any) -> bool:
+    """Whether a value has the numbers of a first and a last cycle."""
+    if not isinstance(cycles, tuple | list) or len(cycles) != 2:
+        return False
+    return all(type(one) is int and one > 0 for one in cycles)
+
+
+# Keys that are no quantities: what they may be, and how that is told.
+_OTHERS: dict[str, dict[str, tuple[Callable[[Any], bool], str]]] = {
     "window": {
-        "start": _Quantity("s", "0.5 ms"),
-        "end": _Quantity("s", "2 ms"),
-        "cycle": _Quantity("", "1"),
-        "cycles": _Quantity("", "[1, 3]"),
+        "cycle": (lambda v: type(v) is int and v > 0, "a whole number from 1 up"),
+        "cycles": (is_range, "the numbers of the first and the last one, like [1, 3]"),
     },
-    "data": {"duplicates": _Quantity("", "average"), "sheet": _Quantity("", "Sheet1")},
+    "data": {
+        "duplicates": (lambda v: v in ("average", "refuse"), "one of average, refuse"),
+        "sheet": (lambda v: isinstance(v, str), 'a name, like "Sheet1"'),
+    },
 }
 _SCALE = "4444.4 N/V"
 # What is read from the file of [motion], beside displacements of masses inside.
@@ -138,10 +150,7 @@ def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
     if len(raw) > _LARGEST:
         raise InputError(f"{path}: has {len(raw)} characters; a TOML must have {_LARGEST} at most.")
     try:
-        text = raw.decode("utf-8-sig")
-        if _DOTTED.search(text):  # tomllib takes a time that grows with the square of their number
-            raise RecursionError
-        return tomllib.loads(text)
+        return tomllib.loads(raw.decode("utf-8-sig"))
     except RecursionError:
         raise InputError(f"{path}: is nested too deeply; write a TOML of few levels.") from None
     except UnicodeDecodeError:
@@ -155,8 +164,8 @@ def check_keys(where: str, given: Iterable[str], valid: Iterable[str]) -> None:
     valid = list(valid)
     for key in given:
         if key not in valid:
-            near = difflib.get_close_matches(key[:LONGEST], valid, n=2, cutoff=0.4) or valid
-            key = key if len(key) <= LONGEST else f"{key[:LONGEST]} …"
+            key = key[:LONGEST]
+            near = difflib.get_close_matches(key, valid, n=2, cutoff=0.4) or valid
             raise InputError(f"{where} has no key {key!r}; meant may be {', '.join(near)}.")
 
 
@@ -168,110 +177,86 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     """
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
     check_keys(f"{path}:", document, ["name", "columns", "motion", "priors", *_SECTIONS])
-    values: dict[str, dict[str, Any]] = {}
-    spreads: dict[str, float] = {}
-    for section, keys in _SECTIONS.items():
-        table = document.get(section, {})
-        if not isinstance(table, dict):
-            raise InputError(f"{path}: {section} must be a table, [{section}].")
-        check_keys(f"{path}: [{section}]", table, keys)
-        values[section] = {k: _value(path, section, k, v, spreads) for k, v in table.items()}
-    name = document.get("name", printable(toml_beside(test).stem))
-    if not isinstance(name, str) or not name.strip():
-        raise InputError(f"{path}: name = {name!r} is no text; give it in quotation marks.")
-    if len(name) > LONGEST:
-        many = f"name has {len(name)} characters; it must have {LONGEST} at most"
-        raise InputError(f"{path}: {many}.")
-    for code in (f"U+{ord(c):04X}" for c in name if not c.isprintable()):
-        raise InputError(f"{path}: name has a control character, {code}; write it in plain text.")
-    return Settings(
-        name=name,
-        specimen=_specimen(path, values["specimen"], spreads),
-        striker=Striker(**values["striker"]) if values["striker"] else None,
-        noise=Noise(**values["noise"]),
-        window=_window(path, values["window"]),
-        columns=_columns(path, document.get("columns", {}), channels),
-        uncertainties=spreads,
-        motion=_motion(path, document["motion"], spreads) if "motion" in document else None,
-        priors=_priors(path, document.get("priors", {})),
-        **values["data"],
-    )
+    with naming(path):
+        spreads: dict[str, float] = {}
+        values: dict[str, dict[str, Any]] = {}
+        for section, keys in _SECTIONS.items():
+            table, others = _table(document, section), _OTHERS.get(section, {})
+            check_keys(f"[{section}]", table, [*keys, *others])
+            values[section] = {k: _value(section, k, v, spreads) for k, v in table.items()}
+        name = document.get("name", printable(toml_beside(test).stem))
+        if not (isinstance(name, str) and name.strip() and name.isprintable()):
+            raise InputError(f"name = {name!r} must be a printable text in quotation marks.")
+        if len(name) > LONGEST:
+            raise InputError(f"name has {len(name)} characters; it must have {LONGEST} at most.")
+        priors, window = _table(document, "priors"), values["window"]
+        for key, value in priors.items():  # the model, which is not known here, says which
+            if not isinstance(value, str):
+                raise InputError(f'[priors] {key} = {value!r} must be like "5.5 ± 0.1 MPa".')
+        if {"cycle", "cycles"} <= window.keys():
+            raise InputError("[window] has both cycle and cycles; give one of them.")
+        if "cycles" in window:
+            window["cycle"], window["last"] = window.pop("cycles")
+        return Settings(
+            name=name,
+            specimen=_specimen(values["specimen"], spreads),
+            striker=Striker(**values["striker"]) if values["striker"] else None,
+            noise=Noise(**values["noise"]),
+            window=Window(**window),
+            columns=_columns(_table(document, "columns"), channels),
+            uncertainties=spreads,
+            motion=_motion(path, document, spreads),
+            priors=priors,
+            **values["data"],
+        )
 
 
-def _priors(path: Path, table: Any) -> dict[str, str]:
-    """Texts by parameter; the model, which is not known here, says which there are."""
+def _table(document: dict[str, Any], name: str, within: str = "") -> dict[str, Any]:
+    table = document.get(name, {})
     if not isinstance(table, dict):
-        raise InputError(f"{path}: priors must be a table, [priors].")
-    for key, value in table.items():
-        if not isinstance(value, str):
-            told = f'{path}: [priors] {key} = {value!r} must be a text like "5.5 ± 0.1 MPa"'
-            raise InputError(f"{told}.")
+        raise InputError(f"{within}{name} must be a table, [{within}{name}].")
     return table
 
 
-def is_range(cycles: Any) -> bool:
-    """Whether a value has the numbers of a first and a last cycle."""
-    if not isinstance(cycles, tuple | list) or len(cycles) != 2:
-        return False
-    return all(type(one) is int and one > 0 for one in cycles)
-
-
-def _window(path: Path, values: dict[str, Any]) -> Window:
-    first, last = values.pop("cycles", (values.get("cycle"), None))
-    if last is not None and "cycle" in values:
-        raise InputError(f"{path}: [window] has both cycle and cycles; give one of them.")
-    return Window(**{**values, "cycle": first, "last": last})
-
-
-def _value(path: Path, section: str, key: str, value: Any, spreads: dict[str, float]) -> Any:
+def _value(section: str, key: str, value: Any, spreads: dict[str, float]) -> Any:
     """Check and return what a key says, in SI, and put its ± into `spreads`."""
-    si, example, spread = _SECTIONS[section][key]
-    where, wrong = f"{path}: [{section}] {key}", ""
-    if key == "cycle" and (type(value) is not int or value < 1):
-        wrong = f"= {value!r} must be a whole number from 1 up"
-    elif key == "cycles" and not is_range(value):
-        wrong = f"= {value!r} must be the numbers of the first and the last one, like [1, 3]"
-    elif key == "duplicates" and value not in ("average", "refuse"):
-        wrong = f"= {value!r} must be one of average, refuse"
-    elif key == "heights" and (not isinstance(value, list) or not value):
-        wrong = 'must be a list like ["0.700 mm", "0.490 mm"], base first'
-    elif key == "sheet" and not isinstance(value, str):
-        wrong = f'= {value!r} must be a name, like "Sheet1"'
-    if wrong:
-        raise InputError(f"{where} {wrong}.")
-    if key in ("cycle", "cycles", "duplicates", "sheet"):
+    where, several = f"[{section}] {key}", key == "heights"
+    if (other := _OTHERS.get(section, {}).get(key)) is not None:
+        if not other[0](value):
+            raise InputError(f"{where} = {value!r} must be {other[1]}.")
         return value
+    if several and (not isinstance(value, list) or not value):
+        raise InputError(f'{where} must be a list like ["0.700 mm", "0.490 mm"], base first.')
+    si, example, spread = _SECTIONS[section][key]
     numbers = []
-    for i, v in enumerate(value if key == "heights" else [value], 1):
-        number, sigma = parse_uncertain(v, si, where, example)
-        if sigma is not None and not spread:
-            raise no_spread(where, v, example)
-        if sigma:
-            spreads[f"{spread}_{i}" if key == "heights" else spread] = sigma
+    for i, v in enumerate(value if several else [value], 1):
+        if spread:
+            number, sigma = parse_uncertain(v, si, where, example)
+            spreads |= {f"{spread}_{i}" if several else spread: sigma} if sigma else {}
+        else:
+            number = parse_quantity(v, si, where, example)
         if section != "window" and not 0.0 < number < math.inf:
             raise InputError(f'{where} = "{v}" must be positive.')
         numbers.append(number)
-    return tuple(numbers) if key == "heights" else numbers[0]
+    return tuple(numbers) if several else numbers[0]
 
 
-def _specimen(path: Path, values: dict[str, Any], spreads: dict[str, float]) -> Specimen:
-    size = "diameter" in values or "area" in values
+def _specimen(values: dict[str, Any], spreads: dict[str, float]) -> Specimen:
+    size = 'a diameter = "5 mm" or an area = "19.6 mm^2"'
     if "height" not in values:
-        also, it = ("", "it") if size else (", and so is diameter or area", "them")
-        right = 'height = "1.19 mm"' + ("" if size else ', diameter = "5 mm"')
-        raise InputError(f"{path}: [specimen] height is missing{also}; give {it} like {right}.")
+        raise InputError(f'[specimen] height is missing; give it like "1.19 mm", and {size}.')
+    if not values.keys() & {"diameter", "area"}:
+        raise InputError(f"[specimen] needs {size}.")
     diameter, spread = values.pop("diameter", None), spreads.pop("diameter", 0.0)
-    if not size:
-        raise InputError(f'{path}: [specimen] needs a diameter = "5 mm" or an area = "19.6 mm^2".')
     if diameter is not None:
         area = math.pi * diameter**2 / 4
         if not math.isclose(values.setdefault("area", area), area, rel_tol=0.02):
-            raise InputError(f"{path}: [specimen] area and diameter disagree; give one of them.")
+            raise InputError("[specimen] area and diameter disagree; give one of them.")
         if spread:
             spreads.setdefault("area", 2.0 * values["area"] * spread / diameter)
     heights = values.get("heights")
     if heights and not math.isclose(sum(heights), values["height"], rel_tol=0.02):
-        raise InputError(f"{path}: [specimen] heights must add up to height.")
+        raise InputError("[specimen] heights must add up to height.")
     return Specimen(**values)
 
 
@@ -291,53 +276,48 @@ def _file(toml: Path, table: Any) -> Path | None:
     return toml.parent / name
 
 
-def _motion(path: Path, table: Any, spreads: dict[str, float]) -> Motion:
-    file = _file(path, table)
+def _motion(path: Path, document: dict[str, Any], spreads: dict[str, float]) -> Motion | None:
+    if "motion" not in document:
+        return None
+    table, file = document["motion"], _file(path, document["motion"])
     if isinstance(table, dict):
-        check_keys(f"{path}: [motion]", table, ["file", "delay", "columns"])
+        check_keys("[motion]", table, ["file", "delay", "columns"])
     if file is None:
-        raise InputError(f'{path}: [motion] must name a file, like file = "camera.csv".')
-    columns = _columns(path, table.get("columns", {}), MOTION_CHANNELS, "motion.columns")
-    given, where = table.get("delay", "0 s"), f"{path}: [motion] delay"
-    delay, sigma = parse_uncertain(given, "s", where, "0 ± 50 us", zero=True)
-    if sigma:
-        spreads["delay"] = sigma
+        raise InputError('[motion] must name a file, like file = "camera.csv".')
+    columns = _columns(_table(table, "columns", "motion."), MOTION_CHANNELS, "motion.columns")
+    given = table.get("delay", "0 s")
+    delay, sigma = parse_uncertain(given, "s", "[motion] delay", "0 ± 50 us", zero=True)
+    spreads |= {"delay": sigma} if sigma else {}
     return Motion(file, columns, delay)
 
 
 def _columns(
-    path: Path, table: Any, channels: Iterable[str], name: str = "columns"
+    table: dict[str, Any], channels: Iterable[str], name: str = "columns"
 ) -> dict[str, Column]:
-    if not isinstance(table, dict):
-        raise InputError(f"{path}: {name} must be a table, [{name}].")
-    inside = [key for key in table if interior_node(key)]
-    check_keys(f"{path}: [{name}]", table, [*channels, *inside])
+    check_keys(f"[{name}]", table, [*channels, *filter(interior_node, table)])
     columns: dict[str, Column] = {}
     for channel, spec in table.items():
-        where = f"{path}: [{name}] {channel}"
+        where, inside = f"[{name}] {channel}", interior_node(channel) is not None
         column = spec.get("column") if isinstance(spec, dict) else None
         if not (isinstance(column, str) or (type(column) is int and column > 0)):
-            raise InputError(
-                f'{where} must be like {{ column = "Load", unit = "V" }}, or with a number, '
-                "column = 2."
-            )
-        motion = channel == "displacement" or interior_node(channel) is not None
-        check_keys(where, spec, ["column", "unit", "scale", *(["counts_down"] if motion else [])])
-        down = spec.get("counts_down", False)
-        if not isinstance(down, bool):
+            right = '{ column = "Load", unit = "V" }, or with a number, column = 2'
+            raise InputError(f"{where} must be like {right}.")
+        turned = ["counts_down"] if inside or channel == "displacement" else []
+        check_keys(where, spec, ["column", "unit", "scale", *turned])
+        down, unit, scale = (spec.get(key) for key in ("counts_down", "unit", "scale"))
+        if not isinstance(down, bool | None):
             raise InputError(f"{where}: counts_down = {down!r} must be true or false.")
-        unit = spec.get("unit")
         if unit is not None and (not isinstance(unit, str) or not is_unit(unit)):
             raise InputError(f'{where}: unit = {unit!r} is unknown; give it like unit = "mm".')
-        scale = spec.get("scale", 1)
-        parts = split_quantity(split_uncertain(str(scale))[0])
+        text = "1" if scale is None else str(scale)
+        parts = split_quantity(split_uncertain(text)[0])
         if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not is_unit(parts[1]):
             raise InputError(f'{where}: scale = {scale!r} must be like -1 or "{_SCALE}".')
-        _, sigma = parse_uncertain(str(scale), parts[1], f"{where}: scale", _SCALE)
-        if sigma is not None and (channel in ("time", "cycle") or interior_node(channel)):
-            raise InputError(
-                f"{where}: scale = {scale!r} has a ±, which has no meaning there; give it without."
-            )
-        spread = (sigma or 0.0) / abs(parts[0])
-        columns[channel] = Column(column, unit, *parts, down, spread)
+        if inside or channel in ("time", "cycle"):  # a ± has no meaning there
+            parse_quantity(text, parts[1], f"{where}: scale", _SCALE)
+            spread = 0.0
+        else:
+            sigma = parse_uncertain(text, parts[1], f"{where}: scale", _SCALE)[1]
+            spread = (sigma or 0.0) / abs(parts[0])
+        columns[channel] = Column(column, unit, *parts, bool(down), spread)
     return columns

@@ -76,14 +76,9 @@ def parse_quantity(value: object, si: str, where: str, example: str) -> float:
     """Read a quantity such as "1.19 mm" in the unit `si`; `where` and `example` are for errors."""
     number, sigma = parse_uncertain(value, si, where, example)
     if sigma is not None:
-        raise no_spread(where, value, example)
+        wrong = f'{where} = "{value}" has a ±, which has no meaning there'
+        raise InputError(f'{wrong}; give it like "{example}".')
     return number
-
-
-def no_spread(where: str, value: object, example: str) -> InputError:
-    """Say that a quantity must not have a standard deviation."""
-    wrong = f'{where} = "{value}" has a ±, which has no meaning there'
-    return InputError(f'{wrong}; give it like "{example}".')
 
 
 def parse_uncertain(

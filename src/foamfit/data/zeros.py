@@ -35,12 +35,6 @@ class Span:
     returned: bool = True
 
     @classmethod
-    def of_slow_test(cls, record: Record, start: Start) -> Span:
-        """Keep a slow test from its contact on; nothing else shows that the specimen was free."""
-        n = len(record)
-        return cls(start.first, n, max(0, start.first - 2) if start.free else 0, n)
-
-    @classmethod
     def of_impact(cls, record: Record, start: Start, levels: Levels) -> Span:
         """Keep a tenth of the rows of contact before it, a fiftieth after it.
 
@@ -215,10 +209,7 @@ def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker)
 
 
 def mark_flight(record: Record, start: Start, span: Span) -> Record:
-    """Mark the rows outside of contact in which the motion is not the striker's as not measured.
-
-    Three rows or so about contact, which may be earlier or later, are not measured either.
-    """
+    """Mark rows in which the motion is not the striker's, or may not be yet, as not measured."""
     if record.displacement is None or start.gauge in ("flight", ""):
         return record
     step = float(np.median(np.diff(record.instants)))
@@ -232,10 +223,7 @@ def mark_flight(record: Record, start: Start, span: Span) -> Record:
 def flight_notes(
     record: Record, start: Start, span: Span, levels: Levels, striker: Striker, spread: float
 ) -> list[str]:
-    """Compare the striker's flight before contact with its velocity ± `spread`, m/s.
-
-    An acceleration near that of gravity is said, too: no law here has it.
-    """
+    """Compare the striker's flight with its velocity ± `spread`, m/s; name gravity if it acts."""
     n, w, given, notes = start.first - 2, record.displacement, striker.velocity, list[str]()
     if w is None or not given or n < 8:
         return notes

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import tomli_w
 
-from foamfit.cli.fitting import cycles_of
+from foamfit.cli.fit import cycles_of
 from foamfit.data.csv_file import read_test
 from foamfit.data.describe import describe
 from foamfit.data.energy import audit

@@ -236,7 +236,7 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
 def _run(job: Job) -> tuple[str, str]:
     """Fit and write the result; return "" or why the fit failed, and the text on cycles."""
     try:
-        from foamfit.cli.fitting import fit_as_asked
+        from foamfit.cli.fit import fit_as_asked
         from foamfit.report.studies.cycles import cycles_text
         from foamfit.results import Fit
         from foamfit.solve.precompile import at_first_use

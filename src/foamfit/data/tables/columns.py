@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 
@@ -22,13 +21,13 @@ TWINS = {"stress": "force", "force": "stress", "displacement": "strain", "strain
 _SOURCES = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
 
 
-def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) -> dict[str, int]:
+def assign_columns(table: Table, given: dict[str, Column]) -> dict[str, int]:
     """Which column each channel is in: as [columns] of the TOML says, else as the headers do."""
     found: dict[str, int] = {}
     strained = "strain" in given or any(h.rank("strain") is not None for h in table.headers)
     for channel in _channels(table, given):
         if channel in given:
-            found[channel] = _place(table, channel, given[channel].column, toml)
+            found[channel] = _place(table, channel, given[channel].column)
             continue
         ranks = {k: r for k, h in enumerate(table.headers) if (r := h.rank(channel)) is not None}
         if interior_node(channel):  # a column that the TOML calls the top is not inside
@@ -42,9 +41,9 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
         if len(best) > 1:
             both = " and ".join(map(table.name, best))
             entry = f"{channel} = {{ column = {quoted(table, best[0])} }}"
-            more = f", or write {entry} in [columns] of {toml.name}" if toml else ""
             raise InputError(
-                f"{table.path}: columns {both} could both be the {channel}; keep one{more}."
+                f"columns {both} could both be the {channel}; keep one, or write {entry} in "
+                "[columns]."
             )
         if best and not (ranks[best[0]] == WEAK and strained):
             found[channel] = best[0]
@@ -66,23 +65,19 @@ def _channels(table: Table, given: dict[str, Column]) -> list[str]:
     return [*CHANNELS, *sorted(inside, key=lambda c: (c not in given, interior_node(c) or 0))]
 
 
-def _place(table: Table, channel: str, column: str | int, toml: Path | None) -> int:
+def _place(table: Table, channel: str, column: str | int) -> int:
     """Place of a column that the TOML gives by its header or its number."""
-    where, count = f"{toml}: [columns] {channel}: column", len(table.headers)
     if isinstance(column, int):
-        if column <= count:
-            return column - 1
-        raise InputError(
-            f"{where} {column} is not in {table.path.name}, which has {count} columns."
-        )
-    places = [k for k, h in enumerate(table.headers) if h.is_named(column)]
+        places = [column - 1] if column <= len(table.headers) else []
+    else:
+        places = [k for k, h in enumerate(table.headers) if h.is_named(column)]
     if len(places) == 1:
         return places[0]
-    more = f"nowhere in {table.path.name}, which has {table.listed}"
-    if places:
-        numbers = " or ".join(str(k + 1) for k in places)
-        more = f"twice in {table.path.name}; give its number, column = {numbers}"
-    raise InputError(f"{where} {column!r} is {more}.")
+    numbers = " or ".join(str(k + 1) for k in places)
+    more = f"twice in it; give its number, column = {numbers}"
+    if not places:
+        more = f"nowhere in it, which has {len(table.headers)} columns: {table.listed}"
+    raise InputError(f"[columns] {channel}: column {column!r} is {more}.")
 
 
 def quoted(table: Table, k: int) -> str:
@@ -95,7 +90,7 @@ def quoted(table: Table, k: int) -> str:
 def _clear_time(table: Table, columns: list[int]) -> list[int]:
     """Of several columns that could be the time keep the one that never goes back, if it is one."""
     try:
-        numbers, _ = read_numbers(table, {str(k): k for k in columns})
+        numbers = read_numbers(table, {str(k): k for k in columns})[0]
     except InputError:  # tests of different lengths, side by side
         return columns
     steps = {k: np.diff(numbers[str(k)]) for k in columns}
@@ -108,7 +103,7 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
     header, given = table.headers[k], given or _NONE
     if channel == "cycle":  # counted; pint takes "Cycles" in a header for a unit of angle
         return 1.0
-    right, where = example(channel), f"{table.path}: column {table.name(k)}"
+    right, where = example(channel), f"column {table.name(k)}"
     if header.measure(channel) and channel == "stress":
         raise InputError(
             f"{where} is a {header.measure(channel)} stress, which needs the cross-section of each "
@@ -167,10 +162,9 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
     if not forced and not ("time" in has and braked and striker.mass):
         entries = entries_of(table, has, "force", "displacement", "time")
         raise InputError(
-            f"{table.path}: no column is a stress or a force (there are {table.listed}); name one "
-            f"like 'stress (MPa)', or write {entries} in [columns]; "
-            "with a time and the [striker] mass an acceleration or a velocity will do, and with "
-            "its velocity a displacement."
+            f"no column is a stress or a force (there are {table.listed}); name one like 'stress "
+            f"(MPa)', or write {entries} in [columns]; with a time and the [striker] mass an "
+            "acceleration or a velocity will do, and with its velocity a displacement."
         )
     if motion is not None:
         _check_motion(table, columns, motion.file.name)
@@ -187,9 +181,9 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
     if "time" not in has or not sources:
         timed = "" if "time" in has else f"{entries_of(table, has, 'time')} there, and "
         raise InputError(
-            f"{table.path}: no column is a displacement or a strain (there are {table.listed}); "
-            f"name one like 'displacement (mm)', or write {entries_of(table, has, 'displacement')} "
-            f"in [columns], or give {timed}the [striker] mass and velocity to integrate the motion."
+            f"no column is a displacement or a strain (there are {table.listed}); name one like "
+            f"'displacement (mm)', or write {entries_of(table, has, 'displacement')} in [columns], "
+            f"or give {timed}the [striker] mass and velocity to integrate the motion."
         )
     return {c: k for c, k in columns.items() if c in has}
 
@@ -199,14 +193,12 @@ def _check_motion(table: Table, columns: dict[str, int], name: str) -> None:
     own = [c for c in columns if c in _MOTIONS or interior_node(c)]
     if own:
         raise InputError(
-            f"{table.path}: column {table.headers[columns[own[0]]].text!r} is a {own[0]}, but "
-            f"[motion] file = {name!r} has the motion; leave one of them out."
+            f"column {table.headers[columns[own[0]]].text!r} is a {own[0]}, but [motion] file = "
+            f"{name!r} has the motion; leave one of them out."
         )
     if "time" not in columns:
-        raise InputError(
-            f"{table.path}: no column is a time (there are {table.listed}); with [motion] it needs "
-            "one like 'time (ms)'."
-        )
+        told = f"no column is a time (there are {table.listed})"
+        raise InputError(f"{told}; with [motion] it needs one like 'time (ms)'.")
 
 
 def motion_columns(table: Table, columns: dict[str, int]) -> dict[str, int]:
@@ -215,9 +207,8 @@ def motion_columns(table: Table, columns: dict[str, int]) -> dict[str, int]:
     for wanted, names in (("time", ["time"]), ("displacement", _MOTIONS)):
         if not needed.keys() & set(names):
             raise InputError(
-                f"{table.path}: no column is a {' or a '.join(names)} (there are {table.listed}); "
-                f"name one like '{example(wanted)}', or write {wanted} = "
-                f'{{ column = "…", unit = "{CHANNELS[wanted].unit}" }} in [columns].'
+                f"no column is a {' or a '.join(names)} (there are {table.listed}); name one like "
+                f"'{example(wanted)}', or write {entries_of(table, set(), wanted)} in [columns]."
             )
     return needed
 

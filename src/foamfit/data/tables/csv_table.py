@@ -22,7 +22,7 @@ from foamfit.data.tables.headers import CHANNELS, Header, parse_header
 from foamfit.data.tables.layouts import blanks_as_tabs, scope_of, unpacked
 from foamfit.data.toml_file import LONGEST, read_bytes
 from foamfit.data.units import is_unit
-from foamfit.errors import InputError
+from foamfit.errors import InputError, naming
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -72,66 +72,46 @@ class Table(Text):
         return repr(text) if alone else f"{text!r} (number {column + 1})"
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield (row number in the file, cells) of the rows that are not blank."""
-        return (row for row in self._lines() if any(cell.strip() for cell in row[1]))
-
-    def _lines(self) -> Iterator[tuple[int, list[str]]]:
+        """Yield (row number in the file, cells) of the lines that are not blank."""
         file = io.BytesIO(self.raw)
         lines = io.TextIOWrapper(file, self.encoding, errors="replace", newline="")
-        rows = _cells(self.path, lines, self.separator)
-        return (row for row in rows if row[0] > self.first_row)
+        rows = _cells(lines, self.separator)
+        below = (row for row in rows if row[0] > self.first_row)
+        return (row for row in below if len(row[1]) > 1 or "".join(row[1]).strip())
 
     def body(self) -> bytes:
         """Return the rows below the header."""
         return self.raw.split(b"\n", self.first_row)[-1] if self.first_row else self.raw
 
-    def row_numbers(self, count: int, empty: Iterable[int] = ()) -> NDArray[np.int64]:
-        """Return the row numbers in the file of its `count` samples, without the `empty` rows."""
-        body = self.body().rstrip()
-        if body.count(b"\n") + 1 == count:  # without a blank line
-            return np.arange(count, dtype=np.int64) + self.first_row + 1
-        gone = set(empty)
-        numbers = (number for number, _ in self.rows() if number not in gone)
-        return np.fromiter(numbers, np.int64, count)
-
-    def empty_rows(self, columns: Iterable[int]) -> NDArray[np.int64]:
-        """Return the numbers of the rows that have separators, but nothing in some columns."""
-        wanted = list(columns)
-        found = [
-            row
-            for row, cells in self._lines()
-            if len(cells) > 1 and not any(cells[k].strip() for k in wanted if k < len(cells))
-        ]
-        return np.array(found, dtype=np.int64)
-
 
 def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
     """Read a file as text; `wanted` says what the path must be, `sheet` which of a workbook."""
     raw = read_bytes(path, f"give {wanted}")
-    sha256 = hashlib.sha256(raw).hexdigest()
-    raw = unpacked(path, raw, sheet)
-    if not raw.strip():
-        raise InputError(f"{path}: the file is empty; it must hold a header and rows of numbers.")
-    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        raw = raw.decode("utf-16", errors="replace").encode()
-    raw = raw.removeprefix(codecs.BOM_UTF8)
-    if b"\n" not in raw:
-        raw = raw.replace(b"\r", b"\n")
-    if b"\0" in raw:
-        raise InputError(f"{path}: is a binary file; it must be a text table (CSV) or .xlsx.")
+    sha256, encoding = hashlib.sha256(raw).hexdigest(), "utf-8"
+    with naming(path):
+        raw = unpacked(raw, sheet)
+        if not raw.strip():
+            raise InputError("the file is empty; it must hold a header and rows of numbers.")
+        if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            raw = raw.decode("utf-16", errors="replace").encode()
+        raw = raw.removeprefix(codecs.BOM_UTF8)
+        if b"\n" not in raw:
+            raw = raw.replace(b"\r", b"\n")
+        if b"\0" in raw:
+            raise InputError("is a binary file; it must be a text table (CSV) or .xlsx.")
     try:
         raw.decode()
     except UnicodeDecodeError:
-        return Text(path, raw, "latin-1", sha256)
-    return Text(path, raw, "utf-8", sha256)
+        encoding = "latin-1"
+    return Text(path, raw, encoding, sha256)
 
 
 def find_table(text: Text, names: set[str | int]) -> Table:
     """Find separator, header row and decimal sign; `names` are the columns given in the TOML."""
-    path, lines = text.path, io.TextIOWrapper(io.BytesIO(text.raw), text.encoding, newline=None)
+    lines = io.TextIOWrapper(io.BytesIO(text.raw), text.encoding, newline=None)
     head = [line.rstrip("\r\n") for line, _ in zip(lines, range(_HEAD_ROWS), strict=False)]
-    grids = {s: [cells for _, cells in _cells(path, head, s)] for s in _SEPARATORS}
-    whole = path, text.raw, text.encoding, text.sha256
+    grids = {s: [cells for _, cells in _cells(head, s)] for s in _SEPARATORS}
+    whole = text.path, text.raw, text.encoding, text.sha256
     scope = scope_of(grids[","])
     if scope is not None:
         headers, first = tuple(map(parse_header, scope.headers)), scope.rows
@@ -142,33 +122,36 @@ def find_table(text: Text, names: set[str | int]) -> Table:
         rows = (sum(map(_is_sample, grid)) > 2 for grid in grids.values())
         tabbed = None if any(rows) else blanks_as_tabs(text.raw.decode(text.encoding))
         if tabbed is not None:
-            return find_table(Text(path, tabbed.encode(), "utf-8", text.sha256), names)
-    separator, i = found or _above_numbers(path, grids, names)
+            return find_table(Text(text.path, tabbed.encode(), "utf-8", text.sha256), names)
+    separator, i = found or _above_numbers(grids, names)
     grid = grids[separator]
     if i < 0:  # no header
         first = next(k for k, cells in enumerate(grid) if _is_sample(cells))
         headers = tuple(Header(f"column {k}") for k in range(1, len(grid[first]) + 1))
-        decimal = _decimal_sign(path, grid[first:], len(headers), separator)
+        decimal = _decimal_sign(grid[first:], len(headers), separator)
         return Table(*whole, separator, decimal, 0, (), first, headers)
     above = [k for k, cells in enumerate(grid[:i], 1) if _holds_numbers(cells)]
     if len(above) >= MIN_ROWS:
-        where = f"rows {above[0]} to {above[-1]} hold numbers above the header in row {i + 1}"
-        raise InputError(f"{path}: {where}; a file must hold one table with one header.")
-    for k, n in enumerate(map(len, grid[i]), 1):
-        if n > LONGEST:
-            many = f"row {i + 1}: the name of column {k} has {n} characters"
-            raise InputError(f"{path}: {many}; it must have {LONGEST} at most.")
+        raise InputError(
+            f"rows {above[0]} to {above[-1]} hold numbers above the header in row {i + 1}; a file "
+            "must hold one table with one header."
+        )
+    if (longest := max(map(len, grid[i]))) > LONGEST:
+        raise InputError(
+            f"row {i + 1}: the name of a column has {longest} characters; it must have {LONGEST} "
+            "at most."
+        )
     first, texts = _unit_row(grid, i)
     headers = tuple(map(parse_header, texts))
     body = [cells for cells in grid[first:] if any(c.strip() for c in cells)]
     if not body:
-        raise InputError(f"{path}: has a header in row {i + 1} but no rows of numbers below it.")
-    decimal = _decimal_sign(path, body, len(texts), separator)
+        raise InputError(f"has a header in row {i + 1} but no rows of numbers below it.")
+    decimal = _decimal_sign(body, len(texts), separator)
     cells = tuple(cell.strip() for cell in grid[i])
     return Table(*whole, separator, decimal, i + 1, cells, first, headers)
 
 
-def _cells(path: Path, lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
+def _cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the number of the last line of each row, and its cells."""
     reader = csv.reader(lines, delimiter=separator)
     try:
@@ -176,7 +159,7 @@ def _cells(path: Path, lines: Iterable[str], separator: str) -> Iterator[tuple[i
             yield reader.line_num, cells
     except csv.Error:
         cell = f"row {reader.line_num} has a cell of more than {csv.field_size_limit()} characters"
-        raise InputError(f"{path}: {cell}; the file must be a text table (CSV).") from None
+        raise InputError(f"{cell}; the file must be a text table (CSV).") from None
 
 
 def _header_row(grids: dict[str, list[list[str]]], names: set[str]) -> tuple[str, int] | None:
@@ -194,9 +177,7 @@ def _header_row(grids: dict[str, list[list[str]]], names: set[str]) -> tuple[str
     return found
 
 
-def _above_numbers(
-    path: Path, grids: dict[str, list[list[str]]], names: set[str | int]
-) -> tuple[str, int]:
+def _above_numbers(grids: dict[str, list[list[str]]], names: set[str | int]) -> tuple[str, int]:
     """Separator and place of the row above the numbers, -1 where that names no columns.
 
     Without it the TOML must give the columns by their numbers.
@@ -218,11 +199,11 @@ def _above_numbers(
         )
         shown = ", ".join(grid[rows[0]])[:LONGEST]
         raise InputError(
-            f"{path}: no row names the columns above row {rows[0] + 1}, {shown!r}; give their "
-            f"numbers in [columns], like {entries}."
+            f"no row names the columns above row {rows[0] + 1}, {shown!r}; give their numbers in "
+            f"[columns], like {entries}."
         )
     example = "time (ms), stress (MPa), displacement (mm)"
-    raise InputError(f"{path}: no row names the columns; the first must be like '{example}'.")
+    raise InputError(f"no row names the columns; the first must be like '{example}'.")
 
 
 def _score(cells: list[str], names: set[str]) -> int:
@@ -249,7 +230,7 @@ def _is_sample(cells: list[str]) -> bool:
     return 2 * sum(map(_is_number, cells)) > max(sum(c.strip() != "" for c in cells), 3)
 
 
-def _decimal_sign(path: Path, body: list[list[str]], width: int, separator: str) -> str:
+def _decimal_sign(body: list[list[str]], width: int, separator: str) -> str:
     """Comma or point; where the comma separates cells too, the numbers stand in quotation marks."""
     values = [value.strip() for row in body for value in row[:width]]
     commas = [v for v in values if re.fullmatch(r"[+-]?\d*(?:,\d+)+(?:[eE][+-]?\d+)?", v)]
@@ -258,7 +239,7 @@ def _decimal_sign(path: Path, body: list[list[str]], width: int, separator: str)
     thousands = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
     if all(thousands.fullmatch(v) for v in commas):
         raise InputError(
-            f"{path}: {commas[0]!r} may have a decimal comma or a separator of thousands; "
+            f"{commas[0]!r} may have a decimal comma or a separator of thousands; "
             "write the numbers with a decimal point and without separators."
         )
     points = sum("." in v and _is_number(v) for v in values)
@@ -294,49 +275,47 @@ def _below_rule(grid: list[list[str]], i: int) -> int:
 
 def read_numbers(
     table: Table, columns: dict[str, int]
-) -> tuple[dict[str, Array], NDArray[np.int64]]:
-    """Read columns as they stand in the file, and the numbers of rows that are left out as empty.
+) -> tuple[dict[str, Array], NDArray[np.int64], NDArray[np.int64]]:
+    """Read columns as they stand in the file: numbers, their rows, and rows without any of them.
 
     InputError names the first cell that is no number.
     """
-    empty = np.zeros(0, dtype=np.int64)
     try:
-        frame = _frame(table, columns, table.body())
+        frame = _frame(table, columns)
     except ValueError as error:
-        empty = table.empty_rows(columns.values())
-        _refuse_cells(table, columns, set(empty))
-        if not empty.size:
-            raise InputError(f"{table.path}: is no regular table ({error}).") from None
-        lines = table.body().split(b"\n")
-        for number in empty:
-            lines[number - table.first_row - 1] = b""
-        frame = _frame(table, columns, b"\n".join(lines))
-    numbers = {c: frame[str(k)].to_numpy(np.float64) for c, k in columns.items()}
-    too_many = frame[str(len(table.headers))].astype(bool).any()
-    if too_many or not all(np.isfinite(values).all() for values in numbers.values()):
         _refuse_cells(table, columns)
-    for channel, values in numbers.items():
-        _refuse_thousands(table, columns[channel], values)
+        raise InputError(f"is no regular table ({error}).") from None
+    values = {channel: frame[str(k)].to_numpy(np.float64) for channel, k in columns.items()}
+    empty = np.all([np.isnan(one) for one in values.values()], axis=0)
+    rows = table.first_row + 1 + np.arange(len(frame))
+    if table.body().rstrip().count(b"\n") + 1 != len(frame):  # there are blank lines
+        rows = np.fromiter((number for number, _ in table.rows()), np.int64)
+        if rows.size != len(frame):
+            raise InputError("is no regular table; a row must have a cell for each column.")
+    numbers = {channel: one[~empty] for channel, one in values.items()}
+    too_many = frame[str(len(table.headers))].notna().any()
+    if too_many or not all(np.isfinite(one).all() for one in numbers.values()):
+        _refuse_cells(table, columns)
+    for channel, one in numbers.items():
+        _refuse_thousands(table, columns[channel], one)
         if table.clock is not None and columns[channel] == 0:
-            numbers[channel] = table.clock[0] + table.clock[1] * values
-    return numbers, empty
+            numbers[channel] = table.clock[0] + table.clock[1] * one
+    return numbers, rows[~empty], rows[empty]
 
 
 def _refuse_thousands(table: Table, column: int, values: Array) -> None:
     """Refuse numbers whose decimal sign may separate thousands: 998 is followed by 1.002."""
-    size = np.abs(values)
+    size, sign = np.abs(values), table.decimal
     part = size[size != np.round(size)]
     if not part.size or part.min() < 1 or size.max() >= 1000:
         return
-    sign = table.decimal
     cells = [cells[column].strip() for _, cells in table.rows() if column < len(cells)]
     whole = [cell for cell in cells if re.fullmatch(r"[+-]?[1-9]\d{1,2}", cell)]
     parted = [cell for cell in cells if sign in cell]
     if whole and all(re.fullmatch(rf"[+-]?[1-9]\d{{0,2}}\{sign}\d{{3}}", cell) for cell in parted):
         raise InputError(
-            f"{table.path}: column {table.name(column)}: {parted[0]!r} beside numbers like "
-            f"{whole[-1]!r} seems to separate thousands; write the numbers with a decimal point "
-            "and without separators."
+            f"column {table.name(column)}: {parted[0]!r} beside numbers like {whole[-1]!r} seems "
+            "to separate thousands; write the numbers with a decimal point and without separators."
         )
 
 
@@ -367,7 +346,7 @@ def without_cut_row(table: Table) -> tuple[Table, list[Dropped]]:
     ]
 
 
-def _frame(table: Table, columns: dict[str, int], body: bytes) -> pd.DataFrame:
+def _frame(table: Table, columns: dict[str, int]) -> pd.DataFrame:
     """Parse rows of numbers; the columns have their places as names."""
     import pandas as pd
 
@@ -376,33 +355,33 @@ def _frame(table: Table, columns: dict[str, int], body: bytes) -> pd.DataFrame:
     header = table.separator.join(map(str, range(excess + 1))).encode()
     kinds = {str(k): "float64" for k in columns.values()}
     return pd.read_csv(  # its ParserError is a ValueError
-        io.BytesIO(header + b"\n" + body),
+        io.BytesIO(header + b"\n" + table.body()),
         sep=table.separator,
         decimal=table.decimal,
         encoding=table.encoding,
         usecols=[*kinds, str(excess)],
         dtype=kinds | {str(excess): "str"},
-        na_filter=False,
+        keep_default_na=False,
+        na_values=[""],
+        skipinitialspace=True,
         index_col=False,
     )
 
 
-def _refuse_cells(table: Table, columns: dict[str, int], empty: Iterable[int] = ()) -> None:
-    """Find the first bad cell, row by row, and name it; `empty` rows have none."""
+def _refuse_cells(table: Table, columns: dict[str, int]) -> None:
+    """Find the first bad cell, row by row, and name it."""
     count = len(table.headers)
     for row, cells in table.rows():
-        where = f"{table.path}: row {row}"
-        if tuple(cell.strip() for cell in cells) == table.header_cells:
-            again = f"repeats the header of row {table.header_row}"
-            raise InputError(f"{where} {again}; a file must hold one table with one header.")
-        if any(cell.strip() for cell in cells[count:]):
-            many = f"has {len(cells)} cells, but the header has {count}"
-            raise InputError(f"{where} {many}; every row must have as many as the header.")
-        for k in columns.values() if row not in empty else ():
-            cell = cells[k].strip() if k < len(cells) else ""
-            wrong = _wrong(cell, table.decimal)
-            if wrong:
-                raise InputError(f"{where}, column {table.headers[k].text!r} is {wrong}.")
+        cells = [cell.strip() for cell in cells] + [""] * (count - len(cells))
+        if tuple(cells) == table.header_cells:
+            again = f"row {row} repeats the header of row {table.header_row}"
+            raise InputError(f"{again}; a file must hold one table with one header.")
+        if any(cells[count:]):
+            many = f"row {row} has {len(cells)} cells, but the header has {count}"
+            raise InputError(f"{many}; every row must have as many as the header.")
+        for k in columns.values() if any(cells[k] for k in columns.values()) else ():
+            if wrong := _wrong(cells[k], table.decimal):
+                raise InputError(f"row {row}, column {table.headers[k].text!r} is {wrong}.")
 
 
 def _wrong(cell: str, decimal: str) -> str:

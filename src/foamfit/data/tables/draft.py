@@ -38,10 +38,7 @@ _WANTED = {
 
 
 def draft(text: Text) -> tuple[str, list[str]]:
-    """Return the text of a TOML, and those of its lines that must be answered.
-
-    What was understood is filled in; each question is a line behind "# " with an example.
-    """
+    """Return the text of a TOML with questions behind "# ", and those that must be answered."""
     columns, name = _columns(text), printable(toml_beside(text.path).stem[:LONGEST])
     head = (
         f"# {printable(text.path.name)}: what foamfit needs to know of this test.",
@@ -49,8 +46,7 @@ def draft(text: Text) -> tuple[str, list[str]]:
         f"name = {json.dumps(name, ensure_ascii=False)}",
     )
     needed, impact, helps = (
-        (section[0], *(f"# {line}" for line in section[1:]))
-        for section in (_NEEDED, _IMPACT, _HELPS)
+        (title, *(f"# {line}" for line in lines)) for title, *lines in (_NEEDED, _IMPACT, _HELPS)
     )
     parts = [head, needed, impact, ("[columns]", *columns), helps]
     missing = [line.removeprefix("# ") for line in columns if "  # needed" in line]
@@ -74,7 +70,7 @@ def _columns(text: Text) -> list[str]:
     """Lines of [columns]: those that the headers answer, and the others as questions."""
     try:
         table = find_table(text, set())
-        found = assign_columns(table, {}, None)
+        found = assign_columns(table, {})
     except InputError as error:
         told = f"# {printable(' '.join(str(error).split()))}"
         entries = (f'{n[0]} = {{ column = "…", unit = "{CHANNELS[n[0]].unit}" }}' for n in _WANTED)
@@ -87,7 +83,7 @@ def _columns(text: Text) -> list[str]:
             si_factor(table, channel, k, None)
             lines.append(f"{name} }}")
         except InputError as error:
-            why = str(error).partition(": column ")[2].partition(";")[0]
+            why = str(error).removeprefix("column ").partition(";")[0]
             lines.append(f'# {name}, unit = "{channel_of(channel).unit}" }}  # needed: {why}')
     others = [k for k in range(len(table.headers)) if k not in found.values()]
     for names, what in _WANTED.items():

@@ -7,7 +7,6 @@ import io
 import re
 import warnings
 import zlib
-from pathlib import Path
 from statistics import mode
 from typing import NamedTuple
 
@@ -33,25 +32,23 @@ class Scope(NamedTuple):
     clock: tuple[float, float] | None = None
 
 
-def unpacked(path: Path, raw: bytes, sheet: str | None) -> bytes:
+def unpacked(raw: bytes, sheet: str | None) -> bytes:
     """Return the text in the bytes of a file: of a .gz what it holds, of an .xlsx one sheet."""
     if raw.startswith(b"\x1f\x8b"):
         try:
             raw = gzip.GzipFile(fileobj=io.BytesIO(raw)).read(_LARGEST + 1)
         except (OSError, EOFError, zlib.error) as error:
-            raise InputError(f"{path}: is no whole gzip file ({error}); pack it again.") from None
+            raise InputError(f"is no whole gzip file ({error}); pack it again.") from None
         if len(raw) > _LARGEST:
-            raise InputError(
-                f"{path}: unpacks to more than {_LARGEST >> 20} MB; cut it to the test."
-            )
+            raise InputError(f"unpacks to more than {_LARGEST >> 20} MB; cut it to the test.")
     if raw.startswith(b"PK\x03\x04"):
-        return _sheet(path, raw, sheet)
+        return _sheet(raw, sheet)
     if sheet is not None:
-        raise InputError(f"{path}: is no Excel workbook; leave [data] sheet out.")
+        raise InputError("is no Excel workbook; leave [data] sheet out.")
     return raw
 
 
-def _sheet(path: Path, raw: bytes, sheet: str | None) -> bytes:
+def _sheet(raw: bytes, sheet: str | None) -> bytes:
     """Return one sheet of a workbook, its cells separated by tabs."""
     import pandas as pd
 
@@ -61,9 +58,9 @@ def _sheet(path: Path, raw: bytes, sheet: str | None) -> bytes:
             sheets = pd.read_excel(io.BytesIO(raw), sheet_name=None, header=None, dtype=object)
     except ImportError:
         needs = 'reading .xlsx needs openpyxl, which is not installed: pip install "foamfit[excel]"'
-        raise InputError(f"{path}: {needs}") from None
+        raise InputError(needs) from None
     except Exception as error:  # many kinds are raised for a ZIP that is not a workbook
-        raise InputError(f"{path}: is no Excel workbook that can be read ({error}).") from None
+        raise InputError(f"is no Excel workbook that can be read ({error}).") from None
     tables = [
         str(name)
         for name, frame in sheets.items()
@@ -72,11 +69,11 @@ def _sheet(path: Path, raw: bytes, sheet: str | None) -> bytes:
     if sheet is None and len(tables) != 1:
         found = f"{len(tables)} sheets of numbers, {listed(map(repr, tables))}" if tables else ""
         entry = f'[data] sheet = "{next(iter(tables or map(str, sheets)))}"'
-        raise InputError(f"{path}: has {found or 'no sheet of numbers'}; choose one by {entry}.")
+        raise InputError(f"has {found or 'no sheet of numbers'}; choose one by {entry}.")
     name = tables[0] if sheet is None else sheet
     if name not in sheets:
         there = listed(repr(str(one)) for one in sheets)
-        raise InputError(f"{path}: has no sheet {name!r} ([data] sheet); it has {there}.")
+        raise InputError(f"has no sheet {name!r} ([data] sheet); it has {there}.")
     frame = sheets[name].map(lambda cell: " ".join(cell.split()) if type(cell) is str else cell)
     return frame.to_csv(sep="\t", header=False, index=False).encode()
 

@@ -1,0 +1,189 @@
+"""`foamfit compare`, `published`, `predict` and `card`: what is done with results."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import click
+
+from foamfit.cli import options
+from foamfit.cli.group import main
+from foamfit.cli.options import Output
+from foamfit.errors import InputError
+from foamfit.terminal import say
+
+
+@main.command()
+@click.argument("results", metavar="RESULT [RESULT …]", nargs=-1, required=True, type=options.FILE)
+@options.option(
+    "--published name",
+    "The published set to compare with. Default: the one in the name of the test.",
+    str,
+    metavar="NAME",
+)
+@options.PLOT
+@options.WIDTH
+@options.option("--csv table", "Also write a table.", options.FILE)
+def compare(
+    results: tuple[Path, ...],
+    name: str | None,
+    plot: Path | None,
+    figure_width: str,
+    table: Path | None,
+) -> None:
+    """Put result folders beside the published parameters, or beside the first of them.
+
+    \b
+    Examples:
+        foamfit compare fits/foam-1/model-1/impact fits/foam-1/model-1/stress
+        foamfit compare fits/TEST/bistable --published foam-1/model-1 --plot comparison.png
+    """
+    from foamfit.report.comparison import compare as side_by_side
+    from foamfit.report.comparison import comparison_text, plot_comparison, write_csv
+
+    read = [path / "fit.json" if path.is_dir() else path for path in results]
+    options.check_files(table, plot, read)
+    comparison = side_by_side(results, name)
+    say(comparison_text(comparison))
+    if plot is not None:
+        plot_comparison(comparison, plot, width=figure_width)
+        say(f"\ndrawn in {plot}")
+    if table is not None:
+        write_csv(comparison, table)
+        say(f"\nwritten to {table}")
+
+
+@main.command()
+def published() -> None:
+    """Print the published parameter sets and their derived points."""
+    from foamfit.springs.published import table
+
+    say(table())
+
+
+@main.command()
+@click.argument("result", metavar="RESULT", type=options.FILE)
+@options.TEST
+@options.SPECIMEN
+@options.option(
+    "--cycle", "Cycle of a slow record. Default: the first.", options.COUNT, metavar="N"
+)
+@options.CYCLES
+@options.option(
+    "--drive",
+    "Default: that of the result.",
+    click.Choice(["impact", "stress", "displacement"]),
+)
+@options.option(
+    "--extrapolate", "Also predict a rate outside the fitted ones by more than a factor of 1.25."
+)
+@options.option(
+    "--draws",
+    "Draws of specimens for the band.",
+    click.IntRange(40, 100_000),
+    default=400,
+    metavar="N",
+)
+@options.option(
+    "--seed", "The same result, test and seed give the same numbers.", options.WHOLE, default=0
+)
+@options.output("predictions/<test>", "prediction.json")
+def predict(
+    result: Path,
+    test: Path,
+    specimen: Path | None,
+    cycle: int | None,
+    cycles: tuple[int, int] | None,
+    output: Output,
+    **asked: Any,
+) -> None:
+    """Predict TEST.csv from RESULT: the folder of a fit or of a joint fit, or its JSON.
+
+    TEST.csv was not fitted; its specimen, striker and motion are simulated with the parameters of
+    the result. The folder holds prediction.json, prediction.csv (per sample) and pictures: the
+    curve with its 95 % band and what makes the band, the parameters, the scatter between specimens,
+    the noise and what the law missed before.
+
+    \b
+    Examples:
+        foamfit predict fits/TEST/microscale OTHER.csv
+        foamfit predict joint/new-heel OTHER.csv --cycle 2 --out predictions/second
+        foamfit predict fits/TEST/microscale TEST.csv --cycles 1-5
+    """
+    output.check(without_report=False)
+    from foamfit.data.csv_file import read_test
+    from foamfit.data.toml_file import toml_beside
+    from foamfit.report.studies.prediction import check_replaceable, prediction_text
+    from foamfit.study.prediction.identified import read_source
+
+    toml = toml_beside(test)
+    default = Path("predictions", toml.stem)
+    check_replaceable(output.out or default)
+    folder = output.folder(default, (test, specimen or toml, result))
+    read_source(result)  # a wrong path is reported before anything is compiled
+    with options.compiling(output.silent) as compile_rest:
+        measurement = read_test(test, specimen, cycle, cycles=cycles)
+        from foamfit.study import predict as study
+
+        compile_rest()
+        found = study.predict(result, measurement, **asked)
+        output.finish(
+            found.save,
+            folder / "prediction.png",
+            found.to_json_dict,
+            lambda: prediction_text(found),
+            figure_width=output.figure_width,
+        )
+
+
+@main.command()
+@click.argument("result", metavar="RESULT", type=options.FILE)
+@options.option(
+    "--format",
+    "LS-DYNA *MAT_083 or *MAT_057, Radioss LAW90, Abaqus low-density foam, or the curves alone.",
+    metavar="mat083|mat057|law90|abaqus|csv",
+    required=True,
+)
+@options.option(
+    "--units", "Consistent units of the card.", metavar="kg-mm-ms|t-mm-s|SI", default="kg-mm-ms"
+)
+@options.option(
+    "--rates",
+    "Strain rates of the loading curves, 1/s. Default: those of the fitted tests.",
+    metavar="RATE,RATE,…",
+)
+@options.option("--out", "The card. Default: cards/<test>-<format> and its ending.", options.FILE)
+def card(result: Path, format: str, units: str, rates: str | None, out: Path | None) -> None:
+    """Write a material card of the law in RESULT: the folder of a fit or of a joint fit.
+
+    Beside FILE stand FILE.json (parameters, curves in SI, misfit of fit and card), FILE.png and
+    FILE.pdf: measured, fitted, card. A rate outside the fitted ones gets the curve of the nearest
+    fitted rate, with a warning; beyond the measured strain the law extrapolates.
+
+    \b
+    Examples:
+        foamfit card fits/TEST/microscale --format mat083
+        foamfit card joint/new-heel --format law90 --units t-mm-s --rates 0.01,1,100 --out foam.rad
+    """
+    from foamfit.cards import card as cards
+    from foamfit.study.prediction.identified import read_source
+
+    asked = None if rates is None else rates.split(",")
+    cards.check(format, units, asked)
+    source = read_source(result)
+    name = re.sub(r"[^\w.+-]+", "-", source.name).strip("-.") or "card"
+    file = out or Path("cards", f"{name}-{format}{cards.FORMATS[format][0]}")
+    folder = result if result.is_dir() else result.parent
+    if folder.resolve() in file.resolve().parents:
+        raise InputError(
+            f"{file} lies in a result, which is replaced as a whole; choose another --out"
+        )
+    with options.compiling(False, source.model.name, source.model.relaxation) as compile_rest:
+        compile_rest()
+        made = cards.card(result, format=format, units=units, rates=asked)
+    if out is None:
+        file.parent.mkdir(exist_ok=True)
+    made.save(file)
+    say(f"{made.summary()}\nwritten to {file}, with {file.name}.json, .png and .pdf beside it")
