@@ -237,7 +237,7 @@ def two_springs(*springs, noise=0.005):
 @pytest.mark.parametrize("springs", [(STIFF, SOFT), (SOFT, STIFF)])
 def test_a_mass_inside_shows_which_spring_is_at_the_base(springs):
     measurement = two_springs(*springs)
-    result = ff.fit(measurement, model="bistable+bistable", starts=12)
+    result = ff.fit(measurement, model="bistable+bistable", starts=6)
     for spring, true in zip(result.chain.springs, springs, strict=True):
         assert spring.sigma_a == pytest.approx(true.sigma_a, rel=0.05)
         assert spring.kc == pytest.approx(true.kc, rel=0.05)
@@ -251,7 +251,7 @@ def test_a_mass_inside_shows_which_spring_is_at_the_base(springs):
 
 def test_without_a_mass_inside_the_softest_spring_is_put_at_the_base():
     blind = replace(two_springs(STIFF, SOFT), interior={})
-    result = ff.fit(blind, model="bistable+bistable", starts=12)
+    result = ff.fit(blind, model="bistable+bistable", starts=2)
     base, top = result.chain.springs
     assert base.sigma_a < 0.7 * top.sigma_a
     assert result.curves.interior == {}
@@ -277,7 +277,7 @@ def test_the_result_says_that_a_motion_was_integrated_from_the_force():
     ],
 )
 def test_interior_masses_that_are_not_there_are_said_to_change_nothing(model, drive, why):
-    _, impact = synthetic_impact()
+    _, impact = synthetic_impact(samples=101)
     asked, plain = (
         ff.fit(impact, model=model, drive=drive, starts=1, interior_mass=mass)
         for mass in (True, False)
@@ -353,7 +353,7 @@ def test_a_striker_on_cartilage_is_fitted_and_its_impulse_doubted(
     toml.write_text(CARTILAGE + columns)
     measurement = ff.read_test(DATA / "cartilage-impact" / name, toml)
     assert measurement.motion == motion
-    result = ff.fit(measurement)
+    result = ff.fit(measurement, starts=4)
     assert result.drive == "impact"
     assert result.energy["impulse_ratio"] == pytest.approx(ratio, abs=0.01)
     assert any("momentum" in warning for warning in result.warnings)

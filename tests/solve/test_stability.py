@@ -61,7 +61,8 @@ def judge(point: Point, answer: ff.Response) -> None:
 def cheap(point: Point) -> bool:
     """Leave to the study what takes a second or more."""
     vibration = (point.mass > 0.0 and point.springs > 1) or point.top_mass > 0.0
-    return point.springs <= (1 if vibration else 8) and point.samples <= 300
+    rings = vibration and point.drive == "stress" and not (point.eta or point.site_eta)
+    return point.springs <= (1 if vibration else 8) and point.samples <= 300 and not rings
 
 
 # ------------------------------------------------------------------------------------- the scenes

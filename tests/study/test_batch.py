@@ -312,7 +312,8 @@ def test_what_another_thread_imports_while_a_process_starts_stays_imported(monke
     assert sys.modules["__main__"] is script
 
 
-def test_one_process_that_ends_takes_nothing_else_with_it(tmp_path):
+def test_one_process_that_ends_takes_nothing_else_with_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
     with Processes(2) as pool:
         calls = [pool.submit(time.sleep, 0.05) for _ in range(6)]
         twice = pool.submit(os._exit, 1)
