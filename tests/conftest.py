@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import os
 import signal
 import subprocess
@@ -28,6 +29,7 @@ ROOT = Path(__file__).parent.parent
 EXPERIMENTS = ROOT / "experiments"
 DATA = Path(os.environ.get("FOAMFIT_DATA", ROOT.parent / "shared" / "data"))
 
+gc.disable()  # what is imported and collected stays
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
 os.environ["COLUMNS"] = "100"  # of what commands print, whatever the terminal of the tests
 
@@ -76,6 +78,12 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     session.config.stash[BEGUN] = [
         first_use(part) for part, loop in LOOPS.items() if not cache.compiled(loop)
     ]
+
+
+def pytest_collection_finish() -> None:
+    """Look for garbage in what the tests make, not in what was collected."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)
