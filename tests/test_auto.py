@@ -206,7 +206,7 @@ CASES = {
 def test_a_clear_structure_is_found(name):
     springs, heights, site = CASES[name]
     test = impact(springs, heights, site, velocity=2.6)
-    result = ff.fit(test, model="auto", starts=6, intervals="local")
+    result = ff.fit(test, model="auto", starts=3, intervals="local")
     assert result.ladder.chosen.name == name
     assert result.model == result.ladder.chosen.model
     assert result.misfit["stress_time"] == result.ladder.chosen.misfit["stress_time"]
