@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import functools
+import gc
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+# Each process of the tests computes with one thread: small matrices gain nothing by more, and
+# threads that wait for a busy core take thirty times as long. NumPy reads this when imported.
+os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 import pytest
@@ -25,6 +31,7 @@ ROOT = Path(__file__).parent.parent
 EXPERIMENTS = ROOT / "experiments"
 DATA = Path(os.environ.get("FOAMFIT_DATA", ROOT.parent / "shared" / "data"))
 
+gc.disable()  # what is imported and collected stays
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
 os.environ["COLUMNS"] = "100"  # of what commands print, whatever the terminal of the tests
 # Tests run in as many processes as there are cores; more threads would only wait for each other.
@@ -38,7 +45,12 @@ needs_data = pytest.mark.skipif(
 
 # What compiles, in a process of its own, loops that a first fit does not need, and these loops.
 FIRST_USE = Path(__file__).with_name("first_use.py")
-LOOPS = {"many": "integrate_aggregate", "memory": "integrate_with_memory"}
+LOOPS = {
+    "struck": "integrate_with_memory",  # takes longest
+    "along": "relaxed_along",
+    "many": "integrate_aggregate",
+}
+BEGUN = pytest.StashKey[list[subprocess.Popen[bytes]]]()
 
 
 def first_use(part: str) -> subprocess.Popen[bytes]:
@@ -55,7 +67,10 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile what several processes will need before they start, once and on two cores."""
+    """Compile what several processes will need, once and on all cores.
+
+    The loops of a first fit before these processes start, the others while they collect the tests.
+    """
     if hasattr(session.config, "workerinput"):
         # One of several is begun without Ctrl-C, and would begin others without it in the tests.
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -65,8 +80,21 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if not cache.compiled():
         with precompile.side_by_side() as compile_rest:
             compile_rest()
-    begun = [first_use(part) for part, loop in LOOPS.items() if not cache.compiled(loop)]
-    for process in begun:
+    session.config.stash[BEGUN] = [
+        first_use(part) for part, loop in LOOPS.items() if not cache.compiled(loop)
+    ]
+
+
+def pytest_collection_finish() -> None:
+    """Look for garbage in what the tests make, not in what was collected."""
+    gc.freeze()
+    gc.enable()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished(node: Any) -> None:
+    """Let no process begin with its tests before all is compiled."""
+    for process in node.config.stash.get(BEGUN, []):
         assert process.wait() == 0
 
 

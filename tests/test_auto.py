@@ -205,7 +205,8 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_a_clear_structure_is_found(name):
     springs, heights, site = CASES[name]
-    result = ff.fit(impact(springs, heights, site, velocity=2.6), model="auto", starts=6)
+    test = impact(springs, heights, site, velocity=2.6)
+    result = ff.fit(test, model="auto", starts=3, intervals="local")
     assert result.ladder.chosen.name == name
     assert result.model == result.ladder.chosen.model
     assert result.misfit["stress_time"] == result.ladder.chosen.misfit["stress_time"]
@@ -214,10 +215,10 @@ def test_a_clear_structure_is_found(name):
 
 
 def test_two_bistable_springs_are_told_from_fewer(monkeypatch):
-    """With all starts, which two springs need; for time, without the model of a linear spring."""
+    """With many starts, which two springs need; for time, without the model of a linear spring."""
     monkeypatch.setattr(auto, "LADDER", groups("bistable", "bistable+bistable"))
     test = impact([SOFT, STIFF], HALVES, velocity=4.5)
-    result = ff.fit(test, model="auto")
+    result = ff.fit(test, model="auto", starts=12, intervals="local")
     assert result.ladder.chosen.name == "bistable+bistable without damping"
     below = result.ladder.rungs[:2]
     assert all(rung.bic > result.ladder.chosen.bic + evidence.MARGIN for rung in below)
@@ -327,7 +328,7 @@ def test_held_back_samples_are_predicted_by_a_fit_to_the_others():
 
 
 def test_a_microscale_spring_that_relaxes_is_found():
-    result = ff.fit(slow_loop(), model="auto", starts=4)
+    result = ff.fit(slow_loop(), model="auto", starts=4, intervals="local")
     chosen = result.ladder.chosen
     assert chosen.name == "microscale with relaxation"
     assert (chosen.relaxation, result.relaxation) == (1, 1)
@@ -345,7 +346,7 @@ def test_where_no_model_reaches_the_noise_prediction_decides(monkeypatch):
         "LADDER",
         (*groups("bistable", "microscale"), *groups("microscale", relaxation=1)),
     )
-    result = ff.fit(slow_loop(wave=0.005), model="auto", starts=4)
+    result = ff.fit(slow_loop(wave=0.005), model="auto", starts=4, intervals="local")
     ladder = result.ladder
     assert ladder.by_prediction
     assert ladder.chosen.name == "microscale with relaxation"
@@ -389,7 +390,7 @@ def test_a_running_shoe_foam_ends_below_one_percent(thin_foams, tmp_path, monkey
 def test_a_simpler_model_is_carried_into_its_relaxation():
     """With a share of zero the curves are those of the simpler one."""
     test = slow_loop()
-    simple = ff.fit(test, model="microscale", starts=2)
+    simple = ff.fit(test, model="microscale", starts=2, intervals="local")
     problem = make_problem(test, "microscale", None, None, None, False, relaxation=1)
     tried = [SimpleNamespace(result=simple, chisqr=1.0)]
     auto._carry(problem.params, problem.model, tried)
@@ -518,7 +519,8 @@ def test_outliers_leave_the_ladder_standing():
     spikes = {"stress": Outliers(left_out, at, stress[left_out])}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(auto, "LADDER", groups("bistable"))
-        result = ff.fit(replace(test, stress=stress, outliers=spikes), model="auto", starts=4)
+        spoilt = replace(test, stress=stress, outliers=spikes)
+        result = ff.fit(spoilt, model="auto", starts=4, intervals="local")
     assert any("systematic residuals remain" in text for text in result.warnings)
 
 
@@ -607,7 +609,7 @@ def climbed(wavy):
     """Two models, neither of which reaches the noise."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(auto, "LADDER", groups("bistable", "linear+bistable"))
-        return ff.fit(wavy, model="auto", starts=4)
+        return ff.fit(wavy, model="auto", starts=4, intervals="local")
 
 
 def test_ranges_are_made_of_the_chosen_model_alone(wavy, monkeypatch):

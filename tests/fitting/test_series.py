@@ -19,7 +19,7 @@ STIFF = ff.BistableSpring(1.2e6, 3e7, -6e4, 0.20, 0.50, 3e5, 2.2e5)
 def common_loop():
     """Synthetic loop of both in series: displacement (m), stress (Pa)."""
     chain = ff.Chain([SOFT, STIFF], [0.005, 0.005], 4.5e-5)
-    motion = 0.0037 * np.concatenate([np.linspace(0, 1, 300), np.linspace(1, 0, 300)[1:]])
+    motion = 0.0037 * np.concatenate([np.linspace(0, 1, 150), np.linspace(1, 0, 150)[1:]])
     time = np.linspace(0.0, 4.0, motion.size)
     found = ff.simulate(chain, ff.DisplacementDrive(motion), time)
     return motion, time, found.base_stress

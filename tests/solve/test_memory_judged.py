@@ -39,9 +39,9 @@ FRESH = {
     "motion": (5, 6, 8, 9, 14),
     "motion+relaxation": (8, 10, 11, 31, 35),
     "worn": (82, 172, 194, 263, 499),
-    "worn+relaxation": (41, 101, 336, 412),
+    "worn+relaxation": (41, 336, 412),
     "worn chain": (14, 161, 218, 303),
-    "worn motion": (55, 110, 131, 160, 301),
+    "worn motion": (55, 110, 131, 301),
 }
 
 

@@ -451,7 +451,8 @@ def relaxed_along(
             break
         if start:
             kept.y[:] = -state[SIGMA]
-            kept.by[:] = -d_nodes[3]
+            for p in range(count):
+                kept.by[:, p] = -d_nodes[3, p]
         sigma[j] = _sum_up(row, state[SIGMA], d_nodes[3], kept, by[:, j], by_g[:, j], by_tau[:, j])
         branches[j] = int(state[BRANCH])
     return sigma, branches, by, by_g, by_tau

@@ -215,7 +215,9 @@ def strains_along(
         if kept:
             strain, branches = eps[i], history[i]
         if rows[i, KIND] == MICROSCALE:
-            strain[:], _, branches[:] = strain_along(rows[i], sigma)
+            found, _, passed = strain_along(rows[i], sigma)
+            for j in range(n):
+                strain[j], branches[j] = found[j], passed[j]
         else:
             follow_stress(rows[i], sigma, strain, branches)
         if i == 0:

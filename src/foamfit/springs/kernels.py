@@ -38,6 +38,8 @@ _BRIDGELESS: dict[str, Any] = {
     "no_cpython_wrapper": True,
     "fastmath": {"contract"},
 }
+# An array is copied number by number: `a[:] = b` takes two seconds to compile in each process, for
+# the text of the error that shapes differ.
 _COUNTLESS: dict[str, Any] = {**_BRIDGELESS, "_nrt": False}
 maker = njit(**_BRIDGELESS, cache=True)
 inner = njit(**_COUNTLESS)

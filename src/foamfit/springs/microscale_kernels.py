@@ -437,7 +437,7 @@ def stress_along(row: Row, eps: Array) -> tuple[Array, Array, Branches]:
         branches[j] = int(state[BRANCH])
         if not sigma[j] < math.inf:  # past the end of branch c: nothing follows
             sigma[j:] = math.inf
-            branches[j:], rank[:, j:] = branches[j], rank[:, j : j + 1]
+            branches[j:], rank[0, j:], rank[1, j:] = branches[j], rank[0, j], rank[1, j]
             break
     return sigma, rank, branches
 

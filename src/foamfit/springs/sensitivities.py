@@ -85,7 +85,9 @@ def _followed(rows: Array, sigma: Array, size: int) -> _Followed:
     ranks = np.zeros((count, 2, n))
     for i in range(count):
         if rows[i, KIND] == MICROSCALE:
-            ranks[i] = strain_along(rows[i], sigma)[1]
+            found = strain_along(rows[i], sigma)[1]
+            for j in range(n):
+                ranks[i, 0, j], ranks[i, 1, j] = found[0, j], found[1, j]
     return _Followed(
         np.empty(count), np.zeros((size, 3)), ranks, np.zeros((count, CARRIED)),
         np.zeros((count, 2)), np.zeros(count), np.zeros((size, count, 2)),

@@ -658,5 +658,7 @@ def integrate_with_memory(
         what = directions[p, 1]
         of_tau = what > OWN_RELAXATION and (what - OWN_RELAXATION) % 2 == 1
         if of_tau or what in (OWN_ETA, DRAG):
-            out[1 + p] /= unit
+            for curve in out[1 + p]:
+                for j in range(curve.size):
+                    curve[j] /= unit
     return outcome, end * unit, steps, switches
