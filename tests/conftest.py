@@ -18,14 +18,12 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_limits
 
 import fabricated
 import foamfit as ff
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.report import folder as result_folder
 from foamfit.solve import cache, precompile
-from foamfit.study.processes import ONE_THREAD
 
 ROOT = Path(__file__).parent.parent
 EXPERIMENTS = ROOT / "experiments"
@@ -34,9 +32,6 @@ DATA = Path(os.environ.get("FOAMFIT_DATA", ROOT.parent / "shared" / "data"))
 gc.disable()  # what is imported and collected stays
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
 os.environ["COLUMNS"] = "100"  # of what commands print, whatever the terminal of the tests
-# Tests run in as many processes as there are cores; more threads would only wait for each other.
-os.environ |= ONE_THREAD
-threadpool_limits(1, user_api="blas")
 
 needs_data = pytest.mark.skipif(
     not DATA.is_dir(), reason="the measurements of others are not beside this checkout"
