@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numba import njit
 
-from foamfit.springs.equilibrium import equilibrate
+from foamfit.springs.equilibrium import Group, equilibrate
 from foamfit.springs.kernels import (
     ETA,
     branch_at_strain,
@@ -48,8 +48,8 @@ def _group(rows, branches, heights, i0, i1, u, rate, guess, freeze):
         return stress, slope_on(rows[i0], branches[i0], eps) / heights[i0], eta / heights[i0]
     own = branches[i0:i1].copy() if freeze else branches[i0:i1]
     eps = np.empty(i1 - i0)
-    none = np.zeros(i1 - i0)  # no spring keeps a rank
-    stress = equilibrate(rows[i0:i1], own, none, heights[i0:i1], u, guess, eps)
+    none = np.zeros((i1 - i0, 2))  # no spring keeps a rank
+    stress = equilibrate(Group(rows[i0:i1], own, none, heights[i0:i1]), u, guess, eps)
     soft = 0.0
     for i in range(i0, i1):
         soft += heights[i] / slope_on(rows[i], own[i - i0], eps[i - i0])

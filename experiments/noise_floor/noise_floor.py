@@ -29,7 +29,7 @@ from scipy.special import ndtri
 
 import foamfit as ff
 from foamfit.fitting.problem import make_problem
-from foamfit.springs.law import least_eps_star
+from foamfit.springs.law import most_beyond
 from foamfit.springs.model import Model
 from foamfit.trust.best_point import BestPoint
 
@@ -68,7 +68,7 @@ def random_spring(rng: np.random.Generator) -> tuple[ff.MicroscaleSpring, float]
         kc = k0 * 10 ** rng.uniform(-0.5, 1)
         sigma_plus, spread_plus = k0 * rng.uniform(0.1, 0.5), rng.uniform(0.15, 0.6)
         spring = ff.MicroscaleSpring(
-            k0=k0, kc=kc, eps_star=least_eps_star(k0, kc) + rng.uniform(0.02, 0.3),
+            k0=k0, kc=kc, eps_star=most_beyond(k0, kc, 1.0)[0] + rng.uniform(0.02, 0.3),
             sigma_plus=sigma_plus, spread_plus=spread_plus,
             sigma_minus=sigma_plus * rng.uniform(0.3, 0.8), spread_minus=rng.uniform(0.3, 0.9),
             relaxation=[(rng.uniform(0.1, 1.0), DURATION * 10 ** rng.uniform(-2, -0.5))],

@@ -8,7 +8,7 @@ import pytest
 import foamfit as ff
 from conftest import loop_measurement
 from foamfit.data.measurement import Specimen
-from foamfit.springs.exchange import exchanges
+from foamfit.springs.model import exchanges
 from foamfit.springs.loop import Loop
 from foamfit.springs.model import Model
 
