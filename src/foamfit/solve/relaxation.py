@@ -23,8 +23,11 @@ import numpy as np
 
 from foamfit.springs import microscale_kernels as micro
 from foamfit.springs.kernels import (
+    HELD,
     KIND,
     N_COLUMNS,
+    REMEMBERS,
+    A,
     Array,
     Branches,
     Row,
@@ -82,7 +85,16 @@ class Kept(NamedTuple):
     by_tau: Array
 
 
-_, _begin, _leaves, _switch_law, _settle = followed.functions_of("microscale")[:5]
+_, _begin, _leaves, _switch_law, _settle_law = followed.functions_of("microscale")[:5]
+
+
+@inner
+def _settle(row: Row, state: Array, eps: float) -> None:
+    """Bring a spring to a strain that lies on its branch, and find its slope there."""
+    _settle_law(row, state, eps)
+    closed = state[BRANCH] == A or (state[BRANCH] == HELD and row[REMEMBERS] == 0.0)
+    if row[KIND] == MICROSCALE and closed and state[SIGMA] < math.inf:
+        micro.at_stress(row, state, state[SIGMA])  # on others it comes with the stress
 
 
 @inner

@@ -226,17 +226,12 @@ def stress_in(row: Row, state: Array, eps: float) -> float:
     """
     branch = int(state[BRANCH])
     if branch == HELD and row[REMEMBERS] == 0.0:
-        sigma = held_stress(row, state[SNAPPED], state[REST], eps)
-        if sigma < math.inf:
-            at_stress(row, state, sigma)
-        return sigma
+        return held_stress(row, state[SNAPPED], state[REST], eps)
     reach = 1.0 + (row[EPS_STAR] if moves(branch) or state[SNAPPED] > 0.0 else 0.0)
     if not eps < reach:
         return math.inf
     if branch == A and (state[NEVER] == 1.0 or eps == 0.0):
-        sigma = stress_on_a(row[STIFFENING], row[K0], eps)
-        at_stress(row, state, sigma)
-        return sigma
+        return stress_on_a(row[STIFFENING], row[K0], eps)
     sigma, slope, low, high = state[SIGMA], state[FLEXIBILITY], -math.inf, math.inf
     bounded = not slope > 0.0
     if bounded:
@@ -593,34 +588,38 @@ def strain_tangents(
     At those places stand the derivatives of the rank w at a fixed stress. Returns what
     `under_stress` does, but for the strain.
     """
-    n, two = row[STIFFENING], 1.0 / (row[KC] + sigma)
+    k0, two = row[K0], 1.0 / (row[KC] + sigma)
     p, rest, weight = 0.0, 1.0, 0.0
     if branch != A:
         p, weight = share(rank), density(rank)
         rest = share(-rank) if rank > 0.0 else 1.0 - p
-    never, weight_ever = (rest, weight) if rank == ever else (share(-ever), density(ever))
-    fresh = rest if branch == SNAP or never == 1.0 else never  # on branch a, and never snapped
-    worn = max(rest - fresh, 0.0)
     for c in range(carried(row)):
         out[c] = 0.0
+    fresh, worn, by_ever, pace = rest, 0.0, 0.0, 0.0
     if row[REMEMBERS] == 0.0:
-        a, slope, _ = on_a(1.0, row[K0], sigma)
-        one, softer = a, slope
+        one, slope, _ = on_a(1.0, k0, sigma)
+        softer = slope
     else:
-        a, slope, by_n = changes_on_a(n, row[K0], sigma)
+        n, never, weight_ever = row[STIFFENING], rest, weight
+        if rank != ever:
+            never, weight_ever = share(-ever), density(ever)
+        if branch != SNAP and never != 1.0:
+            fresh = never  # on branch a, and never snapped
+            worn = max(rest - fresh, 0.0)
+        a, slope, by_n = changes_on_a(n, k0, sigma)
         one, softer, by_n_softer = a, slope, by_n
-        if branch != SNAP and row[K_SNAPPED] != row[K0]:
+        if branch != SNAP and row[K_SNAPPED] != k0:
             one, softer, by_n_softer = changes_on_a(n, row[K_SNAPPED], sigma)
+        if never < 1.0:
+            by_ever = weight_ever * (one - a)
         out[OF_STIFFENING] = fresh * by_n + worn * by_n_softer
         out[OF_SOFTENING] = worn * sigma * softer
         if branch in (AGAIN, BOTH):
             out[OF_WEAKENING] = 1.0 / row[SPREAD_PLUS]
-    out[0] = -sigma * (fresh * slope + worn * softer) / row[K0]
+    out[0] = -sigma * (fresh * slope + worn * softer) / k0
     out[1], out[2] = -p * sigma * two * two, p
     soft = fresh * slope + worn * softer + p * row[KC] * two * two
-    by_rank, by_ever, pace = weight * (row[EPS_STAR] + sigma * two - one), 0.0, 0.0
-    if never < 1.0:
-        by_ever = weight_ever * (one - a)
+    by_rank = weight * (row[EPS_STAR] + sigma * two - one)
     if moves(branch):
         back = branch == BACK
         per_scale, first = 1.0 / row[SPREAD_MINUS if back else SPREAD_PLUS], 5 if back else 3

@@ -381,9 +381,9 @@ def _stressed_term(
 
 
 @inner
-def is_bare(links: Links) -> bool:
-    """Whether every spring is undamped and alone between two masses."""
-    if links.top != FREE or links.ends.size != links.law.shape[0]:
+def is_bare(links: Links, memory: Memory | None) -> bool:
+    """Whether every spring is undamped and, but for those with memory, alone between two masses."""
+    if links.top != FREE or (memory is None and links.ends.size != links.law.shape[0]):
         return False
     damped = 0
     for i in range(links.law.shape[0]):
@@ -392,25 +392,52 @@ def is_bare(links: Links) -> bool:
 
 
 @inlined
+def _accelerate(links: Links, s: Array, push: Array, n: int) -> None:
+    """Write the next order of the motion of all masses under a chain without dashpots."""
+    w, v, group, last, share = s[W], s[V], s[GROUP], links.mass.size - 1, 1.0 / (n + 1)
+    for g in range(last + 1):
+        net = -group[g, n]
+        if g < last:
+            net += group[g + 1, n]
+        else:
+            net += push[n] if n < 2 else 0.0
+            if links.drag > 0.0:
+                net -= links.drag * v[g, n]
+        v[g, n + 1] = net * (share / links.mass[g])
+        w[g, n + 1] = v[g, n] * share
+
+
+@inlined
 def expand_bare(links: Links, s: Array, push: Array, order: int) -> None:
     """Fill the series of a chain that `is_bare`, as `expand` does, asking less at each order."""
-    law, w, v, eps, sig, group = links.law, s[W], s[V], s[EPS], s[SIG], s[GROUP]
-    last = links.mass.size - 1
+    law, w, eps, sig, group = links.law, s[W], s[EPS], s[SIG], s[GROUP]
     for n in range(order + 1):
-        for i in range(last + 1):
+        for i in range(links.mass.size):
             eps[i, n] = (w[i, n] - (w[i - 1, n] if i > 0 else 0.0)) * (1.0 / law[i, HEIGHT])
             sig[i, n] = group[i, n] = _law_stress(law, i, eps, sig, n)
-        share = 1.0 / (n + 1)
-        for i in range(last + 1):
-            net = -group[i, n]
-            if i < last:
-                net += group[i + 1, n]
-            else:
-                net += push[n] if n < 2 else 0.0
-                if links.drag > 0.0:
-                    net -= links.drag * v[i, n]
-            v[i, n + 1] = net * (share / links.mass[i])
-            w[i, n + 1] = v[i, n] * share
+        _accelerate(links, s, push, n)
+
+
+@inner
+def expand_remembered(links: Links, s: Array, push: Array, order: int, memory: Memory) -> None:
+    """Fill the series of a chain with memory that `is_bare`, whose springs may share a stress."""
+    law, w, eps, sig, group = links.law, s[W], s[EPS], s[SIG], s[GROUP]
+    for n in range(order + 1):
+        for g in range(links.mass.size):
+            i0, i1 = springs_of(links.ends, g)
+            u_n = w[g, n] - (w[g - 1, n] if g > 0 else 0.0)
+            if n > 0 and i1 - i0 > 1:
+                group[g, n] = _share_elongation(law, i0, i1, eps, sig, u_n, n, memory)
+                continue
+            if i1 - i0 == 1:
+                eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])
+            common = i0
+            for i in range(i0, i1):
+                sig[i, n] = _stress_term(law, i, eps, sig, n, memory)
+                if law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0:
+                    common = i  # see `_group_term`
+            group[g, n] = sig[common, n]
+        _accelerate(links, s, push, n)
 
 
 @inner

@@ -42,6 +42,7 @@ from foamfit.solve.explicit.series import (
     enter_tangents,
     expand,
     expand_bare,
+    expand_remembered,
     is_bare,
     make_series,
     settle,
@@ -420,7 +421,7 @@ def _integrated(
     sizes = np.zeros((size, 2))
     done = begin(run, heights, start, speed, memory)
     lagging = memory is not None
-    bare = memory is None and is_bare(links)
+    bare = is_bare(links, memory)
     # Whether the base stress may be much smaller than the springs' stresses, or change faster: a
     # mass hides the base from the blow, or a dashpot acts there.
     apart = ends.size > 1 or links.law[0, DASHPOT] > 0.0
@@ -438,7 +439,10 @@ def _integrated(
                 knot, now, fresh = knot + 1, 0.0, True
             since, horizon = t[knot], _prescribe(top, values, clock, knot, now, push, motion)
         if bare:
-            expand_bare(links, s, push, order)
+            if memory is None:
+                expand_bare(links, s, push, order)
+            else:
+                expand_remembered(links, s, push, order, memory)
         elif not expand(links, s, push, motion, order, memory):
             return FLAT_UNDER_STRESS, since + now, step, switches
         if step > 0:
