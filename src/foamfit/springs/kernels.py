@@ -189,31 +189,19 @@ def slope_on(row: Row, branch: int, eps: float) -> float:
 
 
 @inner
-def _ends(row: Row, branch: int, to: int) -> tuple[float, float]:
-    """Ends of a branch, in columns that stand `to` columns behind the strains."""
+def interval(row: Row, branch: int, of: int = 0) -> tuple[float, float]:
+    """Strains (low, high) at which a spring leaves a branch; `of` OF_STRESS, the stresses."""
     if branch == A:
-        return -math.inf, row[EPS_A + to]
+        return -math.inf, row[EPS_A + of]
     if branch == D:
-        return row[EPS_A + to], row[EPS_HAT_C + to]
+        return row[EPS_A + of], row[EPS_HAT_C + of]
     if branch == C:
-        return row[EPS_C + to], math.inf
+        return row[EPS_C + of], math.inf
     if branch == E:
-        return row[EPS_HAT_A + to], row[EPS_C + to]
+        return row[EPS_HAT_A + of], row[EPS_C + of]
     if branch == LINE:
         return (0.0 if row[KIND] == UNILATERAL else -math.inf), math.inf
     return -math.inf, 0.0
-
-
-@inner
-def interval(row: Row, branch: int) -> tuple[float, float]:
-    """Strains (low, high) at which a spring leaves a branch."""
-    return _ends(row, branch, 0)
-
-
-@inner
-def stress_interval(row: Row, branch: int) -> tuple[float, float]:
-    """Stresses (low, high) at which a spring leaves a branch."""
-    return _ends(row, branch, OF_STRESS)
 
 
 @inner
@@ -323,7 +311,7 @@ def follow_stress(row: Row, sigma: Array, eps: Array, history: Branches) -> None
     branch, first = first_branch(row), 0
     while first < sigma.size:
         branch = branch_at_stress(row, branch, sigma[first])
-        low, high = stress_interval(row, branch)
+        low, high = interval(row, branch, OF_STRESS)
         last = first + 1
         while last < sigma.size and low < sigma[last] < high:
             last += 1
