@@ -482,15 +482,6 @@ def _fill_of_a(
         by_n[m] = (below[m] - out[m] - total) / (n * n)
 
 
-@inlined
-def _square(x: Array, n: int) -> float:
-    """Order n of the square of a series."""
-    total = 0.0
-    for j in range((n + 1) // 2):
-        total += x[j] * x[n - j]
-    return 2.0 * total + (x[n // 2] * x[n // 2] if n % 2 == 0 else 0.0)
-
-
 @inner
 def fill_partials(memory: Memory, i: int, moving: bool, eps: Array, order: int) -> float:
     """Fill the derivatives of a spring's strain at fixed stress; returns the slope dΣ/dε now."""
@@ -516,15 +507,26 @@ def fill_partials(memory: Memory, i: int, moving: bool, eps: Array, order: int) 
     at_ever = density(state[micro.EVER]) if never > 0.0 else 0.0
     first, place = (5, row[LOG_MINUS]) if branch == BACK else (3, row[LOG_PLUS])
     per_k, per_k0, per_kc, per_s = 1.0 / k, 1.0 / (n * row[K0]), 1.0 / row[KC], 1.0 / s[0]
+    weakens = remembers and branch in (AGAIN, BOTH)
+    by_k0, by_kc, by_star, by_stress = out[0, i], out[1, i], out[2, i], out[BY_STRESS, i]
+    by_place, by_scale = out[first, i], out[first + 1, i]
     per_scale, per_place, worn = 1.0 / now[SCALE], math.exp(-place) / now[SCALE], now[LEFT] - never
     for o in range(order + 1):
-        square_c[o] = _square(below_c, o)
+        aa = cc = 0.0
+        for j in range((o + 1) // 2):
+            aa += below[j] * below[o - j]
+            cc += below_c[j] * below_c[o - j]
+        aa, cc, middle = 2.0 * aa, 2.0 * cc, o // 2
+        if o % 2 == 0:
+            aa += below[middle] * below[middle]
+            cc += below_c[middle] * below_c[middle]
+        square_c[o] = cc
         if not remembers:
-            square[o] = _square(below, o)
+            square[o] = aa
         gap[o] = at_rank * (below[o] - below_c[o] + (star if o == 0 else 0.0))
         qa, qaa, pc, pcc = worn * below[o], worn * square[o], p * below_c[o], p * square_c[o]
-        out[2, i, o] = snapped[o] if moving else (p if o == 0 else 0.0)
-        by_stress = 0.0
+        by_star[o] = snapped[o] if moving else (p if o == 0 else 0.0)
+        by_stress[o] = 0.0
         if moving:
             wide = gap[0] * dense[o]
             for j in range(1, o + 1):
@@ -540,12 +542,12 @@ def fill_partials(memory: Memory, i: int, moving: bool, eps: Array, order: int) 
                 by_score += score[j] * width[o - j]
                 by_s -= s[j] * steep[o - j]
             steep[o] = by_s * per_s
-            by_stress = steep[o] * per_scale
-            out[first, i, o], out[first + 1, i, o] = -wide * per_place, -by_score * per_scale
-            if branch in (AGAIN, BOTH):
+            by_stress[o] = steep[o] * per_scale
+            by_place[o], by_scale[o] = -wide * per_place, -by_score * per_scale
+            if weakens:
                 out[micro.OF_WEAKENING, i, o] = wide * per_scale
         on_a = qa - qaa
-        by_stress += qaa * per_k + pcc * per_kc
+        by_stress[o] += qaa * per_k + pcc * per_kc
         if remembers:
             by_n = worn * out[BY_N, i, o]
             for j in range(1, o + 1 if moving else 1):
@@ -555,12 +557,11 @@ def fill_partials(memory: Memory, i: int, moving: bool, eps: Array, order: int) 
             if never > 0.0:
                 on_a += never * (fresh[o] - hard[o])
                 by_n += never * out[BY_N_FRESH, i, o]
-                by_stress += never * hard[o] / row[K0]
+                by_stress[o] += never * hard[o] / row[K0]
                 out[BY_EVER, i, o] = at_ever * (fresh[o] - below[o])
             out[micro.OF_STIFFENING, i, o] = by_n
-        out[0, i, o], out[1, i, o] = -on_a * per_k0, (pcc - pc) * per_kc
-        out[BY_STRESS, i, o] = by_stress
-    return now[GAIN] / out[BY_STRESS, i, 0]
+        by_k0[o], by_kc[o] = -on_a * per_k0, (pcc - pc) * per_kc
+    return now[GAIN] / by_stress[0]
 
 
 @inlined
