@@ -272,4 +272,4 @@ def test_auto_says_which_model_of_how_many() -> None:
     _, test = synthetic_impact()
     told: list[str] = []
     api.fit(test, model="auto", starts=2, progress=lambda _, what: told.append(what))
-    assert told[0].startswith("model 1 of 10: bistable without damping: ")
+    assert told[0].startswith("model 1 of 11: bistable without damping: ")

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from foamfit.springs.equilibrium import equilibrate
+from foamfit.springs.equilibrium import Group, equilibrate
 from foamfit.springs.kernels import ETA, branch_at_strain, first_branch, stress_on
 
 VERLET, RK4 = range(2)
@@ -37,7 +37,7 @@ def _group(rows, branches, heights, i0, i1, u, rate, guess, freeze):
     own = branches[i0:i1].copy() if freeze else branches[i0:i1]
     eps = np.empty(i1 - i0)
     none = np.zeros((i1 - i0, 2))  # no spring keeps a rank
-    return equilibrate(rows[i0:i1], own, none, heights[i0:i1], u, guess, eps)
+    return equilibrate(Group(rows[i0:i1], own, none, heights[i0:i1]), u, guess, eps)
 
 
 @compiled

@@ -8,9 +8,8 @@ import pytest
 import foamfit as ff
 from conftest import loop_measurement
 from foamfit.data.measurement import Specimen
-from foamfit.springs.exchange import exchanges
 from foamfit.springs.loop import Loop
-from foamfit.springs.model import Model
+from foamfit.springs.model import Model, exchanges
 
 SOFT = ff.BistableSpring(2.0e6, 9e7, -9e4, 0.055, 0.22, 6e5, 1.1e5)
 STIFF = ff.BistableSpring(1.2e6, 3e7, -6e4, 0.20, 0.50, 3e5, 2.2e5)

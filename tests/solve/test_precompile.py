@@ -66,7 +66,7 @@ def test_a_fit_of_springs_with_memory_calls_what_was_compiled_and_nothing_else()
     ff.fit(timed, model="microscale", starts=1, intervals="local")
     for function in (
         relaxation.relaxed_along,
-        microscale_kernels.fill_microscale,
+        kernels.fill_microscale,
         microscale_kernels.stress_along,
         microscale_kernels.stress_tangents_along,
     ):

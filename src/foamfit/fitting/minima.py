@@ -15,8 +15,8 @@ from foamfit.arrays import Array
 from foamfit.fitting.box import Space
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import MISSING, Tracker, descend, has_several, rank
-from foamfit.springs.exchange import exchanges
 from foamfit.springs.laws.record import Law
+from foamfit.springs.model import exchanges
 from foamfit.springs.parameters import NUISANCE, relaxation_names, split_name
 
 # Most minima whose springs exchange properties, and most descents from each but the best.

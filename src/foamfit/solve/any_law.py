@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve.motion import Motion, Slopes, list_switches
-from foamfit.solve.scene import FREE, MOTION, STRESS
+from foamfit.solve.scene import MOTION, STRESS, Motion, Slopes, difference, list_switches
 from foamfit.springs import laws as known
-from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact
+from foamfit.springs.chain import Chain
 from foamfit.springs.laws import followed
 from foamfit.springs.laws.followed import MEMORY, STRENGTH, TIME, compiled
 from foamfit.springs.laws.record import BRANCH, EPS, Law
@@ -44,18 +43,9 @@ class Springs(NamedTuple):
     eta: Array  # Pa·s
 
 
-class InSeries(NamedTuple):
-    """Compiled loops of springs in series, see `in_series`."""
-
-    begin: Callable[..., None]
-    stretch: Callable[..., float]
-    elongate: Callable[..., float]
-    note: Callable[..., None]
-
-
 @cache
-def in_series(laws: tuple[Law, ...]) -> InSeries:
-    """Loops that take springs of these laws to a common stress or to an elongation."""
+def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
+    """Loops that begin with springs of these laws, stretch and elongate them, and note a sample."""
     loops = followed.loops_of(laws)
     start, step, to_stress, count = loops.start, loops.step, loops.to_stress, len(laws)
 
@@ -108,7 +98,7 @@ def in_series(laws: tuple[Law, ...]) -> InSeries:
             nodes[i, j] = top
             branches[i, j] = int(springs.states[i, BRANCH])
 
-    return InSeries(begin, stretch, elongate, note)
+    return begin, stretch, elongate, note
 
 
 @cache
@@ -297,7 +287,7 @@ class AnyLawPlan(NamedTuple):
         while 2 * parts * count <= MOST_STEPS:
             parts *= 2
             finer = self.follow(rows, heights, drag, parts)
-            miss = max(_miss(run.nodes, finer.nodes), _miss(run.stress, finer.stress))
+            miss = max(difference(finer.nodes, run.nodes), difference(finer.stress, run.stress))
             run = finer
             if miss <= 2.0 * rtol:
                 return run
@@ -350,8 +340,10 @@ class AnyLawPlan(NamedTuple):
         place = places.get(what, count + what - OWN_RELAXATION if what > DRAG else what)
         value = {OWN_HEIGHT: heights[spring], DRAG: drag}.get(what, rows[spring, place])
         own = self.laws[spring].params
-        size = self._peak(found) if what < len(own) and own[what].unit == "Pa" else 1.0
-        zero = {OWN_ETA: self._damping(found), DRAG: self._damping(found) / self.height}
+        peak = max(float(np.abs(found.stress).max()), 1.0)
+        size = peak if what < len(own) and own[what].unit == "Pa" else 1.0
+        damping = peak * (float(self.time[-1] - self.time[0]) or 1.0)  # it carries all the stress
+        zero = {OWN_ETA: damping, DRAG: damping / self.height}
         step = RELATIVE * abs(value) or ABSOLUTE * zero.get(what, size)
 
         def beside(by: float) -> Followed | None:
@@ -373,23 +365,11 @@ class AnyLawPlan(NamedTuple):
         above, below = above or found, below or found
         return (above.nodes - below.nodes) / width, (above.stress - below.stress) / width
 
-    def _damping(self, found: Followed) -> float:
-        """Damping that would carry the whole stress, Pa·s."""
-        return self._peak(found) * (float(self.time[-1] - self.time[0]) or 1.0)
 
-    def _peak(self, found: Followed) -> float:
-        """Largest stress, Pa."""
-        return max(float(np.abs(found.stress).max()), 1.0)
-
-
-def _miss(one: Array, other: Array) -> float:
-    """Largest difference of two runs over the range of the second, rest included."""
-    span = max(float(other.max()), 0.0) - min(float(other.min()), 0.0)
-    return float(np.abs(one - other).max()) / span if span > 0.0 else 0.0
-
-
-def plan_of(chain: Chain, drive: Drive, time: Array) -> AnyLawPlan:
-    """Make a scene ready.
+def plan_of(
+    chain: Chain, time: Array, top: int, values: Array, speed: float, above: float
+) -> AnyLawPlan:
+    """Make a scene ready; `above` is the mass on top, kg, the others are those of a `Plan`.
 
     Raises
     ------
@@ -402,20 +382,11 @@ def plan_of(chain: Chain, drive: Drive, time: Array) -> AnyLawPlan:
             "masses between springs go with the paper's laws only: leave them out beside a "
             "registered law"
         )
-    top, values, speed, above = FREE, np.zeros(1), 0.0, chain.masses[-1]
-    if isinstance(drive, Impact):
-        speed, above = drive.velocity, above + drive.mass
-    elif isinstance(drive, DisplacementDrive):
-        top, values = MOTION, np.array(drive.displacement)
-    else:
-        top, values = STRESS, np.array(drive.stress)
-        if above > 0.0 or chain.site_damping > 0.0:
-            raise InputError(
-                "a prescribed stress on a mass or an onsite damper goes with the paper's laws "
-                "only: leave them out beside a registered law"
-            )
+    if speed == 0.0 and top not in (MOTION, STRESS):
+        raise InputError(
+            "a prescribed stress on a mass or an onsite damper goes with the paper's laws "
+            "only: leave them out beside a registered law"
+        )
     laws = tuple(known.law(kind) for kind in chain.kinds)
-    return AnyLawPlan(
-        laws, chain.height, top, values, time, speed, np.array([above / chain.area]),
-        chain.site_damping / chain.height,
-    )  # fmt: skip
+    drag, mass = chain.site_damping / chain.height, np.array([above / chain.area])
+    return AnyLawPlan(laws, chain.height, top, values, time, speed, mass, drag)

@@ -50,6 +50,7 @@ from foamfit.springs.kernels import (
     KH_MINUS,
     KH_PLUS,
     KIND,
+    OF_STRESS,
     Array,
     Branches,
     above,
@@ -58,8 +59,8 @@ from foamfit.springs.kernels import (
     compiled,
     first_branch,
     inner,
+    interval,
     maker,
-    stress_interval,
 )
 from foamfit.springs.law import BISTABLE, UNILATERAL
 
@@ -144,7 +145,7 @@ def _least(tree: Array) -> int:
 def _enter(group: Group, i: int, branch: int) -> None:
     """Put a spring on a branch."""
     group.branches[i] = branch
-    low, high = stress_interval(group.rows[i], branch)
+    low, high = interval(group.rows[i], branch, OF_STRESS)
     _set(group.upper, i, high)
     _set(group.lower, i, -low)
 

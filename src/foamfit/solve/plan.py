@@ -16,9 +16,9 @@ from foamfit.solve import scene as scenes
 from foamfit.solve.any_law import AnyLawPlan, plan_of
 from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import steps
-from foamfit.solve.motion import CLOSED_FORM as CLOSED_FORM
-from foamfit.solve.motion import NO_SWITCHES, Slopes, list_switches
-from foamfit.solve.motion import Motion as Motion
+from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
+from foamfit.solve.scene import NO_SWITCHES, Slopes, list_switches
+from foamfit.solve.scene import Motion as Motion
 from foamfit.springs import equilibrium, kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.law import BISTABLE, LINEAR
@@ -252,12 +252,7 @@ class Plan(NamedTuple):
         )  # fmt: skip
 
     def _closed_form(
-        self,
-        rows: Array,
-        heights: Array,
-        rtol: float,
-        everything: bool,
-        directions: Directions,
+        self, rows: Array, heights: Array, rtol: float, everything: bool, directions: Directions
     ) -> Motion:
         """Undamped and massless: one stress in all springs; or one spring under known motion."""
         moved, wanted = self.top == scenes.MOTION, everything or len(directions) > 0
@@ -418,18 +413,6 @@ def _time(t: ArrayLike) -> Array:
     return time
 
 
-def _check_samples(drive: Drive, time: Array) -> None:
-    """Refuse a drive that has not one value per sample."""
-    if isinstance(drive, Impact):
-        return
-    name = "stress" if isinstance(drive, StressDrive) else "displacement"
-    values = drive.stress if isinstance(drive, StressDrive) else drive.displacement
-    if values.size != time.size:
-        raise InputError(
-            f"{name} has {values.size} samples and t has {time.size}: give one value per sample"
-        )
-
-
 def plan(
     chain: Chain,
     drive: Drive,
@@ -463,22 +446,25 @@ def plan(
         If t does not increase or has not one value per sample of the drive.
     """
     time = _time(t)
-    _check_samples(drive, time)
-    if chain.is_registered:
-        return plan_of(chain, drive, time)
-    above = chain.masses[-1]
-    speed, values = 0.0, _NOTHING
-    top = scenes.FREE
+    speed, values, top = 0.0, _NOTHING, scenes.FREE
     if isinstance(drive, Impact):
-        above += drive.mass
         speed = drive.velocity
     else:
-        values = np.array(drive.stress if isinstance(drive, StressDrive) else drive.displacement)
-        if isinstance(drive, DisplacementDrive):
-            above = 0.0
-            top = scenes.MOTION
-        elif above == 0.0:
-            top = scenes.VISCOUS if chain.site_damping > 0.0 else scenes.STRESS
+        name = "stress" if isinstance(drive, StressDrive) else "displacement"
+        values = np.array(getattr(drive, name))
+        if values.size != time.size:
+            raise InputError(
+                f"{name} has {values.size} samples and t has {time.size}: give one value per sample"
+            )
+    above = chain.masses[-1]
+    if isinstance(drive, Impact):
+        above += drive.mass
+    elif isinstance(drive, DisplacementDrive):
+        above, top = 0.0, scenes.MOTION
+    elif above == 0.0:
+        top = scenes.VISCOUS if chain.site_damping > 0.0 else scenes.STRESS
+    if chain.is_registered:
+        return plan_of(chain, time, top, values, speed, above)
     ends, masses = chain.arrays.top, np.array([above / chain.area])
     if chain.arrays.heavy:
         inside = np.flatnonzero(chain.arrays.masses[:-1] > 0.0)

@@ -26,6 +26,8 @@ from foamfit.springs.kernels import (
     HELD,
     KIND,
     N_COLUMNS,
+    REMEMBERS,
+    A,
     Array,
     Branches,
     Row,
@@ -37,8 +39,7 @@ from foamfit.springs.kernels import (
 )
 from foamfit.springs.law import MICROSCALE
 from foamfit.springs.laws import followed
-from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
-from foamfit.springs.ranks import (
+from foamfit.springs.microscale_kernels import (
     BRANCH,
     CARRIED,
     CURVATURE,
@@ -50,6 +51,7 @@ from foamfit.springs.ranks import (
     SIGMA,
     STATE,
 )
+from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 from foamfit.springs.sensitivities import branch_derivative
 
 # The nodes on [0, 1], and the coefficients of 1, r, r², r³ in the Lagrange polynomials on them.
@@ -90,8 +92,9 @@ _, _begin, _leaves, _switch_law, _settle_law = followed.functions_of("microscale
 def _settle(row: Row, state: Array, eps: float) -> None:
     """Bring a spring to a strain that lies on its branch, and find its slope there."""
     _settle_law(row, state, eps)
-    if row[KIND] == MICROSCALE and state[BRANCH] <= HELD:  # on others it comes with the stress
-        micro.fill_slopes(row, state)
+    closed = state[BRANCH] == A or (state[BRANCH] == HELD and row[REMEMBERS] == 0.0)
+    if row[KIND] == MICROSCALE and closed and state[SIGMA] < math.inf:
+        micro.at_stress(row, state, state[SIGMA])  # on others it comes with the stress
 
 
 @inner
@@ -169,22 +172,6 @@ def _tabulate(h: float, tau: float, moments: Array, table: Array) -> None:
     table[OF_BUMP] = max(moments[2] - 2.0 * moments[3] + moments[4], 0.0) / moments[0]
 
 
-@inlined
-def _begin_table(row: Row, lasts: float, table: Array) -> None:
-    """Note the share of each term that shows while the motion lasts, s."""
-    for k in range(table.shape[0]):
-        share = min(1.0, lasts / row[N_COLUMNS + 2 * k + 1])
-        table[k, LASTING] = row[N_COLUMNS + 2 * k] * share
-
-
-@inlined
-def _tabulate_all(row: Row, h: float, moments: Array, table: Array) -> None:
-    """Bring the tables of all terms to steps of the length h."""
-    for k in range(table.shape[0]):
-        if not abs(h - table[k, STEP]) <= 1e-13 * h:
-            _tabulate(h, row[N_COLUMNS + 2 * k + 1], moments, table[k])
-
-
 @inner
 def _truncation(nodes: Array, table: Array, begins: float, ends_with: float) -> float:
     """Estimate what the cubic through four nodes does to the stress of all terms in the end.
@@ -215,45 +202,35 @@ def _truncation(nodes: Array, table: Array, begins: float, ends_with: float) -> 
     return fourth * error
 
 
-@inner
-def _fill_by_slopes(
-    nodes: Array, state: Array, origin: float, flexibility: float, curvature: float
-) -> float:
-    """Fill the last three nodes by the cubic through values and slopes at both ends of a step.
-
-    The spring is settled at its end. Returns how much of r²(1 - r)² the stress has beside the cubic
-    by its second derivatives, infinite where the slope is not known or changes too much.
-    """
-    if not (flexibility > 0.0 and state[FLEXIBILITY] > 0.0):
-        return math.inf
-    longer, stiff, stiff_last = state[EPS] - origin, 1.0 / flexibility, 1.0 / state[FLEXIBILITY]
-    begins, ends_with = longer * stiff, longer * stiff_last
-    if not abs(ends_with - begins) <= EVEN * abs(begins):
-        return math.inf
-    nodes[3] = state[SIGMA]
-    rise = nodes[3] - nodes[0]
-    for i in range(1, 3):
-        r = NODES[i]
-        bent = (1.0 - r) * (begins - rise) - r * (ends_with - rise)
-        nodes[i] = nodes[0] + r * (rise + (1.0 - r) * bent)
-    low, high = begins - rise, ends_with - rise
-    first = 4.0 * low + 2.0 * high - begins * begins * curvature * stiff
-    last = 2.0 * low + 4.0 * high + ends_with * ends_with * state[CURVATURE] * stiff_last
-    return 0.5 * max(abs(first), abs(last))
-
-
 @inlined
 def _try_slopes(
     row: Row, state: Array, nodes: Array, table: Array, end: float, bar: float, largest: float
 ) -> bool:
-    """Take a step to a strain by the slopes at its ends; false, and not taken, if it is too long.
+    """Take a step to a strain by the cubic through values and slopes at its ends.
 
-    `bar` is the wanted error over the `largest` stress.
+    False, and not taken, if it is too long: the second derivatives tell how much of r²(1 - r)² the
+    stress has beside the cubic. `bar` is the wanted error over the `largest` stress.
     """
     origin, flexibility, curvature = state[EPS], state[FLEXIBILITY], state[CURVATURE]
     _settle(row, state, end)
-    bump = _fill_by_slopes(nodes, state, origin, flexibility, curvature)
-    if MARGIN * bump * _of_bump(table) <= bar * max(largest, abs(state[SIGMA])):
+    bump = math.inf
+    if flexibility > 0.0 and state[FLEXIBILITY] > 0.0:
+        longer, stiff, stiff_last = end - origin, 1.0 / flexibility, 1.0 / state[FLEXIBILITY]
+        begins, ends_with = longer * stiff, longer * stiff_last
+        if abs(ends_with - begins) <= EVEN * abs(begins):
+            nodes[3] = state[SIGMA]
+            rise = nodes[3] - nodes[0]
+            low, high = begins - rise, ends_with - rise
+            for i in range(1, 3):
+                r = NODES[i]
+                nodes[i] = nodes[0] + r * (rise + (1.0 - r) * ((1.0 - r) * low - r * high))
+            first = 4.0 * low + 2.0 * high - begins * begins * curvature * stiff
+            last = 2.0 * low + 4.0 * high + ends_with * ends_with * state[CURVATURE] * stiff_last
+            bump = 0.0
+            for k in range(table.shape[0]):
+                bump += table[k, LASTING] * table[k, OF_BUMP]
+            bump *= 0.5 * max(abs(first), abs(last))
+    if MARGIN * bump <= bar * max(largest, abs(state[SIGMA])):
         return True
     state[EPS], state[SIGMA] = origin, nodes[0]
     state[FLEXIBILITY], state[CURVATURE] = flexibility, curvature
@@ -282,26 +259,16 @@ def _try_nodes(
 
 @inlined
 def _derive(
-    row: Row, state: Array, seed: Array, nodes: Array, d_ranks: Array, d_nodes: Array,
-    first: float, last: float,
-) -> None:  # fmt: skip
-    """Fill the derivatives of the stress at the nodes of a step between two strains."""
+    row: Row, state: Array, seed: Array, nodes: Array, d_ranks: Array, d_nodes: Array, first: float
+) -> None:
+    """Fill the derivatives of the stress at the nodes of a step, from a strain to where it is."""
     for c in range(d_nodes.shape[1]):
         d_nodes[0, c] = d_nodes[3, c]
     here = state[SIGMA], state[EPS]
     for i in range(1, 4):
-        state[EPS], state[SIGMA] = first + NODES[i] * (last - first), nodes[i]
+        state[EPS], state[SIGMA] = first + NODES[i] * (here[1] - first), nodes[i]
         _tangents(row, state, seed, d_ranks, d_nodes[i])
     state[SIGMA], state[EPS] = here
-
-
-@inlined
-def _derive_end(
-    row: Row, state: Array, seed: Array, d_ranks: Array, d_nodes: Array, wanted: bool
-) -> None:
-    """Fill the derivatives of the stress where the spring is now, if they are wanted."""
-    if wanted:
-        _tangents(row, state, seed, d_ranks, d_nodes[3])
 
 
 @inlined
@@ -343,15 +310,6 @@ def _sum_up(
     return total
 
 
-@inner
-def _of_bump(table: Array) -> float:
-    """Return what r²(1 - r)² in each step does to the stress of all terms in the end."""
-    error = 0.0
-    for k in range(table.shape[0]):
-        error += table[k, LASTING] * table[k, OF_BUMP]
-    return error
-
-
 @compiled
 def relaxed_along(
     row: Row, eps: Array, t: Array, rtol: float, derive: bool, seeds: Array
@@ -380,6 +338,7 @@ def relaxed_along(
         by what a spring remembers; by the g of every term (terms, n), and by its τ (terms or 0, n).
     """
     n, terms, wanted = eps.size, (row.size - N_COLUMNS) // 2, int(derive)
+    taus = row[N_COLUMNS + 1 :: 2]
     count = micro.carried(row)
     sigma, branches, by = np.empty(n), np.empty(n, np.int64), np.empty((wanted * count, n))
     by_g, by_tau = np.empty((terms, n)), np.empty((wanted * terms, n))
@@ -389,7 +348,8 @@ def relaxed_along(
     d_ranks, d_nodes = np.zeros((2, CARRIED)), np.zeros((4, count))
     _begin(row, state)
     largest, entered, plain = 0.0, True, 0
-    _begin_table(row, t[n - 1] - t[0], table)
+    for k in range(terms):
+        table[k, LASTING] = row[N_COLUMNS + 2 * k] * min(1.0, (t[n - 1] - t[0]) / taus[k])
     for j in range(n):
         before, start, done = state[EPS], j == 0, 0.0
         while True:
@@ -405,7 +365,8 @@ def relaxed_along(
             if start:  # from rest to the first sample in no time
                 _settle(row, state, end)
                 done, entered = until, True
-            _derive_end(row, state, seeds[j], d_ranks, d_nodes, derive and entered)
+            if derive and entered:
+                _tangents(row, state, seeds[j], d_ranks, d_nodes[3])
             entered = False
             pace = until - done
             at, first = done, state[EPS]
@@ -415,7 +376,9 @@ def relaxed_along(
                 nodes[0], origin = state[SIGMA], state[EPS]
                 flexibility, curvature = state[FLEXIBILITY], state[CURVATURE]
                 h = pace * (t[j] - t[j - 1])
-                _tabulate_all(row, h, moments, table)
+                for k in range(terms):
+                    if not abs(h - table[k, STEP]) <= 1e-13 * h:
+                        _tabulate(h, taus[k], moments, table[k])
                 goal = end if last else first + (done + pace - at) / (until - at) * (end - first)
                 tried = plain > 0 and last and pace == 1.0 and not derive
                 short = tried and _try_slopes(row, state, nodes, table, end, rtol, largest)
@@ -434,7 +397,7 @@ def relaxed_along(
                 if not short:
                     plain = CHECKED if sloped and error <= PLAIN * rtol * largest else 0
                 if derive:
-                    _derive(row, state, seeds[j], nodes, d_ranks, d_nodes, origin, goal)
+                    _derive(row, state, seeds[j], nodes, d_ranks, d_nodes, origin)
                 _relax(row, h, table, nodes, d_nodes, kept)
                 done = until if last else done + pace
                 pace *= 2.0
@@ -447,7 +410,8 @@ def relaxed_along(
                 continue
             if state[EPS] != end:  # so near the end of a branch that no time is left
                 _settle(row, state, end)
-                _derive_end(row, state, seeds[j], d_ranks, d_nodes, derive)
+                if derive:
+                    _tangents(row, state, seeds[j], d_ranks, d_nodes[3])
             break
         if start:
             kept.y[:] = -state[SIGMA]

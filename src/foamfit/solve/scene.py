@@ -1,9 +1,11 @@
-"""What all compiled integrators share: the scene, its samples, and how a run can end."""
+"""What all integrators share: the scene, its samples, how a run can end and what it finds."""
 
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 from typing import NamedTuple
+
+import numpy as np
 
 from foamfit.springs.kernels import Array, Branches, inner
 
@@ -14,6 +16,9 @@ DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE = range(5)
 # The base stress is followed to its own size where that is at least so much of the springs'
 # stresses: what has not come through to the base yet is not worth a step.
 LEAST_BASE = 1e-6
+
+CLOSED_FORM = "closed form"
+NO_SWITCHES, _NONE = np.empty((0, 5)), np.zeros(0)
 
 # A `Scene` as integrators are given it: a named tuple would cost each call a microsecond more.
 SceneTuple = tuple[Array, Array, Branches, Array, float, int, Array, float, Array]
@@ -51,6 +56,45 @@ class Samples(NamedTuple):
     t: Array
     curves: Array
     slopes: Array
+
+
+class Slopes(NamedTuple):
+    """Derivatives of displacement (p, nodes, n_t) and base stress (p, n_t) in p directions.
+
+    Of those marked in `one_sided` (p,), there are two.
+    """
+
+    displacement: Array
+    base_stress: Array
+    one_sided: Array = _NONE
+
+
+class Motion(NamedTuple):
+    """The bare outcome of a run; see `Response`. `slopes` is None where none were asked for."""
+
+    displacement: Array
+    base_stress: Array
+    contact_end: float
+    switches: Array
+    steps: int
+    method: str = CLOSED_FORM
+    slopes: Slopes | None = None
+    unresolved: float = 0.0  # vibrations that were damped out, relative to the ranges
+
+
+def list_switches(time: Array, strain: Array, branches: Branches) -> Array:
+    """List the changes of branch between samples, at the later sample."""
+    samples, springs = np.nonzero((branches[:, 1:] != branches[:, :-1]).T)
+    out, later = np.empty((samples.size, 5)), samples + 1
+    out[:, 0], out[:, 1], out[:, 4] = time[later], springs, strain[springs, later]
+    out[:, 2], out[:, 3] = branches[springs, samples], branches[springs, later]
+    return out
+
+
+def difference(one: Array, other: Array) -> float:
+    """Largest difference of two motions over the range of the first, rest included."""
+    span = max(float(one.max()), 0.0) - min(float(one.min()), 0.0)
+    return float(np.abs(one - other).max()) / span if span > 0.0 else 0.0
 
 
 @inner

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve.any_law import AnyLawPlan
-from foamfit.solve.motion import Slopes
 from foamfit.solve.plan import (
     AGGREGATE,
     CLOSED_FORM,
@@ -26,7 +25,7 @@ from foamfit.solve.plan import (
     Plan,
     plan,
 )
-from foamfit.solve.scene import MOTION
+from foamfit.solve.scene import MOTION, Slopes, difference
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Drive, check_scene
 from foamfit.springs.law import BISTABLE, MICROSCALE
@@ -143,8 +142,8 @@ def _verified(
             break
         finer = _followed(scene, rows, heights, rtol * factor, directions, lost)
         miss = max(
-            _difference(finer.displacement, motion.displacement),
-            _difference(finer.base_stress, motion.base_stress),
+            difference(finer.displacement, motion.displacement),
+            difference(finer.base_stress, motion.base_stress),
         )
         if miss <= 0.3 * rtol and min(finer.unresolved, motion.unresolved) <= rtol:
             return finer if finer.unresolved <= rtol else motion
@@ -189,12 +188,6 @@ def _many(scene: Plan, motion: Motion, few: int) -> bool:
     """Whether a motion took many steps (those of springs under one stress are but switches)."""
     vibrates = len(scene.ends) > 1 and len(motion.switches) > FEW_SWITCHES
     return (motion.steps > few or vibrates) and motion.method != AGGREGATE
-
-
-def _difference(one: Array, other: Array) -> float:
-    """Largest difference of two motions over the range of the first, rest included."""
-    span = max(float(one.max()), 0.0) - min(float(one.min()), 0.0)
-    return float(np.abs(one - other).max()) / span if span > 0.0 else 0.0
 
 
 def _distance_to_pole(rows: Array, heights: Array, displacement: Array) -> float:
@@ -338,7 +331,7 @@ def simulate(
     else:
         motion = _verified(scene, rows, heights, rtol, directions)
     if scene.top == MOTION and len(chain.springs) > 1:
-        miss = _difference(scene.values, motion.displacement[-1])
+        miss = difference(scene.values, motion.displacement[-1])
         if not miss <= max(rtol, ROUNDING):
             raise SimulationError(
                 f"the springs' elongations miss the prescribed displacement by {miss:.1g} of its "

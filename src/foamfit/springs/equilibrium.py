@@ -8,6 +8,7 @@ of their elongations has one root, whatever switches lie on the way: nothing is 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,62 +34,57 @@ from foamfit.springs.microscale_kernels import rank_at, strain_along, under_stre
 # The least strain that an elongation is followed to is this times rounding.
 LEAST = 1e-6
 
-# ---------------------------------------------------------------- springs in series, in equilibrium
+
+class Group(NamedTuple):
+    """Springs in series with their branches (springs,) and, of microscale ones, ranks (springs, 2).
+
+    heights (springs,) are in m.
+    """
+
+    rows: Array
+    branches: Branches
+    ranks: Array
+    heights: Array
 
 
 @inner
-def _series_strain(
-    rows: Array, branches: Branches, ranks: Array, heights: Array, sigma: float, eps: Array
-) -> tuple[float, float, float]:
+def _series_strain(group: Group, sigma: float, eps: Array) -> tuple[float, float, float]:
     """Fill the strains of springs in series under one stress, from what they remember.
 
     Returns elongation, compliance, and the size of the terms that the elongation is made of.
     """
-    total = 0.0
-    compliance = 0.0
-    size = 0.0
+    rows, branches, ranks, heights = group
+    total = compliance = size = 0.0
     for i in range(rows.shape[0]):
         if rows[i, KIND] == MICROSCALE:
             rank, ever, branch = rank_at(rows[i], ranks[i, 0], ranks[i, 1], branches[i], sigma)
             eps[i], soft, by_rank, _, pace = under_stress(rows[i], branch, rank, ever, sigma)
             compliance += heights[i] * (soft + by_rank * pace)
-            total += heights[i] * eps[i]
-            size += heights[i] * max(abs(eps[i]), LEAST)
-            continue
-        branch = branch_at_stress(rows[i], branches[i], sigma)
-        if branch == OPEN:
-            eps[i] = -math.inf
         else:
-            eps[i] = strain_on(rows[i], branch, sigma)
-            compliance += heights[i] / slope_on(rows[i], branch, eps[i])
+            branch = branch_at_stress(rows[i], branches[i], sigma)
+            eps[i] = strain_on(rows[i], branch, sigma) if branch != OPEN else -math.inf
+            if branch != OPEN:
+                compliance += heights[i] / slope_on(rows[i], branch, eps[i])
         total += heights[i] * eps[i]
         size += heights[i] * max(abs(eps[i]), LEAST)
     return total, compliance, size
 
 
 @inner
-def _bracket(
-    rows: Array,
-    branches: Branches,
-    ranks: Array,
-    heights: Array,
-    elongation: float,
-    sigma: float,
-    eps: Array,
-) -> tuple[float, float]:
+def _bracket(group: Group, elongation: float, sigma: float, eps: Array) -> tuple[float, float]:
     """Stresses (low, high) between which springs in series reach `elongation`."""
     step = 1e-3 * abs(sigma)
-    for i in range(rows.shape[0]):
-        step = max(step, 1e-6 * rows[i, K0])
+    for i in range(group.rows.shape[0]):
+        step = max(step, 1e-6 * group.rows[i, K0])
     low = high = sigma
     for _ in range(200):
-        if _series_strain(rows, branches, ranks, heights, low, eps)[0] <= elongation:
+        if _series_strain(group, low, eps)[0] <= elongation:
             break
         high = low
         low -= step
         step *= 2.0
     for _ in range(200):
-        if _series_strain(rows, branches, ranks, heights, high, eps)[0] >= elongation:
+        if _series_strain(group, high, eps)[0] >= elongation:
             break
         low = high
         high += step
@@ -97,27 +93,18 @@ def _bracket(
 
 
 @maker
-def _split_jump(
-    rows: Array,
-    branches: Branches,
-    ranks: Array,
-    heights: Array,
-    elongation: float,
-    low: float,
-    high: float,
-    eps: Array,
-) -> float:
+def _split_jump(group: Group, elongation: float, low: float, high: float, eps: Array) -> float:
     """Share out an elongation that lies inside a jump at one stress; returns that stress.
 
     Flat branches (k_h± = 0) share it from the base up. Where a unilateral spring opens, the stress
     is zero and the gap takes what the other springs leave.
     """
-    upper = np.empty(eps.size)
-    _series_strain(rows, branches, ranks, heights, high, upper)
-    rest = elongation - _series_strain(rows, branches, ranks, heights, low, eps)[0]
+    rows, heights, upper = group.rows, group.heights, np.empty(eps.size)
+    _series_strain(group, high, upper)
+    rest = elongation - _series_strain(group, low, eps)[0]
     for i in range(eps.size):
         if eps[i] == -math.inf and rows[i, KIND] == UNILATERAL:
-            rest = elongation - _series_strain(rows, branches, ranks, heights, 0.0, eps)[0]
+            rest = elongation - _series_strain(group, 0.0, eps)[0]
             eps[i] += rest / heights[i]
             return 0.0
     for i in range(eps.size):
@@ -128,26 +115,19 @@ def _split_jump(
 
 
 @maker
-def equilibrate(
-    rows: Array,
-    branches: Branches,
-    ranks: Array,
-    heights: Array,
-    elongation: float,
-    sigma: float,
-    eps: Array,
-) -> float:
+def equilibrate(group: Group, elongation: float, sigma: float, eps: Array) -> float:
     """Common stress of undamped springs in series at a given elongation; fills their strains.
 
     Newton's method finds it, from the eighth trial on inside a bracket that every third trial
     halves. Where the root lies in a jump of the elongation (k_h± = 0, or a snap so narrow that
     neighbouring numbers for the stress lie apart in it), the springs share it from the base up.
-    `branches` and `ranks` (springs, 2), those of microscale springs, are brought up to date.
+    Branches and ranks are brought up to date.
     """
+    rows, branches, ranks, _ = group
     found = False
     low, high = -math.inf, math.inf
     for trial_number in range(400):
-        total, compliance, size = _series_strain(rows, branches, ranks, heights, sigma, eps)
+        total, compliance, size = _series_strain(group, sigma, eps)
         miss = total - elongation
         if abs(miss) <= 2e-15 * (size + abs(elongation)) and math.isfinite(total):
             found = True
@@ -158,7 +138,7 @@ def equilibrate(
             low = max(low, sigma)
         trial = sigma - miss / compliance
         if trial_number == 8:  # a kink or a jump: bracket it
-            low, high = _bracket(rows, branches, ranks, heights, elongation, sigma, eps)
+            low, high = _bracket(group, elongation, sigma, eps)
         if trial_number >= 8 and (trial_number % 3 == 0 or not low < trial < high):
             trial = 0.5 * (low + high)
             if trial in (low, high):  # neighbouring numbers: nothing lies between them
@@ -168,7 +148,7 @@ def equilibrate(
             trial = 0.5 * (low + high) if math.isfinite(low) and math.isfinite(high) else sigma
         sigma = trial
     if not found:
-        sigma = _split_jump(rows, branches, ranks, heights, elongation, low, high, eps)
+        sigma = _split_jump(group, elongation, low, high, eps)
     for i in range(eps.size):
         if rows[i, KIND] == MICROSCALE:
             reached = rank_at(rows[i], ranks[i, 0], ranks[i, 1], branches[i], sigma)
@@ -187,13 +167,13 @@ def equilibrium_along(
     Fills the common stress (n,), the strains and the branches (springs, n).
     """
     count, n = rows.shape[0], top.size
-    branches = np.empty(count, np.int64)
-    now, ranks = np.empty(count), np.full((count, 2), -math.inf)
+    now, branches = np.empty(count), np.empty(count, np.int64)
+    group = Group(rows, branches, np.full((count, 2), -math.inf), heights)
     for i in range(count):
         branches[i] = first_branch(rows[i])
     last = 0.0
     for j in range(n):
-        last = equilibrate(rows, branches, ranks, heights, top[j], last, now)
+        last = equilibrate(group, top[j], last, now)
         sigma[j] = last
         for i in range(count):
             eps[i, j] = now[i]

@@ -21,7 +21,9 @@ from foamfit.springs.law import (
     MICROSCALE,
     UNILATERAL,
     admissible,
+    crossing,
     derived_points,
+    most_beyond,
 )
 
 Row = Array
@@ -50,9 +52,10 @@ once = njit(error_model="numpy", inline="always")
 # `solve.precompile`.
 piece = njit(**_COUNTLESS, cache=True)
 
-# Columns of a row.
-KIND, K0, KC, EPS_A, EPS_C, KH_PLUS, KH_MINUS, ETA = range(8)
-SIGMA_A, SIGMA_C, EPS_STAR, EPS_HAT_A, EPS_HAT_C, SIGMA_HAT_A, SIGMA_HAT_C, N_COLUMNS = range(8, 16)
+# Columns of a row; the stress at each point stands OF_STRESS columns behind its strain.
+KIND, K0, KC, KH_PLUS, KH_MINUS, ETA, EPS_STAR, OF_STRESS = *range(7), 4
+EPS_A, EPS_C, EPS_HAT_A, EPS_HAT_C = range(7, 11)
+SIGMA_A, SIGMA_C, SIGMA_HAT_A, SIGMA_HAT_C, N_COLUMNS = range(11, 16)
 
 # A microscale spring has in place of most of them the logarithms of sigma_plus and sigma_minus, the
 # spreads, and the logarithm of the stress where both laws of snapping meet (see `law.crossing`).
@@ -71,6 +74,8 @@ A, D, C, E, LINE, OPEN, HELD, SNAP, BACK, BOTH, AGAIN = range(11)
 
 _derived_points = inner(derived_points)
 _admissible = inner(admissible)
+_crossing = inner(crossing)
+_most_beyond = inner(most_beyond)
 
 
 @compiled
@@ -91,6 +96,36 @@ def fill_bistable(values: Array, row: Row) -> bool:
     row[SIGMA_HAT_A] = -math.inf if hat_a == -math.inf else k0 * hat_a / (1.0 - hat_a)
     row[SIGMA_HAT_C] = sigma_a + kh_plus * (hat_c - eps_a)
     return True
+
+
+@compiled
+def fill_microscale(values: Array, row: Row) -> bool:
+    """Write the own parameters and what follows from them; false if they are not admissible.
+
+    They are k0 … spread_minus, then, as far as there are any, stiffening, and softening and
+    weakening.
+    """
+    count, stiffening, softening, weakening = values.size, 1.0, 0.0, 0.0
+    if count == 8 or count == 10:
+        stiffening = values[7]
+    if count > 8:
+        softening, weakening = values[count - 2], values[count - 1]
+    for own in range(7):
+        if own != 2 and not 0.0 < values[own] < math.inf:
+            return False
+    fine = 0.0 <= values[2] < math.inf and 0.0 < stiffening < math.inf
+    if not (fine and 0.0 <= softening < math.inf and 0.0 <= weakening < math.inf):
+        return False
+    row[KIND], row[K0], row[KC], row[EPS_STAR] = MICROSCALE, values[0], values[1], values[2]
+    row[LOG_PLUS], row[SPREAD_PLUS] = math.log(values[3]), values[4]
+    row[LOG_MINUS], row[SPREAD_MINUS] = math.log(values[5]), values[6]
+    row[REMEMBERS], row[STIFFENING] = 1.0 if count > 7 else 0.0, stiffening
+    row[K_SNAPPED] = row[K0] * math.exp(-softening)
+    row[LOG_AGAIN] = row[LOG_PLUS] - weakening
+    row[LOG_CROSS] = _crossing(row[LOG_AGAIN], row[SPREAD_PLUS], row[LOG_MINUS], row[SPREAD_MINUS])
+    if not row[K_SNAPPED] > 0.0:
+        return False
+    return row[EPS_STAR] >= _most_beyond(row[K_SNAPPED], row[KC], stiffening)[0]
 
 
 @compiled
@@ -156,32 +191,16 @@ def slope_on(row: Row, branch: int, eps: float) -> float:
 
 
 @inner
-def interval(row: Row, branch: int) -> tuple[float, float]:
-    """Strains (low, high) at which a spring leaves a branch."""
+def interval(row: Row, branch: int, of: int = 0) -> tuple[float, float]:
+    """Strains (low, high) at which a spring leaves a branch; `of` OF_STRESS, the stresses."""
     if branch == A:
-        return -math.inf, row[EPS_A]
+        return -math.inf, row[EPS_A + of]
     if branch == D:
-        return row[EPS_A], row[EPS_HAT_C]
+        return row[EPS_A + of], row[EPS_HAT_C + of]
     if branch == C:
-        return row[EPS_C], math.inf
+        return row[EPS_C + of], math.inf
     if branch == E:
-        return row[EPS_HAT_A], row[EPS_C]
-    if branch == LINE:
-        return (0.0 if row[KIND] == UNILATERAL else -math.inf), math.inf
-    return -math.inf, 0.0
-
-
-@inner
-def stress_interval(row: Row, branch: int) -> tuple[float, float]:
-    """Stresses (low, high) at which a spring leaves a branch."""
-    if branch == A:
-        return -math.inf, row[SIGMA_A]
-    if branch == D:
-        return row[SIGMA_A], row[SIGMA_HAT_C]
-    if branch == C:
-        return row[SIGMA_C], math.inf
-    if branch == E:
-        return row[SIGMA_HAT_A], row[SIGMA_C]
+        return row[EPS_HAT_A + of], row[EPS_C + of]
     if branch == LINE:
         return (0.0 if row[KIND] == UNILATERAL else -math.inf), math.inf
     return -math.inf, 0.0
@@ -294,7 +313,7 @@ def follow_stress(row: Row, sigma: Array, eps: Array, history: Branches) -> None
     branch, first = first_branch(row), 0
     while first < sigma.size:
         branch = branch_at_stress(row, branch, sigma[first])
-        low, high = stress_interval(row, branch)
+        low, high = interval(row, branch, OF_STRESS)
         last = first + 1
         while last < sigma.size and low < sigma[last] < high:
             last += 1

@@ -22,13 +22,7 @@ LEAST_RANK = -8.3
 
 
 def derived_points(
-    k0: float,
-    kc: float,
-    dsigma: float,
-    eps_a: float,
-    eps_c: float,
-    kh_plus: float,
-    kh_minus: float,
+    k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
 ) -> tuple[float, float, float, float, float]:
     """Derive (σ_a, σ̄_c, ε_*, ε̂_a, ε̂_c) of a bistable spring in closed form.
 
@@ -69,13 +63,7 @@ def derived_points(
 
 
 def admissible(
-    k0: float,
-    kc: float,
-    dsigma: float,
-    eps_a: float,
-    eps_c: float,
-    kh_plus: float,
-    kh_minus: float,
+    k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
 ) -> bool:
     """Tell whether the seven parameters are admissible (model: 0 < ε_a < ε_c, -1 < Δσ/σ_a <= 0, …).
 
@@ -93,15 +81,6 @@ def admissible(
     )
 
 
-def least_eps_star(k0: float, kc: float) -> float:
-    """Least ε_* of a microscale spring: with it branch c lies at or beyond branch a everywhere.
-
-    It is the largest σ/(k0+σ) - σ/(kc+σ), that at σ = √(k0 kc), or zero.
-    """
-    one, other = math.sqrt(k0), math.sqrt(kc)
-    return max(0.0, (other - one) / (other + one))
-
-
 def crossing(log_plus: float, spread_plus: float, log_minus: float, spread_minus: float) -> float:
     """Logarithm of the stress where snap-through and snap-back of one rank are at one stress.
 
@@ -116,9 +95,10 @@ def crossing(log_plus: float, spread_plus: float, log_minus: float, spread_minus
 def most_beyond(k: float, kc: float, n: float) -> tuple[float, float]:
     """Largest excess of branch a over branch c without its ε_*, and the stress where it is.
 
-    The excess is f(σ) = a(σ; k) - σ/(kc+σ) with a = 1 - (1 + nσ/k)^(-1/n) (model, section 8); for
-    n = 1 that of `least_eps_star`. It rises where g(σ) = 2 ln(kc+σ) - ln(k kc) - (1+1/n) ln(1+nσ/k)
-    is positive; g turns once at most, so f has one maximum at most.
+    With it as ε_* at least, branch c lies at or beyond branch a everywhere. The excess is
+    f(σ) = a(σ; k) - σ/(kc+σ) with a = 1 - (1 + nσ/k)^(-1/n) (model, section 8). It rises where
+    g(σ) = 2 ln(kc+σ) - ln(k kc) - (1+1/n) ln(1+nσ/k) is positive; g turns once at most, so f has
+    one maximum at most.
     """
     if n == 1.0:
         one, other = math.sqrt(k), math.sqrt(kc)

@@ -1,10 +1,19 @@
 """The compiled microscale law: one spring followed along a history, and its derivatives.
 
-Its memory is the rank w up to which micro-springs have snapped, in standard normal scores: the
-snapped fraction is p = Φ(w). With u₊ = (ln σ - ln sigma_plus)/spread_plus and u₋ likewise (both -∞
-in tension), w ← min(max(w, u₊), max(u₊, u₋)). So Φ is never inverted, and 1 - p = Φ(-w) keeps all
-its digits. Stress and strain grow together along any history, so that a branch ends at a strain as
-well as at a stress: the path of a spring is walked from end to end of its branches.
+With p the fraction that has snapped and P the largest it has ever been (model, section 8),
+
+    ε = (1-P) a(σ; k0) + (P-p) a(σ; k0 e^-d) + p (eps_star + σ/(kc+σ)),
+    a(σ; k) = 1 - (1 + nσ/k)^(-1/n).
+
+The memory of a spring is two ranks w and W in standard normal scores, p = Φ(w) and P = Φ(W). So Φ
+is never inverted, and 1 - p = Φ(-w) keeps all its digits. On first loading w = W = u₊ with
+u₊ = (ln σ - ln sigma_plus)/spread_plus. What has snapped before snaps through once more at
+w = u₊ + s/spread_plus up to W, is held there until u₊ = W, and then first loading goes on. It snaps
+back at w = u₋. A spring without softening, weakening and stiffening forgets W, which it does not
+need: for it P = 0.
+
+Stress and strain grow together along any history, so that a branch ends at a strain as well as at a
+stress: the path of a spring is walked from end to end of its branches.
 """
 
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
@@ -14,8 +23,8 @@ import math
 
 import numpy as np
 
-from foamfit.springs import memory_kernels as memory
 from foamfit.springs.kernels import (
+    AGAIN,
     BACK,
     BOTH,
     EPS_STAR,
@@ -23,7 +32,6 @@ from foamfit.springs.kernels import (
     K0,
     K_SNAPPED,
     KC,
-    KIND,
     LOG_AGAIN,
     LOG_CROSS,
     LOG_MINUS,
@@ -38,122 +46,169 @@ from foamfit.springs.kernels import (
     Branches,
     Row,
     compiled,
+    inlined,
     inner,
 )
-from foamfit.springs.law import (
-    LEAST_RANK,
-    MICROSCALE,
-    crossing,
-    least_eps_star,
-    most_beyond,
-)
-from foamfit.springs.memory_kernels import turned as turned
-from foamfit.springs.ranks import (
-    BRANCH,
-    CARRIED,
-    CURVATURE,
-    EPS,
-    EVER,
-    FIRST,
-    FLEXIBILITY,
-    HIGH,
-    LAST,
-    LEAST,
-    LOW,
-    MEET,
-    NEAR,
-    OF_STRAIN,
-    PLAIN_CARRIED,
-    RANK,
-    REST,
-    SIGMA,
-    SIGMA_FIRST,
-    SIGMA_HIGH,
-    SIGMA_LAST,
-    SIGMA_LOW,
-    SIGMA_MEET,
-    SNAPPED,
-    STATE,
-    density,
-    share,
-)
+from foamfit.springs.law import LEAST_RANK
 
-_least_eps_star = inner(least_eps_star)
-_crossing = inner(crossing)
-_most_beyond = inner(most_beyond)
+# The state: strain, stress, branch, rank w, p, 1 - p, the strains and stresses at which the branch
+# ends, and dε/dσ, d²ε/dσ² where the stress was last sought; the rank W, 1 - P, and the strain below
+# which no micro-spring is taken to snap.
+EPS, SIGMA, BRANCH, RANK, SNAPPED, REST, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH = range(10)
+FLEXIBILITY, CURVATURE, EVER, NEVER, LEAST_AT, STATE = range(10, 16)
+# Derivatives that are carried: by k0 … spread_minus, by (the logarithm of) the strain itself, and,
+# of a spring that remembers, by stiffening, softening, weakening; so many of them where it does
+# not.
+OF_STRAIN, OF_STIFFENING, OF_SOFTENING, OF_WEAKENING, CARRIED, PLAIN_CARRIED = 7, 8, 9, 10, 11, 8
+# A step of Halley's method so small, in widths over which the law bends, is the last: what it
+# leaves is about its cube.
+NEAR = 3e-6
+# The least stress that is sought: the least normal number.
+LEAST = 2.0**-1022
+_ROOT_HALF, _ROOT_TURN = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @inner
-def _fill_alike(values: Array, row: Row) -> bool:
-    """Write k0 … spread_minus of a spring of any ε_*; false if they are not admissible."""
-    k0, kc, eps_star = values[0], values[1], values[2]
-    spread_plus, spread_minus = values[4], values[6]
-    for own in range(7):
-        if own != 2 and not 0.0 < values[own] < math.inf:
-            return False
-    if not 0.0 <= eps_star < math.inf:
-        return False
-    row[KIND], row[K0], row[KC], row[EPS_STAR] = MICROSCALE, k0, kc, eps_star
-    row[LOG_PLUS], row[SPREAD_PLUS] = math.log(values[3]), spread_plus
-    row[LOG_MINUS], row[SPREAD_MINUS] = math.log(values[5]), spread_minus
-    row[LOG_CROSS] = _crossing(row[LOG_PLUS], spread_plus, row[LOG_MINUS], spread_minus)
-    row[REMEMBERS], row[STIFFENING], row[K_SNAPPED], row[LOG_AGAIN] = 0.0, 1.0, k0, row[LOG_PLUS]
-    return True
-
-
-@compiled
-def fill_microscale(values: Array, row: Row) -> bool:
-    """Write k0 … spread_minus and what follows from them; false if they are not admissible."""
-    return _fill_alike(values, row) and row[EPS_STAR] >= _least_eps_star(row[K0], row[KC])
+def share(rank: float) -> float:
+    """Φ, the share of all ranks that lies below one."""
+    return 0.5 * math.erfc(-_ROOT_HALF * rank)
 
 
 @inner
-def _remember(row: Row, stiffening: float, softening: float, weakening: float) -> bool:
-    """Write what a spring remembers (model, section 8); false if it is not admissible."""
-    if not (0.0 < stiffening < math.inf):
-        return False
-    if not (0.0 <= softening < math.inf and 0.0 <= weakening < math.inf):
-        return False
-    row[REMEMBERS], row[STIFFENING] = 1.0, stiffening
-    row[K_SNAPPED] = row[K0] * math.exp(-softening)
-    row[LOG_AGAIN] = row[LOG_PLUS] - weakening
-    cross = _crossing(row[LOG_AGAIN], row[SPREAD_PLUS], row[LOG_MINUS], row[SPREAD_MINUS])
-    row[LOG_CROSS] = cross
-    if not row[K_SNAPPED] > 0.0:
-        return False
-    return row[EPS_STAR] >= _most_beyond(row[K_SNAPPED], row[KC], stiffening)[0]
+def density(rank: float) -> float:
+    """Φ', the density of ranks."""
+    return _ROOT_TURN * math.exp(-0.5 * rank * rank)
 
 
-@compiled
-def fill_stiffening(values: Array, row: Row) -> bool:
-    """Write k0 … spread_minus and stiffening; false if they are not admissible."""
-    return _fill_alike(values, row) and _remember(row, values[7], 0.0, 0.0)
+# ---------------------------------------------------------------- the elastic branches
 
 
-@compiled
-def fill_mullins(values: Array, row: Row) -> bool:
-    """Write k0 … spread_minus, softening and weakening; false if they are not admissible."""
-    return _fill_alike(values, row) and _remember(row, 1.0, values[7], values[8])
+@inlined
+def _root(n: float, x: float) -> tuple[float, float]:
+    """Return a = 1 - (1 + nx)^(-1/n), and -ln(1 - a); `log1p` and `expm1` are the slow ones."""
+    y = 1.0 + n * x
+    if y > 1.25:
+        log = math.log(y) / n
+        return 1.0 - math.exp(-log), log
+    log = math.log1p(n * x) / n
+    return -math.expm1(-log), log
 
 
-@compiled
-def fill_memory(values: Array, row: Row) -> bool:
-    """Write k0 … spread_minus, stiffening, softening and weakening; false if not admissible."""
-    return _fill_alike(values, row) and _remember(row, values[7], values[8], values[9])
-
-
-# ---------------------------------------------------------------- the law
+@inlined
+def on_a(n: float, k: float, sigma: float) -> tuple[float, float, float]:
+    """Strain a(σ; k) of the stiffening branch and its two derivatives; -inf if it has none."""
+    if n == 1.0:
+        one = 1.0 / (k + sigma)
+        slope = k * one * one
+        return (sigma * one, slope, -2.0 * slope * one) if sigma > -k else (-math.inf, 0.0, 0.0)
+    above = k + n * sigma
+    if not above > 0.0:
+        return -math.inf, 0.0, 0.0
+    strain, log = _root(n, sigma / k)
+    per = 1.0 / above
+    slope = (1.0 - strain if strain < 0.9 else math.exp(-log)) * per
+    return strain, slope, -(1.0 + n) * slope * per
 
 
 @inner
-def strain_of(row: Row, p: float, rest: float, sigma: float) -> float:
-    """Strain at which the share p has snapped, and the share `rest` = 1 - p has not."""
-    return rest * (sigma / (row[K0] + sigma)) + p * (row[EPS_STAR] + sigma / (row[KC] + sigma))
+def stress_on_a(n: float, k: float, eps: float) -> float:
+    """Stress at a strain of that branch; infinite from its end on."""
+    if not eps < 1.0:
+        return math.inf
+    return k * eps / (1.0 - eps) if n == 1.0 else k * math.expm1(-n * math.log1p(-eps)) / n
+
+
+@inlined
+def changes_on_a(n: float, k: float, sigma: float) -> tuple[float, float, float]:
+    """Strain a(σ; k), and its derivatives by σ and by n; σ is above the pole."""
+    strain, log = _root(n, sigma / k)
+    left, per = 1.0 - strain if strain < 0.9 else math.exp(-log), 1.0 / (k + n * sigma)
+    return strain, left * per, left * (sigma * per - log) / n
+
+
+# ---------------------------------------------------------------- the branches of the spring
+
+
+@inner
+def line(row: Row, branch: int) -> tuple[float, float]:
+    """Place and scale of the normal distribution of ln σ that the rank follows on a branch."""
+    if branch == BACK:
+        return row[LOG_MINUS], row[SPREAD_MINUS]
+    return row[LOG_PLUS] if branch == SNAP else row[LOG_AGAIN], row[SPREAD_PLUS]
+
+
+@inner
+def moves(branch: int) -> bool:
+    """Whether micro-springs snap on a branch."""
+    return branch != A and branch != HELD
+
+
+@inlined
+def mixture(
+    row: Row, branch: int, p: float, rest: float, never: float, sigma: float
+) -> tuple[float, float, float, float, float]:
+    """Strain at a stress where p, 1 - p and 1 - P are these, and two derivatives at fixed p, P.
+
+    Then strain and slope of the branch a that snaps.
+    """
+    n, k = row[STIFFENING], row[K_SNAPPED]
+    two = 1.0 / (row[KC] + sigma)
+    on_c = row[KC] * two * two
+    if branch == SNAP or never == 1.0:  # none that has snapped is on branch a
+        k, never = row[K0], 0.0
+    one, slope, bend = on_a(n, k, sigma)
+    strain = rest * one + p * (row[EPS_STAR] + sigma * two)
+    soft, bent = rest * slope + p * on_c, rest * bend - 2.0 * p * on_c * two
+    if never > 0.0 and k != row[K0]:
+        fresh, stiff, stiffer = on_a(n, row[K0], sigma)
+        strain += never * (fresh - one)
+        soft += never * (stiff - slope)
+        bent += never * (stiffer - bend)
+    return strain, soft, bent, one, slope
+
+
+@inlined
+def at_stress(row: Row, state: Array, sigma: float) -> float:
+    """Strain at a stress on the branch that the spring is on; fills dε/dσ and d²ε/dσ²."""
+    branch = int(state[BRANCH])
+    if not moves(branch):
+        p, rest = state[SNAPPED], state[REST]
+        strain, slope, bend, _, _ = mixture(row, branch, p, rest, state[NEVER], sigma)
+        state[FLEXIBILITY], state[CURVATURE] = slope, bend
+        return strain
+    if not sigma > 0.0:
+        return -math.inf
+    place, scale = line(row, branch)
+    rank = (math.log(sigma) - place) / scale
+    p = share(rank)
+    rest = share(-rank) if rank > 0.0 else 1.0 - p
+    strain, slope, bend, one, on_one = mixture(row, branch, p, rest, state[NEVER], sigma)
+    two = 1.0 / (row[KC] + sigma)
+    gap, rate = row[EPS_STAR] + sigma * two - one, density(rank) / (scale * sigma)
+    bend += 2.0 * rate * (row[KC] * two * two - on_one)
+    bend -= rate * gap * (rank / scale + 1.0) / sigma
+    state[FLEXIBILITY], state[CURVATURE] = slope + rate * gap, bend
+    return strain
+
+
+@inner
+def _ends_of_stress(row: Row, state: Array, eps: float) -> tuple[float, float]:
+    """Stresses between which the spring has a strain: those of the stiffest and softest branch."""
+    n, star, stiff = row[STIFFENING], row[EPS_STAR], stress_on_a(row[STIFFENING], row[K0], eps)
+    if eps < 0.0 or (not moves(int(state[BRANCH])) and state[SNAPPED] == 0.0):
+        soft = stress_on_a(n, row[K_SNAPPED], eps)
+        low, high = min(stiff, soft), max(stiff, soft)
+    else:
+        low, high = 0.0, stiff
+        if eps > star:
+            low = row[KC] * (eps - star) / (1.0 - (eps - star))
+    wide = 1e-14
+    return low - wide * abs(low), high + wide * abs(high)
 
 
 @inner
 def held_stress(row: Row, p: float, rest: float, eps: float) -> float:
-    """Stress at which so many have snapped, the inverse of `strain_of`: one root of a quadratic."""
+    """Stress at which so many have snapped, of a spring that forgets: one root of a quadratic."""
     k0, kc, beyond = row[K0], row[KC], eps - p * row[EPS_STAR]
     a, product = 1.0 - beyond, beyond * k0 * kc
     if not a > 0.0:
@@ -164,207 +219,52 @@ def held_stress(row: Row, p: float, rest: float, eps: float) -> float:
 
 
 @inner
-def _strain_between(row: Row, log: float, spread: float, sigma: float) -> float:
-    """Strain at a stress at which rank and stress belong together; see `_along_law`."""
-    if sigma == math.inf:
-        return 1.0 + row[EPS_STAR]
-    if not sigma > 0.0:
-        return -math.inf
-    rank = (math.log(sigma) - log) / spread
-    return strain_of(row, share(rank), share(-rank), sigma)
-
-
-@inner
-def begin(row: Row, state: Array) -> None:
-    """Set the state of a spring that never bore anything."""
-    if row[REMEMBERS] > 0.0:
-        memory.begin(row, state, 0.0)
-        return
-    state[:] = 0.0
-    state[BRANCH], state[RANK], state[REST] = A, -math.inf, 1.0
-    plus, minus = row[LOG_PLUS], row[LOG_MINUS]
-    state[SIGMA_MEET] = math.exp(row[LOG_CROSS])
-    state[MEET] = _strain_between(row, plus, row[SPREAD_PLUS], state[SIGMA_MEET])
-    least = plus + row[SPREAD_PLUS] * LEAST_RANK
-    state[SIGMA_FIRST] = math.exp(least)
-    state[FIRST] = strain_of(row, 0.0, 1.0, state[SIGMA_FIRST])
-    state[SIGMA_LAST] = math.exp(min(least, minus + row[SPREAD_MINUS] * LEAST_RANK))
-    state[LAST] = strain_of(row, 0.0, 1.0, state[SIGMA_LAST])
-    _enter(row, state, A)
-
-
-@inner
-def begin_above(row: Row, state: Array, least: float) -> None:
-    """Set the state of a spring that never bore anything, and snaps nothing below a strain."""
-    if row[REMEMBERS] > 0.0:
-        memory.begin(row, state, least)
-        return
-    begin(row, state)
-    if min(state[FIRST], state[LAST]) >= least:
-        return
-    plus = _along_law(row, state, least, row[LOG_PLUS], row[SPREAD_PLUS])
-    minus = _along_law(row, state, least, row[LOG_MINUS], row[SPREAD_MINUS])
-    if state[FIRST] < least:
-        state[FIRST], state[SIGMA_FIRST] = least, plus
-    if state[LAST] < least:
-        state[LAST], state[SIGMA_LAST] = least, min(plus, minus)
-    _enter(row, state, A)
-
-
-@inner
-def _hysteretic_below(row: Row) -> bool:
-    """Whether snap-back lies below snap-through under the stress at which both meet, or above."""
-    return row[SPREAD_MINUS] >= row[SPREAD_PLUS]
-
-
-@inner
-def _enter(row: Row, state: Array, branch: int) -> None:
-    """Enter a branch at the strain and stress where the spring is."""
-    below = _hysteretic_below(row)
-    state[BRANCH] = branch
-    state[LOW], state[SIGMA_LOW] = -math.inf, -math.inf
-    state[HIGH], state[SIGMA_HIGH] = math.inf, math.inf
-    if branch == A:
-        state[RANK], state[SNAPPED], state[REST] = -math.inf, 0.0, 1.0
-        state[HIGH], state[SIGMA_HIGH] = state[FIRST], state[SIGMA_FIRST]
-    elif branch == SNAP:
-        if below:
-            state[HIGH], state[SIGMA_HIGH] = state[MEET], state[SIGMA_MEET]
-    else:
-        state[LOW], state[SIGMA_LOW] = state[LAST], state[SIGMA_LAST]
-        met = below if branch == BOTH else not below
-        if met and state[MEET] > state[LOW]:
-            state[LOW], state[SIGMA_LOW] = state[MEET], state[SIGMA_MEET]
-        if branch == BOTH and not below:
-            state[HIGH], state[SIGMA_HIGH] = state[MEET], state[SIGMA_MEET]
-    state[FLEXIBILITY] = 0.0
-
-
-@inner
-def _hold(row: Row, state: Array, up: bool) -> None:
-    """Hold the rank that has been reached, where the strain turns (upwards or downwards)."""
-    if up:
-        rank = (math.log(state[SIGMA]) - row[LOG_MINUS]) / row[SPREAD_MINUS]
-    else:
-        rank = (math.log(state[SIGMA]) - row[LOG_PLUS]) / row[SPREAD_PLUS]
-    p, rest = share(rank), share(-rank)
-    state[BRANCH], state[RANK], state[SNAPPED], state[REST] = HELD, rank, p, rest
-    state[FLEXIBILITY] = 0.0
-    if up:
-        state[LOW], state[SIGMA_LOW] = state[EPS], state[SIGMA]
-        sigma = math.exp(row[LOG_PLUS] + row[SPREAD_PLUS] * rank)
-        state[SIGMA_HIGH] = max(sigma, state[SIGMA])
-        state[HIGH] = max(strain_of(row, p, rest, sigma), state[EPS])
-    else:
-        state[HIGH], state[SIGMA_HIGH] = state[EPS], state[SIGMA]
-        sigma = math.exp(row[LOG_MINUS] + row[SPREAD_MINUS] * rank)
-        state[SIGMA_LOW] = min(sigma, state[SIGMA])
-        state[LOW] = min(strain_of(row, p, rest, sigma), state[EPS])
-
-
-@inner
-def switch(row: Row, state: Array, up: bool) -> None:
-    """Go over from the end of a branch, or from where the strain turns, to the next branch."""
-    if row[REMEMBERS] > 0.0:
-        memory.switch(row, state, up)
-        return
-    branch = int(state[BRANCH])
-    if turned(state, up):
-        _hold(row, state, up)
-        return
-    end = HIGH if up else LOW
-    state[EPS], state[SIGMA] = state[end], state[end + SIGMA_LOW - LOW]
-    if branch == HELD:
-        _enter(row, state, SNAP if up else BACK)
-    elif branch == A:
-        below = _hysteretic_below(row)
-        _enter(row, state, SNAP if (state[SIGMA] < state[SIGMA_MEET]) == below else BOTH)
-    elif branch == SNAP:
-        _enter(row, state, BOTH)
-    elif state[SIGMA] == state[SIGMA_LAST]:
-        _enter(row, state, A)
-    elif branch == BACK:
-        _enter(row, state, BOTH)
-    else:
-        _enter(row, state, SNAP if up else BACK)
-
-
-@inner
 def stress_in(row: Row, state: Array, eps: float) -> float:
-    """Stress at a strain on the branch that the spring is on; infinite if it cannot have any."""
-    if row[REMEMBERS] > 0.0:
-        return memory.stress_in(row, state, eps)
+    """Stress at a strain on the branch that the spring is on; infinite past its end.
+
+    Halley's method from the parabola through the point before, inside a bracket.
+    """
     branch = int(state[BRANCH])
-    if branch == A:
-        return row[K0] * eps / (1.0 - eps) if eps < 1.0 else math.inf
-    if branch == HELD:
+    if branch == HELD and row[REMEMBERS] == 0.0:
         return held_stress(row, state[SNAPPED], state[REST], eps)
-    if branch == BACK:
-        return _along_law(row, state, eps, row[LOG_MINUS], row[SPREAD_MINUS])
-    return _along_law(row, state, eps, row[LOG_PLUS], row[SPREAD_PLUS])
-
-
-@inner
-def _stress_below(row: Row, eps: float, log: float, spread: float) -> float:
-    """Return a stress above 0 below that at a strain above 0, where p = Φ((ln σ - log)/spread).
-
-    Branches a and c take less than half of the strain there, and p eps_star the other half at most:
-    at a rank below 0, p is at most exp(-rank²/2)/2.
-    """
-    bent = 0.5 * min(eps, 1.0) * min(row[K0], row[KC])
-    rank = -math.sqrt(2.0 * math.log(max(row[EPS_STAR] / eps, 1.0)))
-    return max(min(bent, math.exp(log + spread * rank)), LEAST)
-
-
-@inner
-def _along_law(row: Row, state: Array, eps: float, log: float, spread: float) -> float:
-    """Stress at a strain where p = Φ((ln σ - log)/spread), to rounding.
-
-    Halley's method from the parabola through the point before, inside a bracket. The strain lies
-    between those of branches a and c.
-    """
-    k0, kc, star = row[K0], row[KC], row[EPS_STAR]
-    if not eps < 1.0 + star:
+    reach = 1.0 + (row[EPS_STAR] if moves(branch) or state[SNAPPED] > 0.0 else 0.0)
+    if not eps < reach:
         return math.inf
-    low, high = 0.0, k0 * eps / (1.0 - eps) if eps < 1.0 else math.inf
-    high *= 1.0 + 1e-15
-    if eps > star:
-        low = kc * (eps - star) / (1.0 - (eps - star)) * (1.0 - 1e-15)
-    sigma, slope = state[SIGMA], state[FLEXIBILITY]
-    if slope > 0.0:
+    if branch == A and (state[NEVER] == 1.0 or eps == 0.0):
+        return stress_on_a(row[STIFFENING], row[K0], eps)
+    sigma, slope, low, high = state[SIGMA], state[FLEXIBILITY], -math.inf, math.inf
+    bounded = not slope > 0.0
+    if bounded:
+        low, high = _ends_of_stress(row, state, eps)
+        if not low < sigma < high:
+            sigma = _inside(row, low, high)
+    else:
         step = (eps - state[EPS]) / slope
         sigma += step * (1.0 - 0.5 * step * state[CURVATURE] / slope)
-    if not low < sigma < high:
-        sigma = 0.5 * (low + high) if high < math.inf else max(2.0 * low, k0)
-    for _ in range(200):
-        rank = (math.log(sigma) - log) / spread
-        one, two = 1.0 / (k0 + sigma), 1.0 / (kc + sigma)
-        p = share(rank)
-        rest = share(-rank) if rank > 0.0 else 1.0 - p
-        gap = star + sigma * (two - one)  # of branch c to branch a
-        miss = rest * (sigma * one) + p * (star + sigma * two) - eps
-        rate = density(rank) / (spread * sigma)
-        on_a, on_c = k0 * one * one, kc * two * two
-        slope = rest * on_a + p * on_c + rate * gap
-        bend = 2.0 * (rate * (on_c - on_a) - rest * on_a * one - p * on_c * two)
-        bend -= rate * gap * (rank / spread + 1.0) / sigma
-        state[FLEXIBILITY], state[CURVATURE] = slope, bend
+    narrow = min(row[SPREAD_PLUS], row[SPREAD_MINUS], 1.0) if moves(branch) else 1.0
+    for _ in range(300):
+        miss = at_stress(row, state, sigma) - eps
+        slope, bend = state[FLEXIBILITY], state[CURVATURE]
+        step = miss / slope
+        part = 1.0 - 0.5 * step * bend / slope
+        if 0.5 < part < 2.0:
+            step /= part
+        new = sigma - step
+        if abs(step) <= NEAR * abs(sigma) * narrow and low <= new <= high:
+            state[FLEXIBILITY] += bend * (new - sigma)
+            return new
+        if not bounded:  # the guess was not good enough
+            low, high = _ends_of_stress(row, state, eps)
+            bounded = True
+            if not low < sigma < high:
+                sigma = _inside(row, low, high)
+                continue
         if miss > 0.0:
             high = sigma
         else:
             low = sigma
-        step = miss / slope
-        share_of = 1.0 - 0.5 * step * bend / slope
-        if 0.5 < share_of < 2.0:
-            step /= share_of
-        new = sigma - step
-        if abs(step) <= NEAR * sigma * min(spread, 1.0) and low <= new <= high:
-            state[FLEXIBILITY] += bend * (new - sigma)
-            return new
         if not low < new < high:
-            if low == 0.0:  # halving a stress of any size in its logarithm needs an end above 0
-                low = min(_stress_below(row, eps, log, spread), sigma)
-            new = math.sqrt(low) * math.sqrt(high) if high < math.inf else 2.0 * sigma
+            new = _halfway(low, high, sigma)
             if not low < new < high:  # neighbouring numbers: nothing lies between them
                 return sigma
         sigma = new
@@ -372,23 +272,121 @@ def _along_law(row: Row, state: Array, eps: float, log: float, spread: float) ->
 
 
 @inner
-def settle(row: Row, state: Array, eps: float) -> None:
-    """Bring a spring to a strain that lies on its branch."""
-    sigma = stress_in(row, state, eps)
-    state[EPS], state[SIGMA] = eps, sigma
+def _inside(row: Row, low: float, high: float) -> float:
+    """Return a stress between two, of which the second may be infinite."""
+    return 0.5 * (low + high) if high < math.inf else max(2.0 * low, row[K0])
 
 
 @inner
-def fill_slopes(row: Row, state: Array) -> None:
-    """Fill dε/dσ and d²ε/dσ² on a branch on which no micro-spring snaps: held, or `a`.
+def _halfway(low: float, high: float, sigma: float) -> float:
+    """Return a stress between two, halfway in its logarithm where that can be."""
+    if high == math.inf:
+        return 2.0 * max(sigma, LEAST)
+    if low > 0.0:
+        return math.sqrt(low) * math.sqrt(high)
+    if low == 0.0:
+        return 1e-3 * high if high > 1e6 * LEAST else 0.5 * high
+    return 0.5 * (low + high)
 
-    Those of a spring that remembers come with the stress.
-    """
-    if row[REMEMBERS] > 0.0:
+
+# ---------------------------------------------------------------- from branch to branch
+
+
+@inner
+def begin(row: Row, state: Array, least: float) -> None:
+    """Set the state of a spring that never bore anything, and snaps nothing below a strain."""
+    state[:] = 0.0
+    state[RANK], state[EVER], state[REST], state[NEVER] = -math.inf, -math.inf, 1.0, 1.0
+    state[LEAST_AT] = least
+    _enter(row, state, A)
+
+
+@inner
+def _ends(row: Row, state: Array, end: int, sigma: float) -> None:
+    """Let the branch end at a stress: upwards (HIGH) or downwards (LOW)."""
+    kept = state[FLEXIBILITY], state[CURVATURE]
+    eps = at_stress(row, state, sigma)
+    state[FLEXIBILITY], state[CURVATURE] = kept
+    if (end == HIGH and eps < state[EPS]) or (end == LOW and eps > state[EPS]):
+        eps, sigma = state[EPS], state[SIGMA]
+    state[end], state[end + SIGMA_LOW - LOW] = eps, sigma
+
+
+@inner
+def _no_less(row: Row, state: Array, end: int) -> None:
+    """Move the end of a branch up to the least strain at which a micro-spring may snap."""
+    least = state[LEAST_AT]
+    if state[end] < least:
+        kept = state[FLEXIBILITY], state[CURVATURE]
+        state[end + SIGMA_LOW - LOW], state[end] = stress_in(row, state, least), least
+        state[FLEXIBILITY], state[CURVATURE] = kept
+
+
+@inner
+def _has_loop(row: Row, sigma: float, up: bool) -> bool:
+    """Whether snap-back lies below snap-through just above, or just below, a stress."""
+    below = row[SPREAD_MINUS] >= row[SPREAD_PLUS]
+    log = math.log(sigma)
+    if below:
+        return log < row[LOG_CROSS] if up else log <= row[LOG_CROSS]
+    return log >= row[LOG_CROSS] if up else log > row[LOG_CROSS]
+
+
+@inner
+def _last_stress(row: Row) -> float:
+    """Stress at which the last micro-spring has snapped back."""
+    through = row[LOG_AGAIN] + row[SPREAD_PLUS] * LEAST_RANK
+    return math.exp(min(through, row[LOG_MINUS] + row[SPREAD_MINUS] * LEAST_RANK))
+
+
+@inner
+def _enter(row: Row, state: Array, branch: int) -> None:
+    """Enter a branch at the strain and stress where the spring is."""
+    state[BRANCH], state[FLEXIBILITY] = branch, 0.0
+    state[LOW], state[SIGMA_LOW] = -math.inf, -math.inf
+    state[HIGH], state[SIGMA_HIGH] = math.inf, math.inf
+    below, cross = row[SPREAD_MINUS] >= row[SPREAD_PLUS], math.exp(row[LOG_CROSS])
+    if branch == A:
+        state[RANK], state[SNAPPED], state[REST] = -math.inf, 0.0, 1.0
+        first = row[LOG_PLUS] if state[NEVER] == 1.0 else row[LOG_AGAIN]
+        _ends(row, state, HIGH, math.exp(first + row[SPREAD_PLUS] * LEAST_RANK))
+        if state[HIGH] < state[LEAST_AT]:
+            state[BRANCH] = SNAP if state[NEVER] == 1.0 else AGAIN
+            _no_less(row, state, HIGH)
+            state[BRANCH] = A
         return
-    one, two = 1.0 / (row[K0] + state[SIGMA]), 1.0 / (row[KC] + state[SIGMA])
-    on_a, on_c = state[REST] * row[K0] * one * one, state[SNAPPED] * row[KC] * two * two
-    state[FLEXIBILITY], state[CURVATURE] = on_a + on_c, -2.0 * (on_a * one + on_c * two)
+    if branch != BACK and (branch != SNAP or row[REMEMBERS] == 0.0):
+        high = math.inf
+        if row[REMEMBERS] > 0.0:
+            high = math.exp(row[LOG_AGAIN] + row[SPREAD_PLUS] * state[EVER])
+        if (branch != BOTH) == below:  # where both lines meet, the other one begins
+            high = min(high, cross)
+        if high < math.inf:
+            _ends(row, state, HIGH, high)
+    if branch in (BOTH, BACK):
+        last = _last_stress(row)
+        _ends(row, state, LOW, max(last, cross) if (branch == BOTH) == below else last)
+        _no_less(row, state, LOW)
+
+
+@inner
+def _hold(row: Row, state: Array, rank: float) -> None:
+    """Hold a rank that has been reached."""
+    p, rest = share(rank), share(-rank)
+    state[BRANCH], state[RANK], state[SNAPPED], state[REST] = HELD, rank, p, rest
+    state[FLEXIBILITY] = 0.0
+    first = row[LOG_PLUS] if rank >= state[EVER] else row[LOG_AGAIN]
+    back = row[LOG_MINUS] + row[SPREAD_MINUS] * rank
+    again = row[LOG_AGAIN] + row[SPREAD_PLUS] * rank
+    _ends(row, state, HIGH, max(math.exp(first + row[SPREAD_PLUS] * rank), state[SIGMA]))
+    _ends(row, state, LOW, min(math.exp(min(back, again)), state[SIGMA]))
+
+
+@inner
+def turned(state: Array, up: bool) -> bool:
+    """Whether a spring that snaps, or snaps back, is now moved the other way."""
+    branch = state[BRANCH]
+    return branch == BACK if up else branch in (SNAP, AGAIN)
 
 
 @inner
@@ -401,16 +399,68 @@ def leaves(state: Array, eps: float) -> bool:
 
 
 @inner
+def _snap(row: Row, state: Array) -> None:
+    """Snap through: once more what has snapped before, or on first loading."""
+    if row[REMEMBERS] > 0.0 and (state[RANK] >= state[EVER] or state[NEVER] == 1.0):
+        _enter(row, state, SNAP)
+    elif _has_loop(row, state[SIGMA], True):
+        _enter(row, state, AGAIN if row[REMEMBERS] > 0.0 else SNAP)
+    else:
+        _enter(row, state, BOTH)
+
+
+@inner
+def switch(row: Row, state: Array, up: bool) -> None:
+    """Go over from the end of a branch, or from where the strain turns, to the next branch."""
+    branch, remembers = int(state[BRANCH]), row[REMEMBERS] > 0.0
+    if turned(state, up):
+        rank = rank_now(row, state)
+        if branch == SNAP and remembers:
+            state[EVER], state[NEVER] = rank, share(-rank)
+        _hold(row, state, rank)
+        if not up and row[LOG_AGAIN] == row[LOG_PLUS] and not _has_loop(row, state[SIGMA], False):
+            _enter(row, state, BOTH)
+        return
+    end = HIGH if up else LOW
+    state[EPS], state[SIGMA] = state[end], state[end + SIGMA_LOW - LOW]
+    sigma = state[SIGMA]
+    if branch == A or (branch == HELD and up):
+        _snap(row, state)
+    elif branch == HELD:
+        _enter(row, state, BACK if _has_loop(row, sigma, False) else BOTH)
+    elif up:
+        log = row[LOG_AGAIN] + row[SPREAD_PLUS] * state[EVER]
+        if not remembers:
+            _enter(row, state, SNAP if branch == BOTH else BOTH)
+        elif math.log(sigma) < log - 1e-14 * max(abs(log), 1.0):
+            _enter(row, state, AGAIN if branch == BOTH else BOTH)
+        else:  # all that ever snapped has snapped again
+            state[RANK] = state[EVER]
+            if row[LOG_AGAIN] == row[LOG_PLUS]:
+                _enter(row, state, SNAP)
+            else:
+                _hold(row, state, state[EVER])
+    elif sigma <= _last_stress(row) or state[EPS] <= state[LEAST_AT]:
+        _enter(row, state, A)
+    else:
+        _enter(row, state, BOTH if branch == BACK else BACK)
+
+
+@inner
+def settle(row: Row, state: Array, eps: float) -> None:
+    """Bring a spring to a strain that lies on its branch."""
+    sigma = stress_in(row, state, eps)
+    state[EPS], state[SIGMA] = eps, sigma
+
+
+@inner
 def rank_now(row: Row, state: Array) -> float:
     """The rank up to which micro-springs have snapped."""
-    if row[REMEMBERS] > 0.0:
-        return memory.rank_now(row, state)
     branch = int(state[BRANCH])
-    if branch in (A, HELD):
+    if not moves(branch):
         return state[RANK]
-    if branch == BACK:
-        return (math.log(state[SIGMA]) - row[LOG_MINUS]) / row[SPREAD_MINUS]
-    return (math.log(state[SIGMA]) - row[LOG_PLUS]) / row[SPREAD_PLUS]
+    place, scale = line(row, branch)
+    return (math.log(state[SIGMA]) - place) / scale
 
 
 @inner
@@ -421,13 +471,13 @@ def ever_now(state: Array, rank: float) -> float:
 
 @compiled
 def stress_along(row: Row, eps: Array) -> tuple[Array, Array, Branches]:
-    """Stress, ranks and branch of one microscale spring along a strain history, from rest.
+    """Stress, ranks (2, n) and branch of one microscale spring along a strain history, from rest.
 
-    The ranks (2, n) are those of what has snapped, and of what has ever snapped.
+    The ranks are those of what has snapped, and of what has ever snapped.
     """
     sigma, rank = np.empty(eps.size), np.empty((2, eps.size))
     branches, state = np.empty(eps.size, np.int64), np.empty(STATE)
-    begin(row, state)
+    begin(row, state, 0.0)
     for j in range(eps.size):
         while leaves(state, eps[j]):
             switch(row, state, eps[j] > state[EPS])
@@ -442,27 +492,36 @@ def stress_along(row: Row, eps: Array) -> tuple[Array, Array, Branches]:
     return sigma, rank, branches
 
 
+# ---------------------------------------------------------------- along a stress
+
+
 @inner
 def rank_at(
     row: Row, rank: float, ever: float, branch: int, sigma: float
 ) -> tuple[float, float, int]:
-    """Ranks of what has snapped, and has ever, and branch of a spring last seen at other stresses.
-
-    The second rank counts only where the spring remembers.
-    """
-    if row[REMEMBERS] > 0.0:
-        return memory.rank_at(row, rank, ever, branch, sigma)
-    plus = minus = -math.inf
+    """Ranks w and W and branch at a stress of a spring that was last seen at others."""
+    remembers = row[REMEMBERS] > 0.0
+    first = again = back = -math.inf
     if sigma > 0.0:
         log = math.log(sigma)
-        plus = (log - row[LOG_PLUS]) / row[SPREAD_PLUS]
-        minus = (log - row[LOG_MINUS]) / row[SPREAD_MINUS]
-    most = max(plus, minus)
-    if rank < plus:
-        rank, branch = plus, SNAP if minus > plus else BOTH
+        first = (log - row[LOG_PLUS]) / row[SPREAD_PLUS]
+        again = (log - row[LOG_AGAIN]) / row[SPREAD_PLUS]
+        back = (log - row[LOG_MINUS]) / row[SPREAD_MINUS]
+    least = max(first, min(again, ever))
+    most = max(least, back)
+    if remembers and first > max(ever, LEAST_RANK):  # first loading, of a virgin spring too
+        return first, first, SNAP
+    if rank < least:
+        rank, branch = least, BOTH
+        if remembers and least == ever:
+            branch = HELD
+        elif back > least:
+            branch = AGAIN if remembers else SNAP
     elif rank > most:
-        rank, branch = most, BACK if minus > plus else BOTH
-    elif plus < rank < most or branch == (BACK if rank == plus else SNAP):
+        rank, branch = most, BACK if back > least else BOTH
+    elif least < rank < most or rank == ever:
+        branch = HELD
+    elif (rank == least and branch == BACK) or (rank == most and branch in (SNAP, AGAIN)):
         branch = HELD  # also at an end of the held stresses that it has not passed
     if rank < LEAST_RANK:
         rank, branch = -math.inf, A
@@ -473,48 +532,101 @@ def rank_at(
 def under_stress(
     row: Row, branch: int, rank: float, ever: float, sigma: float
 ) -> tuple[float, float, float, float, float]:
-    """Strain at a stress, its derivatives by stress and both ranks, and of the rank by the stress.
+    """Strain at a stress and its derivatives by stress, w and W; and that of w by the stress.
 
-    The strain is -inf where the spring cannot carry the tension.
+    On first loading w and W are one: its derivative is that by w. The strain is -inf where the
+    spring cannot carry the tension.
     """
-    if row[REMEMBERS] > 0.0:
-        return memory.under_stress(row, branch, rank, ever, sigma)
-    if not sigma > -row[K0]:
-        return -math.inf, 0.0, 0.0, 0.0, 0.0
-    one = 1.0 / (row[K0] + sigma)
+    n, never = row[STIFFENING], share(-ever)
+    p, rest = (share(rank), share(-rank)) if branch != A else (0.0, 1.0)
+    strain, soft, _, one, _ = mixture(row, branch, p, rest, never, sigma)
+    if strain == -math.inf or (branch == A and never == 1.0):
+        return strain, soft, 0.0, 0.0, 0.0
+    by_ever, pace = 0.0, 0.0
+    if branch != SNAP and never < 1.0 and row[K_SNAPPED] != row[K0]:
+        by_ever = density(ever) * (one - on_a(n, row[K0], sigma)[0])
     if branch == A:
-        return sigma * one, row[K0] * one * one, 0.0, 0.0, 0.0
-    two, p, rest = 1.0 / (row[KC] + sigma), share(rank), share(-rank)
-    on_a, on_c = sigma * one, row[EPS_STAR] + sigma * two
-    soft = rest * row[K0] * one * one + p * row[KC] * two * two
-    pace = 0.0
+        return strain, soft, 0.0, by_ever, 0.0
+    by_rank = density(rank) * (row[EPS_STAR] + sigma / (row[KC] + sigma) - one)
     if branch != HELD:
-        pace = 1.0 / (row[SPREAD_MINUS if branch == BACK else SPREAD_PLUS] * sigma)
-    return rest * on_a + p * on_c, soft, density(rank) * (on_c - on_a), 0.0, pace
+        pace = 1.0 / (line(row, branch)[1] * sigma)
+    return strain, soft, by_rank, by_ever, pace
 
 
 @compiled
 def strain_along(row: Row, sigma: Array) -> tuple[Array, Array, Branches]:
-    """Strain, ranks and branch of one microscale spring along a stress history, from rest.
+    """Strain, ranks (2, n) and branch of one microscale spring along a stress history, from rest.
 
-    The ranks (2, n) are those of what has snapped, and of what has ever snapped.
-    The strain is -inf where the spring cannot carry the tension.
+    The ranks are those of `stress_along`; the strain is -inf where the spring cannot carry the
+    tension.
     """
     eps, ranks = np.empty(sigma.size), np.empty((2, sigma.size))
     branches, branch, rank, ever = np.empty(sigma.size, np.int64), A, -math.inf, -math.inf
     for j in range(sigma.size):
         rank, ever, branch = rank_at(row, rank, ever, branch, sigma[j])
-        eps[j] = -math.inf
-        if row[REMEMBERS] > 0.0:
-            p, rest, never = share(rank), share(-rank), share(-ever)
-            eps[j] = memory.mixture(row, branch, p, rest, never, sigma[j])[0]
-        elif sigma[j] > -row[K0]:
-            eps[j] = strain_of(row, share(rank), share(-rank), sigma[j])
+        p, rest, never = share(rank), share(-rank), share(-ever)
+        eps[j] = mixture(row, branch, p, rest, never, sigma[j])[0]
         branches[j], ranks[0, j], ranks[1, j] = branch, rank, ever
     return eps, ranks, branches
 
 
 # ---------------------------------------------------------------- derivatives
+
+
+@inner
+def carried(row: Row) -> int:
+    """How many derivatives are carried along."""
+    return CARRIED if row[REMEMBERS] > 0.0 else PLAIN_CARRIED
+
+
+@inlined
+def strain_tangents(
+    row: Row, branch: int, rank: float, ever: float, sigma: float, out: Array
+) -> tuple[float, float, float, float]:
+    """Fill the derivatives of the strain, at fixed stress and ranks, by all but the snap stresses.
+
+    At those places stand the derivatives of the rank w at a fixed stress. Returns what
+    `under_stress` does, but for the strain.
+    """
+    k0, two = row[K0], 1.0 / (row[KC] + sigma)
+    p, rest, weight = 0.0, 1.0, 0.0
+    if branch != A:
+        p, weight = share(rank), density(rank)
+        rest = share(-rank) if rank > 0.0 else 1.0 - p
+    for c in range(carried(row)):
+        out[c] = 0.0
+    fresh, worn, by_ever, pace = rest, 0.0, 0.0, 0.0
+    if row[REMEMBERS] == 0.0:
+        one, slope, _ = on_a(1.0, k0, sigma)
+        softer = slope
+    else:
+        n, never, weight_ever = row[STIFFENING], rest, weight
+        if rank != ever:
+            never, weight_ever = share(-ever), density(ever)
+        if branch != SNAP and never != 1.0:
+            fresh = never  # on branch a, and never snapped
+            worn = max(rest - fresh, 0.0)
+        a, slope, by_n = changes_on_a(n, k0, sigma)
+        one, softer, by_n_softer = a, slope, by_n
+        if branch != SNAP and row[K_SNAPPED] != k0:
+            one, softer, by_n_softer = changes_on_a(n, row[K_SNAPPED], sigma)
+        if never < 1.0:
+            by_ever = weight_ever * (one - a)
+        out[OF_STIFFENING] = fresh * by_n + worn * by_n_softer
+        out[OF_SOFTENING] = worn * sigma * softer
+        if branch in (AGAIN, BOTH):
+            out[OF_WEAKENING] = 1.0 / row[SPREAD_PLUS]
+    out[0] = -sigma * (fresh * slope + worn * softer) / k0
+    out[1], out[2] = -p * sigma * two * two, p
+    soft = fresh * slope + worn * softer + p * row[KC] * two * two
+    by_rank = weight * (row[EPS_STAR] + sigma * two - one)
+    if moves(branch):
+        back = branch == BACK
+        per_scale, first = 1.0 / row[SPREAD_MINUS if back else SPREAD_PLUS], 5 if back else 3
+        pace = per_scale / sigma
+        out[first] = -math.exp(-row[LOG_MINUS if back else LOG_PLUS]) * per_scale
+        out[first + 1] = -rank * per_scale
+    return soft, by_rank, by_ever, pace
 
 
 @inner
@@ -530,56 +642,37 @@ def tangents(
 ) -> float:
     """Fill the derivatives of the stress at a strain; returns the slope dσ/dε.
 
-    They are by k0 … spread_minus, and by the logarithm of the strain; where the spring remembers,
-    also by stiffening, softening, weakening. `d_ranks` (2, CARRIED), the same of both ranks, is
-    brought up to date where the spring moves.
+    They are by k0 … spread_minus, the logarithm of the strain, stiffening, softening, weakening.
+    `d_ranks` (2, CARRIED), the same of w and W, is brought up to date where the spring moves.
     """
-    d_rank = d_ranks[0]
+    d_rank, d_ever, count = d_ranks[0], d_ranks[1], carried(row)
+    soft, by_rank, by_ever, pace = strain_tangents(row, branch, rank, ever, sigma, out)
+    slope = 1.0 / (soft + by_rank * pace)
+    out[OF_STRAIN] = -eps
+    if not moves(branch):
+        for c in range(count):
+            if branch == A:
+                d_rank[c] = 0.0
+            elif rank == ever:
+                d_rank[c] = d_ever[c]
+            out[c] = -slope * (out[c] + by_rank * d_rank[c] + by_ever * d_ever[c])
+        return slope
+    first = 5 if branch == BACK else 3
+    by_middle, by_spread, by_weakening = out[first], out[first + 1], 0.0
+    out[first], out[first + 1] = by_rank * by_middle, by_rank * by_spread
     if row[REMEMBERS] > 0.0:
-        return memory.tangents(row, branch, rank, ever, sigma, eps, d_rank, d_ranks[1], out)
-    k0, kc, star = row[K0], row[KC], row[EPS_STAR]
-    one, two = 1.0 / (k0 + sigma), 1.0 / (kc + sigma)
-    if branch == A:
-        for c in range(PLAIN_CARRIED):
-            d_rank[c] = out[c] = 0.0
-        slope = 1.0 / (k0 * one * one)
-        out[0] = slope * sigma * one * one
-        out[OF_STRAIN] = slope * eps
-        return slope
-    p, rest = share(rank), share(-rank)
-    weight = density(rank) * (star + sigma * (two - one))  # dε/dw
-    flexible = rest * k0 * one * one + p * kc * two * two
-    if branch == HELD:
-        slope = 1.0 / flexible
-        for c in range(PLAIN_CARRIED):
-            out[c] = -slope * weight * d_rank[c]
-        out[0] += slope * rest * sigma * one * one
-        out[1] += slope * p * sigma * two * two
-        out[2] -= slope * p
-        out[OF_STRAIN] += slope * eps
-        return slope
-    back = branch == BACK
-    spread = row[SPREAD_MINUS] if back else row[SPREAD_PLUS]
-    first = 5 if back else 3
-    by_log = -math.exp(-(row[LOG_MINUS] if back else row[LOG_PLUS])) / spread
-    slope = 1.0 / (flexible + weight / (spread * sigma))
-    for c in range(PLAIN_CARRIED):
-        out[c] = d_rank[c] = 0.0
-    d_rank[first], d_rank[first + 1] = by_log, -rank / spread
-    out[0] = slope * rest * sigma * one * one
-    out[1] = slope * p * sigma * two * two
-    out[2] = -slope * p
-    out[first], out[first + 1] = -slope * weight * by_log, slope * weight * rank / spread
-    out[OF_STRAIN] = slope * eps
-    for c in range(PLAIN_CARRIED):
-        d_rank[c] += out[c] / (spread * sigma)
+        by_weakening = out[OF_WEAKENING]
+        out[OF_WEAKENING] = by_rank * by_weakening
+    for c in range(count):
+        out[c] = -slope * (out[c] + by_ever * d_ever[c])
+        d_rank[c] = pace * out[c]
+    d_rank[first] += by_middle
+    d_rank[first + 1] += by_spread
+    d_rank[OF_WEAKENING] += by_weakening
+    if branch == SNAP:
+        for c in range(count):
+            d_ever[c] = d_rank[c]
     return slope
-
-
-@inner
-def carried(row: Row) -> int:
-    """How many derivatives are carried along."""
-    return CARRIED if row[REMEMBERS] > 0.0 else PLAIN_CARRIED
 
 
 @compiled
@@ -599,26 +692,3 @@ def stress_tangents_along(
         for c in range(count):
             out[c, j] = now[c]
     return out, slope
-
-
-@inner
-def strain_tangents(
-    row: Row, branch: int, rank: float, ever: float, sigma: float, out: Array
-) -> None:
-    """Fill the derivatives of the strain by k0, kc, eps_star; of the rank by sigma_plus and so on.
-
-    Those of the strain are at a fixed stress and rank, those of the rank at a fixed stress.
-    """
-    if row[REMEMBERS] > 0.0:
-        memory.strain_tangents(row, branch, rank, ever, sigma, out)
-        return
-    one, two, p = 1.0 / (row[K0] + sigma), 1.0 / (row[KC] + sigma), share(rank)
-    out[0], out[1], out[2] = -share(-rank) * sigma * one * one, -p * sigma * two * two, p
-    for own in range(3, OF_STRAIN):
-        out[own] = 0.0
-    if branch == BACK:
-        out[5] = -math.exp(-row[LOG_MINUS]) / row[SPREAD_MINUS]
-        out[6] = -rank / row[SPREAD_MINUS]
-    elif branch not in (A, HELD):
-        out[3] = -math.exp(-row[LOG_PLUS]) / row[SPREAD_PLUS]
-        out[4] = -rank / row[SPREAD_PLUS]

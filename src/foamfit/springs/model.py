@@ -7,9 +7,10 @@ relaxation terms, then the heights of a chain, then `site_eta`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -229,3 +230,39 @@ def with_options(model: str, **options: bool) -> str:
                 f"none; take model {having[0]}, or leave {name} out"
             )
     return "+".join(laws.with_options(kind, asked) for kind in kinds)
+
+
+def exchanges(model: Model, values: Array) -> Iterator[Array]:
+    """Give the chains in which two springs of one kind have exchanged some properties.
+
+    A chain under a common stress shows the sum of its springs' elongations, so properties are put
+    as stresses and as elongations between them (`Law.exchanged`): with each exchange the springs
+    snap at the same stresses and the rest of the loop moves as little as it can.
+
+    Parameters
+    ----------
+    model
+        The springs.
+    values
+        Vector of parameters, (n,) SI; nuisance parameters behind those of the springs stay.
+    """
+    index, laws = model.index, model.laws
+    for pair in combinations(range(len(laws)), 2):
+        law, other = (laws[i] for i in pair)
+        if law is not other or law.exchanged is None:
+            continue
+        to_stresses, from_stresses = law.exchanged
+        names = [f"s{i + 1}_height" for i in pair]
+        heights = [float(values[index[n]]) if n in index else 1.0 for n in names]
+        own = [
+            to_stresses(model.own(i, values)[:-1], height)
+            for i, height in zip(pair, heights, strict=True)
+        ]
+        count = len(law.params)
+        for bits in range(1, 2 ** (count - 1)):
+            chosen = np.array([bool(bits >> k & 1) for k in range(count)])
+            out = values.copy()
+            for i, height, mine, their in zip(pair, heights, own, own[::-1], strict=True):
+                mixed = np.where(chosen, their, mine)
+                model.own(i, out)[:-1] = from_stresses(mixed, height)
+            yield out

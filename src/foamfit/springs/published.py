@@ -62,26 +62,12 @@ class PublishedSet:
         return self.eta / (2.0 * height * math.sqrt(density * self.bistable.kc))
 
 
-def _bistable(
-    k0: float,
-    drop: float,
-    eps_a: float,
-    eps_c: float,
-    kh_plus: float,
-    kh_minus: float,
-    kc: float,
-) -> BistableSpring:
-    """Make a spring of Tables 2 and 3: k0 in MPa, Δσ/σ_a, ε_a, ε_c, slopes over k0."""
+def _bistable(k0: float, drop: float, eps_a: float, eps_c: float, *ratios: float) -> BistableSpring:
+    """Make a spring of Tables 2 and 3: k0 in MPa, Δσ/σ_a, ε_a, ε_c, and k_h+, k_h-, k_c over k0."""
     slope = k0 * MPA
-    return BistableSpring(
-        k0=slope,
-        kc=kc * slope,
-        dsigma=drop * slope * eps_a / (1.0 - eps_a),
-        eps_a=eps_a,
-        eps_c=eps_c,
-        kh_plus=kh_plus * slope,
-        kh_minus=kh_minus * slope,
-    )
+    kh_plus, kh_minus, kc = (ratio * slope for ratio in ratios)
+    dsigma = drop * slope * eps_a / (1.0 - eps_a)
+    return BistableSpring(slope, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus)
 
 
 _AREA = math.pi / 4.0 * (5.0 * MM) ** 2
@@ -96,10 +82,8 @@ def _one_spring(name: str, kh_minus: float, eta: float | None, ratio: float | No
 
 
 def _model_3() -> PublishedSet:
-    springs: list[Spring] = [
-        LinearSpring(60 * MPA),
-        _bistable(2.0, -0.32, 0.35, 0.71, 3.40, 0.525, 30.0),
-    ]
+    bistable = _bistable(2.0, -0.32, 0.35, 0.71, 3.40, 0.525, 30.0)
+    springs = [LinearSpring(60 * MPA), bistable]
     chain = Chain(springs, [0.700 * MM, 0.490 * MM], _AREA, [5.56 * MG, 0.0], site_damping=3e2)
     return PublishedSet(
         "foam-1/model-3", "linear+bistable", chain, 3e2, 0.0297, striker_mass=7e-3, **_FOAM_1
@@ -107,10 +91,8 @@ def _model_3() -> PublishedSet:
 
 
 def _foam_2() -> PublishedSet:
-    springs: list[Spring] = [
-        LinearSpring(250 * MPA, unilateral=True),
-        _bistable(5.75, -0.80, 0.40, 0.70, 6.00, 0.200, 40.0),
-    ]
+    bistable = _bistable(5.75, -0.80, 0.40, 0.70, 6.00, 0.200, 40.0)
+    springs = [LinearSpring(250 * MPA, unilateral=True), bistable]
     chain = Chain(springs, [0.350 * MM, 0.756 * MM], _AREA, [5.05 * MG, 0.0], site_damping=1e4)
     return PublishedSet(
         "foam-2", "linear+bistable", chain, 1e4, 0.525, striker_mass=7e-3, **_FOAM_2
@@ -169,31 +151,14 @@ def table() -> str:
 
 
 def _published_row(item: PublishedSet, spring: Spring, height: float) -> list[str]:
-    h = f"{height / MM:.3f}"
+    k0, h = f"{spring.k0 / MPA:g}", f"{height / MM:.3f}"
     if not isinstance(spring, BistableSpring):
-        return [
-            item.name,
-            spring.law.kind,
-            f"{spring.k0 / MPA:g}",
-            "",
-            "",
-            "",
-            "",
-            h,
-            "",
-            "",
-            "",
-        ]
-    return [
-        item.name,
-        "bistable",
-        f"{spring.k0 / MPA:g}",
+        return [item.name, spring.law.kind, k0, *[""] * 4, h, *[""] * 3]
+    drop, eta = (
         f"{spring.dsigma / spring.sigma_a:.2f}",
         "-" if item.eta is None else f"{item.eta:g}",
-        f"{spring.eps_a:g}",
-        f"{spring.eps_c:g}",
-        h,
-        f"{spring.kh_plus / spring.k0:.3g}",
-        f"{spring.kh_minus / spring.k0:.3g}",
-        f"{spring.kc / spring.k0:.3g}",
-    ]
+    )
+    strains = [f"{strain:g}" for strain in (spring.eps_a, spring.eps_c)]
+    slopes = [spring.kh_plus, spring.kh_minus, spring.kc]
+    ratios = [f"{slope / spring.k0:.3g}" for slope in slopes]
+    return [item.name, "bistable", k0, drop, eta, *strains, h, *ratios]

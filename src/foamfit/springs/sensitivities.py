@@ -30,9 +30,14 @@ from foamfit.springs.kernels import (
     slope_on,
 )
 from foamfit.springs.law import BISTABLE, MICROSCALE
-from foamfit.springs.microscale_kernels import strain_along, strain_tangents, under_stress
+from foamfit.springs.microscale_kernels import (
+    CARRIED,
+    OF_STRAIN,
+    OF_WEAKENING,
+    strain_along,
+    strain_tangents,
+)
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
-from foamfit.springs.ranks import CARRIED, OF_STRAIN, OF_WEAKENING
 
 
 @inner
@@ -103,10 +108,9 @@ def _follow(
     branch = branches[i, j]
     if rows[i, KIND] == MICROSCALE:
         w, ever = at.ranks[i, 0, j], at.ranks[i, 1, j]
-        _, soft, by_rank, by_ever, at.pace[i] = under_stress(rows[i], branch, w, ever, sigma)
-        at.by_ranks[i, 0], at.by_ranks[i, 1] = by_rank, by_ever
-        strain_tangents(rows[i], branch, w, ever, sigma, at.by[i])
-        at.slope[i] = 1.0 / (soft + by_rank * at.pace[i])
+        soft, by_rank, by_ever, pace = strain_tangents(rows[i], branch, w, ever, sigma, at.by[i])
+        at.by_ranks[i, 0], at.by_ranks[i, 1], at.pace[i] = by_rank, by_ever, pace
+        at.slope[i] = 1.0 / (soft + by_rank * pace)
         return
     if j == 0 or branch != branches[i, j - 1]:
         for p in range(directions.shape[0]):

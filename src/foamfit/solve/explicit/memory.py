@@ -27,48 +27,38 @@ import numpy as np
 
 from foamfit.solve.polynomial import first_crossing, value_at
 from foamfit.springs import microscale_kernels as micro
-from foamfit.springs import ranks
 from foamfit.springs.kernels import (
     AGAIN,
     BACK,
+    BOTH,
     EPS_STAR,
+    ETA,
     HELD,
     K0,
     K_SNAPPED,
     KC,
+    KH_MINUS,
+    KH_PLUS,
     KIND,
+    LOG_MINUS,
+    LOG_PLUS,
     N_COLUMNS,
     REMEMBERS,
     SNAP,
     STIFFENING,
     Array,
     Branches,
+    D,
+    E,
     Row,
     inlined,
     inner,
     maker,
     piece,
 )
-from foamfit.springs.law import MICROSCALE
-from foamfit.springs.memory_kernels import line, mixture
+from foamfit.springs.law import BISTABLE, MICROSCALE
+from foamfit.springs.microscale_kernels import CARRIED, OF_STRAIN, density, share
 from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
-from foamfit.springs.ranks import (
-    BRANCH,
-    CARRIED,
-    EPS,
-    EVER,
-    FLEXIBILITY,
-    HIGH,
-    LOW,
-    NEVER,
-    OF_STRAIN,
-    RANK,
-    REST,
-    SIGMA,
-    STATE,
-    density,
-    share,
-)
 
 # Columns of `Memory.series`, which stand side by side at each order since the recurrences read them
 # all: equilibrium stress s; Σ z_k; 1 - a, 1 + eps_star - c; their difference; P; n u_n, u_n, φ, h;
@@ -76,7 +66,7 @@ from foamfit.springs.ranks import (
 EQ, RELAXED, BELOW_A, BELOW_C, BETWEEN, SNAPPED, PACE, SCORE, DENSITY, BEND = range(10)
 FRESH, N_MEMORY = 10, 11
 # Rows of `Memory.partials`: the derivatives of the strain at fixed stress by the parameters of the
-# law (see `springs.ranks`), by both ranks, and by the stress; then what these are made of.
+# law (see `microscale_kernels`), by both ranks, and by the stress; then what these are made of.
 BY_RANK, BY_EVER, BY_STRESS, SQUARE_A, SQUARE_C, WIDTH, STEEP = range(CARRIED, CARRIED + 7)
 SQUARE_FRESH, BY_N, BY_N_FRESH, LOG, N_PARTIALS = range(CARRIED + 7, CARRIED + 12)
 # Rows of `Memory.tangents`: the derivatives of s, and those of the z of the terms.
@@ -138,7 +128,7 @@ def make_memory(rows: Array, order: int, directions: Branches, one_sided: Array)
     count, terms, size = rows.shape[0], (rows.shape[1] - N_COLUMNS) // 2, directions.shape[0]
     memory = Memory(
         rows,
-        np.zeros((count, STATE)),
+        np.zeros((count, micro.STATE)),
         np.zeros((count, N_NOW)),
         np.zeros((count, order + 2, N_MEMORY + terms)),
         np.zeros((N_PARTIALS, count, order + 2)),
@@ -155,7 +145,7 @@ def make_memory(rows: Array, order: int, directions: Branches, one_sided: Array)
             gain += rows[i, N_COLUMNS + 2 * k]
         memory.now[i, GAIN], memory.now[i, PER_GAIN] = gain, 1.0 / gain
         if rows[i, KIND] == MICROSCALE:
-            micro.begin_above(rows[i], memory.state[i], LEAST_STRAIN)
+            micro.begin(rows[i], memory.state[i], LEAST_STRAIN)
     return memory
 
 
@@ -167,20 +157,20 @@ def load(memory: Memory, i: int, eps: float) -> int:
     """Load a microscale spring from rest to a strain in one go; returns its branch."""
     row, state = memory.rows[i], memory.state[i]
     while micro.leaves(state, eps):
-        micro.switch(row, state, eps > state[EPS])
+        micro.switch(row, state, eps > state[micro.EPS])
     micro.settle(row, state, eps)
-    return int(state[BRANCH])
+    return int(state[micro.BRANCH])
 
 
 @inner
 def enter_mixture(memory: Memory, i: int) -> tuple[float, float]:
     """Prepare for the branch that a microscale spring has entered; the strains of its ends."""
     row, state, now = memory.rows[i], memory.state[i], memory.now[i]
-    branch, low, high = int(state[BRANCH]), state[LOW], state[HIGH]
-    now[PLACE], now[SCALE] = line(row, branch)
-    hard = branch == SNAP or state[NEVER] == 1.0  # none that has snapped is on branch a
+    branch, low, high = int(state[micro.BRANCH]), state[micro.LOW], state[micro.HIGH]
+    now[PLACE], now[SCALE] = micro.line(row, branch)
+    hard = branch == SNAP or state[micro.NEVER] == 1.0  # none that has snapped is on branch a
     now[STIFF], now[K_MAIN] = row[STIFFENING], row[K0] if hard else row[K_SNAPPED]
-    now[UNSNAPPED] = 0.0 if hard else state[NEVER]
+    now[UNSNAPPED] = 0.0 if hard else state[micro.NEVER]
     for own in range(3, CARRIED):
         for n in range(memory.partials.shape[2] if own != OF_STRAIN else 0):
             memory.partials[own, i, n] = 0.0
@@ -198,9 +188,13 @@ def leave(memory: Memory, i: int, eps: float, up: bool, turning: bool, d_eps: Ar
     """
     row, state, now = memory.rows[i], memory.state[i], memory.now[i]
     if turning:
-        state[FLEXIBILITY] = 0.0
+        state[micro.FLEXIBILITY] = 0.0
         micro.settle(row, state, eps)
-        branch, rank, sigma = int(state[BRANCH]), micro.rank_now(row, state), state[SIGMA]
+        branch, rank, sigma = (
+            int(state[micro.BRANCH]),
+            micro.rank_now(row, state),
+            state[micro.SIGMA],
+        )
         ever, d_ranks = micro.ever_now(state, rank), memory.scratch[:2]
         d_ranks[:] = 0.0
         slope = micro.tangents(row, branch, rank, ever, sigma, eps, d_ranks, memory.scratch[2])
@@ -213,10 +207,10 @@ def leave(memory: Memory, i: int, eps: float, up: bool, turning: bool, d_eps: Ar
             if branch == SNAP:
                 memory.evers[k, i] = memory.ranks[k, i]
     micro.switch(row, state, up)
-    if row[REMEMBERS] > 0.0 and state[RANK] == state[EVER]:
+    if row[REMEMBERS] > 0.0 and state[micro.RANK] == state[micro.EVER]:
         for k in range(memory.directions.shape[0]):
             memory.ranks[k, i] = memory.evers[k, i]
-    return int(state[BRANCH])
+    return int(state[micro.BRANCH])
 
 
 @inner
@@ -282,14 +276,14 @@ def start_mixture(memory: Memory, i: int, moving: bool, eps: float) -> float:
     """Order 0 of a microscale spring: the stress at a strain, and all that follows from it."""
     row, state, now, m = memory.rows[i], memory.state[i], memory.now[i], memory.series[i, 0]
     micro.settle(row, state, eps)
-    s = state[SIGMA]
+    s = state[micro.SIGMA]
     k, stiff = now[K_MAIN], now[STIFF]
     per_a, per_c = 1.0 / (k + stiff * s), 1.0 / (row[KC] + s)
     below_a, below_c = k * per_a, row[KC] * per_c
     if stiff != 1.0:
         below_a = below_a ** (1.0 / stiff)
     m[BELOW_A], m[BELOW_C], m[BETWEEN] = below_a, below_c, below_a - below_c
-    p, q, steep = state[ranks.SNAPPED], state[REST], 0.0
+    p, q, steep = state[micro.SNAPPED], state[micro.REST], 0.0
     if moving:
         u = (math.log(s) - now[PLACE]) / now[SCALE]
         p, q, at = share(u), share(-u), density(u)
@@ -435,19 +429,14 @@ def strain_at(row: Row, state: Array, now: Array, moving: bool, s: float) -> tup
 
     What it takes is the spring's own of a `Memory`.
     """
-    p, q, steep = state[ranks.SNAPPED], state[REST], 0.0
+    branch, p, q, steep = int(state[micro.BRANCH]), state[micro.SNAPPED], state[micro.REST], 0.0
     if moving:
         if not s > 0.0:
             return math.nan, math.nan
         u = (math.log(s) - now[PLACE]) / now[SCALE]
         p, q, steep = share(u), share(-u), density(u) / (now[SCALE] * s)
-    one, two = 1.0 / (row[K0] + s), 1.0 / (row[KC] + s)
-    if row[REMEMBERS] > 0.0:
-        eps, soft, _, on_main, _ = mixture(row, int(state[BRANCH]), p, q, state[NEVER], s)
-        return eps, soft + (row[EPS_STAR] + s * two - on_main) * steep
-    soft = q * row[K0] * one * one + p * row[KC] * two * two
-    gap = row[EPS_STAR] + s * (two - one)
-    return q * (s * one) + p * (row[EPS_STAR] + s * two), soft + gap * steep
+    eps, soft, _, on_main, _ = micro.mixture(row, branch, p, q, state[micro.NEVER], s)
+    return eps, soft + (row[EPS_STAR] + s / (row[KC] + s) - on_main) * steep
 
 
 @inner
@@ -457,13 +446,211 @@ def advance_memory(state: Array, series: Array, order: int, span: float) -> None
     They are those of `Memory`.
     """
     for i in range(state.shape[0]):
-        if state[i, BRANCH] >= HELD:
+        if state[i, micro.BRANCH] >= HELD:
             reached = value_at(series[i, :, EQ], order, span)
-            state[i, FLEXIBILITY] = 0.0
-            state[i, SIGMA] = reached if reached > 0.0 else state[i, SIGMA]
+            state[i, micro.FLEXIBILITY] = 0.0
+            state[i, micro.SIGMA] = reached if reached > 0.0 else state[i, micro.SIGMA]
         total = 0.0
         for k in range(N_MEMORY, series.shape[2]):
             z = value_at(series[i, :, k], order, span)
             series[i, 0, k] = z
             total += z
         series[i, 0, RELAXED] = total
+
+
+# ---------------------------------------------------------------- derivatives by parameters: those
+# of the strain at a fixed stress; the recurrences above, linearised
+
+
+@inner
+def _fill_of_a(
+    s: Array, below: Array, k: float, n: float, out: Array, log: Array, by_n: Array, order: int
+) -> None:
+    """Fill the series of (1 - a)^(1+n), of ln(1 + ns/k) and of ∂a/∂n from that of 1 - a."""
+    per = 1.0 / (k + n * s[0])
+    out[0], log[0] = below[0] * k * per, math.log1p(n * s[0] / k)
+    for m in range(1, order + 1):
+        power, logs = (1.0 + n) * m * s[m] * out[0], 0.0
+        for j in range(1, m):
+            power += ((1.0 + n) * j + n * (m - j)) * s[j] * out[m - j]
+            logs += s[j] * (m - j) * log[m - j]
+        out[m], log[m] = -power * per / m, n * (s[m] - logs / m) * per
+    for m in range(order + 1):
+        total = 0.0
+        for j in range(m + 1):
+            total += below[j] * log[m - j]
+        by_n[m] = (below[m] - out[m] - total) / (n * n)
+
+
+@inner
+def fill_partials(memory: Memory, i: int, moving: bool, eps: Array, order: int) -> float:
+    """Fill the derivatives of a spring's strain at fixed stress; returns the slope dΣ/dε now."""
+    row, state, now, m = memory.rows[i], memory.state[i], memory.now[i], memory.series[i]
+    out, remembers, branch = memory.partials, row[REMEMBERS] > 0.0, int(state[micro.BRANCH])
+    n, star, k, never, p = (
+        row[STIFFENING],
+        row[EPS_STAR],
+        now[K_MAIN],
+        now[UNSNAPPED],
+        now[FRACTION],
+    )
+    first_loading = branch == SNAP or state[micro.NEVER] == 1.0  # not so where all have snapped
+    s, below, below_c, fresh = m[:, EQ], m[:, BELOW_A], m[:, BELOW_C], m[:, FRESH]
+    snapped, score, dense = m[:, SNAPPED], m[:, SCORE], m[:, DENSITY]
+    square, square_c, hard = out[SQUARE_A, i], out[SQUARE_C, i], out[SQUARE_FRESH, i]
+    gap, width, steep = out[BY_RANK, i], out[WIDTH, i], out[STEEP, i]
+    if remembers:
+        _fill_of_a(s, below, k, n, square, out[LOG, i], out[BY_N, i], order)
+    if never > 0.0:
+        _fill_of_a(s, fresh, row[K0], n, hard, out[LOG, i], out[BY_N_FRESH, i], order)
+    at_rank = 1.0 if moving else density(state[micro.RANK])
+    at_ever = density(state[micro.EVER]) if never > 0.0 else 0.0
+    first, place = (5, row[LOG_MINUS]) if branch == BACK else (3, row[LOG_PLUS])
+    per_k, per_k0, per_kc, per_s = 1.0 / k, 1.0 / (n * row[K0]), 1.0 / row[KC], 1.0 / s[0]
+    weakens = remembers and branch in (AGAIN, BOTH)
+    by_k0, by_kc, by_star, by_stress = out[0, i], out[1, i], out[2, i], out[BY_STRESS, i]
+    by_place, by_scale = out[first, i], out[first + 1, i]
+    per_scale, per_place, worn = 1.0 / now[SCALE], math.exp(-place) / now[SCALE], now[LEFT] - never
+    for o in range(order + 1):
+        aa = cc = 0.0
+        for j in range((o + 1) // 2):
+            aa += below[j] * below[o - j]
+            cc += below_c[j] * below_c[o - j]
+        aa, cc, middle = 2.0 * aa, 2.0 * cc, o // 2
+        if o % 2 == 0:
+            aa += below[middle] * below[middle]
+            cc += below_c[middle] * below_c[middle]
+        square_c[o] = cc
+        if not remembers:
+            square[o] = aa
+        gap[o] = at_rank * (below[o] - below_c[o] + (star if o == 0 else 0.0))
+        qa, qaa, pc, pcc = worn * below[o], worn * square[o], p * below_c[o], p * square_c[o]
+        by_star[o] = snapped[o] if moving else (p if o == 0 else 0.0)
+        by_stress[o] = 0.0
+        if moving:
+            wide = gap[0] * dense[o]
+            for j in range(1, o + 1):
+                qa -= snapped[j] * below[o - j]
+                qaa -= snapped[j] * square[o - j]
+                pcc += snapped[j] * square_c[o - j]
+                wide += gap[j] * dense[o - j]
+            if o > 0:  # all of the strain is in these parts
+                pc = star * snapped[o] - qa - eps[o] - (never * fresh[o] if never > 0.0 else 0.0)
+            width[o] = wide
+            by_score, by_s = wide * score[0], wide
+            for j in range(1, o + 1):
+                by_score += score[j] * width[o - j]
+                by_s -= s[j] * steep[o - j]
+            steep[o] = by_s * per_s
+            by_stress[o] = steep[o] * per_scale
+            by_place[o], by_scale[o] = -wide * per_place, -by_score * per_scale
+            if weakens:
+                out[micro.OF_WEAKENING, i, o] = wide * per_scale
+        on_a = qa - qaa
+        by_stress[o] += qaa * per_k + pcc * per_kc
+        if remembers:
+            by_n = worn * out[BY_N, i, o]
+            for j in range(1, o + 1 if moving else 1):
+                by_n -= snapped[j] * out[BY_N, i, o - j]
+            out[micro.OF_SOFTENING, i, o] = 0.0 if first_loading else on_a / n
+            out[BY_EVER, i, o] = 0.0
+            if never > 0.0:
+                on_a += never * (fresh[o] - hard[o])
+                by_n += never * out[BY_N_FRESH, i, o]
+                by_stress[o] += never * hard[o] / row[K0]
+                out[BY_EVER, i, o] = at_ever * (fresh[o] - below[o])
+            out[micro.OF_STIFFENING, i, o] = by_n
+        by_k0[o], by_kc[o] = -on_a * per_k0, (pcc - pc) * per_kc
+    return now[GAIN] / by_stress[0]
+
+
+@inlined
+def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, slope: float, n: int) -> float:
+    """Order n of the derivative of (1 + Σ g) s in direction k, but for what δε_n adds.
+
+    `slope` is dΣ/dε.
+    """
+    d_s = memory.tangents[k, i, D_EQ]
+    soft, own = memory.partials[BY_STRESS, i], memory.directions[k, 1]
+    even = odd = 0.0  # two sums at once
+    if memory.directions[k, 0] == i and own < OWN_ETA:
+        even = memory.partials[own, i, n]
+    if not moving:
+        odd = memory.partials[BY_RANK, i, n] * memory.ranks[k, i]
+    if memory.now[i, UNSNAPPED] > 0.0:
+        even += memory.partials[BY_EVER, i, n] * memory.evers[k, i]
+    for j in range(1, n, 2):
+        even += soft[j] * d_s[n - j]
+        odd += soft[j + 1] * d_s[n - j - 1]
+    if n % 2 == 1:
+        even += soft[n] * d_s[0]
+    return -slope * (even + odd)
+
+
+@inlined
+def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
+    """Order n of the derivative of Σ z_k, and of g s at fixed s, in direction k."""
+    total = 0.0
+    for term in range(memory.series.shape[2] - N_MEMORY):
+        total += memory.tangents[k, i, N_TANGENTS + term, n]
+        own = OWN_RELAXATION + 2 * term
+        if memory.directions[k, 0] == i and memory.directions[k, 1] == own:
+            total += memory.series[i, n, EQ]
+    return total
+
+
+@inlined
+def keep_tangent(memory: Memory, k: int, i: int, n: int, d_sig: float) -> None:
+    """Write order n of the derivative of the equilibrium stress, and the next of what relaxes."""
+    d_s = (d_sig - memory.now[i, BASE]) * memory.now[i, PER_GAIN]
+    memory.tangents[k, i, D_EQ, n] = d_s
+    for term in range(memory.series.shape[2] - N_MEMORY):
+        g, tau = memory.rows[i, N_COLUMNS + 2 * term], memory.rows[i, N_COLUMNS + 2 * term + 1]
+        dz = memory.tangents[k, i, N_TANGENTS + term]
+        flow = dz[n] + g * d_s
+        own = OWN_RELAXATION + 2 * term
+        if memory.directions[k, 0] == i and memory.directions[k, 1] == own:
+            flow += memory.series[i, n, EQ]
+        dz[n + 1] = -flow * (1.0 / (tau * (n + 1)))
+        if memory.directions[k, 0] == i and memory.directions[k, 1] == own + 1:
+            dz[n + 1] -= memory.series[i, n + 1, N_MEMORY + term] * (1.0 / tau)
+
+
+@inner
+def advance_memory_tangents(memory: Memory, k: int, order: int, span: float) -> None:
+    """Carry the derivatives in direction k of what relaxes over a step."""
+    for i in range(memory.now.shape[0]):
+        for term in range(memory.series.shape[2] - N_MEMORY):
+            dz = memory.tangents[k, i, N_TANGENTS + term]
+            dz[0] = value_at(dz, order, span)
+
+
+@inner
+def _is_flat(row: Row, branch: int) -> bool:
+    """Whether a spring is on a flat branch that nothing slows."""
+    slope = row[KH_PLUS] if branch == D else row[KH_MINUS] if branch == E else 1.0
+    return row[KIND] == BISTABLE and slope == 0.0 and row[ETA] == 0.0
+
+
+@inner
+def mark_one_sided(
+    memory: Memory, branches: Branches, eps: Array, series: Array, order: int, span: float
+) -> None:
+    """Mark the directions that would move a spring that snaps and stands still, or a plateau.
+
+    One way of the parameter the spring snaps on, the other way it is held; of several springs on
+    flat branches one goes first: there are two derivatives. `eps` and `series` (p, springs, …) are
+    the series of the strains, and their derivatives.
+    """
+    flat = 0
+    for i in range(branches.size):
+        flat += _is_flat(memory.rows[i], branches[i])
+    for p in range(series.shape[0]):
+        i, own = memory.directions[p, 0], memory.directions[p, 1]
+        if flat > 1 and i >= 0 and own in (0, 2, 3) and _is_flat(memory.rows[i], branches[i]):
+            memory.one_sided[p] = 1.0
+    for i in range(branches.size):
+        if branches[i] in (SNAP, AGAIN, BACK) and stands(eps[i], order, span):
+            for p in range(series.shape[0]):
+                if not stands(series[p, i], order, span) and series[p, i, 1] != 0.0:
+                    memory.one_sided[p] = 1.0

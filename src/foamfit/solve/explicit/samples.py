@@ -3,33 +3,44 @@
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
-from foamfit.solve.explicit.series import (
-    EPS,
-    GROUP,
-    HEIGHT,
-    Links,
-    SeriesTangents,
-    V,
-    W,
-    advance,
-)
+from foamfit.solve.explicit.series import EPS, GROUP, HEIGHT, Links, SeriesTangents, V, W, advance
 from foamfit.solve.explicit.tangents import advance_tangents
-from foamfit.solve.polynomial import (
-    fill_values,
-    slope_at,
-    value_at,
-)
-from foamfit.solve.scene import (
-    STRESS,
-    Samples,
-    fill_line,
-    fly,
-)
-from foamfit.springs.kernels import (
-    Array,
-    inner,
-    piece,
-)
+from foamfit.solve.polynomial import fill_values, slope_at, value_at
+from foamfit.solve.scene import STRESS, Samples, fly
+from foamfit.springs.kernels import Array, inner, piece
+
+
+@inner
+def _write(
+    links: Links,
+    s: Array,
+    order: int,
+    samples: Samples,
+    first: int,
+    last: int,
+    now: float,
+    curves: Array,
+    c: Array,
+    change: tuple[Array, Array] | None,
+) -> None:
+    """Write base stress and displacements of a series at some samples of a step; c is scratch.
+
+    A `change` of heights acts through the strains: (derivatives of `Links.law`, the strains).
+    """
+    law, t, nodes, count = links.law, samples.t, curves.shape[0] - 1, links.law.shape[0]
+    fill_values(s[GROUP, 0], order, t, first, last, now, curves[0])
+    if nodes == 1 and links.top != STRESS:
+        fill_values(s[W, links.ends.size - 1], order, t, first, last, now, curves[1])
+        return
+    for n in range(order + 1):
+        c[n] = 0.0
+    for i in range(count):
+        for n in range(order + 1):
+            c[n] += law[i, HEIGHT] * s[EPS, i, n]
+            if change is not None:
+                c[n] += change[0][i, HEIGHT] * change[1][i, n]
+        if nodes > 1 or i == count - 1:
+            fill_values(c, order, t, first, last, now, curves[min(1 + i, nodes)])
 
 
 @piece
@@ -37,19 +48,7 @@ def sample(
     links: Links, s: Array, order: int, out: Samples, first: int, last: int, now: float, c: Array
 ) -> None:
     """Write base stress and displacements at the samples first … last-1 of a step; c is scratch."""
-    law, nodes = links.law, out.curves.shape[0] - 1
-    fill_values(s[GROUP, 0], order, out.t, first, last, now, out.curves[0])
-    if nodes == 1 and links.top != STRESS:
-        fill_values(s[W, links.ends.size - 1], order, out.t, first, last, now, out.curves[1])
-        return
-    for n in range(order + 1):
-        c[n] = 0.0
-    count = law.shape[0]
-    for i in range(count):
-        for n in range(order + 1):
-            c[n] += law[i, HEIGHT] * s[EPS, i, n]
-        if nodes > 1 or i == count - 1:
-            fill_values(c, order, out.t, first, last, now, out.curves[min(1 + i, nodes)])
+    _write(links, s, order, out, first, last, now, out.curves, c, None)
 
 
 @piece
@@ -65,25 +64,13 @@ def sample_tangents(
     c: Array,
 ) -> None:
     """Write the derivatives of base stress and displacements at some samples of a step."""
-    law, nodes, top = links.law, out.curves.shape[0] - 1, links.ends.size - 1
-    count = law.shape[0]
     for p in range(d.drag.size):
         slopes = out.slopes[p]
         if d.live[p] == 0.0:
-            for i in range(nodes + 1):
-                fill_line(0.0, 0.0, out.t[first:last], now, slopes[i, first:last])
-            continue
-        fill_values(d.series[p, GROUP, 0], order, out.t, first, last, now, slopes[0])
-        if nodes == 1 and links.top != STRESS:
-            fill_values(d.series[p, W, top], order, out.t, first, last, now, slopes[1])
-            continue
-        for n in range(order + 1):
-            c[n] = 0.0
-        for i in range(count):
-            for n in range(order + 1):
-                c[n] += law[i, HEIGHT] * d.series[p, EPS, i, n] + d.law[p, i, HEIGHT] * s[EPS, i, n]
-            if nodes > 1 or i == count - 1:
-                fill_values(c, order, out.t, first, last, now, slopes[min(1 + i, nodes)])
+            slopes[:, first:last] = 0.0
+        else:
+            change = d.law[p], s[EPS]
+            _write(links, d.series[p], order, out, first, last, now, slopes, c, change)
 
 
 @inner

@@ -36,6 +36,7 @@ from foamfit.solve.explicit.memory import (
 )
 from foamfit.solve.polynomial import value_at
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
+from foamfit.springs import microscale_kernels as micro
 from foamfit.springs.kernels import (
     HELD,
     KIND,
@@ -53,7 +54,6 @@ from foamfit.springs.kernels import (
 )
 from foamfit.springs.law import MICROSCALE
 from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
-from foamfit.springs.ranks import FIRST
 from foamfit.springs.sensitivities import branch_derivative
 
 # Rows of the series of a chain: displacement and velocity of the nodes above the groups, strain and
@@ -118,7 +118,7 @@ def enter(rows: Array, i: int, branch: int, law: Array, memory: Memory | None) -
     law[i, CURVED] = 1.0 if curved else 0.0
     law[i, LOW], law[i, HIGH] = interval(rows[i], branch)
     if memory is not None and rows[i, KIND] == MICROSCALE:
-        law[i, LOW], law[i, HIGH] = -math.inf, memory.state[i, FIRST]
+        law[i, LOW], law[i, HIGH] = -math.inf, memory.state[i, micro.HIGH]
 
 
 @inner
@@ -312,14 +312,7 @@ def _share_elongation(
 
 @inlined
 def _damped_term(
-    law: Array,
-    i0: int,
-    i1: int,
-    sig: Array,
-    rate_n: float,
-    push_n: float,
-    drag: float,
-    n: int,
+    law: Array, i0: int, i1: int, sig: Array, rate_n: float, push_n: float, drag: float, n: int
 ) -> float:
     """Order n of the common stress of a group in which every spring has a dashpot.
 
@@ -338,19 +331,15 @@ def _damped_term(
 
 @inlined
 def _group_term(
-    law: Array,
-    i0: int,
-    i1: int,
-    eps: Array,
-    sig: Array,
-    u_n: float,
-    rate_n: float,
-    push_n: float,
-    drag: float,
-    n: int,
-    memory: Memory | None,
+    links: Links, s: Array, g: int, push_n: float, n: int, memory: Memory | None
 ) -> float:
-    """Order n of the common stress of a group whose elongation u and its rate are known."""
+    """Order n of the common stress of a group between nodes whose motion is known so far."""
+    law, (i0, i1), eps, sig = links.law, springs_of(links.ends, g), s[EPS], s[SIG]
+    viscous = g == links.ends.size - 1 and links.top == VISCOUS
+    drag, u_n, rate_n = links.drag if viscous else 0.0, s[W, g, n], 0.0 if viscous else s[V, g, n]
+    if g > 0:
+        u_n -= s[W, g - 1, n]
+        rate_n -= s[V, g - 1, n]
     if i1 - i0 == 1:
         eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])  # the quotient waits for nothing
         sig[i0, n] = _stress_term(law, i0, eps, sig, n, memory)
@@ -374,14 +363,7 @@ def _group_term(
 
 @once
 def _stressed_term(
-    law: Array,
-    i0: int,
-    i1: int,
-    eps: Array,
-    sig: Array,
-    s_n: float,
-    n: int,
-    memory: Memory | None,
+    law: Array, i0: int, i1: int, eps: Array, sig: Array, s_n: float, n: int, memory: Memory | None
 ) -> bool:
     """Order n of the strains of a group whose stress is prescribed; false if it cannot be."""
     for i in range(i0, i1):
@@ -483,15 +465,7 @@ def expand(
                 if not _stressed_term(law, i0, i1, eps, sig, push_n, n, memory):
                     return False
             else:
-                viscous = g == last and top == VISCOUS
-                u_n, rate_n = w[g, n], (0.0 if viscous else v[g, n])
-                if g > 0:
-                    u_n -= w[g - 1, n]
-                    rate_n -= v[g - 1, n]
-                weight = drag if viscous else 0.0
-                group[g, n] = _group_term(
-                    law, i0, i1, eps, sig, u_n, rate_n, push_n, weight, n, memory
-                )
+                group[g, n] = _group_term(links, s, g, push_n, n, memory)
             if i1 - i0 > 1 or stressed:
                 for i in range(i0, i1):
                     if law[i, DASHPOT] > 0.0:

@@ -16,14 +16,12 @@ from foamfit.solve.explicit.memory import (
     EQ,
     GAIN,
     Memory,
-    start_relaxed,
-    start_relaxed_tangent,
-)
-from foamfit.solve.explicit.memory_tangents import (
     advance_memory_tangents,
     fill_partials,
     keep_tangent,
     relaxed_tangent,
+    start_relaxed,
+    start_relaxed_tangent,
     tangent_of_mixture,
 )
 from foamfit.solve.explicit.series import (
@@ -46,20 +44,8 @@ from foamfit.solve.explicit.series import (
     product,
     springs_of,
 )
-from foamfit.solve.scene import (
-    FREE,
-    STRESS,
-    VISCOUS,
-)
-from foamfit.springs.kernels import (
-    BACK,
-    HELD,
-    Array,
-    inlined,
-    inner,
-    once,
-    piece,
-)
+from foamfit.solve.scene import FREE, STRESS, VISCOUS
+from foamfit.springs.kernels import HELD, Array, inlined, inner, once, piece
 
 
 @inner
@@ -248,9 +234,7 @@ def expand_tangents(
         else:
             kind = links.law[i, CURVED]
             if kind >= HELD:
-                s[TILT, i, 0] = fill_partials(
-                    memory, i, kind > HELD, kind == BACK, s[EPS, i], order
-                )
+                s[TILT, i, 0] = fill_partials(memory, i, kind > HELD, s[EPS, i], order)
             else:
                 _fill_tilt(links.law, i, memory.series[:, :, EQ], s[TILT], order)
                 for n in range(order + 1):
@@ -267,7 +251,7 @@ def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memo
     _stress_term(law, i, s[EPS], sig, 0, memory)
     kind, stress = law[i, CURVED], memory.series[i, 0, EQ]
     if kind >= HELD:
-        tilt[i, 0] = fill_partials(memory, i, kind > HELD, kind == BACK, s[EPS, i], 0)
+        tilt[i, 0] = fill_partials(memory, i, kind > HELD, s[EPS, i], 0)
     else:
         _fill_tilt(law, i, memory.series[:, :, EQ], tilt, 0)
         tilt[i, 0] *= memory.now[i, GAIN]

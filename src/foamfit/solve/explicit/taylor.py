@@ -21,8 +21,6 @@ from foamfit.solve.explicit.memory import (
     load,
     longest,
     make_memory,
-)
-from foamfit.solve.explicit.memory_tangents import (
     mark_one_sided,
 )
 from foamfit.solve.explicit.samples import delay, depart, mend_kink, sample, sample_tangents
@@ -52,13 +50,7 @@ from foamfit.solve.explicit.series import (
     share_a_stress,
 )
 from foamfit.solve.explicit.tangents import advance_tangents, expand_tangents, start_relaxing
-from foamfit.solve.polynomial import (
-    LEAST_TRUNCATION,
-    first_crossing,
-    order_for,
-    slope_at,
-    value_at,
-)
+from foamfit.solve.polynomial import LEAST_TRUNCATION, first_crossing, order_for, slope_at, value_at
 from foamfit.solve.scene import (
     DONE,
     FLAT_UNDER_STRESS,
@@ -101,6 +93,7 @@ CLOSE = 1e-13
 # Side on which a spring leaves its branch where its strain turns.
 TURN = 2
 MOST_ORDERS = 24
+Scales = tuple[float, float, float]  # largest displacement, stress and base stress so far
 # Truncation of derivatives, relative to what they were so far, over that of the motion.
 OF_TANGENTS = 1e3
 
@@ -137,31 +130,15 @@ def _tail(
     return worst
 
 
-@inner
-def is_apart(links: Links) -> bool:
-    """Whether the base stress may be much smaller than the springs' stresses, or change faster.
-
-    So it is where a mass hides the base from the blow, or a dashpot acts there.
-    """
-    return links.ends.size > 1 or links.law[0, DASHPOT] > 0.0
-
-
 @inlined
 def step_length(
-    links: Links,
-    s: Array,
-    push: Array,
-    order: int,
-    tol: float,
-    span: float,
-    w_scale: float,
-    s_scale: float,
-    b_scale: float,
+    links: Links, s: Array, push: Array, order: int, tol: float, span: float, scales: Scales
 ) -> float:
     """Longest step within `span` whose last two terms fall below `tol` of motion and stress.
 
     The base stress is measured by its own size: by that of all springs if its scale is infinite.
     """
+    w_scale, s_scale, b_scale = scales
     reach, load = w_scale, max(s_scale, abs(push[0]))
     for _ in range(60):  # at rest the only scale is what the step itself reaches
         tried = span
@@ -191,20 +168,14 @@ def step_length(
 
 @piece
 def tangent_length(
-    law: Array,
-    d: SeriesTangents,
-    order: int,
-    tol: float,
-    span: float,
-    sizes: Array,
-    memory: Memory | None,
+    law: Array, d: SeriesTangents, order: int, tol: float, span: float, sizes: Array, lagging: bool
 ) -> float:
     """Longest step within `span` whose last two terms fall below `tol` of the derivatives so far.
 
     A vibration or relaxation that the motion itself does not show may be in its derivatives: steps
     that are too long for it let these grow without bound. `sizes` (p, 2) holds the largest
-    elongation and base stress of each direction. With memory, those that begin at a high order,
-    behind masses and relaxation, have no size yet that could bound a step.
+    elongation and base stress of each direction. Those that begin at a high order, behind masses
+    and relaxation (`lagging`), have no size yet that could bound a step.
     """
     for p in range(d.drag.size):
         if d.live[p] == 0.0:
@@ -221,7 +192,7 @@ def tangent_length(
                     before = max(before, weight * abs(c[order - 1]))
                     tail = max(tail, weight * abs(c[order]))
                 size, longest = max(sizes[p, part], bar), span
-                if memory is not None and size == 0.0:
+                if lagging and size == 0.0:
                     break
                 bar = tol * size
                 if before * span ** (order - 1) > bar:
@@ -246,17 +217,9 @@ def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, 
 
 
 @inner
-def _enough(
-    law: Array,
-    s: Array,
-    order: int,
-    span: float,
-    tol: float,
-    w_scale: float,
-    s_scale: float,
-    b_scale: float,
-) -> int:
+def _enough(law: Array, s: Array, order: int, span: float, tol: float, scales: Scales) -> int:
     """Orders that are enough over a step that a switch or a sample made short."""
+    w_scale, s_scale, b_scale = scales
     base = max(b_scale, LEAST_BASE * s_scale)
     if w_scale == 0.0 or s_scale == 0.0 or span == 0.0:
         return order
@@ -274,35 +237,6 @@ def _enough(
 
 
 @inner
-def _side(
-    run: Run,
-    order: int,
-    span: float,
-    spring: int,
-    side: int,
-    turned: int,
-    i: int,
-    memory: Memory | None,
-) -> int:
-    """On which side (0: on none) spring i leaves its branch where `spring` leaves the `turned`."""
-    low, high, eps = run.links.law[i, LOW], run.links.law[i, HIGH], run.s[EPS, i, 0]
-    near = 1.0
-    if run.rows[i, KIND] == MICROSCALE:  # its first micro-spring may snap at any strain above 0
-        near = min(abs(eps), 1.0)
-    if i == spring:
-        return side
-    if memory is not None:
-        both = side == TURN and run.branches[i] == turned
-        if both and share_a_stress(run.links.law, run.links.ends, i, spring, memory):
-            return TURN  # the stress turns for both
-    if eps >= high - CLOSE * near and slope_at(run.s[EPS, i], order, span) > 0.0:
-        return 1
-    if eps <= low + CLOSE * near and slope_at(run.s[EPS, i], order, span) < 0.0:
-        return -1
-    return 0
-
-
-@inner
 def switch(
     run: Run,
     order: int,
@@ -317,8 +251,21 @@ def switch(
     rows, branches, law, eps = run.rows, run.branches, run.links.law, run.s[EPS]
     turned = branches[spring]
     for i in range(branches.size):
-        out = _side(run, order, span, spring, side, turned, i, memory)
-        if out == 0:
+        near = 1.0
+        if rows[i, KIND] == MICROSCALE:  # its first micro-spring may snap at any strain above 0
+            near = min(abs(eps[i, 0]), 1.0)
+        together = False
+        if memory is not None and side == TURN and branches[i] == turned:
+            together = share_a_stress(law, run.links.ends, i, spring, memory)
+        if i == spring:
+            out = side
+        elif together:
+            out = TURN  # the stress turns for both
+        elif eps[i, 0] >= law[i, HIGH] - CLOSE * near and slope_at(eps[i], order, span) > 0.0:
+            out = 1
+        elif eps[i, 0] <= law[i, LOW] + CLOSE * near and slope_at(eps[i], order, span) < 0.0:
+            out = -1
+        else:
             continue
         left = branches[i]
         if out != TURN:
@@ -352,14 +299,6 @@ def _prescribe(
     driven = motion if top == MOTION else push
     driven[0], driven[1] = values[knot] + rate * now, rate
     return horizon
-
-
-@inner
-def _clock(t: Array, clock: Array) -> None:
-    """Count the time of each sample from the one before it: no origin then takes its digits."""
-    clock[0] = 0.0
-    for j in range(1, t.size):
-        clock[j] = t[j] - t[j - 1]
 
 
 @piece
@@ -407,14 +346,6 @@ def begin(run: Run, heights: Array, start: Array, speed: float, memory: Memory |
 
 
 @inner
-def _loaded(s: Array, s_scale: float) -> float:
-    """Largest stress so far."""
-    for i in range(s.shape[1]):
-        s_scale = max(s_scale, abs(s[SIG, i, 0]))
-    return s_scale
-
-
-@inner
 def _reached(links: Links, s: Array, w_scale: float) -> tuple[float, float]:
     """Largest displacement so far, and a number that is finite only if the state is."""
     top = links.ends.size - 1
@@ -442,18 +373,6 @@ def _first_end(
         if turning >= 0:
             spring, side = turning, TURN
     return span, spring, side
-
-
-@inlined
-def _expand_tangents(
-    run: Run, order: int, tol: float, span: float, sizes: Array, memory: Memory | None
-) -> float:
-    """Fill the derivatives of a step; returns the longest step within `span` that is good."""
-    expand_tangents(run.links, run.s, run.d, order, memory)
-    if memory is not None:
-        eps, moved = run.s[EPS], run.d.series[:, EPS]
-        mark_one_sided(memory, run.branches, eps, moved, order, span)
-    return tangent_length(run.links.law, run.d, order, OF_TANGENTS * tol, span, sizes, memory)
 
 
 @inlined
@@ -491,9 +410,9 @@ def _integrated(
     count, size = heights.size, directions.shape[0]
     struck, tangent, order = speed > 0.0, size > 0, order_for(tol, MOST_ORDERS)
     links = Links(np.empty((count, N_LAW)), ends, mass, drag, top)
-    clock = t if struck else np.empty(t.size)
-    if not struck:
-        _clock(t, clock)
+    clock = t if struck else np.zeros(t.size)
+    for j in range(1, t.size if not struck else 1):
+        clock[j] = t[j] - t[j - 1]  # each from the one before it: no origin then takes its digits
     s, d = make_series(count, order, directions)
     branches, samples = np.empty(count, np.int64), Samples(clock, out[0], out[1:])
     run = Run(rows, branches, links, s, d, directions, samples, log)
@@ -501,7 +420,11 @@ def _integrated(
     late, c, push, motion = scratch[0], scratch[3], scratch[4], scratch[5]
     sizes = np.zeros((size, 2))
     done = begin(run, heights, start, speed, memory)
-    bare, apart = is_bare(links, memory), is_apart(links)
+    lagging = memory is not None
+    bare = is_bare(links, memory)
+    # Whether the base stress may be much smaller than the springs' stresses, or change faster: a
+    # mass hides the base from the blow, or a dashpot acts there.
+    apart = ends.size > 1 or links.law[0, DASHPOT] > 0.0
     shared = ends.size < count or top == STRESS  # springs have one stress, or are given it
     fine = 0.0 if tangent else tol  # a derivative may be of what is negligible
     w_scale, s_scale, b_scale, pressed, knot, stalled = 0.0, 0.0, math.inf, False, 0, 0
@@ -523,10 +446,12 @@ def _integrated(
         elif not expand(links, s, push, motion, order, memory):
             return FLAT_UNDER_STRESS, since + now, step, switches
         if step > 0:
-            s_scale = _loaded(s, s_scale)
+            for i in range(count):
+                s_scale = max(s_scale, abs(s[SIG, i, 0]))
         if apart:
             b_scale = max(b_scale if step > 0 else 0.0, abs(s[GROUP, 0, 0]))
-        span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale, b_scale)
+        scales = w_scale, s_scale, b_scale
+        span = step_length(links, s, push, order, tol, horizon - now, scales)
         if not math.isfinite(span + s[GROUP, 0, order]):
             return NOT_FINITE, since + now, step, switches
         span, spring, side = _first_end(run, order, fine, span, c, memory)
@@ -537,10 +462,13 @@ def _integrated(
             spring = -1 if leaves else spring
         least = order
         if spring >= 0 or leaves or now + span >= horizon:  # not its own error ended the step
-            least = _enough(links.law, s, order, span, 1e-3 * tol, w_scale, s_scale, b_scale)
+            least = _enough(links.law, s, order, span, 1e-3 * tol, scales)
         more = min(least + 2, order)  # for what is, in time, a derivative of these
         if tangent:
-            shorter = _expand_tangents(run, more, tol, span, sizes, memory)
+            expand_tangents(links, s, d, more, memory)
+            if memory is not None:
+                mark_one_sided(memory, branches, s[EPS], d.series[:, EPS], more, span)
+            shorter = tangent_length(links.law, d, more, OF_TANGENTS * tol, span, sizes, lagging)
             if shorter < span:
                 span, spring, leaves = shorter, -1, False
         end = now + span

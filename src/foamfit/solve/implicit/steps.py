@@ -16,7 +16,6 @@ plain NumPy, over all springs and points at once.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,24 +32,10 @@ from foamfit.solve.implicit.control import (
     slope_at_end,
 )
 from foamfit.solve.implicit.vibration import Vibrations
-from foamfit.solve.rates import OVERDAMPED
+from foamfit.solve.rates import contact_time, is_overdamped
 from foamfit.springs import kernels
-from foamfit.springs.kernels import ETA, K0, OPEN
+from foamfit.springs.kernels import ETA, OPEN
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
-
-
-class Ending(NamedTuple):
-    """How a run ends: as of the explicit integrator, and what it damped out.
-
-    `lost` is the size, relative to motion and stress, of the vibrations that were damped out
-    because they could not be followed.
-    """
-
-    outcome: int
-    time: float
-    steps: int
-    switches: int
-    lost: float = 0.0
 
 
 class _EndError(Exception):
@@ -68,11 +53,12 @@ def integrate_implicit(
     start: Array,
     out: scenes.Samples,
     log: Array,
-) -> Ending:
+) -> tuple[int, float, int, int, float]:
     """Integrate a chain from rest (or struck) over the samples of a scene, by implicit steps.
 
-    The arguments are those of `explicit.taylor.integrate`, as are the outcomes; `tol` is the
-    truncation of a step relative to the motion so far.
+    The arguments are those of `explicit.taylor.integrate`; `tol` is the truncation of a step
+    relative to the motion so far. Returned is what that returns, and the size, relative to motion
+    and stress, of the vibrations that were damped out because they could not be followed.
     """
     with np.errstate(all="ignore"):
         run = _Run(scene, tol, directions, start, out, log)
@@ -83,7 +69,7 @@ def integrate_implicit(
             if run.vibrations.worst[1] > 0.0:
                 scales = run.control.motion, run.control.stress
                 lost += float((run.vibrations.worst / scales).max())
-            return Ending(end.outcome, end.time, run.steps, run.switches, lost)
+            return end.outcome, end.time, run.steps, run.switches, lost
     raise AssertionError  # a run ends by `_EndError`
 
 
@@ -107,12 +93,9 @@ class _Run:
         self.above = slice(int(scene.ends[-2]) if scene.ends.size > 1 else 0, None)
         self.nodes = slice(None) if len(out.curves) > 2 else slice(-1, None)
         duration, weight = float(self.t[-1] - (0.0 if self.struck else self.t[0])), 0.0
-        soft, eta = scene.heights / scene.rows[:, K0], scene.rows[:, ETA]
         if self.struck:
-            contact = math.sqrt(scene.mass[-1] * soft.sum()) + scene.drag * soft.sum()
-            duration = min(duration, 5.0 * (contact + float((eta / scene.rows[:, K0]).max())))
-            flow = float((scene.heights / eta).sum())
-            if soft.sum() > OVERDAMPED * flow * flow * scene.mass[-1]:
+            duration = min(duration, 5.0 * plain(contact_time)(scene))
+            if plain(is_overdamped)(scene):
                 weight = min(1.0, tol / SMALL_BASE_ERROR)
         self.vibrations = Vibrations(scene)
         self.control = Control(self.step, self.vibrations, tol, duration, weight)

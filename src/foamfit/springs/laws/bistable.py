@@ -11,14 +11,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.springs.law import BRANCH_NAMES, derived_points
-from foamfit.springs.laws.record import (
-    LAST_STRAIN,
-    Between,
-    Compared,
-    Law,
-    Param,
-    PointOf,
-)
+from foamfit.springs.laws.record import LAST_STRAIN, Between, Compared, Law, Param, PointOf
 from foamfit.springs.laws.shared import (
     COMPARED_ETA,
     COMPARED_HEIGHT,

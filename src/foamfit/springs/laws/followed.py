@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
-from foamfit.springs import kernels, ranks
+from foamfit.springs import kernels
 from foamfit.springs import microscale_kernels as micro
 from foamfit.springs.law import MICROSCALE
 from foamfit.springs.laws.record import BRANCH, EPS, SIGMA, Functions, Law
@@ -35,12 +35,12 @@ MOST_SWITCHES = 10_000  # of one spring on the way to one strain
 def _begin(row: Array, state: Array) -> None:
     """Set the state of a spring at rest."""
     if row[kernels.KIND] == MICROSCALE:
-        micro.begin(row, state)
+        micro.begin(row, state, 0.0)
         return
     state[:] = 0.0
     branch = kernels.first_branch(row)
     state[BRANCH] = branch
-    state[ranks.LOW], state[ranks.HIGH] = kernels.interval(row, branch)
+    state[micro.LOW], state[micro.HIGH] = kernels.interval(row, branch)
 
 
 @kernels.compiled
@@ -48,7 +48,7 @@ def _leaves(row: Array, state: Array, eps: float) -> bool:
     """Whether a spring leaves its branch before it reaches a strain."""
     if row[kernels.KIND] == MICROSCALE:
         return micro.leaves(state, eps)
-    return eps > state[ranks.HIGH] if eps > state[EPS] else eps < state[ranks.LOW]
+    return eps > state[micro.HIGH] if eps > state[EPS] else eps < state[micro.LOW]
 
 
 @kernels.compiled
@@ -67,19 +67,19 @@ def _switch(row: Array, state: Array, up: bool) -> None:
         micro.switch(row, state, up)
         return
     branch = int(state[BRANCH])
-    state[EPS] = state[ranks.HIGH] if up else state[ranks.LOW]
+    state[EPS] = state[micro.HIGH] if up else state[micro.LOW]
     branch = kernels.above(branch) if up else kernels.below(branch)
     state[BRANCH] = branch
-    state[ranks.LOW], state[ranks.HIGH] = kernels.interval(row, branch)
+    state[micro.LOW], state[micro.HIGH] = kernels.interval(row, branch)
     state[SIGMA] = kernels.stress_on(row, branch, state[EPS])
 
 
 _FILL = {
     "bistable": kernels.fill_bistable,
-    "microscale": micro.fill_microscale,
-    "microscale, stiffening": micro.fill_stiffening,
-    "microscale, mullins": micro.fill_mullins,
-    "microscale, stiffening, mullins": micro.fill_memory,
+    "microscale": kernels.fill_microscale,
+    "microscale, stiffening": kernels.fill_microscale,
+    "microscale, mullins": kernels.fill_microscale,
+    "microscale, stiffening, mullins": kernels.fill_microscale,
     "linear": kernels.fill_linear,
     "unilateral": kernels.fill_unilateral,
 }
@@ -104,7 +104,7 @@ def compiled_functions(law: Law) -> Functions:
 def sizes_of(law: Law) -> tuple[int, int]:
     """Length of a row and of a state of a law."""
     if law.kind in _FILL:
-        return kernels.N_COLUMNS, ranks.STATE
+        return kernels.N_COLUMNS, micro.STATE
     return law.columns or len(law.params), law.states
 
 
@@ -157,26 +157,13 @@ class Loops(NamedTuple):
     delayed: Compiled
 
 
-def _walker(law: Law) -> Compiled:
-    """Take one spring to a strain: over all branches on the way; returns its stress."""
-    _, _, leaves, switch, settle, _ = compiled_functions(law)
-    columns, states = sizes_of(law)
+def _own_loops(law: Law) -> tuple[Compiled, Compiled, Compiled]:
+    """Start one spring at rest, walk it to a strain over all branches on the way, and delay it.
 
-    @compiled
-    def walk(rows: Array, whole: Array, eps: float) -> float:
-        row, state = rows[:columns], whole[:states]  # arrays may have room for longer ones
-        for _ in range(MOST_SWITCHES):
-            if not leaves(row, state, eps):
-                settle(row, state, eps)
-                return state[SIGMA]
-            switch(row, state, eps > state[EPS])
-        return math.nan
-
-    return walk
-
-
-def _starter(law: Law) -> Compiled:
-    begin = compiled_functions(law).begin
+    The second returns its stress; the third that which depends on time, of rate (1/s) and time (s).
+    Arrays may have room for longer rows and states.
+    """
+    _, begin, leaves, switch, settle, viscous = compiled_functions(law)
     columns, states = sizes_of(law)
 
     @compiled
@@ -185,13 +172,15 @@ def _starter(law: Law) -> Compiled:
         begin(rows[:columns], whole[:states])
         return eps
 
-    return start
-
-
-def _delayer(law: Law) -> Compiled:
-    """Give the stress of a spring that depends on time; `pace` are rate (1/s) and time (s)."""
-    viscous = compiled_functions(law).viscous
-    columns, states = sizes_of(law)
+    @compiled
+    def walk(rows: Array, whole: Array, eps: float) -> float:
+        row, state = rows[:columns], whole[:states]
+        for _ in range(MOST_SWITCHES):
+            if not leaves(row, state, eps):
+                settle(row, state, eps)
+                return state[SIGMA]
+            switch(row, state, eps > state[EPS])
+        return math.nan
 
     @compiled
     def none(rows: Array, whole: Array, pace: tuple[float, float]) -> float:
@@ -201,7 +190,7 @@ def _delayer(law: Law) -> Compiled:
     def delayed(rows: Array, whole: Array, pace: tuple[float, float]) -> float:
         return viscous(rows[:columns], whole[:states], pace[0], pace[1])  # type: ignore[misc]
 
-    return none if viscous is None else delayed
+    return start, walk, none if viscous is None else delayed
 
 
 def _chosen(functions: Sequence[Compiled]) -> Compiled:
@@ -270,9 +259,7 @@ def inverse(value_at: Compiled) -> Compiled:
 @cache
 def loops_of(laws: tuple[Law, ...]) -> Loops:
     """Loops of springs of these laws, base first."""
-    walk = _chosen([_walker(law) for law in laws])
-    start = _chosen([_starter(law) for law in laws])
-    delayed = _chosen([_delayer(law) for law in laws])
+    start, walk, delayed = map(_chosen, zip(*map(_own_loops, laws), strict=True))
 
     @compiled
     def step(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
-from foamfit.springs.law import BRANCH_NAMES, least_eps_star, most_beyond
+from foamfit.springs.law import BRANCH_NAMES, most_beyond
 from foamfit.springs.laws.record import LAST_STRAIN, Between, Compared, Law, Param
 from foamfit.springs.laws.shared import (
     COMPARED_ETA,
@@ -258,7 +258,7 @@ def _least_slopes(
 
 _BEYOND_A = Between(
     ("k0", "kc"),
-    lambda k0, kc: (least_eps_star(k0, kc), LAST_STRAIN),
+    lambda k0, kc: (_least_star(k0, kc), LAST_STRAIN),
     lambda k0, kc: _least_slopes(k0, kc)[:2],
 )
 _STRESSES, _SPREADS = (math.log(0.02), math.log(1.0)), (math.log(0.05), math.log(2.0))
