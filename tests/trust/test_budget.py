@@ -121,7 +121,8 @@ def test_what_a_fit_of_the_changed_toml_gives(tmp_path, quantity):
     for name in (*STRESSES, *STRAINS):
         one, other = first.parameters[name], again.parameters[name]
         change = abs(other.value - one.value)
-        assert one.systematic == pytest.approx(change, rel=0.05, abs=0.1 * one.stderr), name
+        # Minima beside each other, which samples at switches make, differ by 0.1 standard errors.
+        assert one.systematic == pytest.approx(change, rel=0.05, abs=0.2 * one.stderr), name
         assert first.budget.contributions[name][quantity] == one.systematic
     if quantity == "area":
         for name in STRESSES:
