@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve.scene import MOTION, STRESS, Motion, Slopes, difference, list_switches
+from foamfit.solve.scene import MOTION, STRESS, Motion, Slopes, difference
+from foamfit.springs import kernels
 from foamfit.springs import laws as known
 from foamfit.springs.chain import Chain
 from foamfit.springs.laws import followed
@@ -315,7 +316,7 @@ class AnyLawPlan(NamedTuple):
                 np.array([nodes for nodes, _ in sides]), np.array([stress for _, stress in sides])
             )
         strain = np.diff(found.nodes, axis=0, prepend=0.0) / np.array(heights)[:, None]
-        switches = list_switches(self.time, strain, found.branches)
+        switches = kernels.list_switches(self.time, strain, found.branches)
         nodes = found.nodes if everything else found.nodes[-1:]
         if slopes is not None and not everything:
             slopes = slopes._replace(displacement=slopes.displacement[:, -1:])

@@ -17,7 +17,7 @@ from foamfit.solve.any_law import AnyLawPlan, plan_of
 from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import steps
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
-from foamfit.solve.scene import NO_SWITCHES, Slopes, list_switches
+from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
 from foamfit.springs import equilibrium, kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
@@ -280,7 +280,9 @@ class Plan(NamedTuple):
                 _on_one_plateau(rows, branches, directions) if moved else _NOTHING[:0],
             )
         eta = rows[0, kernels.ETA]
-        damped = eta > 0.0 or np.isin(directions[:, 1], (OWN_ETA, OWN_HEIGHT)).any()
+        damped = eta > 0.0
+        if len(directions):
+            damped |= bool(np.isin(directions[:, 1], (OWN_ETA, OWN_HEIGHT)).any())
         if moved and len(heights) == 1 and stress.size > 1 and damped:
             rate = np.gradient(strain[0], self.time)
             stress = stress + eta * rate
@@ -298,7 +300,7 @@ class Plan(NamedTuple):
         nodes = heights[:, None] * strain
         for i in range(1, len(nodes)):  # np.cumsum takes six times as long
             nodes[i] += nodes[i - 1]
-        switches = list_switches(self.time, strain, branches)
+        switches = kernels.list_switches(self.time, strain, branches)
         return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
 
     def _stretched(self, rows: Array, heights: Array) -> tuple[Array, Array, NDArray[np.int64]]:

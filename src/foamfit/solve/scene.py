@@ -82,15 +82,6 @@ class Motion(NamedTuple):
     unresolved: float = 0.0  # vibrations that were damped out, relative to the ranges
 
 
-def list_switches(time: Array, strain: Array, branches: Branches) -> Array:
-    """List the changes of branch between samples, at the later sample."""
-    samples, springs = np.nonzero((branches[:, 1:] != branches[:, :-1]).T)
-    out, later = np.empty((samples.size, 5)), samples + 1
-    out[:, 0], out[:, 1], out[:, 4] = time[later], springs, strain[springs, later]
-    out[:, 2], out[:, 3] = branches[springs, samples], branches[springs, later]
-    return out
-
-
 def difference(one: Array, other: Array) -> float:
     """Largest difference of two motions over the range of the first, rest included."""
     span = max(float(one.max()), 0.0) - min(float(one.min()), 0.0)

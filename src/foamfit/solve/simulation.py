@@ -190,14 +190,6 @@ def _many(scene: Plan, motion: Motion, few: int) -> bool:
     return (motion.steps > few or vibrates) and motion.method != AGGREGATE
 
 
-def _distance_to_pole(rows: Array, heights: Array, displacement: Array) -> float:
-    """Least distance, in strain, of a spring on branch c from its end at 1 + ε_*."""
-    strain = np.diff(displacement, axis=0, prepend=0.0).max(axis=1) / heights
-    kind = rows[:, kernels.KIND]
-    near = (kind == MICROSCALE) | (kind == BISTABLE) & (strain > rows[:, kernels.EPS_C])
-    return float(np.where(near, 1.0 - (strain - rows[:, kernels.EPS_STAR]), 1.0).min())
-
-
 def _hard(scene: Plan, rows: Array, heights: Array) -> bool:
     """Whether an impact may bring a spring close to the end of its branch c."""
     energy = 0.5 * float(scene.mass[-1]) * scene.speed**2
@@ -212,10 +204,9 @@ def _distance_at_peak(
     The peak of a fast impact is so short that no sample need lie in it: it is bracketed. In
     equilibrium all springs are longest together.
     """
+    distance = kernels.distance_to_pole(rows, heights, motion.displacement)
     if scene.solver == CLOSED_FORM:
-        peak = int(motion.displacement[-1].argmax())
-        return _distance_to_pole(rows, heights, motion.displacement[:, peak : peak + 1])
-    distance = _distance_to_pole(rows, heights, motion.displacement)
+        return distance
     # Where a microscale spring turns between two samples is among its switches.
     turned = motion.switches[rows[motion.switches[:, 1].astype(int), kernels.KIND] == MICROSCALE]
     beyond = turned[:, 4] - rows[turned[:, 1].astype(int), kernels.EPS_STAR]
@@ -227,7 +218,7 @@ def _distance_at_peak(
     for _ in range(12):
         grid = np.linspace(low, high, 201)
         top = scene._replace(time=grid).run(rows, heights, rtol).displacement
-        distance = min(distance, _distance_to_pole(rows, heights, top))
+        distance = min(distance, kernels.distance_to_pole(rows, heights, top))
         at = int(top[-1].argmax())
         low, high = float(grid[max(at - 1, 0)]), float(grid[min(at + 1, 200)])
         if high - low < 1e-15 * high or at == 200:

@@ -350,6 +350,42 @@ def fault(t: Array) -> int:
 
 
 @compiled
+def list_switches(time: Array, strain: Array, branches: Branches) -> Array:
+    """List the changes of branch between samples, at the later sample."""
+    count, n = branches.shape
+    seen = 0
+    for i in range(count):
+        for j in range(1, n):
+            seen += branches[i, j] != branches[i, j - 1]
+    out, at = np.empty((seen, 5)), 0
+    for j in range(1, n):
+        for i in range(count):
+            if branches[i, j] != branches[i, j - 1]:
+                out[at, 0], out[at, 1], out[at, 4] = time[j], i, strain[i, j]
+                out[at, 2], out[at, 3] = branches[i, j - 1], branches[i, j]
+                at += 1
+    return out
+
+
+@compiled
+def distance_to_pole(rows: Array, heights: Array, displacement: Array) -> float:
+    """Least distance, in strain, of a spring on branch c from its end at 1 + ε_*; at most 1.
+
+    `displacement` (n, n_t) is that of the node above each spring.
+    """
+    least = 1.0
+    for i in range(heights.size):
+        strain = -math.inf
+        for j in range(displacement.shape[1]):
+            below = displacement[i - 1, j] if i > 0 else 0.0
+            strain = max(strain, (displacement[i, j] - below) / heights[i])
+        kind = rows[i, KIND]
+        if kind == MICROSCALE or (kind == BISTABLE and strain > rows[i, EPS_C]):
+            least = min(least, 1.0 - (strain - rows[i, EPS_STAR]))
+    return least
+
+
+@compiled
 def total(values: Array) -> float:
     """Sum of an array; finite only if all of it is."""
     out = 0.0
