@@ -477,8 +477,8 @@ def test_springs_in_series_are_not_searched_on_from_a_poor_first_search(monkeypa
     ladder = ff.fit(wavy, model="auto", starts=2, intervals="local").ladder
     assert [rung.model for rung in ladder.rungs] == ["bistable"]
     first, richer = ladder.skipped
-    assert first.startswith("bistable+bistable: its first search misses the curves by ")
-    assert richer == "linear+bistable+bistable: the first search with bistable+bistable was poor"
+    assert first.startswith("bistable+bistable: its first descents miss the curves by ")
+    assert richer == "linear+bistable+bistable: the first descents with bistable+bistable were poor"
 
 
 def test_a_drive_without_dampers_has_one_rung_for_each_model():

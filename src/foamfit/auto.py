@@ -23,7 +23,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.problem import Problem, make_params
-from foamfit.fitting.search import SearchStoppedError, has_several, what_stopped
+from foamfit.fitting.search import SearchStoppedError, what_stopped
 from foamfit.one_model import Found, Options, Progress
 from foamfit.report import render
 from foamfit.results import Fit, Ladder, Rung, rung_name
@@ -38,10 +38,10 @@ from foamfit.trust.evidence import BLOCKS, MARGIN, SHARE, Tried, misfit_of, pred
 from foamfit.trust.intervals import Announce, Choice
 from foamfit.trust.residuals.residual_tests import BENT, find_structure, neighbours_test, runs_test
 
-# From the simplest up, in groups: one spring; a linear spring below it or its relaxation; one that
-# softens where it has snapped; two springs; three; two that relax. More springs have more
-# parameters (23 and more) than a loop has features. Springs that remember take too long in three,
-# others gain nothing in the last group.
+# From the simplest up, in groups: one spring; a linear spring below it, or its relaxation (which
+# comes first but in an impact, where it takes longer); one that softens where it has snapped;
+# two springs; three; two that relax. More springs have more parameters (23 and more) than a loop
+# has features. Springs that remember take too long in three, others gain nothing in the last group.
 _OWN = [law.kind for law in map(laws.law, laws.PAPER) if law.hysteretic and not law.word]
 _SLOW = [kind for kind in _OWN if laws.law(kind).remembers]
 _QUICK = [kind for kind in _OWN if kind not in _SLOW]
@@ -75,9 +75,9 @@ HOPELESS = 1.1
 # Two of them take a minute even under a known motion: they are not tried where one, perhaps with
 # relaxation, misses the curves by no more than this share of the range.
 CLOSE = 0.01
-# Two that forget are not searched further where a first search misses the curves by so many times
-# more than one spring.
-UNPROMISING = 1.2
+# Springs in series are not searched further where the first descents miss the curves by so many
+# times more than one spring: what follows them gains a fifth at most.
+UNPROMISING = 1.5
 # Share of the time of a comparison after which only the chosen model is left to be judged.
 CHOSEN = 0.9
 # While models are compared: only the chosen one gets ranges and better intervals, which cost as
@@ -174,7 +174,7 @@ class _Comparison:
         self.began, limit = time.perf_counter(), options.max_time
         self.deadline = None if limit is None else time.monotonic() + limit
         self.skipped: list[str] = []  # models that are not tried, and why
-        self.unpromising: list[Model] = []  # those of them whose first search was poor
+        self.unpromising: list[Model] = []  # those of them whose first descents were poor
         self.groups = self._models()
         self.of, self.number = sum(map(len, self.groups)), 0  # models in all, and the present one
         self.tried: list[Tried] = []
@@ -191,9 +191,10 @@ class _Comparison:
         test = self.measurement
         heights, inside = test.specimen.heights, max(test.interior, default=0)
         groups = []
+        impact = self.options.drive == "impact"
         for group in LADDER if test.last_cycle is None else HISTORY:
             allowed = []
-            for model in group:
+            for model in sorted(group, key=lambda one: not (impact or one.relaxation)):
                 count = len(model.kinds)
                 if inside >= count:
                     self._skip(model, f"it has no mass {inside} inside, whose motion was measured")
@@ -277,7 +278,7 @@ class _Comparison:
             self.progress(done, f"model {self.number} of {self.of}: {named}: {what}")
 
         options = replace(self.options, max_time=left, relaxation=model.relaxation)
-        look = self._look if has_several(model) else None
+        look = self._look if len(model.kinds) > 1 else None
         found = one_model.identify(self.measurement, model.name, params, options, tell, look)
         result, best = one_model.judge(found, COMPARED, lambda _: None)
         predicted = None if result.stopped else self._predicted(best)
@@ -285,14 +286,14 @@ class _Comparison:
         return Tried(result, damping, best, time.perf_counter() - began, predicted)
 
     def _look(self, problem: Problem, values: Array) -> None:
-        """End the fit of a chain whose first search is far worse than the best of one spring."""
-        alone = [one for one in self.tried if not has_several(Model.parse(one.result.model))]
+        """End the fit of a chain whose first descents are far worse than the best of one spring."""
+        alone = [one for one in self.tried if len(Model.parse(one.result.model).kinds) == 1]
         objective = problem.objective
         found = misfit_of(objective, objective.residual(values)[: objective.n_data])
         best = min(alone, key=lambda one: one.misfit, default=None)
         if best is not None and found > UNPROMISING * best.misfit:
             raise _UnpromisingError(
-                f"its first search misses the curves by {percent(found)} of the range, "
+                f"its first descents miss the curves by {percent(found)} of the range, "
                 f"{best.name} by {percent(best.misfit)}"
             )
 
@@ -321,7 +322,7 @@ def _hopeless(model: Model, tried: Sequence[Tried], unpromising: Sequence[Model]
 
     for poor in unpromising:
         if Counter(poor.kinds) <= Counter(model.kinds):
-            return f"the first search with {poor.name} was poor"
+            return f"the first descents with {poor.name} were poor"
     slow = [kind for kind in model.kinds if kind in _SLOW]
     if any(model.options.values()):
         (one, told), (other, against) = least([model.words]), least(_QUICK)

@@ -43,7 +43,7 @@ from foamfit.trust.ranges import Open, left_open
 Progress = Callable[[float, str], None]
 # Called with the problem and the best point so far, many times a second; must be quick.
 Watch = Callable[[Problem, Array], None]
-# Called with the problem and the best point of the first search; what it raises ends the fit.
+# Called with the problem and the best point of the first descents; what it raises ends the fit.
 Look = Callable[[Problem, Array], None]
 
 # Descents of the search for each spring, for each of several hysteretic springs in series, and at

@@ -41,8 +41,13 @@ def keep_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def is_other(kind: Any) -> bool:
-    """Whether an argument is a literal, or the memory of springs, which is compiled apart."""
-    return isinstance(kind, types.Literal) or getattr(kind, "instance_class", 0) is memory.Memory
+    """Whether an argument is a literal, or of springs with memory, which are compiled apart."""
+    strided = getattr(kind, "layout", "C") == "A"  # a series of all that these remember
+    return (
+        strided
+        or isinstance(kind, types.Literal)
+        or getattr(kind, "instance_class", 0) is memory.Memory
+    )
 
 
 def test_a_fit_calls_what_was_compiled_and_nothing_else() -> None:

@@ -81,7 +81,7 @@ class Tracker:
 
     `ends` holds the parameters at which the descents on the drive's curves ended; `better` is
     called with every point that is the best so far, `pulse` at every so many evaluations, `looked`
-    with the best point of the first search. What `looked` raises ends the fit.
+    with the best point of the first descents. What `looked` raises ends the fit.
     """
 
     objective: Objective
@@ -101,6 +101,11 @@ class Tracker:
         if self.deadline is not None and time.monotonic() > self.deadline:
             raise SearchStoppedError
         return residual
+
+    def look(self) -> None:
+        """Show the best point, if there is one and somebody wants to see it."""
+        if self.looked is not None and self.best_values is not None:
+            self.looked(self.best_values)
 
     def restart(self) -> None:
         """Go on from the best point with an objective that has changed."""
@@ -195,6 +200,8 @@ def search(
             points = [point for _, point in found]
             counts = {id(point): count for count, point in found}
         ranked = rank(tracker, space, points)
+        if attempt == 0 and tracker.objective.drive != "impact":  # there the loop is not the curves
+            tracker.look()
         if tracker.objective.interior_mass:
             progress(ON_CURVES, "vibration")
             ranked = sorted(ranked + _scan_vibration(tracker, space, points[0]), key=_cost)
@@ -205,11 +212,11 @@ def search(
             cost, end = descend(tracker, space, point, 60)
             tracker.ends.append(space.decode(end))
             out.append((cost, counts.get(id(point), 1)))
+        if attempt == 0:
+            tracker.look()
         edges = _off_edges(tracker, space)
         apart = _descended(tracker, space, _apart(tracker, space))
         out += [(cost, 1) for cost in edges + apart]
-        if attempt == 0 and tracker.looked is not None and tracker.best_values is not None:
-            tracker.looked(tracker.best_values)
         least = IN_SERIES if several else max(attempts // 2, 2 if edges else 1)
         if attempt + 1 == attempts or _settled(tracker, out, attempt, least):
             break
