@@ -26,6 +26,7 @@ from foamfit.cli import main
 from foamfit.solve import cache, polynomial, precompile, rates, relaxation
 from foamfit.solve.explicit import memory, taylor
 from foamfit.springs import kernels, microscale_kernels, sensitivities
+from foamfit.springs.laws import followed
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 
@@ -34,7 +35,7 @@ def keep_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the loops of this package say that numba keeps them compiled in a folder."""
     loop = SimpleNamespace(stats=SimpleNamespace(cache_path=str(folder)))
     for module, name in (
-        (kernels, "fault"), (polynomial, "first_crossing"),
+        (kernels, "fault"), (followed, "_begin"), (polynomial, "first_crossing"),
         (taylor, "integrate"), (rates, "fastest_rates"),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, loop)

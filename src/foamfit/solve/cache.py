@@ -20,8 +20,10 @@ def _caches() -> set[Path]:
     from foamfit.solve import polynomial, rates
     from foamfit.solve.explicit import taylor
     from foamfit.springs import kernels
+    from foamfit.springs.laws import followed
 
-    loops = (kernels.fault, polynomial.first_crossing, taylor.integrate, rates.fastest_rates)
+    law = followed.functions_of("linear").begin
+    loops = (kernels.fault, law, polynomial.first_crossing, taylor.integrate, rates.fastest_rates)
     return {Path(loop.stats.cache_path or ".") for loop in loops}
 
 

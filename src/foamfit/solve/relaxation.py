@@ -259,12 +259,27 @@ def _try_nodes(
 
 @inlined
 def _derive(
-    row: Row, state: Array, seed: Array, nodes: Array, d_ranks: Array, d_nodes: Array, first: float
-) -> None:
-    """Fill the derivatives of the stress at the nodes of a step, from a strain to where it is."""
+    row: Row, state: Array, seed: Array, nodes: Array, d_ranks: Array, d_nodes: Array, first: float,
+    short: bool,
+) -> None:  # fmt: skip
+    """Fill the derivatives of the stress at the nodes of a step, from a strain to where it is.
+
+    On a `short` one they are those of the parabola through both ends and the middle.
+    """
     for c in range(d_nodes.shape[1]):
         d_nodes[0, c] = d_nodes[3, c]
     here = state[SIGMA], state[EPS]
+    if short:
+        state[EPS] = 0.5 * (first + here[1])
+        state[SIGMA] = 0.625 * (nodes[1] + nodes[2]) - 0.125 * (nodes[0] + nodes[3])
+        _tangents(row, state, seed, d_ranks, d_nodes[1])
+        state[SIGMA], state[EPS] = here
+        _tangents(row, state, seed, d_ranks, d_nodes[3])
+        for c in range(d_nodes.shape[1]):
+            before, middle, last = d_nodes[0, c], d_nodes[1, c], d_nodes[3, c]
+            mean, slant = 0.1 * (before + last) + 0.8 * middle, 0.4 * _BEND * (last - before)
+            d_nodes[1, c], d_nodes[2, c] = mean - slant, mean + slant
+        return
     for i in range(1, 4):
         state[EPS], state[SIGMA] = first + NODES[i] * (here[1] - first), nodes[i]
         _tangents(row, state, seed, d_ranks, d_nodes[i])
@@ -380,7 +395,7 @@ def relaxed_along(
                     if not abs(h - table[k, STEP]) <= 1e-13 * h:
                         _tabulate(h, taus[k], moments, table[k])
                 goal = end if last else first + (done + pace - at) / (until - at) * (end - first)
-                tried = plain > 0 and last and pace == 1.0 and not derive
+                tried = plain > 0 and last and pace == 1.0
                 short = tried and _try_slopes(row, state, nodes, table, end, rtol, largest)
                 plain, error, sloped = plain - tried, 0.0, False
                 if not short:
@@ -397,7 +412,7 @@ def relaxed_along(
                 if not short:
                     plain = CHECKED if sloped and error <= PLAIN * rtol * largest else 0
                 if derive:
-                    _derive(row, state, seeds[j], nodes, d_ranks, d_nodes, origin)
+                    _derive(row, state, seeds[j], nodes, d_ranks, d_nodes, origin, short)
                 _relax(row, h, table, nodes, d_nodes, kept)
                 done = until if last else done + pace
                 pace *= 2.0

@@ -69,9 +69,10 @@ _ROOT_HALF, _ROOT_TURN = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @inner
-def share(rank: float) -> float:
-    """Φ, the share of all ranks that lies below one."""
-    return 0.5 * math.erfc(-_ROOT_HALF * rank)
+def shares(rank: float) -> tuple[float, float]:
+    """Φ and 1 - Φ, the shares of all ranks below and above one; the small one has all its digits."""
+    least = 0.5 * math.erfc(_ROOT_HALF * abs(rank))
+    return (1.0 - least, least) if rank > 0.0 else (least, 1.0 - least)
 
 
 @inner
@@ -180,8 +181,7 @@ def at_stress(row: Row, state: Array, sigma: float) -> float:
         return -math.inf
     place, scale = line(row, branch)
     rank = (math.log(sigma) - place) / scale
-    p = share(rank)
-    rest = share(-rank) if rank > 0.0 else 1.0 - p
+    p, rest = shares(rank)
     strain, slope, bend, one, on_one = mixture(row, branch, p, rest, state[NEVER], sigma)
     two = 1.0 / (row[KC] + sigma)
     gap, rate = row[EPS_STAR] + sigma * two - one, density(rank) / (scale * sigma)
@@ -372,7 +372,7 @@ def _enter(row: Row, state: Array, branch: int) -> None:
 @inner
 def _hold(row: Row, state: Array, rank: float) -> None:
     """Hold a rank that has been reached."""
-    p, rest = share(rank), share(-rank)
+    p, rest = shares(rank)
     state[BRANCH], state[RANK], state[SNAPPED], state[REST] = HELD, rank, p, rest
     state[FLEXIBILITY] = 0.0
     first = row[LOG_PLUS] if rank >= state[EVER] else row[LOG_AGAIN]
@@ -416,7 +416,7 @@ def switch(row: Row, state: Array, up: bool) -> None:
     if turned(state, up):
         rank = rank_now(row, state)
         if branch == SNAP and remembers:
-            state[EVER], state[NEVER] = rank, share(-rank)
+            state[EVER], state[NEVER] = rank, shares(rank)[1]
         _hold(row, state, rank)
         if not up and row[LOG_AGAIN] == row[LOG_PLUS] and not _has_loop(row, state[SIGMA], False):
             _enter(row, state, BOTH)
@@ -537,8 +537,8 @@ def under_stress(
     On first loading w and W are one: its derivative is that by w. The strain is -inf where the
     spring cannot carry the tension.
     """
-    n, never = row[STIFFENING], share(-ever)
-    p, rest = (share(rank), share(-rank)) if branch != A else (0.0, 1.0)
+    n, never = row[STIFFENING], shares(ever)[1]
+    p, rest = shares(rank) if branch != A else (0.0, 1.0)
     strain, soft, _, one, _ = mixture(row, branch, p, rest, never, sigma)
     if strain == -math.inf or (branch == A and never == 1.0):
         return strain, soft, 0.0, 0.0, 0.0
@@ -564,7 +564,8 @@ def strain_along(row: Row, sigma: Array) -> tuple[Array, Array, Branches]:
     branches, branch, rank, ever = np.empty(sigma.size, np.int64), A, -math.inf, -math.inf
     for j in range(sigma.size):
         rank, ever, branch = rank_at(row, rank, ever, branch, sigma[j])
-        p, rest, never = share(rank), share(-rank), share(-ever)
+        p, rest = shares(rank)
+        never = shares(ever)[1]
         eps[j] = mixture(row, branch, p, rest, never, sigma[j])[0]
         branches[j], ranks[0, j], ranks[1, j] = branch, rank, ever
     return eps, ranks, branches
@@ -591,8 +592,8 @@ def strain_tangents(
     k0, two = row[K0], 1.0 / (row[KC] + sigma)
     p, rest, weight = 0.0, 1.0, 0.0
     if branch != A:
-        p, weight = share(rank), density(rank)
-        rest = share(-rank) if rank > 0.0 else 1.0 - p
+        p, rest = shares(rank)
+        weight = density(rank)
     for c in range(carried(row)):
         out[c] = 0.0
     fresh, worn, by_ever, pace = rest, 0.0, 0.0, 0.0
@@ -602,7 +603,7 @@ def strain_tangents(
     else:
         n, never, weight_ever = row[STIFFENING], rest, weight
         if rank != ever:
-            never, weight_ever = share(-ever), density(ever)
+            never, weight_ever = shares(ever)[1], density(ever)
         if branch != SNAP and never != 1.0:
             fresh = never  # on branch a, and never snapped
             worn = max(rest - fresh, 0.0)

@@ -30,6 +30,8 @@ BEYOND = 2.0
 OUTWARD, INWARD = 14, 6
 # The cut is placed to this share of the root of its χ².
 PLACED = 0.02
+# Two values are nearly the same if they differ by this share of their distance from the best.
+NEARLY = 0.01
 # Damping of the first step of the other parameters, more until it lowers the cost.
 FOLLOWING = (1e-9, 1e-6, 1e-3)
 # A profile that falls below the best point by this share of the cut has found a better minimum.
@@ -178,17 +180,28 @@ class _Side:
         """
         if len(self.refits) == 1:
             self._outward()
+        met = list[Iterate]()
         for point in sorted(minima, key=lambda point: -self.sign * float(point[self.place])):
             value, open_ = float(point[self.place]), self.bracket()[1] is None
             edge = self.value(self.refits[-1]) if open_ else self.bound
             if self.better or self.sign * (value - edge) <= PLACED * self.half:
                 break
+            if self._known(point, value, met):
+                continue
             found = self.refit.run(point, (self.column, value))
+            met += [] if found is None else [found]
             if found is not None and self.rise(found) < self.quantile**2:
                 # Refits farther out are of another minimum, or have stalled.
                 inside = [at for at in self.refits if self.sign * (self.value(at) - value) < 0.0]
                 self.refits = [*inside, found]
                 self._outward()
+
+    def _known(self, point: Array, value: float, met: Sequence[Iterate]) -> bool:
+        """Whether refits met a lower cost at nearly this value already: many descents end alike."""
+        start = self.value(self.refits[0])
+        near = [at for at in met if abs(self.value(at) - value) < NEARLY * abs(value - start)]
+        least = min((at.cost for at in near), default=0.0)
+        return bool(near) and self.refit.rise(point) >= least - self.refit.best.cost
 
     def _outward(self) -> None:
         """Go on from the outermost refit until well beyond the cut, and place its crossing."""

@@ -57,7 +57,7 @@ from foamfit.springs.kernels import (
     piece,
 )
 from foamfit.springs.law import BISTABLE, MICROSCALE
-from foamfit.springs.microscale_kernels import CARRIED, OF_STRAIN, density, share
+from foamfit.springs.microscale_kernels import CARRIED, OF_STRAIN, density, shares
 from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 
 # Columns of `Memory.series`, which stand side by side at each order since the recurrences read them
@@ -286,7 +286,7 @@ def start_mixture(memory: Memory, i: int, moving: bool, eps: float) -> float:
     p, q, steep = state[micro.SNAPPED], state[micro.REST], 0.0
     if moving:
         u = (math.log(s) - now[PLACE]) / now[SCALE]
-        p, q, at = share(u), share(-u), density(u)
+        (p, q), at = shares(u), density(u)
         m[SCORE], m[DENSITY], m[BEND] = u, at, u * at
         now[PER_S] = 1.0 / s
         now[RATE_U] = now[PER_S] / now[SCALE]
@@ -434,7 +434,7 @@ def strain_at(row: Row, state: Array, now: Array, moving: bool, s: float) -> tup
         if not s > 0.0:
             return math.nan, math.nan
         u = (math.log(s) - now[PLACE]) / now[SCALE]
-        p, q, steep = share(u), share(-u), density(u) / (now[SCALE] * s)
+        (p, q), steep = shares(u), density(u) / (now[SCALE] * s)
     eps, soft, _, on_main, _ = micro.mixture(row, branch, p, q, state[micro.NEVER], s)
     return eps, soft + (row[EPS_STAR] + s / (row[KC] + s) - on_main) * steep
 
