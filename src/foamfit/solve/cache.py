@@ -22,8 +22,14 @@ def _caches() -> set[Path]:
     from foamfit.springs import kernels
     from foamfit.springs.laws import followed
 
-    law = followed.functions_of("linear").begin
-    loops = (kernels.fault, law, polynomial.first_crossing, taylor.integrate, rates.fastest_rates)
+    law: Any = followed.functions_of("linear").begin
+    loops: tuple[Any, ...] = (
+        kernels.fault,
+        law,
+        polynomial.first_crossing,
+        taylor.integrate,
+        rates.fastest_rates,
+    )
     return {Path(loop.stats.cache_path or ".") for loop in loops}
 
 

@@ -70,7 +70,7 @@ _ROOT_HALF, _ROOT_TURN = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
 
 @inner
 def shares(rank: float) -> tuple[float, float]:
-    """Φ and 1 - Φ, the shares of all ranks below and above one; the small one has all its digits."""
+    """Φ and 1 - Φ, the shares of all ranks below and above one; the small one is exact."""
     least = 0.5 * math.erfc(_ROOT_HALF * abs(rank))
     return (1.0 - least, least) if rank > 0.0 else (least, 1.0 - least)
 
