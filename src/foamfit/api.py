@@ -18,7 +18,6 @@ from foamfit.report.samples import dataset
 from foamfit.report.shown import fit_shown
 from foamfit.report.tables import frame
 from foamfit.results import Fit
-from foamfit.springs.model import with_options
 from foamfit.trust.intervals import Announce
 
 if TYPE_CHECKING:
@@ -131,6 +130,10 @@ def fit(
     watch : callable, optional
         Called with the problem and the best parameters so far whenever these improve; it must be
         quick.
+    fix : mapping, optional
+        Parameters to hold at a value (SI), where `params` is not given.
+    vary : sequence of str
+        Names of parameters to vary though they are held by default.
 
     Returns
     -------
@@ -166,16 +169,7 @@ def fit(
         found, _ = judge(searched, chosen.choice, tell, assess)
         progress(1.0, "done")
         return FitResult(**vars(found))
-    if params is not None:
-        raise InputError("params belong to one model; name it instead of 'auto'")
-    if chosen.relaxation:
-        raise InputError(
-            f"relaxation = {chosen.relaxation} belongs to one model; name it instead of 'auto', "
-            "which tries relaxation by itself"
-        )
-    if chosen.priors or measurement.priors:
-        raise InputError("priors belong to one model; name it instead of 'auto'")
-    with_options(model, **chosen.of_springs)
+    chosen.check_auto(params=params is not None, priors=measurement.priors)
     from foamfit.auto import compare_models
 
     return FitResult(**vars(compare_models(measurement, chosen, progress, tell)))

@@ -6,7 +6,7 @@ import difflib
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from numbers import Integral, Real
@@ -18,8 +18,9 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
+from foamfit.fitting.curves import check_time_shift, choose_drive
 from foamfit.fitting.minima import exchange_springs, in_order, scan_places, settle_ends
-from foamfit.fitting.problem import Problem, make_problem
+from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
 from foamfit.fitting.search import (
     REFINED,
     STOPPING,
@@ -86,6 +87,8 @@ class Keywords(TypedDict, total=False):
     draws: int | None
     priors: Mapping[str, str | tuple[float, float]] | None
     watch: Watch | None
+    fix: Mapping[str, float] | None
+    vary: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -110,6 +113,8 @@ class Options:
     draws: int | None = None
     priors: Mapping[str, str | tuple[float, float]] | None = None
     watch: Watch | None = None
+    fix: Mapping[str, float] | None = None
+    vary: Sequence[str] = ()
 
     @classmethod
     def of(cls, function: str, given: Mapping[str, Any]) -> Options:
@@ -156,10 +161,41 @@ class Options:
         """Options that free more parameters of some springs."""
         return {name: getattr(self, name) for name in OPTIONS}
 
+    def check(self, measurement: Measurement, model: str) -> None:
+        """Refuse what the test or the model does not allow, before anything is simulated."""
+        if self.time_shift:
+            check_time_shift(measurement, self.drive or choose_drive(measurement))
+        if model == "auto":
+            self.check_auto()
+        else:
+            self.params(measurement, model)
+
+    def check_auto(self, **given: object) -> None:
+        """Refuse what belongs to one model where models are compared; `given` may be that too."""
+        own = ("priors", self.priors), ("fix and vary", self.fix or self.vary)
+        for name, value in (*given.items(), *own):
+            if value:
+                raise InputError(f"{name} belong to one model; name it instead of 'auto'")
+        if self.relaxation:
+            raise InputError(
+                f"relaxation = {self.relaxation} belongs to one model; name it instead of 'auto', "
+                "which tries relaxation by itself"
+            )
+        with_options("auto", **self.of_springs)
+
+    def params(self, measurement: Measurement, model: str) -> lmfit.Parameters | None:
+        """Return the parameters as `fix` and `vary` want them; None where nothing is asked."""
+        if not (self.fix or self.vary):
+            return None
+        more: dict[str, Any] = {"time_shift": self.time_shift, "relaxation": self.relaxation}
+        made = make_params(measurement, model, self.drive, **more, **self.of_springs)
+        return fix_and_vary(made, model, self.fix or {}, self.vary)
+
     def problem(
         self, measurement: Measurement, model: str, params: lmfit.Parameters | None = None
     ) -> Problem:
         """Set up the fit of one model."""
+        params = self.params(measurement, model) if params is None else params
         model = with_options(model, **self.of_springs)
         more: dict[str, Any] = {
             name: getattr(self, name) for name in ("time_shift", "loss", "relaxation")

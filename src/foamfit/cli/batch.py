@@ -86,8 +86,6 @@ def batch(
         model=asked["model"],
         options={},
         cycles=cycles,
-        fix=asked["fix"] or None,
-        vary=asked["vary"],
         pages=not output.no_report,
         width=output.figure_width,
         history=asked["cycles"],

@@ -20,14 +20,11 @@ from foamfit.springs.options import OPTIONS
 from foamfit.terminal import say
 
 if TYPE_CHECKING:
-    import lmfit
-
     from foamfit.api import FitResult
-    from foamfit.data.measurement import Measurement
     from foamfit.study.cycles import CycleFits
 
 # Options that `foamfit.fit` does not take as keywords, and those that become its `intervals`.
-OF_ONE_MODEL, WAYS = ("cycle", "cycles", "model", "fix", "vary"), ("profile", "bootstrap", "mcmc")
+NO_KEYWORDS, WAYS = ("cycle", "cycles", "model"), ("profile", "bootstrap", "mcmc")
 
 
 def _fixes(
@@ -105,7 +102,7 @@ def keywords_of(asked: Mapping[str, Any]) -> dict[str, Any]:
     if len(given) > 1:
         names = " and ".join(f"--{way}" for way in given)
         raise InputError(f"{names} exclude each other; choose one way to make the intervals")
-    search = {name: one for name, one in asked.items() if name not in (*OF_ONE_MODEL, *WAYS)}
+    search = {name: one for name, one in asked.items() if name not in (*NO_KEYWORDS, *WAYS)}
     way, draws = next(iter(given.items()), ("auto", None))
     return search | {"intervals": way, "draws": None if draws is True else draws}
 
@@ -136,34 +133,14 @@ def fit_as_asked(
     from foamfit import api
     from foamfit.one_model import Options
 
-    Options(**search)  # refuses what is not admissible before anything is compiled
-    params = _params(measurement, model, asked)
+    Options(**search).check(measurement, model)  # before anything is compiled
     with begin(search["max_time"] if several is None else None) as news:  # it limits each cycle
         search |= {"progress": news.progress, "watch": news.watch, "tell": news.tell}
         if several is None:
-            return api.fit(measurement, model=model, params=params, **search)
+            return api.fit(measurement, model=model, **search)
         from foamfit.study import cycles as study
 
-        search["params"] = lambda one: _params(one, model, asked)
         return study.fit_cycles(test, specimen, cycles=several or None, model=model, **search)
-
-
-def _params(
-    measurement: Measurement, model: str, asked: Mapping[str, Any]
-) -> lmfit.Parameters | None:
-    """Return the parameters of a model as --fix and --vary want them; None for auto."""
-    from foamfit.fitting.curves import check_time_shift, choose_drive
-    from foamfit.fitting.problem import fix_and_vary, make_params
-
-    drive, fix, vary = (asked[name] for name in ("drive", "fix", "vary"))
-    more = {name: asked[name] for name in ("time_shift", "relaxation", *OPTIONS)}
-    if asked["time_shift"]:
-        check_time_shift(measurement, drive or choose_drive(measurement))
-    if model != "auto":
-        return fix_and_vary(make_params(measurement, model, drive, **more), model, fix, vary)
-    if fix or vary:
-        raise InputError("--fix and --vary belong to one model; name it instead of --model auto")
-    return None
 
 
 @main.command()

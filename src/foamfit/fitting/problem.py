@@ -105,14 +105,8 @@ def fix_and_vary(
 ) -> lmfit.Parameters:
     """Hold some parameters of a model at values in SI, and vary others that are held by default."""
     vary = tuple(vary)
+    check_fixed_and_varied(params, model, fix, vary)
     for name in (*fix, *vary):
-        if name not in params:
-            raise InputError(
-                f"parameter '{name}' is not one of the model {model}; "
-                f"its parameters are {', '.join(params)}"
-            )
-        if name in fix and name in vary:
-            raise InputError(f"parameter '{name}' cannot be both fixed and varied; choose one")
         if params[name].expr is not None:
             others = ", ".join(other for other in params if other in params[name].expr)
             raise InputError(f"parameter '{name}' follows from {others}; fix or vary that instead")
@@ -125,6 +119,20 @@ def fix_and_vary(
     for name in vary:
         params[name].set(vary=True)
     return params
+
+
+def check_fixed_and_varied(
+    names: Iterable[str], model: str, fix: Mapping[str, float], vary: Iterable[str]
+) -> None:
+    """Refuse what is none of these parameters, or both fixed and varied (InputError)."""
+    for name in (*fix, *vary):
+        if name not in names:
+            raise InputError(
+                f"parameter '{name}' is not one of the model {model}; "
+                f"its parameters are {', '.join(names)}"
+            )
+        if name in fix and name in vary:
+            raise InputError(f"parameter '{name}' cannot be both fixed and varied; choose one")
 
 
 def _add_heights(params: lmfit.Parameters, measurement: Measurement, model: Model) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -24,6 +24,7 @@ from foamfit.data.toml_file import motion_file, toml_beside
 from foamfit.errors import InputError
 from foamfit.files import is_left, read_whole, reason, sweep
 from foamfit.fitting import nuisance
+from foamfit.fitting.problem import check_fixed_and_varied
 from foamfit.one_model import Keywords, Options
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import BATCH_FILES, MARKS, check_target, is_written
@@ -58,13 +59,6 @@ MOST_AHEAD, MOST_BYTES = 1000, 2**28
 PAUSE, SHARE = 5.0, 50.0
 Tests = str | Path | Iterable[str | Path]
 Cycles = int | Sequence[int] | Literal["all"] | None
-
-
-class BatchKeywords(Keywords, total=False):
-    """The options of a fit, and parameters that it holds or varies."""
-
-    fix: Mapping[str, float] | None
-    vary: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -245,7 +239,7 @@ def batch(
     report: bool = True,
     figure_width: str = TWO,
     progress: Progress | None = None,
-    **options: Unpack[BatchKeywords],
+    **options: Unpack[Keywords],
 ) -> pd.DataFrame:
     """Fit every test on its own, in parallel; a result folder for each and one summary.
 
@@ -285,8 +279,7 @@ def batch(
     progress : callable, optional
         Told the `State` after each test.
     options
-        As for `foamfit.fit`; and ``fix``, parameters to hold at a value (SI), and ``vary``, names
-        of parameters to vary though they are held by default.
+        As for `foamfit.fit`.
 
     Returns
     -------
@@ -298,7 +291,6 @@ def batch(
     InputError
         If the call is wrong, or a result cannot be written, as to a full disk.
     """
-    fix, vary = options.pop("fix", None), tuple(options.pop("vary", ()))
     each = () if cycle == "all" else cycle
     if each is not None and not isinstance(each, int):
         each = tuple(int(number) for number in each)
@@ -306,7 +298,7 @@ def batch(
         raise InputError("give either cycle or cycles, not both")
     found = run(
         tests,
-        Recipe(model, options, each, fix, vary, report, figure_width, history=cycles),
+        Recipe(model, options, each, report, figure_width, history=cycles),
         out=out,
         executor=executor,
         jobs=jobs,
@@ -359,26 +351,12 @@ def run(
 def _checked(recipe: Recipe, options: Options) -> str:
     """Return the model's name; refuse what no test could be fitted with."""
     if recipe.model.strip() == "auto":
-        if recipe.fix or recipe.vary:
-            raise InputError("fix and vary belong to one model; name it instead of 'auto'")
-        if options.relaxation:
-            raise InputError(
-                f"relaxation = {options.relaxation} belongs to one model; name it instead of "
-                "'auto', which tries relaxation by itself"
-            )
+        options.check_auto()
         return "auto"
-    asked = {name: getattr(options, name) for name in laws.OPTIONS}
-    model = Model.parse(with_options(recipe.model, **asked), options.relaxation)
+    model = Model.parse(with_options(recipe.model, **options.of_springs), options.relaxation)
     drive = options.drive or "impact"  # which has them all; each test checks its own
     names = (*model.names, *nuisance.names_of(drive, time_shift=True))
-    for name in (*(recipe.fix or ()), *recipe.vary):
-        if name not in names:
-            raise InputError(
-                f"parameter '{name}' is not one of the model {model.name}; "
-                f"its parameters are {', '.join(names)}"
-            )
-        if name in (recipe.fix or ()) and name in recipe.vary:
-            raise InputError(f"parameter '{name}' cannot be both fixed and varied; choose one")
+    check_fixed_and_varied(names, model.name, options.fix or {}, options.vary)
     return model.name
 
 

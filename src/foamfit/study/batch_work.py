@@ -17,17 +17,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import lmfit
-
 from foamfit.api import fit
 from foamfit.codec import build, encode
 from foamfit.data.csv_file import read_test
-from foamfit.data.measurement import Measurement
 from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError, SimulationError
 from foamfit.files import scratch
-from foamfit.fitting.curves import check_time_shift, choose_drive
-from foamfit.fitting.problem import fix_and_vary, make_params
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
 from foamfit.report.studies.batch import REFUSED, Row, row_of
@@ -52,26 +47,10 @@ class Recipe:
     model: str
     options: Mapping[str, Any]
     cycles: int | tuple[int, ...] | None = None
-    fix: Mapping[str, float] | None = None
-    vary: tuple[str, ...] = ()
     pages: bool = True
     width: str = TWO  # of the figures
     laws: Mapping[str, str] = field(default_factory=laws.texts)  # texts of the user's law files
     history: tuple[int, int] | None = None  # first and last of several cycles fitted as one
-
-    def params(self, test: Measurement) -> lmfit.Parameters | None:
-        """The parameters of a test, as `fix` and `vary` want them; None for what fit chooses."""
-        shift = bool(self.options.get("time_shift", False))
-        drive = self.options.get("drive")
-        if shift:
-            check_time_shift(test, drive or choose_drive(test))
-        if self.model == "auto" or not (self.fix or self.vary):
-            return None
-        more: dict[str, Any] = {
-            name: self.options.get(name) or 0 for name in ("relaxation", *laws.OPTIONS)
-        }
-        params = make_params(test, self.model, drive, time_shift=shift, **more)
-        return fix_and_vary(params, self.model, self.fix or {}, self.vary)
 
 
 @dataclass(frozen=True)
@@ -212,10 +191,10 @@ def _results(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write
     pictures: dict[str, Any] = {"pages": recipe.pages, "width": recipe.width}
     if not isinstance(recipe.cycles, tuple):
         test = read_test(path, toml, recipe.cycles, cycles=recipe.history)
-        result = fit(test, model=recipe.model, params=recipe.params(test), **recipe.options)
+        result = fit(test, model=recipe.model, **recipe.options)
         return (row_of(task.name, file, result),), partial(write_result, result, **pictures)
-    options = {"model": recipe.model, "params": recipe.params, **recipe.options}
-    found = fit_cycles(path, toml, cycles=recipe.cycles or None, **options)
+    wanted = recipe.cycles or None
+    found = fit_cycles(path, toml, cycles=wanted, model=recipe.model, **recipe.options)
     rows = list[Row]()
     for number in sorted({*found.results, *found.refused}):
         name = f"{task.name}/cycle-{number}"

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
-
-import lmfit
 
 from foamfit.api import fit
 from foamfit.arrays import single_threaded
 from foamfit.data.csv_file import read_test
-from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.search import what_stopped
 from foamfit.one_model import Keywords, Options, Progress
@@ -27,8 +24,6 @@ from foamfit.trust.intervals import Announce
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
-
-Params = Callable[[Measurement], lmfit.Parameters | None]
 
 
 class CycleFits(FittedCycles):
@@ -77,7 +72,6 @@ def fit_cycles(
     *,
     cycles: Sequence[int] | None = None,
     model: str = "bistable",
-    params: Params | None = None,
     progress: Progress | None = None,
     tell: Announce | None = None,
     **options: Unpack[Keywords],
@@ -94,8 +88,6 @@ def fit_cycles(
         Numbers of the cycles; all by default.
     model, tell, options
         As for `foamfit.fit`.
-    params : callable, optional
-        Gives the parameters of each cycle's measurement, as `foamfit.make_params` does.
     progress : callable, optional
         Told the fraction done and what is going on.
 
@@ -124,10 +116,7 @@ def fit_cycles(
 
         try:
             test = first if number == first.cycle else read_test(path, specimen, number)
-            given = None if params is None else params(test)
-            results[number] = fit(
-                test, model=model, params=given, progress=told, tell=tell, **options
-            )
+            results[number] = fit(test, model=model, progress=told, tell=tell, **options)
             stopped = results[number].stopped
         except (InputError, SimulationError) as error:
             refused[number] = str(error)
