@@ -70,7 +70,7 @@ def batch(
     if jobs is not None and scheduler is not None:
         raise InputError("--jobs and --scheduler exclude each other; leave one of them out")
     output.check()
-    search, (alone, several) = keywords_of(asked), cycles_of(asked["cycle"])
+    search, cycles = keywords_of(asked), cycles_of(asked["cycle"])
     from foamfit.study import processes
 
     if scheduler is None:
@@ -79,12 +79,9 @@ def batch(
     from foamfit.study.batch import run
     from foamfit.study.batch_work import Recipe
 
-    cycles = alone if several is None else several
-    if asked["cycles"] is not None and asked["cycle"] is not None:
-        raise InputError("give either --cycle or --cycles, not both")
     recipe = Recipe(
         model=asked["model"],
-        options={},
+        options=search,
         cycles=cycles,
         pages=not output.no_report,
         width=output.figure_width,
@@ -102,8 +99,8 @@ def batch(
             what = f"{state.done} done, {state.wrong} without a fit, {state.left} left"
             line.progress(state.fitted / max(state.fitted + state.left, 1), what)
 
-        search |= {"out": output.out, "executor": executor, "jobs": jobs, "progress": tell}
-        found = run(tests, recipe, fresh=fresh, specimen=specimen, **search)
+        where: Any = {"out": output.out, "executor": executor, "jobs": jobs, "progress": tell}
+        found = run(tests, recipe, fresh=fresh, specimen=specimen, **where)
     rows = found.summary
 
     def content() -> list[dict[str, Any]]:

@@ -85,15 +85,15 @@ def model_name(asked: Mapping[str, Any]) -> str:
     return "auto" if model == "auto" else Model.parse(model, asked["relaxation"]).words
 
 
-def cycles_of(text: str | None) -> tuple[int | None, tuple[int, ...] | None]:
+def cycles_of(text: str | None) -> int | tuple[int, ...] | None:
     """Read --cycle: the one cycle that is named, or the several that are ("all" names none)."""
     if text is None or text.strip().lower() == "all":
-        return None, None if text is None else ()
+        return None if text is None else ()
     parts = text.split(",")
     if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
         raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
     numbers = tuple(int(part) for part in parts)
-    return (None, numbers) if len(numbers) > 1 else (numbers[0], None)
+    return numbers if len(numbers) > 1 else numbers[0]
 
 
 def keywords_of(asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -122,10 +122,11 @@ def fit_as_asked(
 
     search = keywords_of(asked)
     model = model_name(asked)
-    alone, several = cycles_of(asked["cycle"])
-    together = asked.get("cycles")
-    if together is not None and asked["cycle"] is not None:
+    wanted, together = cycles_of(asked["cycle"]), asked.get("cycles")
+    several = wanted if isinstance(wanted, tuple) else None
+    if together is not None and wanted is not None:
         raise InputError("give either --cycle or --cycles, not both")
+    alone = None if isinstance(wanted, tuple) else wanted
     measurement = read_test(test, specimen, alone, cycles=together)
     for number in set(several or ()).difference(measurement.cycles):
         last = f"its cycles are {min(measurement.cycles)} to {max(measurement.cycles)}"

@@ -144,8 +144,9 @@ class Desk:
         toml = self.csv.with_suffix(".toml")
         try:
             toml.write_text(join_toml(quantities, rest), encoding="utf-8")
-            alone, several = cycles_of(cycle.strip() or None)
-            measurement = read_test(self.csv, toml, several[0] if several else alone)
+            wanted = cycles_of(cycle.strip() or None)
+            first = next(iter(wanted), None) if isinstance(wanted, tuple) else wanted
+            measurement = read_test(self.csv, toml, first)
             # By its own name: the folder of the window means nothing to a user.
             text = describe(replace(measurement, path=Path(self.csv.name)), audit(measurement))
         except InputError as error:

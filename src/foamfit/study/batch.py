@@ -32,7 +32,6 @@ from foamfit.report.studies import batch as tables
 from foamfit.report.studies.batch import Row
 from foamfit.results import law_in_words
 from foamfit.solve import cache, precompile
-from foamfit.springs import laws
 from foamfit.springs.model import Model, with_options
 from foamfit.study.batch_work import (
     Outcome,
@@ -86,8 +85,7 @@ class Batch:
     fresh: bool = False
     progress: Progress = lambda _: None
     rows: dict[str, tuple[Row, ...]] = field(default_factory=dict)  # by the name of the test
-    waiting: dict[Future[Outcome], tuple[str, Path, int]] = field(default_factory=dict)
-    ahead: int = 0  # bytes that wait
+    waiting: dict[Future[Outcome], Task] = field(default_factory=dict)
     fitted: int = 0
     wrong: int = 0
     saved: float = field(default_factory=lambda: time.monotonic())  # when the summary was written
@@ -111,9 +109,9 @@ class Batch:
         """Write summary.csv and summary.html; as a `whole` also parameters side by side."""
         rows = self.summary
         tables.write_summary(rows, self.out)
-        options = self.recipe.options
-        model = with_options(self.recipe.model, **{o: bool(options.get(o)) for o in laws.OPTIONS})
-        law = law_in_words(model, options.get("relaxation", 0))
+        options = Options(**self.recipe.options)
+        model = with_options(self.recipe.model, **options.of_springs)
+        law = law_in_words(model, options.relaxation)
         title, picture = f"{self.out.resolve().name}: {law}", None
         if whole:
             pictures, width = self.recipe.pages, self.recipe.width
@@ -125,7 +123,7 @@ class Batch:
         try:
             for i, (name, path) in enumerate(self.tests):
                 self._begin(executor, name, path)
-                while len(self.waiting) >= MOST_AHEAD or self.ahead >= MOST_BYTES:
+                while len(self.waiting) >= MOST_AHEAD or self._bytes_ahead >= MOST_BYTES:
                     self._collect(1.0)
                 self._collect(0.0)
                 while i == 0 and not self.foreign and self._is_cold() and self.waiting:
@@ -139,6 +137,10 @@ class Batch:
                 self.save()
             raise
         self.save(whole=True)
+
+    @property
+    def _bytes_ahead(self) -> int:
+        return sum(task.size for task in self.waiting.values())
 
     def _is_cold(self) -> bool:
         """Whether the first fit compiles what the others need too."""
@@ -165,12 +167,9 @@ class Batch:
         out = None if self.foreign else folder.absolute()
         task = Task(name, path, toml, self.recipe, mark, out, content)
         try:
-            future = executor.submit(work, task)
+            self.waiting[executor.submit(work, task)] = task
         except (BrokenExecutor, RuntimeError) as error:
             raise self._ended(error) from error
-        size = len(data) + len(motion or b"") if content else 0
-        self.ahead += size
-        self.waiting[future] = (name, path, size)
 
     def _collect(self, seconds: float) -> None:
         """Take the fits that are done, waiting for one so long."""
@@ -180,25 +179,20 @@ class Batch:
         self._save_sometimes()
 
     def _take(self, future: Future[Outcome]) -> None:
-        name, path, size = self.waiting.pop(future)
-        self.ahead -= size
+        task = self.waiting.pop(future)
         try:
-            outcome = future.result()
+            rows, files = future.result()
+            if files is not None:
+                put(files, self.out / task.name)
         except (BrokenExecutor, CancelledError) as error:
             raise self._ended(error) from error
+        except InputError as error:  # it cannot be written
+            raise InputError(f"{error}; {self._done_words()}") from None
         except Exception as error:
-            self._keep(name, (Row(name, str(path), tables.REFUSED, _lost(error)),))
+            self._keep(task.name, (Row(task.name, str(task.path), tables.REFUSED, _lost(error)),))
             return
-        unwritten = outcome.unwritten
-        if unwritten is None and outcome.files is not None:
-            try:
-                put(outcome.files, self.out / name)
-            except InputError as error:
-                unwritten = str(error)
-        if unwritten is not None:
-            raise InputError(f"{unwritten}; {self._done_words()}")
         self.fitted += 1
-        self._keep(name, outcome.rows)
+        self._keep(task.name, rows)
         self._save_sometimes()
 
     def _keep(self, name: str, rows: tuple[Row, ...]) -> None:
@@ -294,8 +288,6 @@ def batch(
     each = () if cycle == "all" else cycle
     if each is not None and not isinstance(each, int):
         each = tuple(int(number) for number in each)
-    if each is not None and cycles is not None:
-        raise InputError("give either cycle or cycles, not both")
     found = run(
         tests,
         Recipe(model, options, each, report, figure_width, history=cycles),
@@ -319,15 +311,13 @@ def run(
     fresh: bool = False,
     specimen: str | Path | None = None,
     progress: Progress | None = None,
-    **options: Unpack[Keywords],
 ) -> Batch:
-    """Do what `batch` says, and return all that is known of it.
-
-    The options of the fits are those of the recipe, or given here.
-    """
-    chosen = Options.of("batch", {**recipe.options, **options})
-    recipe = replace(recipe, model=_checked(recipe, chosen), options=vars(chosen))
+    """Do what `batch` says, and return all that is known of it."""
+    options = Options.of("batch", recipe.options)
+    recipe = replace(recipe, model=_checked(recipe.model, options), options=vars(options))
     check_jobs(jobs)
+    if recipe.cycles is not None and recipe.history is not None:
+        raise InputError("give either cycle or cycles, not both")
     if jobs is not None and executor is not None:
         raise InputError("jobs and an executor exclude each other; leave one of them out")
     inches(recipe.width)  # refuses what is no width
@@ -335,9 +325,9 @@ def run(
     if toml is not None and not toml.is_file():
         raise InputError(f"{toml}: no such file; name the TOML of the specimen of all tests")
     folder = Path("fits", "batch", recipe.model) if out is None else Path(out)
-    found, tell = find_tests(tests), progress or (lambda _: None)
-    made = Batch(folder, recipe, found, toml, executor is not None, fresh, tell)
-    check_out(folder)
+    tell = progress or (lambda _: None)
+    made = Batch(folder, recipe, find_tests(tests), toml, executor is not None, fresh, tell)
+    _check_out(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         sweep(folder.resolve(), [*(name for name, _ in made.tests), *BATCH_FILES])
@@ -348,19 +338,19 @@ def run(
     return made
 
 
-def _checked(recipe: Recipe, options: Options) -> str:
+def _checked(model: str, options: Options) -> str:
     """Return the model's name; refuse what no test could be fitted with."""
-    if recipe.model.strip() == "auto":
+    if model.strip() == "auto":
         options.check_auto()
         return "auto"
-    model = Model.parse(with_options(recipe.model, **options.of_springs), options.relaxation)
+    read = Model.parse(with_options(model, **options.of_springs), options.relaxation)
     drive = options.drive or "impact"  # which has them all; each test checks its own
-    names = (*model.names, *nuisance.names_of(drive, time_shift=True))
-    check_fixed_and_varied(names, model.name, options.fix or {}, options.vary)
-    return model.name
+    names = (*read.names, *nuisance.names_of(drive, time_shift=True))
+    check_fixed_and_varied(names, read.name, options.fix or {}, options.vary)
+    return read.name
 
 
-def check_out(out: Path) -> None:
+def _check_out(out: Path) -> None:
     """Raise InputError unless a folder is free, or holds nothing but what foamfit wrote."""
     if not out.is_dir():
         check_target(out)

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from foamfit.api import fit
 from foamfit.codec import build, encode
@@ -71,24 +71,21 @@ class Task:
     content: tuple[bytes, bytes | None, bytes | None] | None = None
     version: str = field(default_factory=lambda: version("foamfit"))
 
+    @property
+    def size(self) -> int:
+        """Bytes of the content."""
+        return sum(len(one) for one in self.content or () if one)
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a test: its rows, and its files if they were to come back.
 
-    `unwritten` says why the result could not be written; then it is lost.
-    """
+class Outcome(NamedTuple):
+    """What became of a test: its rows, and its files if they were to come back."""
 
     rows: tuple[Row, ...]
     files: Mapping[str, bytes] | None = None
-    unwritten: str | None = None
 
 
 def settings_key(recipe: Recipe) -> str:
-    """What a result is made by: settings and version, not whether there is a page of it.
-
-    Nor how wide its figures are; see `stored`.
-    """
+    """What a result is made by: settings and version; of figures and pages `stored` takes care."""
     parts = asdict(replace(recipe, pages=True)) | {"foamfit": version("foamfit")}
     del parts["width"]
     texts = parts.pop("laws")
@@ -122,7 +119,10 @@ def stored(folder: Path, wanted: str, recipe: Recipe) -> tuple[Row, ...] | None:
 
 
 def work(task: Task) -> Outcome:
-    """Fit one test and write its folder whole; raises nothing that the test could be blamed for."""
+    """Fit one test and write its folder whole; raises nothing that the test could be blamed for.
+
+    InputError says why the result could not be written.
+    """
     if task.version != (own := version("foamfit")):
         raise RuntimeError(
             f"{platform.node()} has foamfit {own}, the call came from {task.version}"
@@ -153,8 +153,8 @@ def work(task: Task) -> Outcome:
                 found = (path for path in sorted(folder.rglob("*")) if path.is_file())
                 files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in found}
             return Outcome(rows, files)
-        except (InputError, OSError) as error:
-            return Outcome(rows, unwritten=str(error))
+        except OSError as error:
+            raise InputError(str(error)) from None
 
 
 def put(files: Mapping[str, bytes], out: Path) -> None:
