@@ -164,22 +164,17 @@ def card(
 
     Parameters
     ----------
-    result : FitResult, JointResult, str or Path
+    result
         A result of `fit` or `joint`, or its folder.
-    format : str
+    format
         "mat083" (LS-DYNA \*MAT_FU_CHANG_FOAM), "mat057" (\*MAT_LOW_DENSITY_FOAM), "law90"
         (Radioss), "abaqus" (\*LOW DENSITY FOAM) or "csv" (the curves alone).
-    units : str
+    units
         "kg-mm-ms", "t-mm-s" or "SI".
-    rates : float or iterable of float, optional
+    rates
         Strain rates of the loading curves, 1/s; by default those of the fitted tests.
-    out : str or Path, optional
+    out
         File to write; FILE.json, FILE.png and FILE.pdf stand beside it.
-
-    Returns
-    -------
-    Card
-        `text`, `misfit`, `unloading`, `curves`, `warnings`; `save` writes it.
 
     Raises
     ------

@@ -37,7 +37,7 @@ BATCH_FILES = {f"summary.{kind}" for kind in ("csv", "html", "tex", "png", "pdf"
 PREDICTION_FILES = {f"prediction.{kind}" for kind in ("json", "csv", "png", "pdf")}
 # One of these is in every result.
 MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json", "prediction.json")
-_FILES = RESULT_FILES | CYCLES_FILES | JOINT_FILES | PREDICTION_FILES | {"batch.json"}
+FILES = RESULT_FILES | CYCLES_FILES | JOINT_FILES | PREDICTION_FILES | {"batch.json"}
 
 
 class _TriedError(Exception):
@@ -174,7 +174,7 @@ def is_written(path: Path, tests: Collection[str] = ()) -> bool:
     if path.is_dir() and (re.fullmatch(r"cycle-\d+", path.name) or path.name in tests):
         within = list(path.iterdir())
         return all(inner.name in RESULT_FILES and is_written(inner) for inner in within)
-    return path.name in _FILES and path.is_file()
+    return path.name in FILES and path.is_file()
 
 
 def _content(path: Path) -> dict[str, Any]:

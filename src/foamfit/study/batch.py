@@ -6,14 +6,8 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    wait,
-)
+from concurrent import futures
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -168,12 +162,12 @@ class Batch:
         task = Task(name, path, toml, self.recipe, mark, out, content)
         try:
             self.waiting[executor.submit(work, task)] = task
-        except (BrokenExecutor, RuntimeError) as error:
+        except RuntimeError as error:  # also BrokenExecutor
             raise self._ended(error) from error
 
     def _collect(self, seconds: float) -> None:
         """Take the fits that are done, waiting for one so long."""
-        done, _ = wait(self.waiting, seconds, FIRST_COMPLETED) if self.waiting else ((), ())
+        done, _ = futures.wait(self.waiting, seconds, futures.FIRST_COMPLETED)
         for future in [one for one in self.waiting if one in done]:
             self._take(future)
         self._save_sometimes()
@@ -184,7 +178,7 @@ class Batch:
             rows, files = future.result()
             if files is not None:
                 put(files, self.out / task.name)
-        except (BrokenExecutor, CancelledError) as error:
+        except (futures.BrokenExecutor, futures.CancelledError) as error:
             raise self._ended(error) from error
         except InputError as error:  # it cannot be written
             raise InputError(f"{error}; {self._done_words()}") from None
@@ -243,37 +237,35 @@ def batch(
 
     Parameters
     ----------
-    tests : str, Path or several
+    tests
         Files, folders and globs; see `foamfit.study.test_files.find_tests`.
-    out : str or Path, optional
+    out
         The folder; by default ``fits/batch/<model>``. It holds ``<test>/`` for each test, the
         result folder of its fit, ``summary.csv`` and ``summary.html``.
-    model : str
+    model, options
         As for `foamfit.fit`.
-    executor : concurrent.futures.Executor, optional
+    executor
         What runs the fits, as a Dask client's ``get_executor()``; tests go there and results come
         back with the calls, so that its machines need no common file system. By default processes
         of this machine, one for each core, with one thread each.
-    jobs : int, optional
+    jobs
         How many processes of this machine.
-    fresh : bool
+    fresh
         Whether everything is fitted again.
-    specimen : str or Path, optional
+    specimen
         One TOML for all tests; by default the one beside each.
-    cycle : int, sequence of int or "all", optional
+    cycle
         The cycle of each record; several are fitted as `foamfit.fit_cycles` does, and each is a
         row of the summary.
-    cycles : (int, int), optional
+    cycles
         First and last of several cycles that are fitted as one history.
-    report : bool
+    report
         Whether each fit has a report and figures.
-    figure_width : str
+    figure_width
         "one" or "two" columns, or a length such as "85 mm". A test whose figures have another
         width is fitted again, as its curves are not kept.
-    progress : callable, optional
+    progress
         Told the `State` after each test.
-    options
-        As for `foamfit.fit`.
 
     Returns
     -------

@@ -18,25 +18,13 @@ ENERGY = "dissipated_energy"
 
 @dataclass(frozen=True, eq=False)
 class FittedCycles:
-    """Fits of the cycles of one record.
+    """Fits of the cycles of one record."""
 
-    Attributes
-    ----------
-    test, model
-        Names of the test and of the model.
-    recorded : tuple of int
-        Numbers of all cycles in the record.
-    results : dict of int to Fit
-        The fit of each cycle that could be read and fitted.
-    refused : dict of int to str
-        Why the others could not, one sentence each.
-    """
-
-    test: str
+    test: str  # Names of the test and of the model
     model: str
-    recorded: tuple[int, ...]
-    results: dict[int, Fit]
-    refused: dict[int, str]
+    recorded: tuple[int, ...]  # Numbers of all cycles in the record
+    results: dict[int, Fit]  # Of each cycle that could be read and fitted
+    refused: dict[int, str]  # Why the others could not, one sentence each
 
     @property
     def varied(self) -> dict[str, list[ParameterEstimate | None]]:

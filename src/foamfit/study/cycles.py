@@ -80,21 +80,16 @@ def fit_cycles(
 
     A later cycle starts at its own contact; its start strain is taken off (see `read_test`).
 
+    A cycle that cannot be read or fitted is in `refused` of the result with its sentence.
+
     Parameters
     ----------
     path, specimen
         The record and its TOML, as for `read_test`.
-    cycles : sequence of int, optional
+    cycles
         Numbers of the cycles; all by default.
-    model, tell, options
+    model, progress, tell, options
         As for `foamfit.fit`.
-    progress : callable, optional
-        Told the fraction done and what is going on.
-
-    Returns
-    -------
-    CycleFits
-        A cycle that cannot be read or fitted is in `refused` with its sentence.
 
     Raises
     ------

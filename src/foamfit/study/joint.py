@@ -101,22 +101,18 @@ def joint(
 
     Parameters
     ----------
-    path : str, Path or Study
+    path
         STUDY.toml, or what `read_study` has read of it: tests, model, drive, and what each
         parameter is: "shared", "own", "scatter", "log rate", "power rate" or "auto", or a number
         that it is held at.
-    jobs : int, optional
+    jobs
         Processes; by default one for each core. The numbers are the same with any.
-    out : str or Path, optional
-        Folder to write the result to, as `JointResult.save` does, with or without `report`.
-    seed : int, optional
+    out, report
+        Folder to write the result to, as `JointResult.save` does, with or without reports.
+    seed
         Of the search; by default that of the study, or 0.
-    progress : callable, optional
+    progress
         Told the fraction done and what is going on.
-
-    Returns
-    -------
-    JointResult
 
     Raises
     ------
@@ -151,11 +147,8 @@ def joint(
             links = joint_fit.choose_kinds(alone.problems, links, auto, starts, alone.n_eff, kinds)
         fit = fit_jointly(alone.problems, links, starts, each=each)
         tell(0.9, "evidence")
-        asked = [
-            name
-            for name in (*fit.found.shared, *fit.found.own)
-            if fit.found.links.kind(name) in RATES or name in auto
-        ]
+        every = (*fit.found.shared, *fit.found.own)
+        asked = [name for name in every if fit.found.links.kind(name) in RATES or name in auto]
         tried = joint_fit.evidence(fit.found, asked, alone.n_eff, kinds, [alone.values])
         result = JointResult(
             study=study,
@@ -278,6 +271,7 @@ def _median_rate(rates: Sequence[float | None]) -> float | None:
 
 
 def _several(rates: Sequence[float | None]) -> bool:
+    """Whether there are tests at two rates."""
     known = [rate for rate in rates if rate is not None]
     return len(known) > 1 and max(known) > (1.0 + SAME_RATE) * min(known)
 

@@ -29,18 +29,15 @@ Joint = TypeVar("Joint", bound=JointData)
 
 def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
     """Covariance of the common values and slopes, SI; see `JointData.to_json_dict`."""
-    point, scales = fit.point, []
-    for name in point.names:
-        one, scale = fit.spreads.get(name), 1.0
+    point, count = fit.point, len(fit.point.names)
+    scales = np.ones(count)
+    for i, name in enumerate(point.names):
         if fit.found.links.kind(name) == "scatter":
-            scale = math.exp(min(one.mean, LARGEST)) if one else fit.found.common[name][0]
-            before = point.of_common(name)[0]
-            scale *= one.stderr / before if one and before > 0.0 else 1.0
-        scales.append(scale)
-    count = len(scales)
-    return point.names, point.uncertainty.covariance.matrix[:count, :count] * np.outer(
-        scales, scales
-    )
+            one, before = fit.spreads.get(name), point.of_common(name)[0]
+            scales[i] = math.exp(min(one.mean, LARGEST)) if one else fit.found.common[name][0]
+            scales[i] *= one.stderr / before if one and before > 0.0 else 1.0
+    matrix = point.uncertainty.covariance.matrix[:count, :count]
+    return point.names, matrix * np.outer(scales, scales)
 
 
 def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, JointParameter]:
@@ -69,9 +66,8 @@ def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParam
         return _scattering(fit, name, each)
     (value, *slope), span = found.common[name], fit.ranges.get(name)
     one = _judged(fit, there[0], name, value, fit.point.of_common(name), span)
-    words = f"one value for {counted(len(there), 'test')}"
-    words = f"at the rate of the median test; {words}" if slope else words
-    why = f"{words}: {one.why}"
+    why = f"one value for {counted(len(there), 'test')}: {one.why}"
+    why = f"at the rate of the median test; {why}" if slope else why
     joint = JointParameter(kind, value, unit, one.stderr, one.ci95, one.state, why, range=span)
     if not slope:
         return joint
@@ -167,6 +163,10 @@ def with_words(result: Joint) -> Joint:
             elif off > POOR:
                 large.append(f"{test} ({curve} {percent(off)})")
     share, top = max(zip(result.shares, result.tests, strict=True))
+    evidence = list[tuple[str, str, str, float]]()  # the best kind, its own, how much lower BIC is
+    for name, tried in result.tried.items():
+        mine, best = next(o for o in tried if o.chosen), min(tried, key=lambda one: one.bic)
+        evidence.append((name, best.kind, mine.kind, mine.bic - best.bic))
     known = [rate for rate in result.rates if rate is not None]
     shown = {
         "parameters": list(result.parameters.items()),
@@ -185,7 +185,7 @@ def with_words(result: Joint) -> Joint:
         gap=result.bic - result.alone.bic(result.alone.n_eff),
         together=span_of(result.fit.found.misfits),
         alone=span_of(result.alone.misfits),
-        evidence=_evidence(result),
+        evidence=evidence,
         **shown,
     )
     kinds = dict[str, list[str]]()
@@ -205,15 +205,6 @@ def with_words(result: Joint) -> Joint:
     )
     status = "failed" if lost else "warnings" if warnings else "ok"
     return replace(result, status=status, warnings=warnings, sentences=sentences)
-
-
-def _evidence(result: JointData) -> list[tuple[str, str, str, float]]:
-    """Of each parameter that was tried: the best kind, its own, and how much lower BIC is."""
-    out = list[tuple[str, str, str, float]]()
-    for name, tried in result.tried.items():
-        mine, best = next(o for o in tried if o.chosen), min(tried, key=lambda one: one.bic)
-        out.append((name, best.kind, mine.kind, mine.bic - best.bic))
-    return out
 
 
 def span_of(found: Sequence[dict[str, float | None]]) -> tuple[float, float] | None:

@@ -96,10 +96,7 @@ class JointParameter:
 def fit_of_test(
     problem: Problem, values: Array, parameters: dict[str, ParameterEstimate], note: str, seed: int
 ) -> Fit:
-    """The result of a test: its curves at the joint fit, its parameters as that has them.
-
-    `systematic` is what the ± of this test's own TOML do to a fit of it alone.
-    """
+    """The result of a test in a joint fit; `systematic` is that of a fit of this test alone."""
     problem.put(values)
     made = conclude(BestPoint(problem, values), SearchRecord(seed, 0, time.perf_counter()))
     checklist = tuple(check for check in made.checklist if check.key not in _OF_A_SEARCH)
@@ -133,7 +130,6 @@ class JointData:
     evidence: tuple[Alternative, ...]
     alone: Together  # The fits of the tests one by one
     refused: Mapping[str, str]  # File and sentence
-    # Parameters whose slope by rate the tests leave open, and by how much; see `open_slope`.
     open_slopes: Mapping[str, float] = field(default_factory=dict)
     status: str = "ok"
     warnings: tuple[str, ...] = ()

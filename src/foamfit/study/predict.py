@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from numbers import Integral
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,7 +41,7 @@ RATE_FACTOR = 1.25
 # Draws that are tried for each that is wanted, before the others are given up.
 TRIES = 5
 BAND = (0.025, 0.975)
-# Tests from which on nothing is said of how few they are; fewer do where fewer parameters change.
+# So many tests are not said to be few; fewer suffice where fewer parameters change.
 FEW_TESTS = 5
 ALIGNING = 40  # steps of the fit of what a record does not say exactly
 
@@ -52,8 +53,7 @@ class Prediction(PredictedTest):
         """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf`` whole; returns the folder.
 
         An older prediction there is replaced as a whole, at the end. Without `report` there is no
-        figure. It is "one" or "two" columns wide, or as wide as a length ("85 mm");
-        prediction.csv holds all that it shows.
+        figure. It is "one" or "two" columns wide, or as wide as a length ("85 mm").
         """
         inches(figure_width)  # refuses what is no width
         return save_prediction(self, folder, report=report, width=figure_width)
@@ -81,21 +81,17 @@ def predict(
 
     Parameters
     ----------
-    result : FitResult, JointResult, str or Path
+    result
         A result of `fit` or `joint`, its folder, or its fit.json or joint.json; the file gives the
         same numbers.
-    test : Measurement, str or Path
+    test
         The test, or its file with its TOML beside it.
-    drive : str, optional
+    drive
         "impact", "stress" or "displacement"; by default that of the result.
-    extrapolate : bool
+    extrapolate
         Whether the rate of the test may lie outside the fitted rates by more than `RATE_FACTOR`.
     draws, seed
         Draws of specimens; same seed, same numbers.
-
-    Returns
-    -------
-    Prediction
 
     Raises
     ------
@@ -132,17 +128,10 @@ def predict(
     drawn = _draw(population, problem, point, draws, seed) if population.scattering else None
     known = {"parameters": _by_parameters(population, aligning, point, tuple(aligned))}
     known |= {"motion": _by_motion(problem, point)}
-    curves = {
-        name: _curve(
-            problem,
-            name,
-            simulated.curves[name],
-            drawn,
-            source,
-            {part: sides[name] for part, sides in known.items() if name in sides},
-        )
-        for name in objective.counted
-    }
+    curves = dict[str, PredictedCurve]()
+    for name in objective.counted:
+        parts = {part: sides[name] for part, sides in known.items() if name in sides}
+        curves[name] = _curve(problem, name, simulated.curves[name], drawn, source, parts)
     changing, count = population.scattering, population.fewest if population.scattering else 0
     warnings = render.sentences(
         "predicted_warnings",
@@ -163,7 +152,7 @@ def predict(
         "predicted_sentences",
         curves=curves.values(),
         scattering=changing,
-        trends=[name for name, slope in population.trends.items() if slope],
+        trends=population.trends,
         aligned=[
             f"{name.replace('_', ' ')} {engineering(value, unit_of(name)).replace('-', '−')}"
             for name, value in aligned.items()
@@ -253,7 +242,10 @@ def _before(problem: Problem, source: Source) -> Problem:
 def _point(population: Population, problem: Problem) -> Array:
     """The common values; where they are not admissible together, those of the nearest test."""
     for values in population.candidates():
-        if _admissible(problem, values):
+        own = values[: len(problem.model.names)]
+        heights = problem.model.heights(own, problem.measurement.specimen.height)
+        known = np.all(np.isfinite(values)) and np.all(heights > 0.0) and own[-1] >= 0.0
+        if known and problem.model.rows(own) is not None:
             return values
     raise SimulationError(
         f"{population.source.where}: its common values are no admissible spring, nor are those of "
@@ -289,17 +281,7 @@ def _aligned(
     return point, {name: told[name] for name in names}
 
 
-def _admissible(problem: Problem, values: Array) -> bool:
-    """Whether a vector of parameters is an admissible chain."""
-    own = values[: len(problem.model.names)]
-    heights = problem.model.heights(own, problem.measurement.specimen.height)
-    if not (np.all(np.isfinite(values)) and np.all(heights > 0.0) and own[-1] >= 0.0):
-        return False
-    return problem.model.rows(own) is not None
-
-
-@dataclass(frozen=True, eq=False)
-class _Drawn:
+class _Drawn(NamedTuple):
     values: list[Array]
     curves: list[dict[str, Array]]
     redrawn: int

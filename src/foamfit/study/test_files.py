@@ -10,43 +10,25 @@ from pathlib import Path
 
 from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError
-from foamfit.report.folder import (
-    BATCH_FILES,
-    CYCLES_FILES,
-    JOINT_FILES,
-    MARKS,
-    PREDICTION_FILES,
-    RESULT_FILES,
-)
+from foamfit.report.folder import BATCH_FILES, FILES, MARKS
 from foamfit.text import listed
 
 ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
 WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
 # Stems of tables that say what the specimens are, beside the tests.
 _SPECIMENS = ("specimen", "specimens")
-_WRITTEN = (*RESULT_FILES, *CYCLES_FILES, *BATCH_FILES, *JOINT_FILES, *PREDICTION_FILES)
 
 
 def find_tests(
     patterns: str | Path | Iterable[str | Path], base: str | Path = "."
 ) -> list[tuple[str, Path]]:
-    """Find the tests that files, folders and globs name.
+    """Find the tests that files, folders and globs ("**" goes into folders) name, from `base`.
 
-    Parameters
-    ----------
-    patterns : str, Path or several of them
-        Files, folders, globs ("**" goes into folders). Of a folder, and of what a glob matches,
-        tables are taken (`ENDINGS`) that are no list of specimens, no motion that a TOML beside
-        them names as that of another test, and no result of foamfit. A file that is named itself
-        is taken unless it is a TOML.
-    base : str or Path
-        The folder that relative ones start from.
-
-    Returns
-    -------
-    list of (str, Path)
-        Names and files in the order of the files, each file once. A name is the stem of its file;
-        where two have the same, parent folders stand before it, joined by "-".
+    Of a folder, and of what a glob matches, tables are taken (`ENDINGS`) that are no list of
+    specimens, no motion that a TOML beside them names as that of another test, and no result of
+    foamfit. A file that is named itself is taken unless it is a TOML. Returned are names and files
+    in the order of the files, each file once. A name is the stem of its file; where two have the
+    same, parent folders stand before it, joined by "-".
 
     Raises
     ------
@@ -103,7 +85,7 @@ def _is_test(path: Path) -> bool:
     if path.name.startswith((".", "~$")):
         return False
     marks = ((path.parent / mark).is_file() for mark in (*MARKS, "summary.html"))
-    return not (path.name in _WRITTEN and any(marks))
+    return not (path.name in FILES | BATCH_FILES and any(marks))
 
 
 def _names(paths: list[Path]) -> Iterator[str]:

@@ -26,12 +26,6 @@ from foamfit.springs.parameters import NUISANCE, split_name
 NORMAL = 1.959964  # half of the 95 % interval of a normal distribution over its standard deviation
 KINDS = ("shared", "own", "scatter", *RATES, "fixed")
 Pair = tuple[float, float]
-# Curves that a drive gives, but which it does not count: see `fitting.curves.default_weights`.
-_UNCOUNTED = {
-    "impact": ("stress_strain",),
-    "stress": ("stress_time", "stress_strain"),
-    "displacement": ("stress_time", "displacement_time"),
-}
 
 
 class HasContent(Protocol):
@@ -139,17 +133,9 @@ class Source:
 
 
 def read_source(result: HasContent | str | Path) -> Source:
-    """Read what a result says of its law.
+    """Read what a result says of its law: one in memory, its folder, its fit.json or joint.json.
 
-    Parameters
-    ----------
-    result : FitResult, JointResult, str or Path
-        A result in memory, its folder, or its fit.json or joint.json.
-
-    Raises
-    ------
-    InputError
-        If there is no result, or it lacks what a prediction needs; the message names it.
+    Raises InputError if there is no result, or it lacks what a prediction needs.
     """
     if isinstance(result, str | Path):
         content, where = load_result(_file(Path(result))), str(result)
@@ -278,10 +264,11 @@ def _misses(tests: list[Mapping[str, Any]]) -> dict[str, list[Miss]]:
     """By how much the counted curves of each channel were missed, test by test."""
     found = dict[str, list[Miss]]()
     for test in tests:
+        counted = test.get("noise") or {}  # has the noise of these curves
         for curve, misfit in (test.get("misfit") or {}).items():
-            if misfit is None or curve in _UNCOUNTED.get(str(test.get("drive")), ()):
+            if misfit is None or (counted and curve not in counted):
                 continue
-            noise, share, most = (test.get("noise") or {}).get(curve) or {}, None, 0.0
+            noise, share, most = counted.get(curve) or {}, None, 0.0
             if span := noise.get("range"):
                 share, most = noise["sigma"] / span, (noise.get("residual_q95") or 0.0) / span
             channel = "stress" if curve.startswith("stress") else curve.removesuffix("_time")

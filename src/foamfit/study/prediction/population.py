@@ -1,7 +1,6 @@
-"""Parameters of a test that was not fitted, from what a result says of them.
+"""Parameters of a test that was not fitted: uncertain as a covariance, or drawn where they scatter.
 
-What the result leaves uncertain of them is a covariance; what changes from specimen to specimen
-(parameters that scatter or are own) is drawn.
+Those that change from specimen to specimen scatter or are own.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,7 @@ class Population:
                 "give a time and a displacement column, or rate0 in joint.json"
             )
 
-    @property
+    @cached_property
     def _known(self) -> dict[str, Identified]:
         return {name: self.source.parameters[name] for name in self.names}
 
@@ -63,19 +63,12 @@ class Population:
     @cached_property
     def held(self) -> tuple[str, ...]:
         """Parameters that vary, that nothing is known of, and that stay at their values."""
-        parameters = self.source.parameters
-        return tuple(
-            name
-            for name in self._uncertain
-            if parameters[name].error is None and parameters[name].span is None
-        )
+        pairs = ((name, self._known[name]) for name in self._uncertain)
+        return tuple(name for name, one in pairs if one.error is None and one.span is None)
 
     @cached_property
     def _open(self) -> tuple[tuple[str, ...], Array]:
-        """Uncertain quantities and their covariance given those that are held.
-
-        Each is known at least to lie between its limits.
-        """
+        """Uncertain quantities, within their limits, and their covariance given what is held."""
         free = [name for name in self._uncertain if name not in self.held]
         free += [f"{name}:b" for name, one in self._known.items() if one.b_stderr]
         there, places = _places(free, self.source.names)
@@ -90,20 +83,16 @@ class Population:
         matrix[np.ix_(mine, mine)] = self._correlation[np.ix_(places, places)]
         errors = np.array([self._error(name) for name in free])
         matrix = matrix * np.outer(errors, errors)
-        flat = {
-            i: self._flat(name, self.limits[name])
-            for i, name in enumerate(free)
-            if name in self.limits
-        }
+        limited = [(i, name) for i, name in enumerate(free) if name in self.limits]
+        flat = {i: self._flat(name, self.limits[name]) for i, name in limited}
         bound = [i for i, spread in flat.items() if math.isfinite(spread)]
-        prior = [flat[i] ** 2 for i in bound]
-        spread = matrix[bound]
+        prior, spread = [flat[i] ** 2 for i in bound], matrix[bound]
         told = np.linalg.lstsq(spread[:, bound] + np.diag(prior), spread, rcond=None)[0]
         return tuple(free), matrix - spread.T @ told
 
     def _error(self, name: str) -> float:
         """Standard error of an uncertain quantity, SI; by its range where it has none."""
-        one = self.source.parameters[name.removesuffix(":b")]
+        one = self._known[name.removesuffix(":b")]
         slope = name.endswith(":b")
         error, ends = (one.b_stderr, one.b_ci95) if slope else (one.error, one.ci95)
         if error is None:
@@ -116,8 +105,7 @@ class Population:
 
     def _flat(self, name: str, span: Pair) -> float:
         """Standard deviation of a flat distribution, of the logarithm where that is positive."""
-        low, high = span
-        one = self.source.parameters[name]
+        (low, high), one = span, self._known[name]
         if low > 0.0 and (is_logarithmic(split_name(name)[1]) or one.kind in ("scatter", *RATES)):
             return abs(one.value) * math.log(high / low) / math.sqrt(12.0)
         return (high - low) / math.sqrt(12.0)
@@ -128,7 +116,7 @@ class Population:
         free, matrix = self._open
         slopes = np.zeros((len(self.names), len(free)))
         for column, name in zip(slopes.T, free, strict=True):
-            one = self.source.parameters[name.removesuffix(":b")]
+            one = self._known[name.removesuffix(":b")]
             at, step = one.b if name.endswith(":b") else one.value, 1e-4 * self._error(name)
             sides = [self._vector(self._means | {name: at + way * step}) for way in (-1.0, 1.0)]
             column[:] = (sides[1] - sides[0]) / (2.0 * step)
@@ -136,14 +124,14 @@ class Population:
 
     @cached_property
     def quantile(self) -> float:
-        """Half of a 95 % interval over a standard error, as the intervals have it in the middle.
+        """Half of a 95 % interval over a standard error: the median over the intervals.
 
-        Few degrees of freedom widen it. That a limit or a curved valley of the cost changes one of
-        them does not: along a valley the others follow.
+        Few degrees of freedom widen it; a limit or a curved valley, which changes one interval,
+        does not, as along a valley the others follow.
         """
         ratios = [
             0.5 * (one.ci95[1] - one.ci95[0]) / one.stderr
-            for one in map(self.source.parameters.__getitem__, self._uncertain)
+            for one in map(self._known.__getitem__, self._uncertain)
             if one.ci95 is not None and one.stderr is not None and not self.source.joint
         ]
         return max(NORMAL, float(np.median(ratios))) if ratios else NORMAL
@@ -175,32 +163,50 @@ class Population:
     @property
     def fewest(self) -> int:
         """Tests from which what changes from specimen to specimen is known."""
-        return min(len(self.source.parameters[name].tests) for name in self.scattering)
+        return min(len(self._known[name].tests) for name in self.scattering)
 
     @cached_property
     def _own(self) -> _Own:
         """Own parameters of the tests, in logarithms where `_in_logarithms`."""
-        names = [name for name in self.scattering if self.source.parameters[name].kind == "own"]
-        columns = []
-        for name in names:
-            tests = np.array(self.source.parameters[name].tests)
-            columns.append(np.log(tests) if self._in_logarithms(name) else tests)
-        if len({column.size for column in columns}) > 1:
+        names = tuple(name for name in self.scattering if self._known[name].kind == "own")
+        if not names:
+            return _Own((), np.empty(0), np.empty(0), np.empty((0, 0)), np.empty(0))
+        if len({len(self._known[name].tests) for name in names}) > 1:
             raise InputError(
                 f"{self.source.where}: own parameters must have a value for each test, all of them "
                 "for the same tests"
             )
-        rates = self.source.parameters[names[0]].rates if names else ()
-        return _Own.of(tuple(names), columns, rates, self.rate)
+        values = np.array([self._known[name].tests for name in names]).T
+        logs = [self._in_logarithms(name) for name in names]
+        values[:, logs] = np.log(values[:, logs])
+        n, k = values.shape
+        mean, off = values.mean(axis=0), values - values.mean(axis=0)
+        slopes, leverage = np.zeros(k), np.full(k, 1.0 / n)
+        known = [one for one in self._known[names[0]].rates if one]
+        if self.rate is not None and len(known) == n >= FEWEST_OF_TREND:
+            x = np.log(known)
+            at, x = math.log(self.rate) - x.mean(), x - x.mean()
+            square = float(x @ x)
+            steep = x @ off / max(square, 1e-300)
+            left = off - np.outer(x, steep)
+            squares = np.maximum([np.sum(off**2, axis=0), np.sum(left**2, axis=0)], 1e-300)
+            gain = n * np.log(squares[0] / squares[1]) - math.log(n)
+            sure = (gain > EVIDENCE) & (square > n * SAME_RATE**2)
+            slopes = np.where(sure, steep, 0.0)
+            mean, off = mean + slopes * at, np.where(sure, left, off)
+            leverage = leverage + np.where(sure, at**2 / max(square, 1e-300), 0.0)
+        freedom = max(n - 1 - bool(np.any(slopes)), 1)
+        spread = np.sqrt((1.0 + leverage) * np.sum(off**2, axis=0) / freedom)
+        return _Own(names, mean, slopes, off, spread)
 
     @property
-    def trends(self) -> dict[str, float]:
-        """Change of own parameters (logarithms where `_in_logarithms`) by the logarithm of rate."""
-        return dict(zip(self._own.names, self._own.slopes.tolist(), strict=True))
+    def trends(self) -> list[str]:
+        """Own parameters that change with the rate."""
+        pairs = zip(self._own.names, self._own.slopes, strict=True)
+        return [name for name, slope in pairs if slope]
 
     def _in_logarithms(self, name: str) -> bool:
-        tests = self.source.parameters[name].tests
-        return is_logarithmic(split_name(name)[1]) and min(tests) > 0.0
+        return is_logarithmic(split_name(name)[1]) and min(self._known[name].tests) > 0.0
 
     def _own_values(self, of: Array) -> dict[str, float]:
         """Own parameters of their logarithms, where these vary, or themselves."""
@@ -211,7 +217,7 @@ class Population:
     def _means(self) -> dict[str, float]:
         """Own parameters that have a trend: the median over the tests is that of no rate."""
         means = self._own_values(self._own.mean)
-        return {name: means[name] for name, slope in self.trends.items() if slope}
+        return {name: means[name] for name in self.trends}
 
     @property
     def point(self) -> Array:
@@ -239,9 +245,10 @@ class Population:
             tail = math.sqrt(freedom / rng.chisquare(freedom))
             drawn = tail * (changed @ rng.standard_normal(len(self.scattering)))
             of = dict(zip(self.scattering, drawn.tolist(), strict=True))
-            known = {name: self.source.parameters[name] for name in of if name not in own.names}
-            values = {name: one.value * _exp(one.scatter * of[name]) for name, one in known.items()}
-            values |= self._own_values(own.mean + own.spread * [of[name] for name in own.names])
+            values = self._own_values(own.mean + own.spread * [of[name] for name in own.names])
+            for name in of.keys() - values.keys():
+                one = self._known[name]
+                values[name] = one.value * _exp(one.scatter * of[name])
             yield self._vector(values) + uncertain @ other.standard_normal(len(self.names))
 
     def _vector(self, given: Mapping[str, float]) -> Array:
@@ -261,17 +268,15 @@ class Population:
         if heights and self.specimen.heights is not None:
             values |= dict(zip(heights, self.specimen.heights, strict=True))
         elif heights:
-            common = self.source.parameters
-            total = sum(common[name].value for name in heights)
-            if common[heights[-1]].kind == "fixed":  # what the others leave
+            total = sum(self._known[name].value for name in heights)
+            if self._known[heights[-1]].kind == "fixed":  # what the others leave
                 values[heights[-1]] = total - sum(values[name] for name in heights[:-1])
             whole = sum(values[name] for name in heights)
             values |= {name: values[name] * self.specimen.height / whole for name in heights}
         return np.array([values[name] for name in self.names])
 
 
-@dataclass(frozen=True, eq=False)
-class _Own:
+class _Own(NamedTuple):
     """Own parameters of n tests, as a sample of what specimens have.
 
     Where there is evidence that one changes with the rate, its mean is on the line through its
@@ -283,38 +288,6 @@ class _Own:
     slopes: Array  # (k,): by the logarithm of the rate; 0 where there is no evidence
     off: Array  # (n, k): what the tests are off their means
     spread: Array  # (k,): standard deviation of a specimen about the mean, known from n tests
-
-    @classmethod
-    def of(
-        cls,
-        names: tuple[str, ...],
-        columns: list[Array],
-        rates: tuple[float | None, ...],
-        rate: float | None,
-    ) -> _Own:
-        """Means and deviations of the columns (n,), one for each name."""
-        if not names:
-            return cls((), np.empty(0), np.empty(0), np.empty((0, 0)), np.empty(0))
-        values = np.array(columns).T
-        n, k = values.shape
-        mean, off = values.mean(axis=0), values - values.mean(axis=0)
-        slopes, leverage = np.zeros(k), np.full(k, 1.0 / n)
-        known = [one for one in rates if one]
-        if rate is not None and len(known) == n >= FEWEST_OF_TREND:
-            x = np.log(known)
-            at, x = math.log(rate) - x.mean(), x - x.mean()
-            square = float(x @ x)
-            steep = x @ off / max(square, 1e-300)
-            left = off - np.outer(x, steep)
-            squares = np.maximum([np.sum(off**2, axis=0), np.sum(left**2, axis=0)], 1e-300)
-            gain = n * np.log(squares[0] / squares[1]) - math.log(n)
-            sure = (gain > EVIDENCE) & (square > n * SAME_RATE**2)
-            slopes = np.where(sure, steep, 0.0)
-            mean, off = mean + slopes * at, np.where(sure, left, off)
-            leverage = leverage + np.where(sure, at**2 / max(square, 1e-300), 0.0)
-        freedom = max(n - 1 - bool(np.any(slopes)), 1)
-        spread = np.sqrt((1.0 + leverage) * np.sum(off**2, axis=0) / freedom)
-        return cls(names, mean, slopes, off, spread)
 
 
 def _places(

@@ -75,52 +75,32 @@ class PredictedParameter:
 
 @dataclass(frozen=True, eq=False)
 class PredictedTest:
-    """A test that was not fitted, predicted from a result.
+    """A test that was not fitted, predicted from a result, SI."""
 
-    Attributes
-    ----------
-    source, joint
-        Name of the result and whether it is of several tests.
-    measurement
-        The test; its specimen, striker and motion are what is simulated.
-    model, relaxation, drive, seed
-        Of the simulation and its draws.
-    curves : dict of str to PredictedCurve
-        By their names in fit.json; those that the drive leaves free.
-    misfit : dict
-        RMS of predicted minus measured over the measured range, as in fit.json.
-    rate, fitted_rates
-        Mean strain rate on loading of the test and of those that were fitted, 1/s.
-    extrapolated : bool
-        Whether the rate lies outside the fitted ones.
-    draws, redrawn : int
-        Draws of specimens, and those more that were not admissible and were drawn again.
-    held : tuple of str
-        Parameters that the result leaves undetermined and that were held at their values.
-    aligned : dict of str to float
-        What the record of the test does not say exactly (its contact time, zeros, striker, time
-        shift) was fitted to it, with the springs held as predicted but for what varies between
-        specimens: values in its own numbers, SI.
-    """
-
-    source: str
-    joint: bool
-    measurement: Measurement
+    source: str  # Name of the result
+    joint: bool  # Whether it is of several tests
+    measurement: Measurement  # The test: its specimen, striker and motion are simulated
     model: str
     relaxation: int
     drive: str
     seed: int
-    curves: dict[str, PredictedCurve]
-    misfit: dict[str, float | None]
+    curves: dict[
+        str, PredictedCurve
+    ]  # By their names in fit.json; those that the drive leaves free
+    misfit: dict[str, float | None]  # RMS of predicted minus measured over the measured range
     parameters: dict[str, PredictedParameter]
+    # Mean strain rate on loading of the test and of those that were fitted, 1/s
     rate: float | None
     fitted_rates: tuple[float, ...]
-    extrapolated: bool
-    draws: int
-    redrawn: int
-    held: tuple[str, ...]
+    extrapolated: bool  # Whether the rate lies outside the fitted ones
+    draws: int  # Of specimens
+    redrawn: int  # Those more that were not admissible and were drawn again
+    held: tuple[str, ...]  # Parameters that the result does not determine, held at their values
     sentences: tuple[str, ...]
     warnings: tuple[str, ...]
+    # What the record of the test does not say exactly (contact time, zeros, striker, time shift),
+    # fitted to it with the springs held as predicted but for what varies between specimens: values
+    # in its own numbers
     aligned: dict[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -160,7 +140,7 @@ class PredictedTest:
         """Return the content of ``prediction.json``: SI, plain types, null = not there."""
         m, model = self.measurement, Model.parse(self.model)
         asked = ("relaxation", "drive", "seed", "draws", "redrawn", "rate", "fitted_rates")
-        found = ("extrapolated", "misfit", "inside", "by_cycle")
+        asked += ("extrapolated", "misfit", "inside", "by_cycle")
         told = ("held", "aligned", "warnings", "sentences")
         content: dict[str, Any] = plain(
             {
@@ -174,7 +154,7 @@ class PredictedTest:
                 "joint": self.joint,
                 "model": model.words,
                 **model.options,
-                **{name: getattr(self, name) for name in (*asked, *found)},
+                **{name: getattr(self, name) for name in asked},
                 "curves": {
                     name: {
                         "range": curve.range,
