@@ -491,9 +491,9 @@ class Fit:
         asked = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
         model = Model.parse(self.model)
         optional = {
-            "correlation": self.correlation and vars(self.correlation),
+            "correlation": self.correlation,
             "budget": self.budget and self.budget.contributions,
-            "ladder": self.ladder and asdict(self.ladder),
+            "ladder": self.ladder,
             "by_cycle": self.by_cycle,
             "priors": self.priors,
         }
@@ -512,12 +512,11 @@ class Fit:
                 "rate": loading_rate(test),
                 "notes": test.notes,
             },
-            "specimen": asdict(test.specimen),
+            "specimen": test.specimen,
             **{name: getattr(self, name) for name in (*asked, "loss", "warnings", "notes")},
             **model.options,
             "model": model.words,
-            "checklist": [asdict(check) for check in self.checklist],
-            "parameters": {name: asdict(one) for name, one in self.parameters.items()},
+            **{name: getattr(self, name) for name in ("checklist", "parameters")},
             "derived": self._derived(),
             **{name: getattr(self, name) for name in ("visited", "misfit", "weights")},
             **{name: getattr(self, name) for name in ("statistics", "noise", "energy")},
@@ -585,12 +584,4 @@ def _without(told: Mapping[str, Any], fields: Mapping[str, Any]) -> dict[str, An
 
 def plain(value: Any) -> Any:
     """Return `value` in the types of JSON, with None for every number that is not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return encode(value)

@@ -363,8 +363,8 @@ def test_what_is_killed_leaves_a_page_as_current_as_the_table(here, tried, monke
     monkeypatch.setattr(module, "SHARE", 0.0)
     seen = list[tuple[list[tuple[str, str]], list[str]]]()
 
-    def look(state):
-        if state.done > 1:
+    def look(made):
+        if len(made.rows) > 1:
             frame = pd.read_csv("out/summary.csv")
             seen.append((shown("out"), list(frame["status"])))
 
@@ -554,8 +554,9 @@ def test_progress_says_done_wrong_left_and_how_long(here, monkeypatch):
     monkeypatch.setattr(command, "progress_line", lambda *_: nullcontext(line))
 
     def fitted(*_, progress, **__):
-        progress(module.State(done=4, wrong=1, left=6, fitted=2))
-        progress(module.State(done=10, wrong=1, left=0, fitted=8))
+        tests = range(10)
+        progress(SimpleNamespace(rows=tests[:4], tests=tests, wrong=1, fitted=2))
+        progress(SimpleNamespace(rows=tests, tests=tests, wrong=1, fitted=8))
         return SimpleNamespace(summary=[], out=here)
 
     monkeypatch.setattr(module, "run", fitted)

@@ -21,7 +21,7 @@ from foamfit.terminal import say
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from foamfit.study.batch import State
+    from foamfit.study.batch import Batch
 
 PATIENCE = 10  # s in which a scheduler must answer
 
@@ -95,9 +95,10 @@ def batch(
         progress_line(output.silent, "batch") as line,
     ):
 
-        def tell(state: State) -> None:
-            what = f"{state.done} done, {state.wrong} without a fit, {state.left} left"
-            line.progress(state.fitted / max(state.fitted + state.left, 1), what)
+        def tell(made: Batch) -> None:
+            done, left = len(made.rows), len(made.tests) - len(made.rows)
+            told = f"{done} done, {made.wrong} without a fit, {left} left"
+            line.progress(made.fitted / max(made.fitted + left, 1), told)
 
         where: Any = {"out": output.out, "executor": executor, "jobs": jobs, "progress": tell}
         found = run(tests, recipe, fresh=fresh, specimen=specimen, **where)

@@ -54,19 +54,6 @@ Tests = str | Path | Iterable[str | Path]
 Cycles = int | Sequence[int] | Literal["all"] | None
 
 
-@dataclass(frozen=True)
-class State:
-    """How far a batch is: tests done in all, of these without a fit, left, and fitted now."""
-
-    done: int
-    wrong: int
-    left: int
-    fitted: int
-
-
-Progress = Callable[[State], None]
-
-
 @dataclass
 class Batch:
     """The tests of a batch, what became of them, and the fits that an executor has; see `batch`."""
@@ -77,11 +64,11 @@ class Batch:
     toml: Path | None = None  # for all; else the one beside each
     foreign: bool = False  # whether the executor's machines may have other files
     fresh: bool = False
-    progress: Progress = lambda _: None
+    progress: Callable[[Batch], None] = lambda _: None
     rows: dict[str, tuple[Row, ...]] = field(default_factory=dict)  # by the name of the test
     waiting: dict[Future[Outcome], Task] = field(default_factory=dict)
-    fitted: int = 0
-    wrong: int = 0
+    fitted: int = 0  # now
+    wrong: int = 0  # of all that are done, without a fit
     saved: float = field(default_factory=lambda: time.monotonic())  # when the summary was written
     took: float = 0.0  # to write it, s
 
@@ -192,8 +179,7 @@ class Batch:
     def _keep(self, name: str, rows: tuple[Row, ...]) -> None:
         self.rows[name] = rows
         self.wrong += not all(row.has_fit for row in rows)
-        done = len(self.rows)
-        self.progress(State(done, self.wrong, len(self.tests) - done, self.fitted))
+        self.progress(self)
 
     def _save_sometimes(self) -> None:
         """Write the summary from time to time: what is killed leaves it as it was then."""
@@ -209,8 +195,8 @@ class Batch:
         return InputError(f"the executor has ended: {told}; {self._done_words()}")
 
     def _done_words(self) -> str:
-        done, count = len(self.rows), counted(len(self.tests), "test")
-        return f"{done} of {count} are done and stay, call again for the others"
+        told = f"{len(self.rows)} of {counted(len(self.tests), 'test')} are done and stay"
+        return f"{told}, call again for the others"
 
 
 def batch(
@@ -226,7 +212,7 @@ def batch(
     cycles: tuple[int, int] | None = None,
     report: bool = True,
     figure_width: str = TWO,
-    progress: Progress | None = None,
+    progress: Callable[[Batch], None] | None = None,
     **options: Unpack[Keywords],
 ) -> pd.DataFrame:
     """Fit every test on its own, in parallel; a result folder for each and one summary.
@@ -265,7 +251,7 @@ def batch(
         "one" or "two" columns, or a length such as "85 mm". A test whose figures have another
         width is fitted again, as its curves are not kept.
     progress
-        Told the `State` after each test.
+        Given the `Batch` after each test: `rows`, `tests`, `wrong` and `fitted` say how far it is.
 
     Returns
     -------
@@ -302,7 +288,7 @@ def run(
     jobs: int | None = None,
     fresh: bool = False,
     specimen: str | Path | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[Batch], None] | None = None,
 ) -> Batch:
     """Do what `batch` says, and return all that is known of it."""
     options = Options.of("batch", recipe.options)

@@ -228,7 +228,7 @@ class JointData:
             **{name: getattr(self, name) for name in ("status", "warnings", "sentences", "rate0")},
             "tests": {
                 name: {
-                    "file": str(self.files[t]),
+                    "file": self.files[t],
                     "drive": self.problems[t].objective.drive,
                     "rate": self.rates[t],
                     "misfit": found.misfits[t],
@@ -243,8 +243,7 @@ class JointData:
             "parameters": {name: one.to_json_dict() for name, one in self.parameters.items()},
             "covariance": {"names": self.covariance[0], "matrix": self.covariance[1]},
             "specimens": {"names": self.fit.correlation[0], "correlation": self.fit.correlation[1]},
-            "evidence": [asdict(one) for one in self.evidence],
-            **{name: getattr(self, name) for name in ("statistics", "refused", "runtime_s")},
+            **{n: getattr(self, n) for n in ("evidence", "statistics", "refused", "runtime_s")},
         }
         return dict(plain(content))
 

@@ -141,7 +141,7 @@ class PredictedTest:
         m, model = self.measurement, Model.parse(self.model)
         asked = ("relaxation", "drive", "seed", "draws", "redrawn", "rate", "fitted_rates")
         asked += ("extrapolated", "misfit", "inside", "by_cycle")
-        told = ("held", "aligned", "warnings", "sentences")
+        told = ("parameters", "held", "aligned", "warnings", "sentences")
         content: dict[str, Any] = plain(
             {
                 "schema": SCHEMA,
@@ -165,7 +165,6 @@ class PredictedTest:
                     }
                     for name, curve in self.curves.items()
                 },
-                "parameters": {name: vars(one) for name, one in self.parameters.items()},
                 **{name: getattr(self, name) for name in told},
             }
         )
