@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 
 # Characters of a line: those of the terminal, but not more or fewer than these.
 WIDTH, NARROWEST = 100, 40
+COLUMN = 10  # where a text behind its label begins
 _NO_BREAK = "\u00a0"  # a space at which no line ends
 _PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n"}
 
@@ -104,11 +105,11 @@ def aligned(rows: Sequence[Sequence[str]], gap: str = "  ", right: Iterable[int]
     return lines
 
 
-def labelled(items: Iterable[tuple[str, Iterable[str]]], column: int = 10) -> str:
-    """Set each label before its texts, which are wrapped from `column` on, no last newline."""
+def labelled(items: Iterable[tuple[str, Iterable[str]]]) -> str:
+    """Set each label before its texts, which are wrapped from `COLUMN` on, no last newline."""
     lines = list[str]()
     for label, texts in items:
         for i, text in enumerate(texts):
             start = label if i == 0 else ""
-            lines += wrapped(f"{start:<{column}}{text}", column + 2)
+            lines += wrapped(f"{start:<{COLUMN}}{text}", COLUMN + 2)
     return "\n".join(lines)

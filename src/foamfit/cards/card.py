@@ -117,11 +117,7 @@ class Card:
         return np.array([-rates[0], *rates[kept]]), np.vstack([back, loading])
 
     def __repr__(self) -> str:
-        """Tell what the card is and what it loses."""
-        return self.summary()
-
-    def summary(self) -> str:
-        """What the command prints of it."""
+        """Tell what the card is and what it loses, as the command prints it."""
         return _words("terminal", card=self)
 
     def save(self, path: str | Path) -> Path:

@@ -186,4 +186,4 @@ def card(result: Path, format: str, units: str, rates: str | None, out: Path | N
     if out is None:
         file.parent.mkdir(exist_ok=True)
     made.save(file)
-    say(f"{made.summary()}\nwritten to {file}, with {file.name}.json, .png and .pdf beside it")
+    say(f"{made}\nwritten to {file}, with {file.name}.json, .png and .pdf beside it")

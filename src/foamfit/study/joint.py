@@ -16,9 +16,9 @@ from foamfit.arrays import Array, single_threaded
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate, rate_error
-from foamfit.errors import InputError, SimulationError
+from foamfit.errors import InputError, SimulationError, naming
 from foamfit.fitting.links import KINDS, RATES, Links
-from foamfit.fitting.problem import Problem, make_params
+from foamfit.fitting.problem import Problem, fix_and_vary, make_params
 from foamfit.fitting.search import Tracker, descend
 from foamfit.fitting.together import Together
 from foamfit.one_model import Options, Progress, identify, weigh_motion
@@ -213,21 +213,15 @@ def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters
     model = Model.parse(study.model, study.relaxation)
     every = [make_params(test, model, study.drive) for test in tests]
     for name in (*study.kinds, *study.held):
-        where = f"{study.path}: [parameters] {name}"
-        there = [params[name] for params in every if name in params]
+        there = [params[name].vary for params in every if name in params]
         if not there:
-            raise InputError(f"{where} is a parameter of none of these tests; leave it out")
-        tied = [one.expr for one in there if one.expr is not None]
-        if tied:
-            raise InputError(f"{where} follows from others ({tied[0]}); name those instead")
-        if name in study.held:
-            for one in there:
-                one.set(value=study.held[name], vary=False, min=-math.inf, max=math.inf)
-        elif not any(one.vary for one in there):
-            if name.endswith("_height"):
-                raise InputError(f"{where} is given by [specimen] heights; leave one of them out")
-            for one in there:
-                one.set(vary=True)
+            told = f"{name} is a parameter of none of these tests; leave it out"
+            raise InputError(f"{study.path}: [parameters] {told}")
+        fix = {name: study.held[name]} if name in study.held else {}
+        for params in every:
+            if name in params and (fix or not any(there)):
+                with naming(f"{study.path}: [parameters]"):
+                    fix_and_vary(params, study.model, fix, () if fix else (name,))
     return every
 
 

@@ -140,7 +140,7 @@ class PredictedTest:
         """Return the content of ``prediction.json``: SI, plain types, null = not there."""
         m, model = self.measurement, Model.parse(self.model)
         asked = ("relaxation", "drive", "seed", "draws", "redrawn", "rate", "fitted_rates")
-        asked += ("extrapolated", "misfit", "inside", "by_cycle")
+        found = ("extrapolated", "misfit", "inside", "by_cycle")
         told = ("parameters", "held", "aligned", "warnings", "sentences")
         content: dict[str, Any] = plain(
             {
@@ -154,7 +154,7 @@ class PredictedTest:
                 "joint": self.joint,
                 "model": model.words,
                 **model.options,
-                **{name: getattr(self, name) for name in asked},
+                **{name: getattr(self, name) for name in (*asked, *found)},
                 "curves": {
                     name: {
                         "range": curve.range,
