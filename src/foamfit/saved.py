@@ -21,8 +21,8 @@ from foamfit.report.samples import FILE as SAMPLES
 from foamfit.report.samples import read_samples
 from foamfit.report.shown import JointViews
 from foamfit.report.studies.batch import read_table
+from foamfit.report.studies.cycles import CycleFits
 from foamfit.results import KEPT, Loop
-from foamfit.study.cycles import CycleFits
 from foamfit.study.joint import JointResult
 from foamfit.study.joint_result import JointParameter
 from foamfit.trust.identifiability import Insight
@@ -98,11 +98,11 @@ class SavedJoint(JointViews):
     warnings: tuple[str, ...]
     sentences: tuple[str, ...]
     tests: tuple[str, ...]
-    rates: tuple[float | None, ...]  # Mean strain rate on loading of each test, 1/s
-    rate0: float | None  # That of the median test
-    parameters: dict[str, JointParameter]  # SI; values by test are in `tests` of each
-    results: dict[str, FitResult]  # Of each test at the joint fit
-    content: dict[str, Any]  # All of joint.json
+    rates: tuple[float | None, ...]  #: Mean strain rate on loading of each test, 1/s
+    rate0: float | None  #: That of the median test
+    parameters: dict[str, JointParameter]  #: SI; values by test are in `tests` of each
+    results: dict[str, FitResult]  #: Of each test at the joint fit
+    content: dict[str, Any]  #: All of joint.json
 
     @property
     def loops(self) -> tuple[Loop, ...]:

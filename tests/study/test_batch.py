@@ -184,12 +184,10 @@ def test_figures_of_another_width_are_made_again_where_there_are_any(here, tried
 
 
 def test_a_cycle_is_a_row_and_its_folder_is_in_that_of_the_test(here, monkeypatch):
-    from foamfit.study.cycles import CycleFits
-
     def fit_cycles(path, specimen, *, cycles, **options):
         assert cycles is None
         results = {1: fabricated.result(), 2: fabricated.result(status="ok")}
-        return CycleFits("a", "bistable", (1, 2, 3), results, {3: "it is cut"})
+        return ff.CycleFits("a", "bistable", (1, 2, 3), results, {3: "it is cut"})
 
     monkeypatch.setattr(batch_work, "fit_cycles", fit_cycles)
     frame = again(cycle="all").set_index("test")

@@ -156,20 +156,20 @@ def card(
     rates: float | Iterable[float | str] | None = None,
     out: str | Path | None = None,
 ) -> Card:
-    r"""Make a material card of a fitted law.
+    r"""Make a material card of a fitted law, a `Card`.
 
     Parameters
     ----------
-    result
+    result : FitResult, JointResult, str or Path
         A result of `fit` or `joint`, or its folder.
-    format
+    format : str
         "mat083" (LS-DYNA \*MAT_FU_CHANG_FOAM), "mat057" (\*MAT_LOW_DENSITY_FOAM), "law90"
         (Radioss), "abaqus" (\*LOW DENSITY FOAM) or "csv" (the curves alone).
-    units
+    units : str
         "kg-mm-ms", "t-mm-s" or "SI".
-    rates
+    rates : float or iterable of float, optional
         Strain rates of the loading curves, 1/s; by default those of the fitted tests.
-    out
+    out : str or Path, optional
         File to write; FILE.json, FILE.png and FILE.pdf stand beside it.
 
     Raises

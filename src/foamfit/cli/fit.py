@@ -21,7 +21,7 @@ from foamfit.terminal import say
 
 if TYPE_CHECKING:
     from foamfit.api import FitResult
-    from foamfit.study.cycles import CycleFits
+    from foamfit.report.studies.cycles import CycleFits
 
 # Options that `foamfit.fit` does not take as keywords, and those that become its `intervals`.
 NO_KEYWORDS, WAYS = ("cycle", "cycles", "model"), ("profile", "bootstrap", "mcmc")

@@ -223,34 +223,34 @@ def batch(
 
     Parameters
     ----------
-    tests
+    tests : str, Path or several
         Files, folders and globs; see `foamfit.study.test_files.find_tests`.
-    out
+    out : str or Path, optional
         The folder; by default ``fits/batch/<model>``. It holds ``<test>/`` for each test, the
         result folder of its fit, ``summary.csv`` and ``summary.html``.
     model, options
         As for `foamfit.fit`.
-    executor
+    executor : concurrent.futures.Executor, optional
         What runs the fits, as a Dask client's ``get_executor()``; tests go there and results come
         back with the calls, so that its machines need no common file system. By default processes
         of this machine, one for each core, with one thread each.
-    jobs
+    jobs : int, optional
         How many processes of this machine.
-    fresh
+    fresh : bool
         Whether everything is fitted again.
-    specimen
+    specimen : str or Path, optional
         One TOML for all tests; by default the one beside each.
-    cycle
+    cycle : int, sequence of int or "all", optional
         The cycle of each record; several are fitted as `foamfit.fit_cycles` does, and each is a
         row of the summary.
-    cycles
+    cycles : (int, int), optional
         First and last of several cycles that are fitted as one history.
-    report
+    report : bool
         Whether each fit has a report and figures.
-    figure_width
+    figure_width : str
         "one" or "two" columns, or a length such as "85 mm". A test whose figures have another
         width is fitted again, as its curves are not kept.
-    progress
+    progress : callable, optional
         Given the `Batch` after each test: `rows`, `tests`, `wrong` and `fitted` say how far it is.
 
     Returns

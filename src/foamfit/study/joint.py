@@ -97,21 +97,21 @@ def joint(
     report: bool = True,
     progress: Progress | None = None,
 ) -> JointResult:
-    """Fit the tests of a study together.
+    """Fit the tests of a study together; returns a `JointResult`.
 
     Parameters
     ----------
-    path
+    path : str, Path or Study
         STUDY.toml, or what `read_study` has read of it: tests, model, drive, and what each
         parameter is: "shared", "own", "scatter", "log rate", "power rate" or "auto", or a number
         that it is held at.
-    jobs
+    jobs : int, optional
         Processes; by default one for each core. The numbers are the same with any.
-    out, report
-        Folder to write the result to, as `JointResult.save` does, with or without reports.
-    seed
+    out : str or Path, optional
+        Folder to write the result to, as `JointResult.save` does, with or without `report`.
+    seed : int, optional
         Of the search; by default that of the study, or 0.
-    progress
+    progress : callable, optional
         Told the fraction done and what is going on.
 
     Raises

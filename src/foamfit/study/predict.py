@@ -21,17 +21,15 @@ from foamfit.fitting.curves import check_drive, check_time_shift, choose_drive, 
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, descend
 from foamfit.report import render
-from foamfit.report.figures import TWO, inches
-from foamfit.report.studies.prediction import save_prediction
+from foamfit.report.studies.prediction import (
+    COLOURS,
+    PredictedCurve,
+    PredictedParameter,
+    Prediction,
+)
 from foamfit.springs.parameters import unit_of
 from foamfit.study.prediction.identified import NORMAL, HasContent, Source, read_source
 from foamfit.study.prediction.population import Population
-from foamfit.study.prediction.predicted import (
-    PARTS,
-    PredictedCurve,
-    PredictedParameter,
-    PredictedTest,
-)
 from foamfit.text import engineering
 
 # Draws of specimens; fewer say nothing of the ends of a 95 % band.
@@ -46,19 +44,6 @@ FEW_TESTS = 5
 ALIGNING = 40  # steps of the fit of what a record does not say exactly
 
 
-class Prediction(PredictedTest):
-    """A test that was not fitted, predicted with its 95 % band, and how it is written."""
-
-    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
-        """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf`` whole; returns the folder.
-
-        An older prediction there is replaced as a whole, at the end. Without `report` there is no
-        figure. It is "one" or "two" columns wide, or as wide as a length ("85 mm").
-        """
-        inches(figure_width)  # refuses what is no width
-        return save_prediction(self, folder, report=report, width=figure_width)
-
-
 @single_threaded
 def predict(
     result: HasContent | str | Path,
@@ -69,11 +54,11 @@ def predict(
     draws: int = DRAWS,
     seed: int = 0,
 ) -> Prediction:
-    """Predict a test that was not fitted.
+    """Predict a test that was not fitted, as a `Prediction`.
 
     Height, area, mass and velocity are those of the test, and so is the rate at which laws of rate
     are evaluated. What its record does not say exactly, such as the contact time and zeros of an
-    impact, is fitted to it (`PredictedTest.aligned`). The 95 % band has these parts: what the
+    impact, is fitted to it (`Prediction.aligned`). The 95 % band has these parts: what the
     result leaves uncertain of the parameters, to first order; their scatter between specimens (of a
     joint result), drawn and simulated; the noise of the test and that of a motion that drives; and
     what the law has missed of the fitted tests beyond their noise, which grows with each cycle
@@ -81,16 +66,16 @@ def predict(
 
     Parameters
     ----------
-    result
+    result : FitResult, JointResult, str or Path
         A result of `fit` or `joint`, its folder, or its fit.json or joint.json; the file gives the
         same numbers.
-    test
+    test : Measurement, str or Path
         The test, or its file with its TOML beside it.
-    drive
+    drive : str, optional
         "impact", "stress" or "displacement"; by default that of the result.
-    extrapolate
+    extrapolate : bool
         Whether the rate of the test may lie outside the fitted rates by more than `RATE_FACTOR`.
-    draws, seed
+    draws, seed : int
         Draws of specimens; same seed, same numbers.
 
     Raises
@@ -358,7 +343,7 @@ def _curve(
     """One curve with its band: quantiles of the draws, all other parts added in quadrature."""
     objective = problem.objective
     channel, n = objective.channel(name), predicted.size
-    parts = {part: np.zeros(n) for part in PARTS if part != "motion"} | known
+    parts = {part: np.zeros(n) for part in COLOURS if part != "motion"} | known
     low = middle = high = predicted
     if drawn is not None:
         ends = np.quantile([curves[name] for curves in drawn.curves], (*BAND, 0.5), axis=0)
@@ -380,7 +365,7 @@ def _curve(
         predicted=predicted,
         lo=middle - np.sqrt((middle - low) ** 2 + more),
         hi=middle + np.sqrt((high - middle) ** 2 + more),
-        parts={part: parts[part] for part in PARTS if part in parts},
+        parts={part: parts[part] for part in COLOURS if part in parts},
         kept=kept,
     )
 
