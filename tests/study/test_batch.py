@@ -26,8 +26,8 @@ from click.testing import CliRunner
 import fabricated
 import foamfit as ff
 from conftest import HEIGHT, synthetic_impact, without_pictures
-from foamfit.cli import batch as command
 from foamfit.cli import main
+from foamfit.cli import many as command
 from foamfit.report.studies import batch as batch_report
 from foamfit.report.studies.batch import (
     MOST_ON_PAGE,
