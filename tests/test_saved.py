@@ -211,7 +211,7 @@ def test_arviz_takes_the_samples(chained) -> None:
 
 
 def test_a_loaded_result_is_compared_and_predicts_as_the_first(tmp_path: Path) -> None:
-    from foamfit.study.prediction.identified import read_source
+    from foamfit.study.identified import read_source
 
     one = fabricated.microscale_result()
     one.save(tmp_path / "x", report=False)

@@ -17,9 +17,8 @@ from foamfit.fitting.together import Together
 from foamfit.report.figures import STYLE, image, laid_out
 from foamfit.report.studies.joint import joint_page, joint_text, plot_compared, plot_joint
 from foamfit.study.joint import JointResult
-from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import Alternative, fit_jointly
-from foamfit.study.joint_result import JointData
+from foamfit.study.joint_result import JointData, common_covariance, parameters_of
 from foamfit.study.study_file import Study
 
 RATES = (0.01, 0.1, 1.0)

@@ -15,16 +15,26 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array, single_threaded
-from foamfit.cards.curves import Curves, fitted_rates, follow, guessed, loading_curves
+from foamfit.cards.curves import (
+    REPLAYS,
+    Curves,
+    Motion,
+    Unloading,
+    fit_unloading,
+    fitted_rates,
+    follow,
+    guessed,
+    loading_curves,
+    unloading_curve,
+)
 from foamfit.cards.records import Record, draw, read_records
-from foamfit.cards.replay import REPLAYS, Motion, Unloading, fit_unloading, unloading_curve
 from foamfit.data.units import factor
 from foamfit.errors import InputError
 from foamfit.files import check_file, write_file
 from foamfit.report.figures import image, laid_out
 from foamfit.report.render import environment
 from foamfit.results import law_in_words, plain
-from foamfit.study.prediction.identified import HasContent, read_source
+from foamfit.study.identified import HasContent, read_source
 
 # Of each format: ending of its file, what begins a comment, and what stands for a density that is
 # not known, a parameter that is nowhere defined: the solvers refuse it.

@@ -116,7 +116,7 @@ def predict(
     from foamfit.data.csv_file import read_test
     from foamfit.data.toml_file import toml_beside
     from foamfit.report.studies.prediction import check_replaceable, prediction_text
-    from foamfit.study.prediction.identified import read_source
+    from foamfit.study.identified import read_source
 
     toml = toml_beside(test)
     default = Path("predictions", toml.stem)
@@ -168,7 +168,7 @@ def card(result: Path, format: str, units: str, rates: str | None, out: Path | N
         foamfit card joint/new-heel --format law90 --units t-mm-s --rates 0.01,1,100 --out foam.rad
     """
     from foamfit.cards import card as cards
-    from foamfit.study.prediction.identified import read_source
+    from foamfit.study.identified import read_source
 
     asked = None if rates is None else rates.split(",")
     cards.check(format, units, asked)

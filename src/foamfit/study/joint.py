@@ -28,9 +28,8 @@ from foamfit.report.shown import Joint, JointViews
 from foamfit.report.studies.joint import save_joint
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
-from foamfit.study.joint_estimates import common_covariance, parameters_of, with_words
 from foamfit.study.joint_fit import Map, fit_jointly
-from foamfit.study.joint_result import JointData
+from foamfit.study.joint_result import JointData, common_covariance, parameters_of, with_words
 from foamfit.study.processes import begin, workers
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted

@@ -28,8 +28,7 @@ from foamfit.report.studies.prediction import (
     Prediction,
 )
 from foamfit.springs.parameters import unit_of
-from foamfit.study.prediction.identified import NORMAL, HasContent, Source, read_source
-from foamfit.study.prediction.population import Population
+from foamfit.study.identified import NORMAL, HasContent, Population, Source, read_source
 from foamfit.text import engineering
 
 # Draws of specimens; fewer say nothing of the ends of a 95 % band.
