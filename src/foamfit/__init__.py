@@ -32,7 +32,7 @@ _HOME = {
     "batch": "study.batch",
     "Prediction": "report.studies.prediction",
     "predict": "study.predict",
-    "JointResult": "study.joint",
+    "JointResult": "study.joint_result",
     "joint": "study.joint",
     "Card": "cards.card",
     "card": "cards.card",

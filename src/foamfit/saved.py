@@ -22,9 +22,9 @@ from foamfit.report.samples import read_samples
 from foamfit.report.shown import JointViews
 from foamfit.report.studies.batch import read_table
 from foamfit.report.studies.cycles import CycleFits
+from foamfit.report.studies.joint import JointParameter
 from foamfit.results import KEPT, Loop
-from foamfit.study.joint import JointResult
-from foamfit.study.joint_result import JointParameter
+from foamfit.study.joint_result import JointResult
 from foamfit.trust.identifiability import Insight
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from foamfit.report.figures import BLUE, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.results import Fit
 from foamfit.saved import SavedJoint, load
-from foamfit.study.joint_result import JointData
+from foamfit.study.joint_result import JointResult
 from foamfit.text import percent, significant
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def read_records(result: object) -> list[Record]:
     if isinstance(result, str | Path):
         path = Path(result)
         return read_records(load(path if path.is_dir() else path.parent))
-    if isinstance(result, JointData):
+    if isinstance(result, JointResult):
         return [Record.of(one()) for one in result.test_fits()]
     if isinstance(result, SavedJoint):
         return [Record.of(one) for one in result.results.values()]

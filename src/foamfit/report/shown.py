@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-Joint = Any  # `foamfit.study.joint_result.JointData`, or `foamfit.saved.SavedJoint`, read back
+Joint = Any  # `foamfit.study.joint_result.JointResult`, or `foamfit.saved.SavedJoint`, read back
 
 
 def fit_shown(result: Fit, *, html: bool = False) -> str:

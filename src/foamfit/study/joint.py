@@ -22,14 +22,17 @@ from foamfit.fitting.problem import Problem, fix_and_vary, make_params
 from foamfit.fitting.search import Tracker, descend
 from foamfit.fitting.together import Together
 from foamfit.one_model import Options, Progress, identify, weigh_motion
-from foamfit.report.figures import TWO, inches
-from foamfit.report.folder import check_target, try_target
-from foamfit.report.shown import Joint, JointViews
-from foamfit.report.studies.joint import save_joint
+from foamfit.report.folder import try_target
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
 from foamfit.study.joint_fit import Map, fit_jointly
-from foamfit.study.joint_result import JointData, common_covariance, parameters_of, with_words
+from foamfit.study.joint_result import (
+    FEW_FOLDERS,
+    JointResult,
+    common_covariance,
+    parameters_of,
+    with_words,
+)
 from foamfit.study.processes import begin, workers
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
@@ -38,8 +41,6 @@ from foamfit.text import counted
 SEARCHED = 3
 # Up to so many tests are fitted in this process: most take less than a tenth of a second each.
 FEW = 100
-# Up to so many result folders are written in this process: each takes a second or two.
-FEW_FOLDERS = 3
 # Reduced χ² of a test over the largest of those, past which it is searched as well.
 FAR = 2.0
 # Steps of a descent from what another test has found.
@@ -48,30 +49,6 @@ STEPS = 60
 ONE_FOR_ALL = 2
 # Rates that differ by less than this share are one.
 SAME_RATE = 0.02
-
-
-class JointResult(JointViews, JointData):
-    """Everything that a joint fit found, and how it is written; its fields are `JointData`'s."""
-
-    def save(
-        self: Joint,
-        folder: str | Path,
-        *,
-        jobs: int | None = None,
-        report: bool = True,
-        figure_width: str = TWO,
-    ) -> Path:
-        """Write joint.json, its page, pictures and table.tex, and a result folder per test.
-
-        An older result there is replaced as a whole, at the end. The folders of the tests are made
-        by `jobs` processes (by default one for each core). Without `report` there are tables alone.
-        Figures are "one" or "two" columns wide, or as wide as a length ("85 mm"). Returns the
-        folder.
-        """
-        inches(figure_width)  # refuses what is no width
-        check_target(folder)
-        with workers(jobs, len(self.tests), FEW_FOLDERS) as each:
-            return save_joint(self, folder, each, report=report, width=figure_width)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +19,15 @@ from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.fitting.together import Together
 from foamfit.report import render
+from foamfit.report.figures import TWO, inches
+from foamfit.report.folder import check_target
+from foamfit.report.shown import Joint, JointViews
+from foamfit.report.studies.joint import JointParameter, TestValue, save_joint
 from foamfit.results import SCHEMA, Fit, Loop, ParameterEstimate, loop_of, plain
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, unit_of
 from foamfit.study.joint_fit import Alternative, JointFit
+from foamfit.study.processes import workers
 from foamfit.study.study_file import Study
 from foamfit.text import counted, listed, percent
 from foamfit.trust import covariance
@@ -30,71 +35,10 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import POOR, UNACCEPTABLE, status_of, warnings_of
 from foamfit.trust.conclude import conclude, noise_of
 
-# Keys of a parameter that only some kinds have.
-_OF_SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
-_OF_RATE = ("b", "b_stderr", "b_ci95", "b_range")
+# Up to so many result folders are written in this process: each takes a second or two.
+FEW_FOLDERS = 3
 # Questions to a search of one test.
 _OF_A_SEARCH = ("ended", "agree")
-
-
-@dataclass(frozen=True)
-class TestValue:
-    """A parameter in one test, SI; None where the test says nothing of it."""
-
-    __test__ = False  # what pytest must not take for a test
-
-    value: float
-    stderr: float | None
-    ci95: tuple[float, float] | None
-    state: str
-    why: str
-
-
-@dataclass(frozen=True)
-class JointParameter:
-    """One parameter of a joint fit, SI.
-
-    `kind` is one of `links.KINDS` or "fixed". `value` is the common one: of a scattering parameter
-    the median specimen's, by a law of rate that at the rate of the median test, of an own one the
-    median over the tests (which has no error). `scatter` is the standard deviation of its logarithm
-    between specimens, `b` the slope of the law of rate. `tests` has its value in each test, unless
-    it is the same in all.
-    """
-
-    kind: str
-    value: float
-    unit: str
-    stderr: float | None = None
-    ci95: tuple[float, float] | None = None
-    state: str | None = None
-    why: str | None = None
-    tests: Mapping[str, TestValue] | None = None
-    scatter: float | None = None
-    scatter_stderr: float | None = None
-    scatter_ci95: tuple[float, float] | None = None
-    b: float | None = None
-    b_stderr: float | None = None
-    b_ci95: tuple[float, float] | None = None
-    # What the error of the law leaves open of it (`joint_fit.ranges_of`); None where all is noise.
-    range: tuple[float, float] | None = None
-    b_range: tuple[float, float] | None = None
-
-    def estimate(self, test: str | None = None) -> ParameterEstimate:
-        """The common value, or that of a test, as the parameter of a fit."""
-        if test is None or self.tests is None:
-            told, span = (self.state or "", self.why or ""), self.range
-            return ParameterEstimate(
-                self.value, self.stderr, self.ci95, self.unit, True, *told, range=span
-            )
-        at = self.tests[test]
-        return ParameterEstimate(at.value, at.stderr, at.ci95, self.unit, True, at.state, at.why)
-
-    def to_json_dict(self) -> dict[str, Any]:
-        """Return its part of joint.json."""
-        gone = ["tests"] if self.tests is None else []
-        gone += [key for key in _OF_SCATTER if self.kind != "scatter"]
-        gone += [key for key in _OF_RATE if self.kind not in RATES]
-        return {key: value for key, value in asdict(self).items() if key not in gone}
 
 
 def fit_of_test(
@@ -119,8 +63,8 @@ def fit_of_test(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class JointData:
+@dataclass(frozen=True, eq=False, repr=False)
+class JointResult(JointViews):
     """Everything that a joint fit found; arrays are in the order of `tests`."""
 
     study: Study
@@ -212,6 +156,26 @@ class JointData:
                 out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
         return out
 
+    def save(
+        self: Joint,
+        folder: str | Path,
+        *,
+        jobs: int | None = None,
+        report: bool = True,
+        figure_width: str = TWO,
+    ) -> Path:
+        """Write joint.json, its page, pictures and table.tex, and a result folder per test.
+
+        An older result there is replaced as a whole, at the end. The folders of the tests are made
+        by `jobs` processes (by default one for each core). Without `report` there are tables alone.
+        Figures are "one" or "two" columns wide, or as wide as a length ("85 mm"). Returns the
+        folder.
+        """
+        inches(figure_width)  # refuses what is no width
+        check_target(folder)
+        with workers(jobs, len(self.tests), FEW_FOLDERS) as each:
+            return save_joint(self, folder, each, report=report, width=figure_width)
+
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of joint.json: SI, plain types, null for what is not there.
 
@@ -282,11 +246,10 @@ class JointData:
 LARGEST = 300.0
 # Share of χ² from which on one test of many is named.
 DOMINANT = 0.5
-Joint = TypeVar("Joint", bound=JointData)
 
 
 def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
-    """Covariance of the common values and slopes, SI; see `JointData.to_json_dict`."""
+    """Covariance of the common values and slopes, SI; see `JointResult.to_json_dict`."""
     point, count = fit.point, len(fit.point.names)
     scales = np.ones(count)
     for i, name in enumerate(point.names):
@@ -410,7 +373,7 @@ def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestV
     return out
 
 
-def with_words(result: Joint) -> Joint:
+def with_words(result: JointResult) -> JointResult:
     """Give a joint fit its status, warnings and sentences."""
     lost, large = dict[str, None](), list[str]()
     for t, (test, problem) in enumerate(zip(result.tests, result.problems, strict=True)):

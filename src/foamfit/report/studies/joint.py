@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ from foamfit.report.render import page, words
 from foamfit.report.shown import Joint
 from foamfit.report.studies.parameters import Compared, plot_parameters
 from foamfit.report.tables import MISFITS, parameters_tex
-from foamfit.results import Fit, law_in_words
+from foamfit.results import Fit, ParameterEstimate, law_in_words
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import percent
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.study.joint_result import JointParameter
 
 DPI = 180  # of the picture
 MOST_ROWS = 60  # of the table of tests on the terminal
@@ -38,6 +38,69 @@ MOST_LOOPS = 48
 # Tests are ordered by rate from this ratio of the largest to the smallest rate on, even if no
 # parameter follows a law of rate; rates of nominally equal tests differ by some percent.
 SEVERAL_RATES = 1.5
+# Keys of a parameter that only some kinds have.
+_OF_SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
+_OF_RATE = ("b", "b_stderr", "b_ci95", "b_range")
+
+
+@dataclass(frozen=True)
+class TestValue:
+    """A parameter in one test, SI; None where the test says nothing of it."""
+
+    __test__ = False  # what pytest must not take for a test
+
+    value: float
+    stderr: float | None
+    ci95: tuple[float, float] | None
+    state: str
+    why: str
+
+
+@dataclass(frozen=True)
+class JointParameter:
+    """One parameter of a joint fit, SI.
+
+    `kind` is one of `links.KINDS` or "fixed". `value` is the common one: of a scattering parameter
+    the median specimen's, by a law of rate that at the rate of the median test, of an own one the
+    median over the tests (which has no error). `scatter` is the standard deviation of its logarithm
+    between specimens, `b` the slope of the law of rate. `tests` has its value in each test, unless
+    it is the same in all.
+    """
+
+    kind: str
+    value: float
+    unit: str
+    stderr: float | None = None
+    ci95: tuple[float, float] | None = None
+    state: str | None = None
+    why: str | None = None
+    tests: Mapping[str, TestValue] | None = None
+    scatter: float | None = None
+    scatter_stderr: float | None = None
+    scatter_ci95: tuple[float, float] | None = None
+    b: float | None = None
+    b_stderr: float | None = None
+    b_ci95: tuple[float, float] | None = None
+    # What the error of the law leaves open of it (`joint_fit.ranges_of`); None where all is noise.
+    range: tuple[float, float] | None = None
+    b_range: tuple[float, float] | None = None
+
+    def estimate(self, test: str | None = None) -> ParameterEstimate:
+        """The common value, or that of a test, as the parameter of a fit."""
+        if test is None or self.tests is None:
+            told, span = (self.state or "", self.why or ""), self.range
+            return ParameterEstimate(
+                self.value, self.stderr, self.ci95, self.unit, True, *told, range=span
+            )
+        at = self.tests[test]
+        return ParameterEstimate(at.value, at.stderr, at.ci95, self.unit, True, at.state, at.why)
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return its part of joint.json."""
+        gone = ["tests"] if self.tests is None else []
+        gone += [key for key in _OF_SCATTER if self.kind != "scatter"]
+        gone += [key for key in _OF_RATE if self.kind not in RATES]
+        return {key: value for key, value in asdict(self).items() if key not in gone}
 
 
 def save_joint(
