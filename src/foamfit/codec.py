@@ -106,12 +106,8 @@ def decode(hint: Any, value: Any, columns: Columns) -> Any:
 def build(made: type, content: Mapping[str, Any], columns: Columns, **names: Any) -> Any:
     """Make a dataclass of its encoded fields; one that has a default may be missing.
 
-    `names` are those in its annotations that its module imports for typing alone.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError, AttributeError
-        If a field is missing, or is not what the dataclass says.
+    `names` are those in its annotations that its module imports for typing alone. What is missing
+    or not as the dataclass says raises KeyError, TypeError, ValueError or AttributeError.
     """
     hints = get_type_hints(made, localns=names)
     given = {}

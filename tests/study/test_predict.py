@@ -80,7 +80,7 @@ def written(folder: Path, content: dict) -> Path:
 
 def population(content: dict, folder: Path, test: Measurement | None = None) -> Population:
     source = read_source(written(folder, content))
-    return Population(source, source.model.names, (test or loop()).specimen, 0.25)
+    return Population(source, (test or loop()).specimen, 0.25)
 
 
 # ------------------------------------------------------------------------------- the band

@@ -133,10 +133,7 @@ class Card:
     def save(self, path: str | Path) -> Path:
         """Write the card, PATH.json, PATH.png and PATH.pdf; returns the path.
 
-        Raises
-        ------
-        InputError
-            If one of them cannot be written; nothing is written then.
+        Raises InputError if one of them cannot be written; nothing is written then.
         """
         path = Path(path)
         files = [path, *(path.with_name(f"{path.name}.{form}") for form in ("json", "png", "pdf"))]

@@ -83,7 +83,7 @@ def follow(
     """
     heights = [one.value for name, one in source.parameters.items() if name.endswith("_height")]
     height = sum(heights) or 1.0  # a single spring of any height has the same stress
-    population = Population(source, source.model.names, Specimen(height, 1.0), rate)
+    population = Population(source, Specimen(height, 1.0), rate)
     chain = source.model.chain(population.point, height, 1.0)
     return simulate(chain, DisplacementDrive(strain * height), time, sensitivities=names)
 

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from foamfit.api import fit
@@ -22,7 +23,6 @@ from foamfit.codec import build, encode
 from foamfit.data.csv_file import read_test
 from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError, SimulationError
-from foamfit.files import scratch
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
 from foamfit.report.studies.batch import REFUSED, Row, row_of
@@ -148,8 +148,8 @@ def work(task: Task) -> Outcome:
             if task.out is not None:
                 save_whole(task.out, fill, swept=True)
                 return Outcome(rows)
-            with scratch() as folder:
-                fill(folder)
+            with TemporaryDirectory() as place:
+                fill(folder := Path(place))
                 found = (path for path in sorted(folder.rglob("*")) if path.is_file())
                 files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in found}
             return Outcome(rows, files)
@@ -212,7 +212,8 @@ def _inputs(task: Task) -> Iterator[tuple[Path, Path]]:
         yield task.path, task.toml
         return
     data, toml, motion = task.content
-    with scratch() as folder:
+    with TemporaryDirectory() as place:
+        folder = Path(place).resolve()
         path, settings = folder / task.path.name, folder / task.toml.name
         path.write_bytes(data)
         if toml is not None:

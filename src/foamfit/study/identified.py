@@ -290,13 +290,12 @@ EVIDENCE, FEWEST_OF_TREND, SAME_RATE = 2.0, 5, 0.05
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """The parameters of one test, in the order of `names` (SI), as a result predicts them.
+    """The parameters of one test, in the order of the model (SI), as a result predicts them.
 
     `rate` (1/s) is that of the test, None where it is not known; `limits` are those of a fit of it.
     """
 
     source: Source
-    names: tuple[str, ...]
     specimen: Specimen
     rate: float | None
     limits: Mapping[str, Pair] = field(default_factory=dict)
@@ -311,9 +310,9 @@ class Population:
                 "give a time and a displacement column, or rate0 in joint.json"
             )
 
-    @cached_property
+    @property
     def _known(self) -> dict[str, Identified]:
-        return {name: self.source.parameters[name] for name in self.names}
+        return self.source.parameters
 
     @cached_property
     def _uncertain(self) -> list[str]:
@@ -374,7 +373,7 @@ class Population:
     def covariance(self) -> Array:
         """What the result leaves uncertain of the parameters, SI, (p, p), to first order."""
         free, matrix = self._open
-        slopes = np.zeros((len(self.names), len(free)))
+        slopes = np.zeros((len(self._known), len(free)))
         for column, name in zip(slopes.T, free, strict=True):
             one = self._known[name.removesuffix(":b")]
             at, step = one.b if name.endswith(":b") else one.value, 1e-4 * self._error(name)
@@ -509,7 +508,7 @@ class Population:
             for name in of.keys() - values.keys():
                 one = self._known[name]
                 values[name] = one.value * _exp(one.scatter * of[name])
-            yield self._vector(values) + uncertain @ other.standard_normal(len(self.names))
+            yield self._vector(values) + uncertain @ other.standard_normal(len(self._known))
 
     def _vector(self, given: Mapping[str, float]) -> Array:
         """Values in their order, at the rate and the height of the test.
@@ -524,7 +523,7 @@ class Population:
                 x = math.log(self.rate / self.source.rate0)
                 value *= factor(one.kind, given.get(f"{name}:b", one.b), x)[0]
             values[name] = value
-        heights = [name for name in self.names if name.endswith("_height")]
+        heights = [name for name in self._known if name.endswith("_height")]
         if heights and self.specimen.heights is not None:
             values |= dict(zip(heights, self.specimen.heights, strict=True))
         elif heights:
@@ -533,7 +532,7 @@ class Population:
                 values[heights[-1]] = total - sum(values[name] for name in heights[:-1])
             whole = sum(values[name] for name in heights)
             values |= {name: values[name] * self.specimen.height / whole for name in heights}
-        return np.array([values[name] for name in self.names])
+        return np.array([values[name] for name in self._known])
 
 
 class _Own(NamedTuple):

@@ -100,7 +100,7 @@ def predict(
     problem = _problem(source, measurement, drive)
     objective = problem.objective
     limits = {name: (one.min, one.max) for name, one in problem.params.items()}
-    population = Population(source, problem.model.names, problem.measurement.specimen, rate, limits)
+    population = Population(source, problem.measurement.specimen, rate, limits)
     springs, aligning = _point(population, problem), _before(problem, source)
     try:
         point, aligned = _aligned(aligning, springs, population.scattering)
@@ -277,7 +277,7 @@ def _draw(population: Population, problem: Problem, point: Array, draws: int, se
     # again would leave one side of all other parameters out.
     objective, specimens, tried = problem.objective, population.draws(seed), 0
     values, curves = list[Array](), list[dict[str, Array]]()
-    limits = _limits(population, point[: len(population.names)])
+    limits = _limits(population, point[: len(population.source.parameters)])
     while len(values) < draws and tried < TRIES * draws:
         tried += 1
         one = np.clip(next(specimens), *limits)
@@ -388,12 +388,12 @@ def _parameters(
     if drawn is not None:
         ends = np.quantile(drawn.values, BAND, axis=0)
     ends = np.clip(ends, *_limits(population, point))
-    rows = zip(population.names, point.tolist(), *ends.tolist(), strict=True)
+    rows = zip(population.source.parameters, point.tolist(), *ends.tolist(), strict=True)
     known = population.source.parameters
     return {name: PredictedParameter(known[name].kind, *row) for name, *row in rows}
 
 
 def _limits(population: Population, point: Array) -> tuple[Array, Array]:
     """Limits of the parameters in a fit of the test, which hold the point."""
-    low, high = np.array([population.limits[name] for name in population.names]).T
+    low, high = np.array([population.limits[name] for name in population.source.parameters]).T
     return np.minimum(low, point), np.maximum(high, point)
