@@ -111,12 +111,18 @@ class Batch:
                     self._collect(1.0)  # one compiles, for all
             while self.waiting:
                 self._collect(1.0)
-        except BaseException:
+        except BaseException as error:
             for future in self.waiting:
                 future.cancel()
             with without_ctrl_c(), suppress(InputError):
                 self.save()
-            raise
+            told = " ".join(str(error).split())
+            if isinstance(error, futures.BrokenExecutor | futures.CancelledError):
+                told = f"the executor has ended: {told or 'it has given up the tests'}"
+            elif not isinstance(error, InputError):
+                raise
+            done = f"{len(self.rows)} of {counted(len(self.tests), 'test')} are done and stay"
+            raise InputError(f"{told}; {done}, call again for the others") from error
         self.save(whole=True)
 
     @property
@@ -149,8 +155,8 @@ class Batch:
         task = Task(name, path, toml, self.recipe, mark, out, content)
         try:
             self.waiting[executor.submit(work, task)] = task
-        except RuntimeError as error:  # also BrokenExecutor
-            raise self._ended(error) from error
+        except RuntimeError as error:  # it was shut down
+            raise futures.BrokenExecutor(str(error)) from error
 
     def _collect(self, seconds: float) -> None:
         """Take the fits that are done, waiting for one so long."""
@@ -165,10 +171,8 @@ class Batch:
             rows, files = future.result()
             if files is not None:
                 put(files, self.out / task.name)
-        except (futures.BrokenExecutor, futures.CancelledError) as error:
-            raise self._ended(error) from error
-        except InputError as error:  # it cannot be written
-            raise InputError(f"{error}; {self._done_words()}") from None
+        except (futures.BrokenExecutor, futures.CancelledError, InputError):  # not written
+            raise
         except Exception as error:
             self._keep(task.name, (Row(task.name, str(task.path), tables.REFUSED, _lost(error)),))
             return
@@ -189,14 +193,6 @@ class Batch:
         self.save()
         self.saved = time.monotonic()
         self.took = self.saved - began
-
-    def _ended(self, error: BaseException) -> InputError:
-        told = " ".join(str(error).split()) or "it has given up the tests"
-        return InputError(f"the executor has ended: {told}; {self._done_words()}")
-
-    def _done_words(self) -> str:
-        told = f"{len(self.rows)} of {counted(len(self.tests), 'test')} are done and stay"
-        return f"{told}, call again for the others"
 
 
 def batch(
