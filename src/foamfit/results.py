@@ -474,8 +474,7 @@ class Fit:
     @property
     def loop(self) -> Loop | None:
         """The loop measured and fitted; over time where no strain was measured."""
-        c, test = self.curves, self.measurement
-        return loop_of(test, c.stress_along, c.stress)
+        return loop_of(self.measurement, self.curves.stress_along, self.curves.stress)
 
     @property
     def snapping(self) -> dict[str, Snapping]:

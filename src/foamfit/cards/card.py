@@ -153,8 +153,8 @@ def draw(
     return figure
 
 
-# Of each format: ending of its file, what begins a comment, and what stands for a density that is
-# not known, a parameter that is nowhere defined: the solvers refuse it.
+# Of each format: ending of its file, what begins a comment, and what stands for an unknown density:
+# a parameter that is nowhere defined, which the solvers refuse.
 FORMATS = {
     "mat083": (".k", "$", "&RHO"),
     "mat057": (".k", "$", "&RHO"),

@@ -29,7 +29,7 @@ NO_KEYWORDS, WAYS = ("cycle", "cycles", "model"), ("profile", "bootstrap", "mcmc
 
 def _fixes(
     context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
-) -> dict[str, float]:
+) -> dict[str, float] | None:
     fixed = {}
     for text in values:
         name, _, number = text.partition("=")
@@ -39,7 +39,7 @@ def _fixes(
             value = math.nan
         if not math.isfinite(value):
             raise click.BadParameter(f"'{text}' is not NAME=VALUE in SI, as s1_eta=0.")
-    return fixed
+    return fixed or None
 
 
 fit_options = options.together(

@@ -46,9 +46,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _LOG = logging.getLogger(__name__)
-# What is given to an executor ahead of what it has done: tests, and bytes of their files.
+# Most tests, and most bytes of their files, that wait in an executor.
 MOST_AHEAD, MOST_BYTES = 1000, 2**28
-# Seconds between two summaries, and how much longer than both its files take to write.
+# Least time between two summaries: in seconds, and over the time that writing one takes.
 PAUSE, SHARE = 5.0, 50.0
 Tests = str | Path | Iterable[str | Path]
 Cycles = int | Sequence[int] | Literal["all"] | None
@@ -143,7 +143,7 @@ class Batch:
         try:
             data, settings, camera = read_whole(path), _bytes(toml), motion_file(toml)
             motion = None if camera is None else _bytes(camera)
-        except OSError:  # who reads the test says it better
+        except OSError:  # reading the test gives a better message
             data, settings, motion = b"", None, None
         mark = fingerprint(self.key, data, settings, motion)
         known = None if self.fresh else stored(folder, mark, self.recipe)

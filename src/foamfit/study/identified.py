@@ -283,8 +283,8 @@ def _misses(tests: list[Mapping[str, Any]]) -> dict[str, list[Miss]]:
     return found
 
 
-# Own parameters change with the rate if that lowers BIC by so much, over so many tests or more, of
-# which the logarithms of the rate spread by more than this.
+# Own parameters follow the rate if that lowers BIC by so much, in so many tests or more whose
+# logarithms of the rate have a larger standard deviation than this.
 EVIDENCE, FEWEST_OF_TREND, SAME_RATE = 2.0, 5, 0.05
 
 

@@ -41,7 +41,7 @@ from foamfit.text import counted
 SEARCHED = 3
 # Up to so many tests are fitted in this process: most take less than a tenth of a second each.
 FEW = 100
-# Reduced χ² of a test over the largest of those, past which it is searched as well.
+# A test whose reduced χ² is so many times the largest of those is searched as well.
 FAR = 2.0
 # Steps of a descent from what another test has found.
 STEPS = 60

@@ -37,7 +37,7 @@ from foamfit.trust.conclude import conclude, noise_of
 
 # Up to so many result folders are written in this process: each takes a second or two.
 FEW_FOLDERS = 3
-# Questions to a search of one test.
+# Questions of the checklist that only the search of one test answers.
 _OF_A_SEARCH = ("ended", "agree")
 
 
@@ -242,9 +242,9 @@ class JointResult(JointViews):
         }
 
 
-# Logarithms of what tests leave open by any number of orders of magnitude end here.
+# Largest logarithm: tests may leave a value open by any number of orders of magnitude.
 LARGEST = 300.0
-# Share of χ² from which on one test of many is named.
+# A test with at least this share of χ² is named.
 DOMINANT = 0.5
 
 

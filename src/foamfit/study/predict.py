@@ -31,11 +31,11 @@ from foamfit.springs.parameters import unit_of
 from foamfit.study.identified import NORMAL, HasContent, Population, Source, read_source
 from foamfit.text import engineering
 
-# Draws of specimens; fewer say nothing of the ends of a 95 % band.
+# Draws of specimens: by default, and at least, as fewer do not resolve the ends of a 95 % band.
 DRAWS, FEWEST = 400, 40
-# By how much the rate of a test may lie outside the fitted ones, as a factor.
+# Factor by which the rate of a test may lie outside the fitted rates.
 RATE_FACTOR = 1.25
-# Draws that are tried for each that is wanted, before the others are given up.
+# Most draws that are tried for each one wanted.
 TRIES = 5
 BAND = (0.025, 0.975)
 # So many tests are not said to be few; fewer suffice where fewer parameters change.

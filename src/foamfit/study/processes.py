@@ -32,7 +32,7 @@ from foamfit.terminal import without_ctrl_c
 FITS = ("foamfit.study.batch_work", "foamfit.data.csv_file", "pandas", "pint")
 PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
 DRAWING = ("foamfit.report.result_figures", "foamfit.springs.kernels", *PAGES)
-# Times that a call is tried whose process ends.
+# How often a call is tried if its process ends.
 ATTEMPTS = 2
 # One thread in each process: the processes are as many as the cores.
 ONE_THREAD = {
@@ -61,9 +61,9 @@ def check_jobs(jobs: int | None) -> None:
 
 
 def prepare(preload: Iterable[str]) -> None:
-    """Have the modules imported from which processes part, beside what this process does.
+    """Import modules, while this process goes on, in the one from which others are forked.
 
-    They are imported once, in a process of its own, where the system has such a start method.
+    Where the system has no such process, nothing is done.
     """
     if "forkserver" in multiprocessing.get_all_start_methods():
         from multiprocessing import forkserver
@@ -139,7 +139,7 @@ class Processes(Executor):
 
 
 def begin(jobs: int | None, count: int, few: int) -> None:
-    """Have imported what `workers` with these arguments will need, beside what goes on here."""
+    """Import what `workers` with these arguments will need, while this process goes on."""
     if _wanted(jobs, count, few) > 1:
         prepare(_JOINT)
 
@@ -182,7 +182,7 @@ def _starting() -> Iterator[None]:
 
 
 def _begin(stop: connection.Connection, law_files: Mapping[str, str]) -> None:
-    """Make a process ready: Ctrl-C is for the one that started it, whose end is its own."""
+    """Prepare a process: it ignores Ctrl-C and ends with the process that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()  # what the imports have made stays
     gc.set_threshold(100_000, 20, 10)

@@ -34,7 +34,7 @@ def find_tests(
     ------
     InputError
         If a glob matches no test, a folder has none, or nothing is there at all; the message names
-        it. One of several that is not there is left to who reads it, as a broken link is.
+        it. A missing file among several is refused where it is read, as a broken link is.
     """
     given = [patterns] if isinstance(patterns, str | Path) else list(patterns)
     if not given:
@@ -78,7 +78,7 @@ def _matches(pattern: str | Path, base: Path) -> list[Path]:
 def _is_test(path: Path) -> bool:
     """Whether a file is taken where it is not named itself."""
     if not path.is_file() and (path.is_dir() or not path.is_symlink()):
-        return False  # a broken link is left to who reads it
+        return False  # a broken link is refused where it is read
     plain = path.with_suffix("") if path.suffix.lower() == ".gz" else path  # no .tar.gz
     if plain.suffix.lower() not in ENDINGS or plain.stem.lower() in _SPECIMENS:
         return False
