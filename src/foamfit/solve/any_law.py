@@ -170,7 +170,8 @@ def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
                 if after <= 0.0 and half < 0.0:
                     share = sigma / (sigma - after) if sigma > after else 0.0
                     end = now + share * h
-                    w, v = w + share * h * half, half
+                    w += share * h * half  # the velocity is that of half of the step
+                    v = half + (share - 0.5) * h * (gravity - drag * half / mass)
                     break
                 w += h * half
                 v = half + 0.5 * h * (gravity - after / mass)
