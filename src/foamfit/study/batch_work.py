@@ -16,7 +16,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 from foamfit.api import fit
 from foamfit.codec import build, encode
@@ -77,11 +77,8 @@ class Task:
         return sum(len(one) for one in self.content or () if one)
 
 
-class Outcome(NamedTuple):
-    """What became of a test: its rows, and its files if they were to come back."""
-
-    rows: tuple[Row, ...]
-    files: Mapping[str, bytes] | None = None
+# What became of a test: its rows, and its files if they were to come back.
+Outcome = tuple[tuple[Row, ...], Mapping[str, bytes] | None]
 
 
 def settings_key(recipe: Recipe) -> str:
@@ -147,12 +144,12 @@ def work(task: Task) -> Outcome:
         try:
             if task.out is not None:
                 save_whole(task.out, fill, swept=True)
-                return Outcome(rows)
+                return rows, None
             with TemporaryDirectory() as place:
                 fill(folder := Path(place))
                 found = (path for path in sorted(folder.rglob("*")) if path.is_file())
                 files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in found}
-            return Outcome(rows, files)
+            return rows, files
         except OSError as error:
             raise InputError(str(error)) from None
 

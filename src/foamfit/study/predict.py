@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 from numbers import Integral
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -109,7 +108,9 @@ def predict(
         raise SimulationError(
             f"{measurement.name} cannot be predicted from {source.where}: {error}"
         ) from None
-    drawn = _draw(population, problem, point, draws, seed) if population.scattering else None
+    values, drawn, redrawn = list[Array](), list[dict[str, Array]](), 0
+    if population.scattering:
+        values, drawn, redrawn = _draw(population, problem, point, draws, seed)
     known = {"parameters": _by_parameters(population, aligning, point, tuple(aligned))}
     known |= {"motion": _by_motion(problem, point)}
     curves = dict[str, PredictedCurve]()
@@ -129,7 +130,7 @@ def predict(
         scattering=changing,
         held=population.held,
         untold=[one.channel for one in curves.values() if one.channel not in source.misses],
-        drawn=draws if drawn is None else len(drawn.values),
+        drawn=len(values) if changing else draws,
         draws=draws,
     )
     sentences = render.sentences(
@@ -152,12 +153,12 @@ def predict(
         seed=int(seed),
         curves=curves,
         misfit=objective.misfit(simulated),
-        parameters=_parameters(population, springs, drawn),
+        parameters=_parameters(population, springs, values),
         rate=rate,
         fitted_rates=source.rates,
         extrapolated=bool(outside),
-        draws=0 if drawn is None else len(drawn.values),
-        redrawn=0 if drawn is None else drawn.redrawn,
+        draws=len(values),
+        redrawn=redrawn,
         held=population.held,
         sentences=sentences,
         warnings=warnings,
@@ -265,14 +266,10 @@ def _aligned(
     return point, {name: told[name] for name in names}
 
 
-class _Drawn(NamedTuple):
-    values: list[Array]
-    curves: list[dict[str, Array]]
-    redrawn: int
-
-
-def _draw(population: Population, problem: Problem, point: Array, draws: int, seed: int) -> _Drawn:
-    """Draw and simulate until there are so many; what is not admissible is drawn again."""
+def _draw(
+    population: Population, problem: Problem, point: Array, draws: int, seed: int
+) -> tuple[list[Array], list[dict[str, Array]], int]:
+    """Draw and simulate: parameters, curves, and how many more were drawn as not admissible."""
     # What lies beyond the limits of a fit of the test is moved there, as a fit does: to draw it
     # again would leave one side of all other parameters out.
     objective, specimens, tried = problem.objective, population.draws(seed), 0
@@ -292,7 +289,7 @@ def _draw(population: Population, problem: Problem, point: Array, draws: int, se
             f"{population.source.where}: only {len(values)} of {tried} specimens drawn from its "
             "scatter can be simulated; hold or share what it leaves undetermined"
         )
-    return _Drawn(values, curves, tried - len(values))
+    return values, curves, tried - len(values)
 
 
 def _by_parameters(
@@ -335,7 +332,7 @@ def _curve(
     problem: Problem,
     name: str,
     predicted: Array,
-    drawn: _Drawn | None,
+    drawn: list[dict[str, Array]],
     source: Source,
     known: dict[str, Array],
 ) -> PredictedCurve:
@@ -344,8 +341,8 @@ def _curve(
     channel, n = objective.channel(name), predicted.size
     parts = {part: np.zeros(n) for part in COLOURS if part != "motion"} | known
     low = middle = high = predicted
-    if drawn is not None:
-        ends = np.quantile([curves[name] for curves in drawn.curves], (*BAND, 0.5), axis=0)
+    if drawn:
+        ends = np.quantile([curves[name] for curves in drawn], (*BAND, 0.5), axis=0)
         low, high, middle = ends
         both = 0.5 * (high - low)
         parts["scatter"] = np.sqrt(np.maximum(both**2 - parts["parameters"] ** 2, 0.0))
@@ -353,7 +350,7 @@ def _curve(
     parts["noise"] = np.full(n, NORMAL * sigma)
     missed = source.law_error(channel, sigma / float(np.ptp(objective.measured[name])))
     parts["law_error"] = missed * span * np.sqrt(_grown(problem.measurement, source))
-    within = {"scatter"} if drawn is None else {"scatter", "parameters"}  # of the draws
+    within = {"scatter", "parameters"} if drawn else {"scatter"}  # of the draws
     more = sum(parts[part] ** 2 for part in parts.keys() - within)
     kept = np.zeros(n, dtype=bool)
     kept[objective.kept(name)] = True
@@ -380,13 +377,13 @@ def _grown(measurement: Measurement, source: Source) -> Array:
 
 
 def _parameters(
-    population: Population, point: Array, drawn: _Drawn | None
+    population: Population, point: Array, drawn: list[Array]
 ) -> dict[str, PredictedParameter]:
     """Each parameter at the test and its 95 % interval, within its limits."""
     half = population.quantile * np.sqrt(np.maximum(np.diag(population.covariance), 0.0))
     ends = np.array([point - half, point + half])
-    if drawn is not None:
-        ends = np.quantile(drawn.values, BAND, axis=0)
+    if drawn:
+        ends = np.quantile(drawn, BAND, axis=0)
     ends = np.clip(ends, *_limits(population, point))
     rows = zip(population.source.parameters, point.tolist(), *ends.tolist(), strict=True)
     known = population.source.parameters
