@@ -116,9 +116,6 @@ def fit(
         Whether branch a of every microscale spring stiffens as the test says: s1_stiffening.
     mullins : bool
         Whether what has snapped once softens and weakens: s1_softening, s1_weakening.
-    loss : str
-        "linear" (least squares), or one that reduces the weight of large residuals: "soft_l1",
-        "huber" or "cauchy".
     intervals : str
         Method of the 95 % intervals: "auto" (local covariance, and profiles of the parameters
         along which the cost is not parabolic), "local", "profile", "bootstrap" or "mcmc".

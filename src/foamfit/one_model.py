@@ -81,7 +81,6 @@ class Keywords(TypedDict, total=False):
     relaxation: int
     stiffening: bool
     mullins: bool
-    loss: str
     intervals: str
     draws: int | None
     priors: Mapping[str, str | tuple[float, float]] | None
@@ -105,7 +104,6 @@ class Options:
     relaxation: int = 0
     stiffening: bool = False
     mullins: bool = False
-    loss: str = "linear"
     intervals: str = "auto"
     draws: int | None = None
     priors: Mapping[str, str | tuple[float, float]] | None = None
@@ -161,12 +159,17 @@ class Options:
     ) -> Problem:
         """Set up the fit of one model."""
         model = with_options(model, **self.of_springs)
-        more: dict[str, Any] = {
-            name: getattr(self, name) for name in ("time_shift", "loss", "relaxation")
-        }
-        given = (self.drive, params, self.weights, self.interior_mass)
-        more["priors"] = measurement.priors | dict(self.priors or {})
-        return make_problem(measurement, model, *given, **more)
+        return make_problem(
+            measurement,
+            model,
+            self.drive,
+            params,
+            self.weights,
+            self.interior_mass,
+            time_shift=self.time_shift,
+            relaxation=self.relaxation,
+            priors=measurement.priors | dict(self.priors or {}),
+        )
 
 
 @dataclass(frozen=True, eq=False)

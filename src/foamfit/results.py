@@ -409,7 +409,6 @@ class Fit:
     checklist: tuple[Check, ...] = ()
     insight: Insight | None = None
     stopped: str | None = None  # what ended the search early: "the time limit", "Ctrl-C"
-    loss: str = "linear"
     noise: dict[str, dict[str, Any]] = field(default_factory=dict)  # of each counted curve
     intervals: Intervals | None = None
     ladder: Ladder | None = None
@@ -513,7 +512,7 @@ class Fit:
                 "notes": test.notes,
             },
             "specimen": asdict(test.specimen),
-            **{name: getattr(self, name) for name in (*asked, "loss", "warnings", "notes")},
+            **{name: getattr(self, name) for name in (*asked, "warnings", "notes")},
             **model.options,
             "model": model.words,
             "checklist": [asdict(check) for check in self.checklist],

@@ -65,12 +65,6 @@ fit_options = options.together(
     option("--time-shift", "Fit the delay of the motion against the force."),
     options.RELAXATION,
     *options.MORE,
-    option(
-        "--loss",
-        "All but linear weigh large residuals less.",
-        click.Choice(["linear", "soft_l1", "huber", "cauchy"]),
-        default="linear",
-    ),
     option("--profile", "95 % intervals by profile likelihood."),
     option(
         "--bootstrap", "95 % intervals by N >= 40 refits to resampled blocks.", int, metavar="N"

@@ -36,7 +36,7 @@ from foamfit.fitting.curves import (
     later,
     moved_at,
 )
-from foamfit.fitting.losses import LOSSES, Weighing, soften, softness
+from foamfit.fitting.weighing import Weighing
 from foamfit.solve.plan import AnyPlan, Motion
 from foamfit.solve.plan import plan as make_plan
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
@@ -97,7 +97,6 @@ class Objective:
     nuisance: tuple[str, ...] = OF_DRIVE
     # The covariance that a driving motion's own uncertainty gives the residual; see `weigh_motion`.
     weighing: Weighing | None = None
-    loss: str = "linear"  # One of `LOSSES`
     given: tuple[nuisances.Prior, ...] = ()  # Priors of parameters of the springs
     followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is known already
     evaluations: int = field(default=0, init=False)  # Sets of parameters that were simulated
@@ -108,10 +107,6 @@ class Objective:
         check_drive(self.measurement, self.drive)
         if self.time_shift:
             check_time_shift(self.measurement, self.drive)
-        if self.loss not in LOSSES:
-            raise InputError(
-                f"loss '{self.loss}' is unknown; it must be one of {', '.join(LOSSES)}"
-            )
         if self.nuisance == OF_DRIVE:
             self.nuisance = nuisances.names_of(self.drive, time_shift=self.time_shift)
         self.rtol = max(self.rtol, RTOL_OF_ANY_LAW * self.model.is_registered)
@@ -176,7 +171,7 @@ class Objective:
         uncertain = self.by_motion(values)
         if uncertain is None:
             return False
-        plain = np.abs(self._moved_by(0.0).differences(values)[: self.n_data])
+        plain = np.abs(self._moved_by(0.0).residual(values)[: self.n_data])
         parts = np.split(plain, np.cumsum(self.sizes)[:-1])
         levels = [
             max(NORMAL * float(np.median(part)), self.noise(name).sigma * self.factor(name), 1e-9)
@@ -192,7 +187,7 @@ class Objective:
         modes = self.motion.modes(self._clock)
         out = np.empty((self.n_data, modes.shape[1]))
         for column, mode in zip(out.T, modes.T, strict=True):
-            sides = [self._moved_by(side * mode).differences(values) for side in (-0.5, 0.5)]
+            sides = [self._moved_by(side * mode).residual(values) for side in (-0.5, 0.5)]
             column[:] = (sides[1] - sides[0])[: self.n_data]
         self.evaluations += 2 * modes.shape[1]
         return out
@@ -560,19 +555,14 @@ class Objective:
 
     # ------------------------------------------------------------------ residual
 
-    def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
+    def residual(self, values: Array) -> Array:
         """Weighted residuals of all counted curves and of the priors, dimensionless.
 
         The first `n_data` are those of the curves: simulated minus measured over the curve's scale,
-        times the root of its weight, softened by the loss; outliers are left out. Behind them
-        stands a residual for each of the `priors`, over its standard deviation. Parameters that
-        cannot be simulated cost a finite penalty and are counted in `failures`. `shift` is taken
-        off before the loss, as if the data differed from the measured ones by that amount.
+        times the root of its weight; outliers are left out. Behind them stands a residual for each
+        of the `priors`, over its standard deviation. Parameters that cannot be simulated cost a
+        finite penalty and are counted in `failures`.
         """
-        return soften(self.differences(values) - shift, self.loss, self.n_data)
-
-    def differences(self, values: Array) -> Array:
-        """Residuals before the loss gives way to large ones; see `residual`."""
         try:
             curves = self.simulate(values)
         except SimulationError:
@@ -585,7 +575,7 @@ class Objective:
         return np.array([(value - one.mean) / one.sigma for value, one in pairs])
 
     def compare(self, curves: Simulated, values: Array) -> Array:
-        """Residuals of simulated curves before the loss gives way to large ones; see `residual`."""
+        """Residuals of simulated curves; see `residual`."""
         parts = [
             (curves.curves[name] - self.measured[name])[self._kept[name]] * self.factor(name)
             for name in self.counted
@@ -632,8 +622,6 @@ class Objective:
         residual = self.compare(curves, values)[: self.n_data]
         slopes[np.abs(residual) >= self.penalty] = 0.0
         slopes = slopes if self.weighing is None else self.weighing(slopes)
-        if self.loss != "linear":
-            slopes *= softness(residual, self.loss)[:, None]
         return np.concatenate([slopes, by_priors]) if self.priors else slopes
 
     def jacobian_along(self, values: Array, moves: Array) -> Array:
@@ -651,7 +639,7 @@ class Objective:
         return self.time.size if taken is None else int(np.count_nonzero(taken))
 
     def rms(self, residual: Array) -> dict[str, float]:
-        """RMS of each counted curve in its unit, from residuals before the loss."""
+        """RMS of each counted curve in its unit, from residuals."""
         parts = np.split(residual[: self.n_data], np.cumsum(self.sizes)[:-1])
         return {
             name: float(np.sqrt(np.mean(part**2))) / self.factor(name)

@@ -212,13 +212,6 @@ class Problem:
         """What was taken off the record, by parameter, SI: values + origins are the file's own."""
         return np.array([self.measurement.origins.get(name, 0.0) for name in self.names])
 
-    @cached_property
-    def linear(self) -> Problem:
-        """The same problem without a soft loss, for derivatives of the plain residuals."""
-        if self.objective.loss == "linear":
-            return self
-        return replace(self, objective=replace(self.objective, loss="linear"))
-
     def vector(self, params: lmfit.Parameters | None = None) -> Array:
         """Flat vector of these parameters, or of the problem's own."""
         values = (self.params if params is None else params).valuesdict()
@@ -371,7 +364,6 @@ def make_problem(
     interior_mass: bool,
     *,
     time_shift: bool = False,
-    loss: str = "linear",
     relaxation: int = 0,
     priors: Mapping[str, object] | None = None,
 ) -> Problem:
@@ -392,7 +384,7 @@ def make_problem(
     time_shift = nuisance.is_late(measurement, time_shift=time_shift)
     objective = Objective(
         measurement, model, drive, chosen,
-        interior_mass=interior_mass, time_shift=time_shift, loss=loss,
+        interior_mass=interior_mass, time_shift=time_shift,
         given=tuple(_prior(name, value, model) for name, value in (priors or {}).items()),
     )  # fmt: skip
     measurement = objective.measurement  # with the noise of each channel

@@ -96,7 +96,7 @@ class Tracker:
     ends: list[Array] = field(default_factory=list)
 
     def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
-        """Residual of the objective; raises SearchStoppedError once the time is up."""
+        """Residual less a shift; raises SearchStoppedError once the time is up."""
         residual = self.consider(values, shift)
         if self.pulse is not None and self.objective.evaluations % PULSE == 0:
             self.pulse()
@@ -118,10 +118,10 @@ class Tracker:
     def consider(self, values: Array, shift: Array | float = 0.0) -> Array:
         """Residual of the objective, whatever the time; with a shift, that of other data."""
         failures = self.objective.failures
-        residual = self.objective.residual(values, shift)
-        cost = float(residual @ residual)
+        residual = self.objective.residual(values)
         if np.any(shift):
-            return residual
+            return residual - shift
+        cost = float(residual @ residual)
         if cost < self.best_cost and self.objective.failures == failures:
             self.best_cost, self.best_values = cost, values.copy()
             if self.better is not None:
@@ -346,7 +346,7 @@ def _search_loop(
     loop = smooth_loop(objective.measurement, followed)
     along = Objective(
         loop, objective.model, "displacement", {"stress_strain": 1.0},
-        time_shift=objective.time_shift, nuisance=objective.nuisance, loss=objective.loss,
+        time_shift=objective.time_shift, nuisance=objective.nuisance,
     )  # fmt: skip
     inner = Tracker(along, tracker.deadline, tracker.better)
     own = space

@@ -34,7 +34,7 @@ CHECKOUTS = (Path(), Path(__file__).parents[3])
 SHOWN = ("model", "drive", "relaxation", "cycle")
 FOLDED = (
     *laws.OPTIONS,
-    *("cycles", "starts", "max_time", "seed", "loss", "interior_mass", "time_shift"),
+    *("cycles", "starts", "max_time", "seed", "interior_mass", "time_shift"),
     *("profile", "bootstrap", "mcmc"),
 )
 # Options on which the curves of a model depend.

@@ -19,33 +19,16 @@ from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
 from foamfit.fitting.branches import unreached
 from foamfit.fitting.links import LOG_RATE, RATES, factor
-from foamfit.fitting.losses import influence, soften
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Block, Covariance, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
-from foamfit.trust.residuals.noise_process import basis_of, parts
+from foamfit.trust.residuals.noise_process import basis_of
 
 # Share of the residuals along a direction that a cycle takes at most, so that it is not all.
 MOST_TAKEN = 0.99
-
-
-def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:
-    """Weights of slopes and pseudo-residuals whose least squares have the covariance of a loss.
-
-    With the mean m of ψ'(r) over each curve (of `sizes` samples): √m and ψ(r)/√m. The normal matrix
-    of the slopes so weighted is half the curvature of the cost, and the covariance of their least
-    squares that of an M-estimate (Huber 1981, Robust Statistics, section 7.6). Under the linear
-    loss they are one and the residuals, as for priors, which follow the curves, under any loss.
-    """
-    psi, slope = influence(residual, loss)
-    weights, data = np.ones(residual.size), sum(sizes)
-    psi[data:] = residual[data:]
-    for part in parts(sizes):
-        weights[part] = max(float(slope[part].mean()), 0.05) ** 0.5
-    return weights, psi / weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,19 +50,13 @@ class BestPoint:
 
     @cached_property
     def residual(self) -> Array:
-        """Residual of curves and priors before the loss reduces large ones."""
+        """Residual of curves and priors."""
         return self.problem.objective.compare(self.simulated, self.values)
 
     @cached_property
-    def soft(self) -> Array:
-        """Residual of curves and priors, softened by the loss."""
-        objective = self.problem.objective
-        return soften(self.residual, objective.loss, objective.n_data)
-
-    @cached_property
     def cost(self) -> float:
-        """Sum of squares of the softened residual."""
-        return float(self.soft @ self.soft)
+        """Sum of squares of the residual."""
+        return float(self.residual @ self.residual)
 
     @cached_property
     def unreached(self) -> dict[str, str]:
@@ -121,14 +98,7 @@ class BestPoint:
     @cached_property
     def jacobian(self) -> Array:
         """Derivative of `residual` by them, (n_data, k)."""
-        return self.problem.linear.slopes(self.values, self.names)
-
-    @cached_property
-    def weighted(self) -> tuple[Array, Array]:
-        """Jacobian and residual whose least squares have the covariance of the loss."""
-        objective = self.problem.objective
-        weights, pseudo = m_estimate(self.residual, objective.sizes, objective.loss)
-        return self.jacobian * weights[:, None], pseudo
+        return self.problem.slopes(self.values, self.names)
 
     @cached_property
     def errors(self) -> tuple[CurveError, ...]:
@@ -137,8 +107,8 @@ class BestPoint:
 
     def to_judge(self, taken: Array | None = None) -> tuple[Any, ...]:
         """What `curve_errors` takes; `taken` is what a joint fit took of the noise."""
-        (jacobian, pseudo), objective = self.weighted, self.problem.objective
-        return pseudo, jacobian * self.sizes, objective.sizes, taken, objective.drive == "stress"
+        objective, scaled = self.problem.objective, self.jacobian * self.sizes
+        return self.residual, scaled, objective.sizes, taken, objective.drive == "stress"
 
     @property
     def misfits(self) -> bool:
@@ -146,11 +116,10 @@ class BestPoint:
         return any(error.found for error in self.errors)
 
     def block(self, errors: Sequence[CurveError]) -> Block:
-        """Its part in a covariance, by the errors of its curves; as estimated with the loss."""
-        jacobian, pseudo = self.weighted
+        """Its part in a covariance, by the errors of its curves."""
         return Block(
-            jacobian * self.sizes,
-            pseudo,
+            self.jacobian * self.sizes,
+            self.residual,
             self.problem.objective.sizes,
             [error.noise for error in errors],
             np.eye(len(self.names)),
@@ -171,7 +140,7 @@ class BestPoint:
 
     @cached_property
     def spread(self) -> Covariance:
-        """Their local covariance, as estimated with the loss."""
+        """Their local covariance."""
         return Uncertainty((self.block(self.errors),), self.sizes).covariance
 
     @cached_property
@@ -191,7 +160,7 @@ class BestPoint:
         return [name for name, known in zip(self.names, told, strict=True) if known]
 
     def rises(self, residual: Array) -> Array:
-        """Rise of the cost at another point, from its softened residual, as χ² of each, (k,)."""
+        """Rise of the cost at another point, from its residual, as χ² of each, (k,)."""
         return np.asarray((float(residual @ residual) - self.cost) / self.spread.inflation)
 
 
@@ -394,7 +363,9 @@ def cycle_growth(best: BestPoint) -> float | None:
         return None
     last = spans[max(spans)]
     kept = np.concatenate([objective.kept(name) for name in objective.counted])
-    return growth(*best.weighted, np.flatnonzero((kept >= last.start) & (kept < last.stop)))
+    return growth(
+        best.jacobian, best.residual, np.flatnonzero((kept >= last.start) & (kept < last.stop))
+    )
 
 
 def growth(jacobian: Array, residual: Array, rows: NDArray[np.intp]) -> float:

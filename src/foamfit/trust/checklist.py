@@ -322,7 +322,7 @@ def _damping_hint(best: BestPoint, determined: Sequence[str]) -> float | None:
     alone = problem.objective.drive == "displacement" and len(problem.model.kinds) == 1
     if not alone or problem.measurement.time is None or held.vary or held.value != 0.0:
         return None
-    column = problem.linear.slopes(best.values, (name,))[:, 0]
+    column = problem.slopes(best.values, (name,))[:, 0]
     size = float(problem.sizes((name,), best.values)[0])
     eta = _one_step(best, determined, column, size)
     return eta if eta is not None and eta > 0.0 else None

@@ -17,7 +17,6 @@ from foamfit.data.measurement import INTEGRATED, interior_channel
 from foamfit.errors import SimulationError
 from foamfit.fitting.branches import visited
 from foamfit.fitting.curves import MOTION_CURVES
-from foamfit.fitting.losses import LOSSES
 from foamfit.fitting.objective import MODEL_ERROR, Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstimate, Switch
@@ -93,7 +92,6 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         checklist=checklist,
         insight=insight,
         stopped=record.stopped,
-        loss=objective.loss,
         relaxation=problem.model.relaxation,
         interior_mass=objective.interior_mass,
         noise=noise_of(best, best.errors if best.names else ()),
@@ -141,8 +139,6 @@ def _noise_notes(objective: Objective) -> Iterator[str]:
             yield say("note", "outliers", count=outliers.at.size, channel=channel)
     if objective.time_shift and objective.drive != "impact":
         yield say("note", "late")
-    if objective.loss != "linear":
-        yield say("note", "loss", loss=objective.loss, width=LOSSES[objective.loss])
 
 
 def _notes(best: BestPoint) -> Iterator[str]:

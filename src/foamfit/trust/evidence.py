@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
 from foamfit.fitting.branches import branch_of_samples
-from foamfit.fitting.losses import soften, softness
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import Tracker
 from foamfit.results import Fit, rung_name
@@ -118,12 +117,11 @@ class Tried:
         self.varied = sum(item.vary for item in self.result.parameters.values())
         self.counted, self.sizes = objective.counted, objective.sizes
         self.spans = [objective.span(name) for name in self.counted]  # in the unit of the residual
-        self.residual = soften(best.residual[: objective.n_data], objective.loss)
+        self.residual = best.residual[: objective.n_data]
         slices = parts(self.sizes)
         self.curves = [self.residual[part] for part in slices]
         self.taus = [autocorrelation_time(curve) for curve in self.curves]
-        soft = softness(best.residual, objective.loss)
-        jacobian = soft[:, None] * best.jacobian * best.sizes
+        jacobian = best.jacobian * best.sizes
         self.grams = np.array([jacobian[part].T @ jacobian[part] for part in slices])
         pairs = zip(self.sizes, self.spans, strict=True)
         floor = sum(n * (EXACT * span) ** 2 for n, span in pairs)

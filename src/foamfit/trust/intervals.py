@@ -156,7 +156,7 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     difference of their residuals.
     """
     if best.misfits:
-        apart, objective = (residual - best.soft)[:, None], best.problem.objective
+        apart, objective = (residual - best.residual)[:, None], best.problem.objective
         noise = zip(best.spread.noise, parts(objective.sizes), strict=True)
         spread = float(np.sum(apart[objective.n_data :] ** 2))  # of priors, of unit variance
         spread += sum(float(process.forms(apart[part])[0]) for process, part in noise)

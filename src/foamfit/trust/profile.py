@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.fitting.levenberg import Iterate, damped_step, descend
-from foamfit.fitting.losses import soften, softness
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
 from foamfit.results import Profile
 from foamfit.trust.best_point import BestPoint
@@ -44,8 +43,7 @@ class Refit:
 
     best: BestPoint
     tracker: Tracker  # Simulates, counts and ends all at its deadline
-    # Taken off the residual, before the loss: data (and means of priors) that differ from those
-    # that were fitted.
+    # Taken off the residual: data (and means of priors) that differ from those that were fitted.
     shift: Array | float = 0.0
 
     def __post_init__(self) -> None:
@@ -57,16 +55,8 @@ class Refit:
 
     def start(self) -> Iterate:
         """The best point itself."""
-        differences = self.best.residual - self.shift
-        objective = self.best.problem.objective
-        soft = soften(differences, objective.loss, objective.n_data)
-        return Iterate(self.best.values, soft, self._jacobian(differences, self.best.jacobian))
-
-    def _jacobian(self, differences: Array, slopes: Array) -> Array:
-        """Derivative of the softened residual by the scaled parameters."""
-        objective = self.best.problem.objective
-        soft = softness(differences, objective.loss, objective.n_data)
-        return np.asarray(soft[:, None] * slopes * self.best.sizes)
+        best = self.best
+        return Iterate(best.values, best.residual - self.shift, best.jacobian * best.sizes)
 
     def residual(self, point: Array) -> Array | None:
         """Residual of a point that can be simulated, else None."""
@@ -112,11 +102,8 @@ class Refit:
             return np.asarray(root * self.tracker.residual(self.point(scaled, box), self.shift))
 
         def jacobian(scaled: Array) -> Array:
-            point = self.point(scaled, box)
-            slopes: Array = problem.linear.slopes(point, names) * np.reshape(root, (-1, 1))
-            if problem.objective.loss == "linear":
-                return slopes * sizes
-            return self._jacobian(problem.objective.differences(point) - self.shift, slopes)
+            slopes = problem.slopes(self.point(scaled, box), names)
+            return np.asarray(slopes * np.reshape(root, (-1, 1)) * sizes)
 
         begin = np.clip(start[self.best.places], *box) / sizes
         first = self.residual(self.point(begin, box))

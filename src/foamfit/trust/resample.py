@@ -36,18 +36,18 @@ def block_length(process: NoiseProcess, n: int) -> int:
 
 
 def _source(
-    residual: Array, like: Array, process: NoiseProcess, law: bool
+    residual: Array, process: NoiseProcess, law: bool
 ) -> Callable[[np.random.Generator], Array]:
     """What draws the noise of one curve: its process beside an error of the law, else its residual.
 
     From the residual, circular blocks with random starts (Politis & Romano 1992). A factor corrects
-    that residuals are smaller than the noise was, which was read off `like`, and that blocks break
-    correlation at their ends: sums over the curve vary as those of its noise.
+    that residuals are smaller than the noise was, and that blocks break correlation at their ends:
+    sums over the curve vary as those of its noise.
     """
     n, length = residual.size, block_length(process, residual.size)
     lags = process.autocovariance(length) / process.variance
     within = 1.0 + 2.0 * float((1.0 - np.arange(1, length) / length) @ lags[1:])
-    power = max(float(np.var(like)), 1e-300)
+    power = max(float(np.var(residual)), 1e-300)
     factor = process.variance / power * max(process.tau / within, 1.0)
     scaled = (residual - residual.mean()) * math.sqrt(factor)
 
@@ -74,12 +74,12 @@ def bootstrap(
     objective = best.problem.objective
     tracker = Tracker(objective) if tracker is None else tracker
     rng = np.random.default_rng([seed, 1])
-    priors, pseudo = len(objective.priors), best.weighted[1]
+    priors = len(objective.priors)
     sources, fitted = [], best.residual[: objective.n_data].copy()
     for part, process, error in zip(
         parts(objective.sizes), best.spread.noise, best.errors, strict=True
     ):
-        sources.append(_source(best.residual[part], pseudo[part], process, error.found))
+        sources.append(_source(best.residual[part], process, error.found))
         if error.found:
             fitted[part] = 0.0
     out: list[Array] = []
