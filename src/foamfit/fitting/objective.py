@@ -127,6 +127,7 @@ class Objective:
             self._own = np.searchsorted(self._clock, own) if self._clock.size > own.size else None
         driving = {"stress": ["stress_time"], "displacement": ["displacement_time"]}
         self._absent = driving.get(self.drive, []) + ["stress_time"] * (time is None)
+        self.usual = nuisances.values_of(self.measurement)
         loading = self._loading()
         self._plans = {damped: self._scene(loading, damped=damped) for damped in (False, True)}
         self.measured = self._measured()
@@ -211,7 +212,6 @@ class Objective:
             if (zero := channels.get(self.channel(curve))) in self.nuisance
         }
         gap = float(np.median(np.diff(self._clock)))
-        self.usual = nuisances.values_of(self.measurement)
         self._steps = dict.fromkeys(self.nuisance, STEP_OF_TIME * gap)
         self._steps |= {name: RELATIVE_STEP * self.usual[name] for name in nuisances.STRIKER}
         if self.measurement.displacement is not None:
@@ -229,11 +229,7 @@ class Objective:
 
     def _loading(self) -> Drive:
         if self.drive == "impact":
-            striker = self.measurement.striker
-            assert striker is not None
-            assert striker.mass is not None
-            assert striker.velocity is not None
-            return Impact(striker.mass, striker.velocity)
+            return Impact(self.usual[nuisances.STRIKER_MASS], self.usual[nuisances.VELOCITY])
         if self.drive == "stress":
             return StressDrive(driving_stress(self._stress, self.model))
         return DisplacementDrive(self._moved)
@@ -329,48 +325,47 @@ class Objective:
     ) -> Simulated:
         """Curves of springs as the channels show them, and their derivatives; see `simulate`."""
         own = places < values.size
-        zero = [p for p in places[~own] if self.nuisance[p - values.size] == "displacement_zero"]
-        damped = values[: self._dashpots.size][self._dashpots].any()
-        still = not (damped or self._dashpots[places[own]].any())
-        moved = bool(zero) and still and self._plans[False].moves_one
-        curves = self._curves(values, nuisance, everything, places[own], moved=moved)
         if own.all():
-            return curves
-        slopes = {}
-        by_zero = {}
-        if moved and curves.slopes is not None:  # the motion goes back by as much
-            by_zero = {int(zero[0]): {name: -one[-1] for name, one in curves.slopes.items()}}
-            own_slopes = {name: one[:-1] for name, one in curves.slopes.items()}
-            curves = replace(curves, slopes=own_slopes)
-        given = curves.slopes or {name: np.empty((0, self.time.size)) for name in curves.curves}
-        by_nuisance = by_zero | {
-            int(place): self._nuisance_slope(values, nuisance, int(place) - values.size)
-            for place in places[~own]
-            if int(place) not in by_zero
+            return self._curves(values, nuisance, everything, places)
+        named = {int(p): self.nuisance[p - values.size] for p in places[~own]}
+        zero = next((p for p, name in named.items() if name == "displacement_zero"), None)
+        still = not self._is_damped(values, places[own])
+        moved = zero is not None and still and self._plans[False].moves_one
+        curves = self._curves(values, nuisance, everything, places[own], moved=moved)
+        carried = curves.slopes or {}
+        by = {
+            int(place): {name: rows[i] for name, rows in carried.items()}
+            for i, place in enumerate(places[own])
         }
-        for name, carried in given.items():
-            slopes[name] = out = np.empty((places.size, self.time.size))
-            out[own] = carried
-            out[~own] = np.reshape(
-                [by_nuisance[int(place)][name] for place in places[~own]], (-1, self.time.size)
-            )
+        for place, name in named.items():
+            if moved and place == zero:  # the motion goes back by as much
+                by[place] = {curve: -rows[-1] for curve, rows in carried.items()}
+            else:
+                by[place] = self._nuisance_slope(values, nuisance, name)
+        slopes = {
+            name: np.array([by[place][name] for place in places.tolist()]) for name in curves.curves
+        }
         return replace(curves, slopes=slopes)
 
-    def _nuisance_slope(self, values: Array, nuisance: Array, at: int) -> dict[str, Array]:
+    def _is_damped(self, values: Array, places: NDArray[np.int64]) -> bool:
+        """Whether a spring has a dashpot, or a derivative by one is wanted."""
+        eta = self._dashpots
+        return bool(values[: eta.size][eta].any() or eta[places].any())
+
+    def _nuisance_slope(self, values: Array, nuisance: Array, name: str) -> dict[str, Array]:
         """Derivative of the curves by one nuisance parameter.
 
         The zero of a channel adds to it; the others by a central difference of two simulations,
         whose error is far below that of their steps. So is the zero of a motion along which the
         stress of an impact is counted.
         """
-        name, n = self.nuisance[at], self.time.size
+        n, at, step = self.time.size, self.nuisance.index(name), self._steps[name]
         followed = self._driven or "stress_strain" in self.counted
         if name in nuisances.ZEROS and not (followed and name == "displacement_zero"):
             own = {curve: self._zero_of.get(curve) == name for curve in self.curves}
             return {curve: np.full(n, float(shifted)) for curve, shifted in own.items()}
         if self.drive != "impact" and name not in (nuisances.TIME_SHIFT, "displacement_zero"):
             return {curve: np.zeros(n) for curve in self.curves}
-        step = self._steps[name]
         sides = []
         for side in (-0.5, 0.5):
             there = nuisance.copy()
@@ -380,89 +375,70 @@ class Objective:
         if name == nuisances.CONTACT_TIME:  # with a dashpot the stress jumps there
             jumped = np.abs(self._clock - nuisance[at]) <= step
             for slope in slopes.values():
-                slope[np.any(jumped.reshape(self.time.size, -1), axis=1)] = 0.0
+                slope[np.any(jumped.reshape(n, -1), axis=1)] = 0.0
         return slopes
 
     def _curves(
-        self, values: Array, nuisance: Array, everything: bool, places: NDArray[np.int64],
-        *, moved: bool = False,
-    ) -> Simulated:  # fmt: skip
+        self,
+        values: Array,
+        nuisance: Array,
+        everything: bool,
+        places: NDArray[np.int64],
+        moved: bool = False,
+    ) -> Simulated:
         """Curves of springs with derivatives by their own parameters alone; see `simulate`.
 
         The last derivative is by the displacement if the driving motion is to be `moved`.
         """
-        height = self.measurement.specimen.height
-        rows = self.model.rows(values)
+        height, rows = self.measurement.specimen.height, self.model.rows(values)
         heights = np.ascontiguousarray(self.model.heights(values, height))
         if rows is None or not (np.all(heights > 0.0) and values[-1] >= 0.0):
             raise SimulationError("the parameters are not admissible")
-        # A dashpot at zero is left out, unless a derivative by it is wanted.
-        damped = bool(values[: self._dashpots.size][self._dashpots].any()) or bool(
-            self._dashpots[places].any()
-        )
-        drag = float(values[-1]) / height
-        everywhere = everything or self._inside
+        damped = self._is_damped(values, places)  # a dashpot at zero is left out
+        drag, everywhere = float(values[-1]) / height, everything or self._inside
         wanted = self.model.directions[places]
         wanted = np.append(wanted, [(0, MOVED)], axis=0) if moved else wanted
         at = dict(zip(self.nuisance, nuisance.tolist(), strict=True))
-        plan = self._placed(self._plans[damped], at)
 
         def run(plan: AnyPlan, everything: bool) -> Motion:
             return plan.run(
                 rows, heights, self.rtol, drag=drag, everything=everything, directions=wanted
             )
 
-        motion = run(plan, everywhere)
-        late = at.get(nuisances.TIME_SHIFT, 0.0)
-        shown = motion
+        plan, late = self._placed(self._plans[damped], at), at.get(nuisances.TIME_SHIFT, 0.0)
+        shown = motion = run(plan, everywhere)
         if late != 0.0 and self.drive == "impact":
             shown = run(plan._replace(time=plan.time - late), everywhere)
         along = motion if self._driven else None
-        wanted_along = everything or "stress_strain" in self.counted
-        if along is None and wanted_along and self._along:
+        if along is None and (everything or "stress_strain" in self.counted) and self._along:
             along = run(self._followed(self._along[damped], at), False)
-        parts = self._parts(motion, shown, along, everywhere, (values, at))
-        curves = {name: self._sampled(curve) for name, (curve, _) in parts.items()}
-        seen = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
-        for name in curves:
-            zero = self._zero_of.get(name)
-            if zero is not None:
-                curves[name] = curves[name] + at[zero]
-            curves[name] = self._late(name, curves[name], late)
-        if not len(wanted):
-            return Simulated(curves, seen)
-        slopes = {}
-        for name, (_, slope) in parts.items():
-            if slope is None:
-                continue
-            by_site = np.flatnonzero(places == values.size - 1)
-            slopes[name] = self._sampled(slope)
-            slopes[name][by_site] /= height  # site_eta acts through η_site/H
-            if name == "acceleration_time":
-                slopes[name][by_site] += self._sampled(self._push_of_site(shown, at)) / height
-            slopes[name] = self._late(name, slopes[name], late)
-        return Simulated(curves, seen, slopes)
-
-    def _parts(
-        self, motion: Motion, moved: Motion, along: Motion | None, everywhere: bool,
-        point: tuple[Array, dict[str, float]],
-    ) -> dict[str, tuple[Array, Array | None]]:  # fmt: skip
-        """Each curve and its derivatives at the instants that are simulated."""
 
         def of(run: Motion, node: int) -> tuple[Array, Array | None]:
             return run.displacement[node], run.slopes and run.slopes.displacement[:, node]
 
-        parts: dict[str, tuple[Array, Array | None]] = {
+        parts = {
             "stress_time": (motion.base_stress, motion.slopes and motion.slopes.base_stress),
-            "displacement_time": of(moved, -1),
+            "displacement_time": of(shown, -1),
         }
         if everywhere:
-            parts |= {name: of(moved, node - 1) for name, node in self.interior.items()}
+            parts |= {name: of(shown, node - 1) for name, node in self.interior.items()}
         if along is not None:
             parts["stress_strain"] = along.base_stress, along.slopes and along.slopes.base_stress
+        by_site = np.flatnonzero(places == values.size - 1)
         if self.accelerated:
-            parts["acceleration_time"] = self._acceleration(moved, *point)
-        return {name: part for name, part in parts.items() if name not in self._absent}
+            parts[ACCELERATION] = self._acceleration(shown, drag, at, by_site)
+        curves, slopes = dict[str, Array](), dict[str, Array]()
+        for name, (curve, slope) in parts.items():
+            if name in self._absent:
+                continue
+            curve, zero = self._sampled(curve), self._zero_of.get(name)
+            curves[name] = self._late(name, curve + at[zero] if zero else curve, late)
+            if slope is not None:
+                sampled = self._sampled(slope)
+                sampled[by_site] /= height  # site_eta acts through η_site/H
+                slopes[name] = self._late(name, sampled, late)
+        seen = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
+        return Simulated(curves, seen, slopes if len(wanted) else None)
 
     # ------------------------------------------------------------------ where and when
 
@@ -524,34 +500,29 @@ class Objective:
         rows = [np.interp(when, self.time, row) for row in np.atleast_2d(curves)]
         return np.reshape(rows, curves.shape)
 
-    def _push_of_site(self, motion: Motion, at: dict[str, float]) -> Array:
-        """Deceleration of the striker by an onsite damper of η_site/H = 1 Pa·s/m, m/s²."""
-        per_mass = self.measurement.specimen.area / at[nuisances.STRIKER_MASS]
-        clock = self._clock - at[nuisances.CONTACT_TIME]
-        speed = np.gradient(motion.displacement[-1], self._clock)
-        return np.where(clock < 0.0, 0.0, per_mass * speed)
-
     def _acceleration(
-        self, motion: Motion, values: Array, at: dict[str, float]
+        self, motion: Motion, drag: float, at: dict[str, float], by_site: NDArray[np.intp]
     ) -> tuple[Array, Array | None]:
         """Deceleration of the striker, m/s², and its derivatives: eq. of motion of the top mass.
 
         A (Σ_N + η_site/H dw/dt)/m; with masses inside the second derivative of the motion itself.
         """
-        drag = float(values[-1]) / self.measurement.specimen.height
         per_mass = self.measurement.specimen.area / at[nuisances.STRIKER_MASS]
+        flying = self._clock < at[nuisances.CONTACT_TIME]
 
-        def of(stress: Array, top: Array) -> Array:
+        def of(stress: Array, top: Array) -> tuple[Array, Array]:
             speed = np.gradient(top, self._clock, axis=-1)
             if self.interior_mass:
-                return -np.gradient(speed, self._clock, axis=-1)
-            flying = self._clock < at[nuisances.CONTACT_TIME]
-            return np.asarray(per_mass * (stress + np.where(flying, 0.0, drag * speed)))
+                return -np.gradient(speed, self._clock, axis=-1), np.zeros_like(speed)
+            braked = np.where(flying, 0.0, speed)
+            return per_mass * (stress + drag * braked), per_mass * braked
 
-        push = of(motion.base_stress, motion.displacement[-1])
+        push, by_drag = of(motion.base_stress, motion.displacement[-1])
         if motion.slopes is None:
             return push, None
-        return push, of(motion.slopes.base_stress, motion.slopes.displacement[:, -1])
+        slopes = of(motion.slopes.base_stress, motion.slopes.displacement[:, -1])[0]
+        slopes[by_site] += by_drag
+        return push, slopes
 
     # ------------------------------------------------------------------ residual
 
