@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foamfit.arrays import Array
+from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import CURVE_STARTS, box_starts, curve_starts, smooth_loop
-from foamfit.fitting.together import Squares
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 
@@ -137,9 +138,23 @@ def descend(
     tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
 ) -> tuple[float, Array]:
     """Levenberg-Marquardt descent inside the box; returns (cost, coordinates) of its end."""
-    squares = Squares.of_one(tracker.residual, tracker.objective, space)
-    end = squares.descend(start, iterations, enough)
+    end = levenberg.descend(*squares(tracker, space), start, space.box, iterations, enough=enough)
     return end.cost, end.point
+
+
+def squares(
+    tracker: Tracker, space: Space, rows: slice | NDArray[np.bool_] = slice(None)
+) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """Residual of some rows by the coordinates of a box, and its derivative."""
+
+    def residual(point: Array) -> Array:
+        return tracker.residual(space.decode(point))[rows]
+
+    def jacobian(point: Array) -> Array:
+        values = space.decode(point)
+        return tracker.objective.jacobian_along(values, space.slopes(point, values))[rows]
+
+    return residual, jacobian
 
 
 def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:

@@ -290,14 +290,14 @@ class JointPoint:
 
     def reach(self, name: str) -> float:
         """How far a shared value is off where the cost has risen by one; 0 where it is unseen."""
-        at, plain = self.names.index(name), self.uncertainty.plain
+        at, plain = self.names.index(name), self.uncertainty
         off = 0.0 if plain.lost[at] else float(np.sqrt(plain.inverse[at, at]))
         return off * float(self._scales[at])
 
     def moved(self, name: str, change: float) -> list[Array]:
         """Values of each test with a shared one moved, and the others after it, were all linear."""
         at, out = self.names.index(name), list[Array]()
-        along = self.uncertainty.plain.inverse[:, at]
+        along = self.uncertainty.inverse[:, at]
         step = change / self._scales[at] * along / along[at]
         for block, best in zip(self.uncertainty.blocks, self.bests, strict=True):
             values = best.values.copy()
@@ -312,7 +312,7 @@ class JointPoint:
 
         Along a direction that several tests determine it took a share of each one's noise only.
         """
-        left = self.uncertainty.plain.lefts[test]
+        left = self.uncertainty.lefts[test]
         share, axes = np.linalg.eigh(left @ left.T)
         own = self.uncertainty.blocks[test].axes[0]
         return np.asarray((own @ axes) * np.sqrt(np.clip(share, 0.0, 1.0)))
@@ -322,7 +322,7 @@ class JointPoint:
         """Covariance and inverse curvature of the unknowns, whatever draws them, SI, (m, m)."""
         known = self.uncertainty
         held = known.held if known.errs else np.zeros(self._scales.size, dtype=bool)
-        alone = replace(known.bent if known.errs else known.plain, drawn=None)
+        alone = replace(known.bent if known.errs else known, drawn=None)
         free = np.ix_(~held, ~held)
         matrix, inverse = np.full((2, held.size, held.size), np.nan)
         matrix[free], inverse[free] = alone.matrix, alone.inverse

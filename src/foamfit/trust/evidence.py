@@ -26,7 +26,7 @@ from foamfit.arrays import Array
 from foamfit.fitting import levenberg
 from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.search import Tracker
+from foamfit.fitting.search import Tracker, squares
 from foamfit.results import Fit, rung_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
@@ -79,16 +79,8 @@ def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
     start, predicted = space.encode(best.values), np.empty(of_sample.size)
     for held in range(BLOCKS):
         rest = of_sample != held
-
-        def residual(point: Array, rest: Array = rest) -> Array:
-            return np.asarray(tracker.residual(space.decode(point))[rest])
-
-        def jacobian(point: Array, rest: Array = rest) -> Array:
-            values = space.decode(point)
-            moves = space.slopes(point, values)
-            return np.asarray(objective.jacobian_along(values, moves)[rest])
-
-        end = levenberg.descend(residual, jacobian, start, space.box, STEPS, enough=ENOUGH)
+        functions = squares(tracker, space, rest)
+        end = levenberg.descend(*functions, start, space.box, STEPS, enough=ENOUGH)
         there = objective.residual(space.decode(end.point))
         predicted[~rest] = there[~rest]
     return misfit_of(objective, predicted[: objective.n_data])
