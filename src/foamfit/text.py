@@ -21,6 +21,11 @@ def engineering(value: float, unit: str) -> str:
     return f"{value / 10.0**power:.4g} {_PREFIXES[power]}{unit}"
 
 
+def quantity(value: float, unit: str | None) -> str:
+    """Write a value with its unit and four digits; a pure number has none."""
+    return engineering(value, unit) if unit else f"{value:.4g}"
+
+
 def number(value: float) -> str:
     """Write a number with four digits and a minus sign; "–" for one that is not finite."""
     if not math.isfinite(value):

@@ -79,9 +79,7 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
     steps = -np.linalg.pinv(scaled, rcond=SINGULAR) @ moved
     rounding = ROUNDING * np.max(np.abs(steps), initial=0.0)
     steps = np.where(np.abs(steps) > rounding, steps, 0.0) * best.sizes
-    moves = np.zeros((best.values.size, len(best.names)))
-    moves[best.places, np.arange(len(best.names))] = 1.0
-    moves = problem.space().follow(best.values, moves, 1e-5 * best.sizes)
+    moves = problem.moves(best.values, best.names)
     return np.asarray((0.5 * (high - low) + moves @ steps) * (share / step))
 
 

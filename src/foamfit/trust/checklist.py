@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, groupby
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +24,6 @@ from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, Intervals, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, split_name
-from foamfit.text import engineering, listed, percent
 from foamfit.trust import SENTENCES, say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK, covariance
@@ -94,18 +95,18 @@ def make_checklist(findings: Findings) -> tuple[Check, ...]:
 def _check(
     key: str,
     answer: bool | None,
-    case: str = "",
     *,
     warnings: Iterable[str] | None = None,
     fatal: bool = False,
     **facts: object,
 ) -> Check:
-    """Check of `sentences.toml`; `case` names its sentence if not that of the answer alone."""
-    table = SENTENCES["check"][key]
-    said = table[case or {True: "yes", False: "no", None: "unknown"}[answer]].format(**facts)
+    """Check of `sentences.toml`; `warnings` are those of a "no" there if none are given."""
+    table, section = SENTENCES["check"][key], f"check.{key}"
+    case = {True: "yes", False: "no", None: "unknown"}[answer]
+    said = say(section, case if case in table else "said", **facts)
     if warnings is None:
-        told = table.get("warning") if answer is False else None
-        warnings = [told.format(**facts)] if told else []
+        told = answer is False and "warning" in table
+        warnings = say(section, "warning", **facts).splitlines() if told else ()
     return Check(key, table["question"], answer, said, tuple(warnings), fatal)
 
 
@@ -123,16 +124,13 @@ def _of_search(e: Findings) -> Iterator[Check]:
 
 
 def _of_curves(e: Findings) -> Iterator[Check]:
-    told, warnings, fatal = [], [], False
+    curves = []
     for name in e.objective.counted:
         off, measured = e.misfit[name] or 0.0, e.objective.measured[name]
         lost = off * float(np.ptp(measured)) > UNACCEPTABLE * float(np.std(measured))
-        fatal = fatal or lost
-        told.append(f"{name.replace('_', '-')} {off:.1%}")
-        if off > POOR or lost:
-            warnings.append(say("check.followed", "lost" if lost else "large", curve=name, off=off))
-    found = ", ".join(told)
-    yield _check("followed", not warnings, warnings=warnings, fatal=fatal, misfits=found)
+        curves.append({"name": name, "off": off, "lost": lost, "poor": off > POOR or lost})
+    fine, fatal = not any(one["poor"] for one in curves), any(one["lost"] for one in curves)
+    yield _check("followed", fine, fatal=fatal, curves=curves)
     yield _at_noise(e)
 
 
@@ -144,35 +142,23 @@ def _at_noise(e: Findings) -> Check:
     objective, known, longest = e.objective, False, 1.0
     errors = e.best.errors if e.best.names else (None,) * len(objective.counted)
     rms = objective.rms(e.best.residual)
-    ratios, missed, warnings = list[str](), list[str](), list[str]()
+    seen, missed = list[dict[str, Any]](), list[dict[str, Any]]()
     for name, size, error in zip(objective.counted, objective.sizes, errors, strict=True):
-        noise, spoken = objective.noise(name), name.replace("_", "-")
-        span, tau = float(np.ptp(objective.measured[name])), error.noise.tau if error else 1.0
+        noise, tau = objective.noise(name), error.noise.tau if error else 1.0
         known, longest = known or noise.sigma > 0.0, max(longest, tau)
-        if error and error.found and span:
-            missed.append(f"{spoken} {percent(error.law / objective.factor(name) / span)}")
-        if noise.sigma <= 1e-9 * objective.scale[name]:  # too small to be seen
-            continue
-        source, most = ("stated", STATED) if noise.given else ("estimated", ESTIMATED)
-        ratio = rms[name] / noise.sigma
-        ratios.append(f"{spoken} {ratio:.2f} ({source})")
-        # Three standard deviations of the RMS of so many effective samples.
-        if ratio > most + 3.0 * math.sqrt(tau / (2.0 * size)):
-            told = say("check.noise", "large", curve=name, ratio=ratio, source=source)
-            warnings.append(told)
-    found = [say("check.noise", "ratios", ratios=", ".join(ratios))] if ratios else []
-    if missed:
-        found.append(say("check.noise", "missed", missed=", ".join(missed)))
-        warnings = [say("check.noise", "law", missed=" and ".join(missed))]
-    elif longest > STRUCTURED:
-        warnings = [say("check.noise", "long", tau=longest)]
-    if not missed and longest >= 1.05:
-        found.append(say("check.noise", "correlated", tau=longest))
-    if not warnings and not (found and known):
-        return _check("noise", None)
-    sentence = "; ".join(found)
-    sentence = sentence[0].upper() + sentence[1:]
-    return _check("noise", not warnings, warnings=warnings, found=sentence)
+        if error and error.found and (span := objective.span(name)):
+            missed.append({"name": name, "missed": error.law / span})
+        if noise.sigma > 1e-9 * objective.scale[name]:  # else too small to be seen
+            source, most = ("stated", STATED) if noise.given else ("estimated", ESTIMATED)
+            ratio = rms[name] / noise.sigma
+            # Three standard deviations of the RMS of so many effective samples.
+            large = ratio > most + 3.0 * math.sqrt(tau / (2.0 * size))
+            seen.append({"name": name, "ratio": ratio, "source": source, "large": large})
+    long, large = longest > STRUCTURED, any(one["large"] for one in seen)
+    answer = False if missed or long or large else None
+    if answer is None and known and (seen or longest >= 1.05):
+        answer = True
+    return _check("noise", answer, seen=seen, missed=missed, tau=longest, long=long)
 
 
 def _determined(e: Findings) -> Check:
@@ -181,21 +167,22 @@ def _determined(e: Findings) -> Check:
     A nuisance parameter that is not determined shows in the intervals of the others.
     """
     own = {name: item for name, item in e.estimates.items() if name not in NUISANCE}
-    vanishing, warnings = [name for name in own if _vanishes(e, name)], list[str]()
-    named = [(name, item) for name, item in own.items() if name not in vanishing]
+    vanishing, reasons_of = [name for name in own if _vanishes(e, name)], {}
     for state in ("not determined", "weak"):
-        of = {name: item.why for name, item in named if item.state == state}
-        groups = [(", ".join(names), why) for why, names in groupby(of, key=of.__getitem__)]
-        told = "; ".join(f"{names} ({why})" for names, why in groups)
-        if len(groups) > REASONS:
-            told = say("check.determined", "many", names=", ".join(of))
-        if of:
-            warnings.append(say("check.determined", "state", state=state.capitalize(), names=told))
+        of = {n: p.why for n, p in own.items() if p.state == state and n not in vanishing}
+        groups = groupby(of, key=of.__getitem__)
+        reasons_of[state] = [(", ".join(names), why) for why, names in groups]
     states = [item.state for item in own.values() if item.state != "fixed"]
-    zero = say("check.determined", "vanishing", names=", ".join(vanishing)) if vanishing else ""
     count, varied = states.count("determined"), len(states)
+    answer = not any(reasons_of.values())
     return _check(
-        "determined", not warnings, warnings=warnings, count=count, all=varied, vanishing=zero
+        "determined",
+        answer,
+        reasons_of=reasons_of,
+        vanishing=vanishing,
+        count=count,
+        all=varied,
+        most=REASONS,
     )
 
 
@@ -212,8 +199,6 @@ def _vanishes(e: Findings, name: str) -> bool:
 def _visited(e: Findings) -> Check:
     problem = e.best.problem
     wanted = [law.needed for law in problem.model.laws]
-    if not any(wanted):
-        return _check("visited", True, "linear")
     seen = visited(problem, e.best.simulated)
     absent = {
         spring: [branch for branch in branches if branch not in covered(seen[spring])]
@@ -226,16 +211,15 @@ def _visited(e: Findings) -> Check:
         for name, item in e.estimates.items()
     )
     answer = True if not lost else False if depend else None
-    every = listed(dict.fromkeys(chain.from_iterable(wanted)))
-    return _check("visited", answer, wanted=every, lost=", ".join(lost))
+    every = tuple(dict.fromkeys(chain.from_iterable(wanted)))
+    return _check("visited", answer, wanted=every, lost=lost)
 
 
 def _of_parameters(e: Findings) -> Iterator[Check]:
     yield _determined(e)
     yield _visited(e)
-    counts = Counter(item.ci95_method for item in e.estimates.values() if item.ci95_method)
-    made = ", ".join(f"{n} by {method}" for method, n in counts.items()) or "There are none"
-    answer = False if e.intervals.warnings else True if counts else None
+    made = Counter(item.ci95_method for item in e.estimates.values() if item.ci95_method)
+    answer = False if e.intervals.warnings else True if made else None
     yield _check("intervals", answer, warnings=e.intervals.warnings, made=made)
     stuck, natural = [], []
     varied = tuple(name for name in e.known if e.estimates[name].vary)
@@ -244,10 +228,10 @@ def _of_parameters(e: Findings) -> Iterator[Check]:
             if abs(e.best.values[e.best.index[name]] - bound) > AT_LIMIT * size:
                 continue
             if bound == 0.0 and may_vanish(name):
-                natural.append(f"{name} is zero, which it may be")
+                natural.append(name)
             else:
-                stuck.append(f"{name} lies at {bound:g}")
-    yield _check("bounds", not stuck, at=", ".join([*stuck, *natural]) or "None lies at one")
+                stuck.append((name, bound))
+    yield _check("bounds", not stuck, stuck=stuck, natural=natural)
 
 
 def _of_test(e: Findings) -> Iterator[Check]:
@@ -258,11 +242,9 @@ def _of_test(e: Findings) -> Iterator[Check]:
     yield _check("velocity", not wrong if moves else None, warnings=wrong if moves else ())
     yield _check("input", not asked, warnings=asked)
     taken, warnings = balance.absorbed_over_striker, balance.energy_warnings()
-    if not warnings and (taken is None or balance.motion == INTEGRATED):
-        yield _check("energy", None, "unknown" if taken is None else "integrated")
-    else:
-        case = "returns" if taken is None else ""
-        yield _check("energy", not warnings, case, warnings=warnings, taken=taken)
+    unknown = not warnings and (taken is None or balance.motion == INTEGRATED)
+    answer = None if unknown else not warnings
+    yield _check("energy", answer, warnings=warnings, taken=taken)
     ratio, warnings = balance.impulse_ratio, balance.impulse_warnings()
     answer = None if ratio is None else not warnings
     yield _check("impulse", answer, warnings=() if ratio is None else warnings, ratio=ratio)
@@ -274,26 +256,23 @@ def _of_what_is_left_out(e: Findings) -> Iterator[Check]:
         yield _check("damping", None)
         return
     eta = _damping_hint(e.best, e.known) or 0.0
-    yield _check("damping", eta == 0.0, size=engineering(eta, "Pa·s"))
+    yield _check("damping", eta == 0.0, eta=eta)
 
 
 def _time_shift(e: Findings) -> Check:
-    test = e.best.problem.measurement
+    test, force = e.best.problem.measurement, e.best.problem.measurement.outliers.get("stress")
+    clipped = force is not None and force.clipped_at is not None
+    facts: dict[str, Any] = {"held": False, "clipped": clipped, "shift": None}
     if e.objective.time_shift:
-        if (shift := e.estimates.get("time_shift")) is None or not shift.vary:
-            return _check("time_shift", None, "held")
-        told = engineering(shift.value, "s").replace("-", "−")
-        return _check("time_shift", True, "fitted", shift=told)
-    force = test.outliers.get("stress")
-    if force is not None and force.clipped_at is not None:
-        return _check("time_shift", None, "clipped")
-    try:
+        shift = e.estimates.get("time_shift")
+        facts |= {"held": shift is None or not shift.vary, "shift": shift and shift.value}
+        return _check("time_shift", None if facts["held"] else True, **facts)
+    with suppress(InputError):
         check_time_shift(test, e.objective.drive)
-    except InputError:
-        return _check("time_shift", None)
-    late = _shift_hint(e.best, e.known) or 0.0
-    told = f"{'late' if late > 0.0 else 'early'} by {engineering(abs(late), 's')}"
-    return _check("time_shift", late == 0.0, late=told)
+        if not clipped:
+            late = _shift_hint(e.best, e.known) or 0.0
+            return _check("time_shift", late == 0.0, late=late, **facts)
+    return _check("time_shift", None, **facts)
 
 
 def _shift_hint(best: BestPoint, determined: Sequence[str]) -> float | None:

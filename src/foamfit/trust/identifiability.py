@@ -18,7 +18,7 @@ from foamfit.arrays import Array
 from foamfit.fitting.box import scale_in_words
 from foamfit.fitting.branches import Section, sections
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import listed, percent
+from foamfit.text import listed
 from foamfit.trust import say
 
 if TYPE_CHECKING:
@@ -126,17 +126,13 @@ class Insight:
         if not self.names:
             return ""
         error, parts = self.weakest()
-        name, unseen = next(iter(parts)), error > 1e3
-        if len(parts) > 1:
-            joint = listed(f"{name} ({part:+.2g})" for name, part in parts.items())
-            key, scale = "free" if unseen else "combination", ""
-        else:
-            at = self.names.index(name)
-            key, joint = "alone" if unseen else "parameter", name
-            scale = scale_in_words(name, self.values[at], self.sizes[at])
-        joint, known = joint.replace("-", "−"), percent(error)
-        told = say("least", key, name=name, names=joint, error=known, scale=scale)
-        return say("least", "silent", names=listed(self.silent), told=told) if self.silent else told
+        joint, scale = listed(f"{name} ({part:+.2g})" for name, part in parts.items()), ""
+        if len(parts) == 1:
+            (joint,) = parts
+            at = self.names.index(joint)
+            scale = scale_in_words(joint, self.values[at], self.sizes[at])
+        names = joint.replace("-", "−")
+        return say("least", "told", names=names, error=error, scale=scale, silent=self.silent)
 
     def combination(self, name: str, loose: float) -> str:
         """Say what the data fix instead of a parameter; "" if it is loose by itself.
