@@ -1,16 +1,14 @@
 """The objective: how far a model's curves are from the measured ones, sample by sample.
 
 Curves are compared in time (or sample by sample along a history), never by interpolating across
-the loop. Two channels were measured, stress and displacement, and perhaps displacements of masses
-inside; what is counted of them, and how much, is in `weights`, so that nothing is counted twice
-silently.
+the loop. `weights` say which curves are counted, so that nothing is counted twice silently.
 """
 
 from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,16 +62,13 @@ RELATIVE_STEP, STEP_OF_TIME, STEP_OF_ZERO = 1e-3, 0.02, 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """The curves of one set of parameters and the run itself.
+    """The curves of one set of parameters, the run itself, and derivatives if they were wanted."""
 
-    `curves` are by their names in `Objective.curves`, absent where the drive prescribes or the test
-    lacks them; stress_strain is the stress (Pa) along the measured displacement. `slopes` are the
-    derivatives (p, n) of the curves by the parameters that were asked for; None where none were.
-    """
-
+    # By their names in `Objective.curves`, absent where the drive prescribes or the test lacks
+    # them; stress_strain is the stress (Pa) along the measured displacement.
     curves: dict[str, Array]
     motion: Motion
-    slopes: dict[str, Array] | None = None
+    slopes: dict[str, Array] | None = None  # (p, n) each
 
 
 @dataclass(eq=False)
@@ -128,8 +123,7 @@ class Objective:
         driving = {"stress": ["stress_time"], "displacement": ["displacement_time"]}
         self._absent = driving.get(self.drive, []) + ["stress_time"] * (time is None)
         self.usual = nuisances.values_of(self.measurement)
-        loading = self._loading()
-        self._plans = {damped: self._scene(loading, damped=damped) for damped in (False, True)}
+        self._plans = self._scenes(self._loading())
         self.measured = self._measured()
         self.counted = tuple(name for name in self.measured if self.weights[name] > 0)
         self._inside = any(name in self.interior for name in self.counted)
@@ -138,7 +132,11 @@ class Objective:
                 f"{self.measurement.name}: no curve is left to fit; give one that the "
                 f"{self.drive} drive has a weight above zero"
             )
-        self.scale = {name: self._scale(name) for name in self.measured}
+        least = {name: MODEL_ERROR * float(np.ptp(curve)) for name, curve in self.measured.items()}
+        self.scale = {  # one standard deviation of the noise; an estimated one not below `least`
+            name: level.sigma if (level := self.noise(name)).given else max(level.sigma, floor)
+            for name, floor in least.items()
+        }
         self._kept = {name: self._fitted(name) for name in self.measured}
         self.sizes = tuple(self.kept(name).size for name in self.counted)
         self.n_data = sum(self.sizes)
@@ -159,10 +157,8 @@ class Objective:
     @cached_property
     def _along(self) -> dict[bool, AnyPlan]:
         """Scenes of the springs along the measured motion; none where there is no motion."""
-        if self.measurement.displacement is None:
-            return {}
-        along = DisplacementDrive(self._moved)
-        return {damped: self._scene(along, damped=damped) for damped in (False, True)}
+        there = self.measurement.displacement is not None
+        return self._scenes(DisplacementDrive(self._moved)) if there else {}
 
     def weigh_motion(self, values: Array) -> bool:
         """Weigh residuals by the motion's own uncertainty at a point; False where it has none.
@@ -234,16 +230,13 @@ class Objective:
             return StressDrive(driving_stress(self._stress, self.model))
         return DisplacementDrive(self._moved)
 
-    def _scene(self, loading: Drive, *, damped: bool) -> AnyPlan:
-        """Make a scene ready; only which springs have a dashpot matters here, not their values.
+    def _scenes(self, loading: Drive) -> dict[bool, AnyPlan]:
+        """Make scenes without and with dashpots ready; the values of the springs do not matter.
 
         Interior masses move in an impact only; along a given motion the springs are in equilibrium.
         """
-        specimen = self.measurement.specimen
-        count = len(self.model.kinds)
-        springs = [law.any_spring() for law in self.model.laws]
-        heights = [specimen.height / count] * count
-        masses = [0.0] * count
+        specimen, count = self.measurement.specimen, len(self.model.kinds)
+        heights, masses = [specimen.height / count] * count, [0.0] * count
         if self.interior_mass and count > 1 and isinstance(loading, Impact):
             if specimen.mass is None:
                 raise InputError(
@@ -251,11 +244,11 @@ class Objective:
                     'like mass = "5.56 mg"'
                 )
             masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
+        springs = [law.any_spring() for law in self.model.laws]
         chain = Chain(springs, heights, specimen.area, masses)
-        return make_plan(
-            chain, loading, self._clock, dashpots=damped, relaxing=self.model.relaxation > 0,
-            max_steps=MAX_STEPS,
-        )  # fmt: skip
+        make = partial(make_plan, chain, loading, self._clock, max_steps=MAX_STEPS)
+        relaxing = self.model.relaxation > 0
+        return {damped: make(dashpots=damped, relaxing=relaxing) for damped in (False, True)}
 
     def _measured(self) -> dict[str, Array]:
         """Measured curves that the drive leaves free."""
@@ -281,19 +274,13 @@ class Objective:
         assert level is not None  # completed by with_noise
         return level
 
-    def _scale(self, name: str) -> float:
-        """One standard deviation of a curve's noise; an estimated one not below MODEL_ERROR."""
-        level = self.noise(name)
-        least = MODEL_ERROR * float(np.ptp(self.measured[name]))
-        return level.sigma if level.given else max(level.sigma, least)
-
     def _fitted(self, name: str) -> slice | NDArray[np.bool_]:
         """Samples of a curve that count: those that its channel measured, but no outliers."""
         outliers = self.measurement.outliers.get(self.channel(name))
-        taken = self.measurement.sampled.get(self.channel(name))
+        taken = self.measurement.sampled.get(self.channel(name), slice(None))
         if outliers is None:
-            return slice(None) if taken is None else taken
-        return ~outliers.left_out if taken is None else taken & ~outliers.left_out
+            return taken
+        return ~outliers.left_out if isinstance(taken, slice) else taken & ~outliers.left_out
 
     # ------------------------------------------------------------------ simulation and residual
 
@@ -302,9 +289,8 @@ class Objective:
     ) -> Simulated:
         """Simulate a flat vector of parameters; what is not counted only if `everything`.
 
-        `places` are those of the parameters by which derivatives are wanted.
-
-        Raises SimulationError if they are not admissible or the scene has no finite answer.
+        `places` are those of the parameters by which derivatives are wanted. Raises SimulationError
+        if the parameters are not admissible or the scene has no finite answer.
         """
         count = len(self.model.names)
         self.evaluations += 1
@@ -542,8 +528,8 @@ class Objective:
 
     def off_priors(self, values: Array) -> Array:
         """How far parameters are off their priors, in standard deviations."""
-        pairs = zip(values[self._prior_places], self.priors, strict=True)
-        return np.array([(value - one.mean) / one.sigma for value, one in pairs])
+        known = zip(values[self._prior_places], self.priors, strict=True)
+        return np.array([(value - one.mean) / one.sigma for value, one in known])
 
     def compare(self, curves: Simulated, values: Array) -> Array:
         """Residuals of simulated curves; see `residual`."""
@@ -559,10 +545,8 @@ class Objective:
     @property
     def floor(self) -> float:
         """Sum of squares that leaves no more of the curves than noise, with a margin of half."""
-        levels = zip(self.counted, self.sizes, strict=True)
-        return 1.5 * sum(
-            n * (self.noise(name).sigma * self.factor(name)) ** 2 for name, n in levels
-        )
+        sizes = zip(self.counted, self.sizes, strict=True)
+        return 1.5 * sum(n * (self.noise(one).sigma * self.factor(one)) ** 2 for one, n in sizes)
 
     def factor(self, name: str) -> float:
         """Residual of a curve that is off by one SI unit."""
@@ -584,11 +568,9 @@ class Objective:
             curves = self.simulate(values, places=places)
         except SimulationError:
             return np.concatenate([np.zeros((self.n_data, places.size)), by_priors])
-        if curves.slopes is None:  # none were asked for
+        if (by := curves.slopes) is None:  # none were asked for
             return np.zeros((self.n_data + len(self.priors), 0))
-        parts = [
-            curves.slopes[name][:, self._kept[name]] * self.factor(name) for name in self.counted
-        ]
+        parts = [by[name][:, self._kept[name]] * self.factor(name) for name in self.counted]
         slopes = np.concatenate(parts, axis=1).T
         residual = self.compare(curves, values)[: self.n_data]
         slopes[np.abs(residual) >= self.penalty] = 0.0
@@ -629,12 +611,12 @@ class Objective:
 
     def shifted(self, curves: Simulated, late: float) -> dict[str, Array]:
         """Curves as channels show them of which the motion is late by so many seconds."""
-        impact, there = self.drive == "impact", curves.curves
+        moved = "displacement" if self.drive == "impact" else " "
         return {
             name: later(self.time, curve, late)
-            if impact and name.startswith("displacement")
+            if name.startswith(moved)
             else self._late(name, curve, late)
-            for name, curve in there.items()
+            for name, curve in curves.curves.items()
         }
 
     def look(self, values: Array, *, everything: bool = False) -> dict[str, float | None] | None:

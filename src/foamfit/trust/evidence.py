@@ -65,10 +65,7 @@ def misfit_of(objective: Objective, residual: Array) -> float:
 def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
     """RMS over the measured ranges of the samples of each block, predicted from the others.
 
-    Raises
-    ------
-    SearchStoppedError
-        If the time (`time.monotonic`) is past the deadline.
+    Raises SearchStoppedError if the time (`time.monotonic`) is past the deadline.
     """
     # With counts of its own, and each sample for itself: weighed residuals mix what is held back.
     problem, objective = best.problem, replace(best.problem.objective, weighing=None)
