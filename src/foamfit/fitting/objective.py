@@ -123,6 +123,8 @@ class Objective:
         driving = {"stress": ["stress_time"], "displacement": ["displacement_time"]}
         self._absent = driving.get(self.drive, []) + ["stress_time"] * (time is None)
         self.usual = nuisances.values_of(self.measurement)
+        striker = self.measurement.striker
+        self._gravity = (striker.gravity if striker else None) or 0.0
         self._plans = self._scenes(self._loading())
         self.measured = self._measured()
         self.counted = tuple(name for name in self.measured if self.weights[name] > 0)
@@ -225,7 +227,8 @@ class Objective:
 
     def _loading(self) -> Drive:
         if self.drive == "impact":
-            return Impact(self.usual[nuisances.STRIKER_MASS], self.usual[nuisances.VELOCITY])
+            usual = self.usual
+            return Impact(usual[nuisances.STRIKER_MASS], usual[nuisances.VELOCITY], self._gravity)
         if self.drive == "stress":
             return StressDrive(driving_stress(self._stress, self.model))
         return DisplacementDrive(self._moved)
@@ -442,8 +445,10 @@ class Objective:
             return plan
         mass = plan.mass.copy()
         mass[-1] = at[nuisances.STRIKER_MASS] / self.measurement.specimen.area
-        time = self._clock - at[nuisances.CONTACT_TIME]
-        return plan._replace(time=time, speed=at[nuisances.VELOCITY], mass=mass)
+        time, weight = self._clock - at[nuisances.CONTACT_TIME], plan.values * mass[-1:]
+        return plan._replace(
+            time=time, speed=at[nuisances.VELOCITY], mass=mass, values=weight / plan.mass[-1]
+        )
 
     def _followed(self, plan: AnyPlan, at: dict[str, float]) -> AnyPlan:
         """Plan of the measured motion of an impact: its zero taken off, none before contact."""
@@ -492,6 +497,7 @@ class Objective:
         """Deceleration of the striker, m/s², and its derivatives: eq. of motion of the top mass.
 
         A (Σ_N + η_site/H dw/dt)/m; with masses inside the second derivative of the motion itself.
+        A sensor on the striker does not feel gravity, nor does its zero before contact show it.
         """
         per_mass = self.measurement.specimen.area / at[nuisances.STRIKER_MASS]
         flying = self._clock < at[nuisances.CONTACT_TIME]
@@ -499,7 +505,8 @@ class Objective:
         def of(stress: Array, top: Array) -> tuple[Array, Array]:
             speed = np.gradient(top, self._clock, axis=-1)
             if self.interior_mass:
-                return -np.gradient(speed, self._clock, axis=-1), np.zeros_like(speed)
+                felt = 0.0 if top.ndim > 1 else self._gravity
+                return felt - np.gradient(speed, self._clock, axis=-1), np.zeros_like(speed)
             braked = np.where(flying, 0.0, speed)
             return per_mass * (stress + drag * braked), per_mass * braked
 
