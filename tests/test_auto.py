@@ -92,6 +92,7 @@ def tried(residual, columns):
         residual=residual,
         sizes=(residual.size,),
         curves=[residual],
+        n_eff=residual.size / evidence.autocorrelation_time(residual),
         taus=[evidence.autocorrelation_time(residual)],
         chisqr=float(residual @ residual),
         grams=np.array([columns.T @ columns]),

@@ -379,7 +379,7 @@ def _conclude(state: _Comparison) -> Fit:
     reference = evidence.reference_of(tried)
     ladder = Ladder(
         rungs=tuple(_rung(i, tried, decision) for i in range(len(tried))),
-        n_eff=evidence.effective_samples(reference),
+        n_eff=reference.n_eff,
         noise_from=reference.name,
         ended=ended,
         stopped=stopped,
@@ -426,7 +426,7 @@ def _rung(i: int, tried: Sequence[Tried], decision: evidence.Decision) -> Rung:
         seconds=one.seconds,
         misfit=dict(result.misfit),
         n_vary=one.varied,
-        n_eff=evidence.effective_samples(one),
+        n_eff=one.n_eff,
         not_determined=one.states("not determined"),
         weak=one.states("weak"),
         chosen=one is best,

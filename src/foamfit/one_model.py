@@ -41,10 +41,9 @@ from foamfit.trust.intervals import Announce, Choice, assess, evaluations_of
 from foamfit.trust.ranges import Open, left_open
 
 Progress = Callable[[float, str], None]
-# Called with the problem and the best point so far, many times a second; must be quick.
+# Called with the problem and the best point so far, many times a second, so it must be quick; or
+# with that of the first descents: what it then raises ends the fit.
 Watch = Callable[[Problem, Array], None]
-# Called with the problem and the best point of the first descents; what it raises ends the fit.
-Look = Callable[[Problem, Array], None]
 
 # Descents of the search for each spring, for each of several hysteretic springs in series, and at
 # most in all.
@@ -132,15 +131,15 @@ class Options:
         limit = self.max_time
         if limit is not None and not (isinstance(limit, Real) and float(limit) > 0):
             raise InputError(f"max_time = {limit!r} is not admissible; it must be positive, in s")
-        if self.weights is not None and not isinstance(self.weights, Mapping):
-            raise InputError(
-                "weights must be a mapping of curves to numbers, like {'stress_time': 1}"
-            )
-        if not isinstance(self.priors or {}, Mapping):
-            raise InputError(
-                "priors must be a mapping of parameters to mean and standard deviation, like "
-                "{'s1_k0': '5.5 ± 0.1 MPa'}"
-            )
+        for name, what in (
+            ("weights", "curves to numbers, like {'stress_time': 1}"),
+            (
+                "priors",
+                "parameters to mean and standard deviation, like {'s1_k0': '5.5 ± 0.1 MPa'}",
+            ),
+        ):
+            if not isinstance(getattr(self, name) or {}, Mapping):
+                raise InputError(f"{name} must be a mapping of {what}")
         _ = self.choice
 
     @property
@@ -195,7 +194,7 @@ def identify(
     params: lmfit.Parameters | None,
     options: Options,
     progress: Progress,
-    look: Look | None = None,
+    look: Watch | None = None,
 ) -> Found:
     """Search and refine; see `foamfit.fit` for the arguments and the errors."""
     began = time.perf_counter()
@@ -235,18 +234,12 @@ def judge(
             if record.stopped is None:
                 found.tracker.pulse = _pulse(found, best, choice, progress)
                 best, record, intervals = _assess(found, best, choice, announce)
-            return _finish(found, best, record, intervals)
+            found.problem.put(best.values)
+            return conclude(best, record, intervals), best
     except KeyboardInterrupt as error:  # a late Ctrl-C keeps what was found
-        record = replace(found.record, stopped=what_stopped(error))
-        return _finish(found, found.best(), record, Intervals())
-
-
-def _finish(
-    found: Found, best: BestPoint, record: SearchRecord, intervals: Intervals
-) -> tuple[Fit, BestPoint]:
-    """Write the point into the parameters, and conclude."""
-    found.problem.put(best.values)
-    return conclude(best, record, intervals), best
+        best = found.best()
+        found.problem.put(best.values)
+        return conclude(best, replace(found.record, stopped=what_stopped(error))), best
 
 
 def _pulse(found: Found, best: BestPoint, choice: Choice, progress: Progress) -> Callable[[], None]:
@@ -255,11 +248,7 @@ def _pulse(found: Found, best: BestPoint, choice: Choice, progress: Progress) ->
     share = JUDGED if choice.ranges and best.misfits else JUDGED_NOISE
     expected = max(share * spent, 1.0) + evaluations_of(best, choice)
     progress(0.0, "intervals")
-
-    def tell() -> None:
-        progress(min((objective.evaluations - spent) / expected, 0.97), "intervals")
-
-    return tell
+    return lambda: progress(min((objective.evaluations - spent) / expected, 0.97), "intervals")
 
 
 def _assess(
@@ -284,15 +273,8 @@ def _assess(
                 better, there = left.better if other else None, best.cost
             made = Intervals(better=better)
             if better is None:
-                made = assess(
-                    best,
-                    choice,
-                    minima=[*tracker.ends, *left.minima],
-                    deadline=tracker.deadline,
-                    budget=budget,
-                    announce=announce,
-                    pulse=tracker.pulse,
-                )
+                minima = [*tracker.ends, *left.minima]
+                made = assess(best, choice, tracker, minima, budget, announce)
             if made.better is None:
                 return best, record, replace(made, ranges=left.ranges)
             tracker.consider(made.better)
@@ -367,9 +349,8 @@ def weigh_motion(problem: Problem, tracker: Tracker) -> None:
     The covariance depends on the best point, so this is done twice.
     """
     for _ in range(WEIGHED):
-        if tracker.best_values is None:
-            return
-        if not problem.objective.weigh_motion(tracker.best_values):
+        best = tracker.best_values
+        if best is None or not problem.objective.weigh_motion(best):
             return
         tracker.restart()
         _refine(problem, tracker)
@@ -378,13 +359,11 @@ def weigh_motion(problem: Problem, tracker: Tracker) -> None:
 def _on_limits(best: BestPoint, cost: float) -> BestPoint:
     """Move parameters within rounding of a limit onto it, if `cost` hardly rises."""
     problem, space = best.problem, best.problem.space()
-    values = best.values + 0.0  # no -0
+    values, names = best.values + 0.0, problem.free()  # no -0
     if np.any(np.signbit(best.values) & (values == 0.0)):
         best = BestPoint(problem, values)
-    names = problem.free()
     places = [problem.index[name] for name in names]
-    near = AT_LIMIT * problem.sizes(names, values)
-    moved = values.copy()
+    near, moved = AT_LIMIT * problem.sizes(names, values), values.copy()
     for limits in (space.low, space.high):
         close = np.abs(values[places] - limits[places]) <= near
         moved[places] = np.where(close, limits[places], moved[places])

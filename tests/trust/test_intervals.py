@@ -339,7 +339,7 @@ def test_an_interrupted_profile_keeps_what_was_done(impact, monkeypatch):
 
 
 def test_a_time_that_is_up_ends_profiles_too(impact):
-    found = assess(impact, Choice("profile"), deadline=0.0)
+    found = assess(impact, Choice("profile"), Tracker(impact.problem.objective, 0.0))
     assert found.ends == {}
     assert not found.profiles[0].complete
 
@@ -479,7 +479,8 @@ def test_where_nothing_can_be_simulated_a_chain_gives_up():
 
 @pytest.mark.parametrize("method", ["bootstrap", "mcmc"])
 def test_a_time_that_is_up_keeps_the_fit(method):
-    found = assess(levels(), Choice(method, 200), deadline=0.0)
+    around = levels()
+    found = assess(around, Choice(method, 200), Tracker(around.problem.objective, 0.0))
     assert found.ends == {}
     (told,) = found.warnings
     assert "stopped by the time limit" in told

@@ -113,7 +113,7 @@ class Objective:
         self._dashpots = np.array([name.endswith("eta") for name in self.model.names])
         self._dashpots[-1] = False  # the onsite damper is none of a spring
         time = self.measurement.time
-        self.time = np.arange(self._stress.size, dtype=float) if time is None else time
+        self.time = np.arange(self.stress.size, dtype=float) if time is None else time
         self._fine = min(self.measurement.block, FINEST) if self.drive != "stress" else 1
         self._clock, self._own = instants(self.time, self._fine), None
         if self._driven:
@@ -221,7 +221,8 @@ class Objective:
         self._prior_places = np.array([names.index(one.name) for one in self.priors], np.int64)
 
     @property
-    def _stress(self) -> Array:
+    def stress(self) -> Array:
+        """Measured stress, Pa."""
         assert self.measurement.stress is not None  # checked by check_drive
         return self.measurement.stress
 
@@ -230,7 +231,7 @@ class Objective:
             usual = self.usual
             return Impact(usual[nuisances.STRIKER_MASS], usual[nuisances.VELOCITY], self._gravity)
         if self.drive == "stress":
-            return StressDrive(driving_stress(self._stress, self.model))
+            return StressDrive(driving_stress(self.stress, self.model))
         return DisplacementDrive(self._moved)
 
     def _scenes(self, loading: Drive) -> dict[bool, AnyPlan]:
@@ -255,10 +256,10 @@ class Objective:
 
     def _measured(self) -> dict[str, Array]:
         """Measured curves that the drive leaves free."""
-        measured = {"stress_time": self._stress}
+        measured = {"stress_time": self.stress}
         if self.measurement.displacement is not None:
             measured["displacement_time"] = self.measurement.displacement
-            measured["stress_strain"] = self._stress
+            measured["stress_strain"] = self.stress
         inside = self.measurement.interior
         measured |= {name: inside[node] for name, node in self.interior.items()}
         if self.accelerated:

@@ -1,12 +1,12 @@
 """The best point of one test or several: curves, residual, Jacobian and covariance.
 
 All that is concluded from a fit reads this: one plain simulation and one with sensitivities. The
-unknowns of several tests are what all have in common, then the own parameters of each; the sandwich
-is that of a single test (`trust.covariance`), with a block for each test.
+unknowns of several tests are what all have in common, then the own parameters of each.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -93,7 +93,7 @@ class BestPoint:
     @cached_property
     def box(self) -> Array:
         """Lower and upper limits of the k parameters, SI, (2, k)."""
-        return np.array([self.limits(name) for name in self.names]).reshape(-1, 2).T
+        return np.reshape([self.limits(name) for name in self.names], (-1, 2)).T
 
     @cached_property
     def jacobian(self) -> Array:
@@ -105,10 +105,15 @@ class BestPoint:
         """Whether the residual of each counted curve is noise, or holds an error of the law too."""
         return curve_errors(*self.to_judge())
 
+    @cached_property
+    def scaled(self) -> Array:
+        """Jacobian by the scaled parameters, (n_data, k)."""
+        return np.asarray(self.jacobian * self.sizes)
+
     def to_judge(self, taken: Array | None = None) -> tuple[Any, ...]:
         """What `curve_errors` takes; `taken` is what a joint fit took of the noise."""
-        objective, scaled = self.problem.objective, self.jacobian * self.sizes
-        return self.residual, scaled, objective.sizes, taken, objective.drive == "stress"
+        objective = self.problem.objective
+        return self.residual, self.scaled, objective.sizes, taken, objective.drive == "stress"
 
     @property
     def misfits(self) -> bool:
@@ -118,7 +123,7 @@ class BestPoint:
     def block(self, errors: Sequence[CurveError]) -> Block:
         """Its part in a covariance, by the errors of its curves."""
         return Block(
-            self.jacobian * self.sizes,
+            self.scaled,
             self.residual,
             self.problem.objective.sizes,
             [error.noise for error in errors],
@@ -156,8 +161,8 @@ class BestPoint:
     @cached_property
     def known(self) -> list[str]:
         """Parameters that the local interval does not leave undetermined."""
-        told = self.halves <= covariance.NOTHING * self.sizes
-        return [name for name, known in zip(self.names, told, strict=True) if known]
+        known = np.flatnonzero(self.halves <= covariance.NOTHING * self.sizes)
+        return [self.names[i] for i in known]
 
     def rises(self, residual: Array) -> Array:
         """Rise of the cost at another point, from its residual, as χ² of each, (k,)."""
@@ -207,11 +212,9 @@ class JointPoint:
     @cached_property
     def _scales(self) -> Array:
         """Scales of the unknowns; 1 of a slope, or a logarithm."""
-        out = list[float]()
+        out, shared = list[float](), set(self.found.shared)
         for name in self.names:
-            shows = [
-                b for b in self.bests if name in self.found.shared and name in b.problem.free()
-            ]
+            shows = [b for b in self.bests if name in shared and name in b.problem.free()]
             out += shows[0].problem.sizes((name,), shows[0].values).tolist() if shows else [1.0]
         for best, own in zip(self.bests, self._own, strict=True):
             out += [best.sizes[best.names.index(name)] for name in own]
@@ -269,8 +272,9 @@ class JointPoint:
 
     def of_common(self, name: str) -> tuple[float, float]:
         """Standard error and degrees of freedom of what is in `names`; NaN of anything else."""
-        row = np.array([1.0 if one == name else 0.0 for one in self.names])
-        return self._known(np.pad(row, (0, self._scales.size - row.size)))
+        row = np.zeros(self._scales.size)
+        row[[i for i, one in enumerate(self.names) if one == name]] = 1.0
+        return self._known(row)
 
     def of_test(self, test: int, name: str) -> tuple[float, float]:
         """Standard error and degrees of freedom of a parameter of one test; NaN if unreached."""
@@ -290,8 +294,8 @@ class JointPoint:
 
     def reach(self, name: str) -> float:
         """How far a shared value is off where the cost has risen by one; 0 where it is unseen."""
-        at, plain = self.names.index(name), self.uncertainty
-        off = 0.0 if plain.lost[at] else float(np.sqrt(plain.inverse[at, at]))
+        at, known = self.names.index(name), self.uncertainty
+        off = 0.0 if known.lost[at] else math.sqrt(known.inverse[at, at])
         return off * float(self._scales[at])
 
     def moved(self, name: str, change: float) -> list[Array]:

@@ -110,10 +110,8 @@ class Tried:
         slices = parts(self.sizes)
         self.curves = [self.residual[part] for part in slices]
         self.taus = [autocorrelation_time(curve) for curve in self.curves]
-        jacobian = best.jacobian * best.sizes
-        self.grams = np.array([jacobian[part].T @ jacobian[part] for part in slices])
-        pairs = zip(self.sizes, self.spans, strict=True)
-        floor = sum(n * (EXACT * span) ** 2 for n, span in pairs)
+        self.grams = np.array([best.scaled[part].T @ best.scaled[part] for part in slices])
+        floor = sum(n * (EXACT * s) ** 2 for n, s in zip(self.sizes, self.spans, strict=True))
         self.chisqr = max(float(self.residual @ self.residual), floor)
         self.misfit = max(misfit_of(objective, self.residual), EXACT)
         # p-values of all curves together (Bonferroni)
@@ -124,6 +122,11 @@ class Tried:
         least = min(self.runs_p, self.neighbours_p)
         self.structureless = self.chisqr <= floor or least >= LEVEL  # only noise is left
         self.errs = self.chisqr > floor and least < SURE  # an error of the model is left for sure
+
+    @property
+    def n_eff(self) -> float:
+        """Effective samples n/τ of all curves."""
+        return float(sum(n / tau for n, tau in zip(self.sizes, self.taus, strict=True)))
 
     @property
     def places(self) -> list[NDArray[np.str_]]:
@@ -158,11 +161,6 @@ def reference_of(tried: Sequence[Tried]) -> Tried:
     return min(tried, key=lambda one: one.chisqr)
 
 
-def effective_samples(reference: Tried) -> float:
-    """Effective samples n/τ of all curves."""
-    return float(sum(n / tau for n, tau in zip(reference.sizes, reference.taus, strict=True)))
-
-
 def effective_parameters(grams: Array, reference: Tried) -> int:
     """How many combinations of its parameters the curves fix against the noise.
 
@@ -181,7 +179,7 @@ def effective_parameters(grams: Array, reference: Tried) -> int:
 
 def criteria(one: Tried, reference: Tried) -> Criteria:
     """AICc and BIC of a model: n_eff ln(χ²/n) and the penalty for its effective parameters."""
-    n_eff = effective_samples(reference)
+    n_eff = reference.n_eff
     rank = effective_parameters(one.grams, reference)
     fit = n_eff * math.log(max(one.chisqr, 1e-300) / one.residual.size)
     freedom = n_eff - rank - 1.0

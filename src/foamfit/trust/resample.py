@@ -13,7 +13,6 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
-from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import Refit
 from foamfit.trust.residuals.noise_process import NoiseProcess, parts
@@ -112,12 +111,10 @@ class MarkovChain:
         """Whether the chain is longer than fifty autocorrelation times, as emcee asks for."""
         return self.steps - self.burn_in >= 50.0 * self.autocorrelation
 
-    def sentence(self) -> str:
-        """What the autocorrelation says of the chain."""
-        times = (self.steps - self.burn_in) / self.autocorrelation
-        enough = "enough" if self.converged else "too short: at least 50 are needed"
-        told = say("interval", "chain", **vars(self), times=times, enough=enough)
-        return say("interval", "stopped", told=told, by=self.stopped) if self.stopped else told
+    @property
+    def times(self) -> float:
+        """Length of the chain over its autocorrelation time."""
+        return (self.steps - self.burn_in) / self.autocorrelation
 
 
 def check_emcee() -> None:
@@ -166,7 +163,7 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     sampler.random_state = np.random.RandomState(bits).get_state()
     # Walkers begin half a standard error off the best point along what the test fixes, no more than
     # `FARTHEST` along the rest.
-    _, singular, axes = np.linalg.svd(best.jacobian * best.sizes, full_matrices=False)
+    _, singular, axes = np.linalg.svd(best.scaled, full_matrices=False)
     reach = 0.5 * math.sqrt(max(variances)) / np.maximum(singular, 1e-300)
     away = np.random.default_rng([seed, 2]).standard_normal((count, singular.size))
     begin = best.values[best.places] / best.sizes + np.minimum(reach, FARTHEST) * away @ axes
