@@ -529,7 +529,7 @@ class Fit:
         }
         made: dict[str, Any] = plain(content)
         columns = self.columns
-        kept = vars(self) | {"insight": self.insight and self.insight.compact()}
+        kept = vars(self)
         fields = {name: encode(kept[name], columns) for name in KEPT}
         rest = _without(made, fields)
         rest["measurement"] = _without(made | made["data"], fields["measurement"])

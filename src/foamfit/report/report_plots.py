@@ -77,7 +77,7 @@ def plot_insight(insight: Insight, correlation: Array | None = None, *, width: s
     """
     wide, k = figures.inches(width), len(insight.names)
     beside = wide >= SIDE_BY_SIDE
-    parts, shares = insight.shares()
+    parts, shares = insight.parts, insight.shares()
     told = [c for c in range(len(parts)) if np.nanmax(shares[:, c], initial=0.0) > 0.005]
     parts, shares = tuple(parts[c] for c in told), shares[:, told]
     matrix = insight.correlation if correlation is None else correlation
