@@ -181,11 +181,24 @@ class Found:
 
     def best(self) -> BestPoint:
         """Return the best point, springs in order, parameters within rounding of a limit on it."""
-        values = self.tracker.best_values
-        assert values is not None  # checked by identify
-        space = self.problem.space()
-        best = BestPoint(self.problem, in_order(space, self.problem.objective, values))
-        return _on_limits(best, self.tracker.best_cost)
+        problem, space, cost = self.problem, self.problem.space(), self.tracker.best_cost
+        assert self.tracker.best_values is not None  # checked by identify
+        values = in_order(space, problem.objective, self.tracker.best_values) + 0.0  # no -0
+        names = problem.free()
+        places = [problem.index[name] for name in names]
+        near, moved = AT_LIMIT * problem.sizes(names, values), values.copy()
+        for limits in (space.low, space.high):
+            close = np.abs(values[places] - limits[places]) <= near
+            moved[places] = np.where(close, limits[places], moved[places])
+        moved = space.complete(moved)
+        best = BestPoint(problem, values)
+        if np.array_equal(moved, values):
+            return best
+        there = BestPoint(problem, moved)
+        try:
+            return there if there.cost <= cost + 1e-6 * (1.0 + cost) else best
+        except SimulationError:
+            return best
 
 
 def identify(
@@ -208,20 +221,16 @@ def identify(
     record = SearchRecord(options.seed, starts, began)
     record = _search(problem, tracker, record, progress)
     if tracker.best_values is None:
+        tried, why = problem.objective.evaluations, "check the drive, the heights and the bounds"
+        try:
+            problem.objective.simulate(problem.vector())
+        except SimulationError as error:
+            why = str(error)
         raise SimulationError(
-            f"{measurement.name}: none of the {problem.objective.evaluations} sets of parameters "
-            f"that were tried could be simulated; {_why_not(problem)}"
+            f"{measurement.name}: none of the {tried} sets of parameters that were tried could be "
+            f"simulated; {why}"
         )
     return Found(problem, tracker, record)
-
-
-def _why_not(problem: Problem) -> str:
-    """Say why the start values cannot be simulated."""
-    try:
-        problem.objective.simulate(problem.vector())
-    except SimulationError as error:
-        return str(error)
-    return "check the drive, the heights and the bounds"
 
 
 def judge(
@@ -354,24 +363,3 @@ def weigh_motion(problem: Problem, tracker: Tracker) -> None:
             return
         tracker.restart()
         _refine(problem, tracker)
-
-
-def _on_limits(best: BestPoint, cost: float) -> BestPoint:
-    """Move parameters within rounding of a limit onto it, if `cost` hardly rises."""
-    problem, space = best.problem, best.problem.space()
-    values, names = best.values + 0.0, problem.free()  # no -0
-    if np.any(np.signbit(best.values) & (values == 0.0)):
-        best = BestPoint(problem, values)
-    places = [problem.index[name] for name in names]
-    near, moved = AT_LIMIT * problem.sizes(names, values), values.copy()
-    for limits in (space.low, space.high):
-        close = np.abs(values[places] - limits[places]) <= near
-        moved[places] = np.where(close, limits[places], moved[places])
-    moved = space.complete(moved)
-    if np.array_equal(moved, values):
-        return best
-    there = BestPoint(problem, moved)
-    try:
-        return there if there.cost <= cost + 1e-6 * (1.0 + cost) else best
-    except SimulationError:
-        return best

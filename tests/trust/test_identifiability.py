@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 import foamfit as ff
 from conftest import AREA, EXPERIMENTS, HEIGHT, synthetic_impact, synthetic_loop
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
-from foamfit.fitting.branches import FLIGHT
+from foamfit.fitting.branches import FLIGHT, sections
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.report.comparison import published_side

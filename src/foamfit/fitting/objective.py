@@ -627,14 +627,11 @@ class Objective:
             for name, curve in curves.curves.items()
         }
 
-    def look(self, values: Array, *, everything: bool = False) -> dict[str, float | None] | None:
-        """Misfits of a point, see `misfit`, which is counted as no step of a fit.
-
-        None if it cannot be simulated.
-        """
+    def look(self, values: Array) -> dict[str, float | None] | None:
+        """Misfits of all curves of a point, which counts as no step; None if not simulated."""
         counts = self.evaluations, self.failures
         try:
-            return self.misfit(self.simulate(values, everything=everything))
+            return self.misfit(self.simulate(values, everything=True))
         except SimulationError:
             return None
         finally:

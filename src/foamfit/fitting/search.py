@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,10 +131,6 @@ class Tracker:
         return residual
 
 
-def _cost(item: tuple[float, Array]) -> float:
-    return item[0]
-
-
 def descend(
     tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
 ) -> tuple[float, Array]:
@@ -160,7 +157,9 @@ def squares(
 def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:
     """Points of the box with their costs, cheapest first."""
     residuals = [tracker.residual(space.decode(point)) for point in points]
-    return sorted(((float(r @ r), p) for r, p in zip(residuals, points, strict=True)), key=_cost)
+    return sorted(
+        ((float(r @ r), p) for r, p in zip(residuals, points, strict=True)), key=itemgetter(0)
+    )
 
 
 def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
@@ -184,15 +183,13 @@ def distinct(ends: list[tuple[float, Array]], apart: float = 1e-3) -> list[tuple
 
     Ends whose costs differ by less than the share `apart` are of one minimum.
     """
-    chosen: list[tuple[int, Array]] = []
-    last = 0.0
-    for cost, point in sorted(ends, key=_cost):
-        if chosen and cost <= (1.0 + apart) * last:
-            chosen[-1] = (chosen[-1][0] + 1, chosen[-1][1])
+    groups: list[list[tuple[float, Array]]] = []
+    for end in sorted(ends, key=itemgetter(0)):
+        if groups and end[0] <= (1.0 + apart) * groups[-1][0][0]:
+            groups[-1].append(end)
         else:
-            chosen.append((1, point))
-            last = cost
-    return chosen
+            groups.append([end])
+    return [(len(group), group[0][1]) for group in groups]
 
 
 def search(
@@ -221,7 +218,7 @@ def search(
             tracker.look()
         if tracker.objective.interior_mass:
             progress(ON_CURVES, "vibration")
-            ranked = sorted(ranked + _scan_vibration(tracker, space, points[0]), key=_cost)
+            ranked = sorted(ranked + _scan_vibration(tracker, space, points[0]), key=itemgetter(0))
         promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
         points = [point for _, point in distinct(promising)][: max(3, starts // 4)]
         for i, point in enumerate(points):

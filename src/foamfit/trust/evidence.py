@@ -89,8 +89,8 @@ class Tried:
 
     `predicted` is the RMS over the range of samples that were held back, None where the time did
     not allow it; `misfit` that of all samples, not less than the simulation's own error, like the
-    chi-square `chisqr`. `residual` (n_data,) is in the order of its `curves`, and `grams` are JᵀJ
-    of each curve, J the derivative by relative changes, (n_curves, k, k).
+    chi-square `chisqr`. `curves` are the residuals of each, and `grams` their JᵀJ, J the derivative
+    by relative changes, (n_curves, k, k).
     """
 
     result: Fit
@@ -106,14 +106,13 @@ class Tried:
         self.varied = sum(item.vary for item in self.result.parameters.values())
         self.counted, self.sizes = objective.counted, objective.sizes
         self.spans = [objective.span(name) for name in self.counted]  # in the unit of the residual
-        self.residual = best.residual[: objective.n_data]
-        slices = parts(self.sizes)
-        self.curves = [self.residual[part] for part in slices]
+        residual, slices = best.residual[: objective.n_data], parts(self.sizes)
+        self.curves = [residual[part] for part in slices]
         self.taus = [autocorrelation_time(curve) for curve in self.curves]
         self.grams = np.array([best.scaled[part].T @ best.scaled[part] for part in slices])
         floor = sum(n * (EXACT * s) ** 2 for n, s in zip(self.sizes, self.spans, strict=True))
-        self.chisqr = max(float(self.residual @ self.residual), floor)
-        self.misfit = max(misfit_of(objective, self.residual), EXACT)
+        self.chisqr = max(float(residual @ residual), floor)
+        self.misfit = max(misfit_of(objective, residual), EXACT)
         # p-values of all curves together (Bonferroni)
         self.runs_p, self.neighbours_p = (
             min(1.0, len(self.sizes) * min(map(test, self.curves)))
@@ -181,7 +180,7 @@ def criteria(one: Tried, reference: Tried) -> Criteria:
     """AICc and BIC of a model: n_eff ln(χ²/n) and the penalty for its effective parameters."""
     n_eff = reference.n_eff
     rank = effective_parameters(one.grams, reference)
-    fit = n_eff * math.log(max(one.chisqr, 1e-300) / one.residual.size)
+    fit = n_eff * math.log(max(one.chisqr, 1e-300) / sum(one.sizes))
     freedom = n_eff - rank - 1.0
     aicc = fit + 2.0 * rank + 2.0 * rank * (rank + 1.0) / freedom if freedom > 0.0 else math.inf
     return Criteria(rank, aicc, fit + rank * math.log(max(n_eff, 1.0)))

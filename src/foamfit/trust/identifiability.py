@@ -188,7 +188,9 @@ def _product(names: list[str], powers: Array) -> str:
     """Write Π p_i^e_i with the largest power 1: "s2_k0·s1_k0^0.43/s1_height^0.57"."""
     powers = powers / powers[np.argmax(np.abs(powers))]
     sides: dict[bool, list[str]] = {True: [], False: []}
-    for name, power in sorted(zip(names, powers, strict=True), key=lambda item: -abs(item[1])):
+    for name, power in sorted(
+        zip(names, powers, strict=True), key=lambda item: -round(abs(item[1]), 6)
+    ):
         shown = f"{abs(power):.2f}".rstrip("0").rstrip(".")
         if abs(power) >= PART:
             sides[bool(power > 0.0)].append(name if shown == "1" else f"{name}^{shown}")

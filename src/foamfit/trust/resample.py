@@ -136,9 +136,8 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     Flat priors within the limits; the likelihood counts n/τ samples of each curve: its sum of
     squares over the variance of its noise is divided by τ. What the test does not determine is
     sampled too and runs over its limits, so that the others are those whatever its value is. The
-    first fifth of the steps of each walker is left out. Raises InputError without emcee.
+    first fifth of the steps of each walker is left out.
     """
-    check_emcee()
     import emcee
 
     objective = best.problem.objective
