@@ -247,11 +247,8 @@ class _Comparison:
                 return
             try:
                 one = self._fit(model, damping, left, i / len(dampings), 1.0 / len(dampings))
-            except _UnpromisingError as error:
-                self.unpromising.append(model)
-                self._skip(model, str(error))
-                return
-            except SimulationError as error:  # a dashpot would not help
+            except (_UnpromisingError, SimulationError) as error:  # a dashpot would not help
+                self.unpromising += [model] if isinstance(error, _UnpromisingError) else []
                 self._skip(model, str(error).removeprefix(f"{self.measurement.name}: "))
                 return
             self.tried.append(one)

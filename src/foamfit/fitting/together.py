@@ -209,32 +209,13 @@ def fit_linked(
     *,
     iterations: int = ITERATIONS,
 ) -> Together:
-    """Fit several tests at once, their parameters linked as `links` say.
+    """Fit several tests of one model at once, their parameters linked as `links` say.
 
-    Parameters
-    ----------
-    problems : sequence of Problem
-        Of one model. Drives and noise may differ, and with them the nuisance parameters; a
-        parameter that does not vary in one of them keeps its value there.
-    links : Links
-        What each parameter is to all tests.
-    starts : sequence of sequences of (n_values,) arrays
-        Each holds a vector of parameters for each test, as its own fit has found; the shared
-        parameters start at the median over the tests, laws of rate at their least squares. The
-        best end of all starts is returned.
-    iterations : int
-        Steps of a descent at most.
-
-    Returns
-    -------
-    Together
-
-    Raises
-    ------
-    InputError
-        If the problems are not of one model.
-    SimulationError
-        If no start can be simulated.
+    Drives and noise may differ, and with them the nuisance parameters; what does not vary in a test
+    keeps its value there. Each of the `starts` holds a vector of parameters for each test: shared
+    ones start at the median over the tests, laws of rate at their least squares. The best end of
+    all starts is returned. Raises InputError if the problems are not of one model, SimulationError
+    if no start can be simulated.
     """
     layout = _Layout.of(tuple(problems), links)
     ends = list[levenberg.Iterate]()

@@ -72,7 +72,7 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
     except SimulationError:
         return np.full(best.values.size, np.nan)
     moved = 0.5 * (after - before)
-    scaled = best.scaled
+    scaled = best.scaled.copy()
     # What lies at a limit stays there.
     off = np.abs(best.box - best.values[best.places]).min(axis=0, initial=np.inf)
     scaled[:, off <= AT_LIMIT * best.sizes] = 0.0

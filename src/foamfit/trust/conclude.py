@@ -241,23 +241,17 @@ def _varied(
     if span is not None:  # it may be that of the point before the last improvement
         span = min(span[0], value), max(span[1], value)
     state, why = state_of(name, value, ends, insight, (low, high), span)
-    objective = problem.objective
+    objective, there = problem.objective, intervals.elsewhere.get(name)
     off, curve = max((objective.off(best.simulated, one) or 0.0, one) for one in objective.counted)
-    if state == "determined" and objective.interior_mass:
-        state, why = "weak", say("why", "vibration", why=why)
-    elif state == "determined" and name in intervals.elsewhere:
-        there = intervals.elsewhere[name] + problem.measurement.origins.get(name, 0.0)
-        state, why = "weak", say("why", "elsewhere", there=there, unit=unit, why=why)
-    elif state == "determined" and off > POOR:
-        state, why = "weak", say("why", "poor", off=off, curve=curve, why=why)
+    if state == "determined" and (objective.interior_mass or there is not None or off > POOR):
+        there = None if there is None else there + problem.measurement.origins.get(name, 0.0)
+        facts = {"vibrates": objective.interior_mass, "there": there, "off": off, "curve": curve}
+        state, why = "weak", say("why", "weak", why=why, unit=unit, **facts)
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
-    if name in intervals.doubtful:
-        why = say("why", "doubtful", why=why)
-    if stalled:
-        method, why = "local covariance", say("why", "stalled", why=why)
-    elif name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf):
-        why = say("why", "astray", why=why)
+    astray = name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf)
+    doubtful, method = name in intervals.doubtful, "local covariance" if stalled else method
+    why = say("why", "interval", why=why, doubtful=doubtful, stalled=stalled, astray=astray)
     ci95, stderr = (max(ends[0], low), min(ends[1], high)), float(best.spread.stderr[column])
     return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method, span)
 

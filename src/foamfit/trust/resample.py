@@ -62,13 +62,9 @@ def bootstrap(
 ) -> tuple[Array, str | None]:
     """Refit data remade from the fitted curves and blocks of the residuals.
 
-    Returned are the parameters of each, (m, k), SI, and what ended the refits early.
-
-    Where a residual holds an error of the law, that stays, and noise of the kind that is in it is
-    added to the measured curve.
-
-    Each refit descends from the best point; other minima of the cost are not searched. They are
-    fewer than asked for if the deadline or Ctrl-C ended them.
+    Returned are the parameters of each, (m, k), SI, and what ended the refits early. Where a
+    residual holds an error of the law, that stays, and noise of the kind that is in it is added to
+    the measured curve. Each refit descends from the best point; other minima are not searched.
     """
     objective = best.problem.objective
     tracker = Tracker(objective) if tracker is None else tracker
