@@ -28,7 +28,6 @@ from foamfit.trust.best_point import BestPoint, cycle_growth
 from foamfit.trust.budget import make_budget
 from foamfit.trust.checklist import (
     POOR,
-    Findings,
     make_checklist,
     may_vanish,
     status_of,
@@ -56,7 +55,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         correlation = Correlation(best.names, spread.correlation, spread.stderr)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals))
     balance, misfit = audit(measurement), objective.misfit(simulated)
-    checklist = make_checklist(Findings(best, estimates, misfit, record, balance, intervals))
+    checklist = make_checklist(best, estimates, misfit, record, balance, intervals)
     springs = best.values[: len(problem.model.names)]
     return Fit(
         measurement=measurement,
