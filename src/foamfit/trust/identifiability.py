@@ -186,11 +186,10 @@ def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
 
 def _product(names: list[str], powers: Array) -> str:
     """Write Π p_i^e_i with the largest power 1: "s2_k0·s1_k0^0.43/s1_height^0.57"."""
-    powers = powers / powers[np.argmax(np.abs(powers))]
+    order = np.argsort(-np.round(np.abs(powers), 6), kind="stable")  # rounding decides no tie
+    powers = powers / powers[order[0]]
     sides: dict[bool, list[str]] = {True: [], False: []}
-    for name, power in sorted(
-        zip(names, powers, strict=True), key=lambda item: -round(abs(item[1]), 6)
-    ):
+    for name, power in ((names[i], powers[i]) for i in order):
         shown = f"{abs(power):.2f}".rstrip("0").rstrip(".")
         if abs(power) >= PART:
             sides[bool(power > 0.0)].append(name if shown == "1" else f"{name}^{shown}")
