@@ -227,7 +227,7 @@ def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
     chain = mcmc(best, choice.draws, choice.seed, tracker)
     lost = [name for name in best.names if name not in best.known]
     few = len(chain.samples) < ENOUGH_DRAWS
-    note = say("interval", "chain", chain=chain, lost=lost, few=few)
+    note = chain.sentence(lost, few)
     fine = chain.converged and chain.stopped is None
     made = _percentiles(best, chain.samples, "MCMC", note, fine)
     columns = chain.samples.reshape(-1, chain.walkers, len(best.names)).T  # (k, walkers, steps)

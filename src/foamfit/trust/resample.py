@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -13,6 +13,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
+from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import Refit
 from foamfit.trust.residuals.noise_process import NoiseProcess, parts
@@ -105,12 +106,16 @@ class MarkovChain:
     @property
     def converged(self) -> bool:
         """Whether the chain is longer than fifty autocorrelation times, as emcee asks for."""
-        return self.steps - self.burn_in >= 50.0 * self.autocorrelation
+        return self.times >= 50.0
 
     @property
     def times(self) -> float:
         """Length of the chain over its autocorrelation time."""
         return (self.steps - self.burn_in) / self.autocorrelation
+
+    def sentence(self, lost: Sequence[str] = (), few: bool = False) -> str:
+        """What the autocorrelation says of the chain; of what is `lost` there are no intervals."""
+        return say("interval", "chain", chain=self, lost=lost, few=few)
 
 
 def check_emcee() -> None:
