@@ -166,8 +166,9 @@ class Together:
         return sum(map(effective_samples, self.problems, self.values))
 
     def bic(self, n_eff: int) -> float:
-        """Bayesian information criterion by so many effective samples, those of the own fits."""
-        return bic(self.cost, self.n_data, self.n_vary, n_eff)
+        """Bayesian information criterion n_eff ln(χ²/n) + k ln(n_eff)."""
+        n, n_eff = self.n_data, max(n_eff, 2)
+        return n_eff * math.log(max(self.cost, 1e-12 * n) / n) + self.n_vary * math.log(n_eff)
 
     @property
     def cost(self) -> float:
@@ -255,12 +256,6 @@ def effective_samples(problem: Problem, values: Array) -> int:
         signs = np.sign([float(np.mean(block)) for block in blocks])
         count += 1 + int(np.count_nonzero(np.diff(signs)))
     return count
-
-
-def bic(cost: float, n_data: int, n_vary: int, n_eff: int) -> float:
-    """Bayesian information criterion n_eff ln(χ²/n) + k ln(n_eff)."""
-    n_eff = max(n_eff, 2)
-    return n_eff * math.log(max(cost, 1e-12 * n_data) / n_data) + n_vary * math.log(n_eff)
 
 
 def _varying(problems: Sequence[Problem]) -> tuple[str, ...]:
