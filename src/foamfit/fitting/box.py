@@ -103,7 +103,6 @@ def others(name: str, param: Param, values: dict[str, float]) -> list[float]:
 
 
 SCALES_IN_WORDS = {
-    "one": "1",
     "stress": "the largest stress",
     "slope": "the largest stress over strain",
     "damping": "the damping that would carry the whole stress",

@@ -158,13 +158,15 @@ def _add_nuisance(
         params.add(name, value=usual[name] + origin, vary=vary, **limits)
 
 
-def _counted_from(params: lmfit.Parameters, origins: Mapping[str, float], sign: float) -> None:
+def _counted_from(
+    params: lmfit.Parameters, origins: Mapping[str, float], sign: float
+) -> lmfit.Parameters:
     """Count nuisance parameters from what was taken off the record, or in its own numbers."""
-    for name, origin in origins.items():
-        if name in params and origin != 0.0:
+    for name in origins.keys() & params.keys():
+        if by := sign * origins[name]:
             one = params[name]
-            by = sign * origin
             one.set(value=one.value + by, min=one.min + by, max=one.max + by)
+    return params
 
 
 def _rest_of_height(measurement: Measurement, model: Model) -> str:
@@ -206,9 +208,7 @@ class Problem:
 
     def told(self) -> lmfit.Parameters:
         """Parameters for the user: nuisance parameters in the numbers of the file."""
-        params = self.params.copy()
-        _counted_from(params, self.measurement.origins, 1.0)
-        return params
+        return _counted_from(self.params.copy(), self.measurement.origins, 1.0)
 
     def is_exact(self, name: str) -> bool:
         """Whether the record leaves a nuisance parameter no freedom, and nobody has held it."""
@@ -246,11 +246,10 @@ class Problem:
         tied = [name for name in self.names if self.params[name].expr is not None]
         if not tied:
             return None
-        places = [self.index[name] for name in tied]
         rest = _rest_of_height(self.measurement, self.model)
         if [self.params[name].expr for name in tied] == [rest]:
             return self._last_height
-        scratch = self.params.copy()
+        places, scratch = [self.index[name] for name in tied], self.params.copy()
 
         def complete(values: Array) -> Array:
             for name in self.free():

@@ -170,8 +170,7 @@ def effective_parameters(grams: Array, reference: Tried) -> int:
     """
     information = np.zeros(grams.shape[1:])
     for gram, part, tau in zip(grams, reference.curves, reference.taus, strict=True):
-        variance = max(float(part @ part), 1e-300) / part.size
-        information += gram / (variance * tau)
+        information += gram / (max(float(part @ part), 1e-300) / part.size * tau)
     singular = np.sqrt(np.maximum(np.linalg.eigvalsh(information), 0.0))
     return max(int(np.count_nonzero(NOTHING * singular > 1.96)), 1)
 

@@ -107,14 +107,11 @@ def assess(
 
 def evaluations_of(best: BestPoint, choice: Choice) -> float:
     """Evaluations that intervals which were asked for are expected to take; 0 by default."""
-    match choice.method:
-        case "mcmc":
-            return float((choice.draws + 1) * walkers(best))
-        case "bootstrap":
-            return EVALUATIONS * choice.draws
-        case "profile":
-            return EVALUATIONS * REFITS * len(best.known)
-    return 0.0
+    if choice.method == "mcmc":
+        return float((choice.draws + 1) * walkers(best))
+    if choice.method == "bootstrap":
+        return EVALUATIONS * choice.draws
+    return EVALUATIONS * REFITS * len(best.known) if choice.method == "profile" else 0.0
 
 
 def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
