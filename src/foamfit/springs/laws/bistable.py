@@ -205,10 +205,9 @@ def read_in_series(loop: Loop, marks: Array, share: float) -> Array:
 
 
 def _stiffness_between(rise: float, low: float, high: float) -> float:
-    """k_c of a branch c that rises by a strain `rise` from stress `low` to `high` (Pa).
+    """k_c of a branch c that rises by a strain from stress `low` to `high` (Pa).
 
-    It is the larger root k of rise (k+low)(k+high) = k (high-low). Where that equation has no root,
-    k = √(low high) comes closest to it.
+    The larger root k of rise (k+low)(k+high) = k (high-low); if none, √(low high) comes closest.
     """
     gain = max(high - low, 1e-9 * high)
     rise = max(rise, 1e-6)
