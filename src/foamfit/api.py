@@ -18,7 +18,8 @@ from foamfit.report.samples import dataset
 from foamfit.report.shown import fit_shown
 from foamfit.report.tables import frame
 from foamfit.results import Fit
-from foamfit.springs.model import with_options
+from foamfit.solve.precompile import at_first_use
+from foamfit.springs.model import Model, with_options
 from foamfit.trust.intervals import Announce
 
 if TYPE_CHECKING:
@@ -154,6 +155,26 @@ def fit(
         raise InputError("params must be lmfit.Parameters, as foamfit.make_params returns them")
     chosen = Options.of("fit", options)
     progress, tell = progress or (lambda *_: None), tell or (lambda _: None)
+    if model != "auto":
+        Model.parse(model, chosen.relaxation)
+    with at_first_use(model, chosen.relaxation) as compile_rest:
+
+        def shown(share: float, what: str) -> None:
+            compile_rest()  # before the first trial, after what is wrong in the call was refused
+            progress(share, what)
+
+        return _fit(measurement, model, params, chosen, shown, tell)
+
+
+def _fit(
+    measurement: Measurement,
+    model: str,
+    params: lmfit.Parameters | None,
+    chosen: Options,
+    progress: Progress,
+    tell: Announce,
+) -> FitResult:
+    """Identify as `fit` does, which see."""
     if model != "auto":
 
         def search(share: float, what: str) -> None:
