@@ -95,9 +95,8 @@ def test_series_of_a_panel_are_told_apart_by_colour_or_shape() -> None:
     for name, figure in figures():
         for ax in figure.axes:
             lines = {str(line.get_label()): line for line in ax.lines}
-            rows = name == "insight"  # a line of each parameter, in a row that bears its name
             shown = [k for k in lines if not (k.startswith("_child") or "all samples" in k)]
-            named = {} if rows else {k: lines[k] for k in shown}
+            named = {k: lines[k] for k in shown}
             for (k, one), (m, other) in combinations(named.items(), 2):
                 by_name = one.get_marker() == "o" or k.startswith("_branch")
                 if cue(one) == cue(other) and not (by_name and k.startswith("_")):

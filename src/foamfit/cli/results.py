@@ -25,13 +25,11 @@ from foamfit.terminal import say
 )
 @options.PLOT
 @options.WIDTH
-@options.option("--csv table", "Also write a table.", options.FILE)
 def compare(
     results: tuple[Path, ...],
     name: str | None,
     plot: Path | None,
     figure_width: str,
-    table: Path | None,
 ) -> None:
     """Put result folders beside the published parameters, or beside the first of them.
 
@@ -41,18 +39,15 @@ def compare(
         foamfit compare fits/TEST/bistable --published foam-1/model-1 --plot comparison.png
     """
     from foamfit.report.comparison import compare as side_by_side
-    from foamfit.report.comparison import comparison_text, plot_comparison, write_csv
+    from foamfit.report.comparison import comparison_text, plot_comparison
 
     read = [path / "fit.json" if path.is_dir() else path for path in results]
-    options.check_files(table, plot, read)
+    options.check_files(None, plot, read)
     comparison = side_by_side(results, name)
     say(comparison_text(comparison))
     if plot is not None:
         plot_comparison(comparison, plot, width=figure_width)
         say(f"\ndrawn in {plot}")
-    if table is not None:
-        write_csv(comparison, table)
-        say(f"\nwritten to {table}")
 
 
 @main.command()

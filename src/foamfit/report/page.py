@@ -20,8 +20,11 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
     `figures` are those of `draw_all`, if they are drawn already.
     """
     drawn = dict(draw_all(result)) if figures is None else figures
-    plain = result.to_json_dict()
-    springs = result.springs
+    plain, springs, insight = result.to_json_dict(), result.springs, result.insight
+    parts, shares = ((), None) if insight is None else insight.shares()
+    correlation = None if insight is None else insight.correlation
+    if result.correlation is not None:  # better known
+        correlation = result.correlation.matrix
     return page(
         "report",
         result=result,
@@ -38,6 +41,8 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
         energy={k: x for k, x in plain["energy"].items() if type(x) in (int, float)},
         energy_sentences=plain["energy"].get("sentences") or [],
         answers=ANSWERS,
+        parts=[] if shares is None else list(zip(parts, shares.T.tolist(), strict=True)),
+        correlation=[] if correlation is None else correlation.tolist(),
         **tables(result),
         figures=drawn,
     )

@@ -75,7 +75,7 @@ def parameters_tex(parameters: Parameters, **more: Any) -> str:
     `more` may hold `kinds` and `between` of a joint fit, by the name of the parameter.
     """
     shown = {n: p for n, p in parameters.items() if p.state != "fixed" or p.value}
-    rows = list(zip(_symbols(shown), itertools.starmap(readable, shown.items()), strict=True))
+    rows = list(zip(symbols(shown), itertools.starmap(readable, shown.items()), strict=True))
     return _tex("parameters", rows=rows, **({"kinds": {}, "between": {}} | more))
 
 
@@ -114,7 +114,7 @@ def by_test(
 ) -> dict[str, Any]:
     """Return heads and rows of a table: a row for each test, for each parameter a column."""
     heads, cells = [], []
-    for own, (name, each) in zip(_symbols(parameters), parameters.items(), strict=True):
+    for own, (name, each) in zip(symbols(parameters), parameters.items(), strict=True):
         factor, unit = unit_of_all(each)
         heads.append((own, unit))
         cells.append([one and readable(name, one, (factor, unit)) for one in each])
@@ -126,7 +126,7 @@ def by_test_tex(first: str, table: Mapping[str, Any]) -> str:
     return _tex("by_test", first=first, **table)
 
 
-def _symbols(names: Iterable[str]) -> list[tuple[str, str]]:
+def symbols(names: Iterable[str]) -> list[tuple[str, str]]:
     """Return the symbols of parameters, without the spring where there is only one."""
     names = list(names)
     springs = 1 + any(name.startswith("s2_") for name in names)
@@ -153,7 +153,7 @@ def frame(parameters: Mapping[str, Any], **more: Mapping[str, Any]) -> pd.DataFr
 
 
 def _rows(parameters: Mapping[str, Any], more: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    for own, (name, p) in zip(_symbols(parameters), parameters.items(), strict=True):
+    for own, (name, p) in zip(symbols(parameters), parameters.items(), strict=True):
         ends = (*(p.ci95 or (None, None)), *(getattr(p, "range", None) or (None, None)))
         spans = zip(("ci95_low", "ci95_high", "range_low", "range_high"), ends, strict=True)
         row = {"parameter": name, "symbol": formula(own), "value": p.value}

@@ -18,13 +18,15 @@ from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.report.figures import image
 from foamfit.report.render import page, words
 from foamfit.report.studies.parameters import DPI as SUMMARY_DPI
-from foamfit.report.studies.parameters import Compared, plot_parameters
+from foamfit.report.studies.parameters import Panel, plot_parameters
 from foamfit.report.summary import CURVES
 from foamfit.report.tables import (
     MISFITS,
     by_test,
     by_test_tex,
+    formula,
     names_of,
+    symbols,
     unit_of_all,
     varied,
     wide_cells,
@@ -176,12 +178,11 @@ def write_comparison(
     write_file(folder / "summary.tex", text.encode("utf-8", "replace"))
     if not (pictures and found):
         return None
-    springs = 2 if any(name.startswith("s2_") for name in found) else 1
-    compared = [
-        Compared(name, {t: p for t, p in zip(tests, each, strict=True) if p is not None}, springs)
-        for name, each in found.items()
+    panels = [
+        Panel(name, formula(own), {t: p for t, p in zip(tests, each, strict=True) if p is not None})
+        for own, (name, each) in zip(symbols(found), found.items(), strict=True)
     ]
-    figure = plot_parameters(f"{title} · {counts_in_words(rows)}", tests, compared, width=width)
+    figure = plot_parameters(f"{title} · {counts_in_words(rows)}", tests, panels, width=width)
     png = image(figure, "png", SUMMARY_DPI)
     write_file(folder / "summary.png", png)
     write_file(folder / "summary.pdf", image(figure, "pdf"))

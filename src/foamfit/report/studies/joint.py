@@ -15,8 +15,8 @@ from foamfit.report.folder import save_whole, write_json, write_result, write_te
 from foamfit.report.readable import in_unit, own_name, readable, readable_unit, symbol
 from foamfit.report.render import page, words
 from foamfit.report.shown import Joint
-from foamfit.report.studies.parameters import Compared, plot_parameters
-from foamfit.report.tables import MISFITS, parameters_tex
+from foamfit.report.studies.parameters import Panel, plot_parameters
+from foamfit.report.tables import MISFITS, formula, parameters_tex, symbols
 from foamfit.results import Fit, law_in_words
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
@@ -201,21 +201,21 @@ def plot_joint(found: Joint, *, width: str = TWO) -> Figure:
 
 def plot_compared(found: Joint, *, width: str = TWO) -> Figure:
     """Draw the parameters of all tests side by side, the tests by rate where they have several."""
-    names, springs = _in_order(found), len(found.model.split("+"))
-    compared = [
-        Compared(
+    names = _in_order(found)
+    shown = {name: one for name, one in _of_springs(found).items() if one.kind != "fixed"}
+    panels = [
+        Panel(
             name,
+            formula(own),
             {names[t]: one.estimate(t) for t in names if one.tests and t in one.tests},
-            springs,
-            one.kind,
-            one.estimate() if one.kind in ("shared", "scatter") else None,
-            one.scatter,
+            kind=one.kind,
+            common=one.estimate() if one.kind in ("shared", "scatter") else None,
+            scatter=one.scatter,
         )
-        for name, one in _of_springs(found).items()
-        if one.kind != "fixed"
+        for own, (name, one) in zip(symbols(shown), shown.items(), strict=True)
     ]
     title = f"{found.name} · {found.model} · {len(names)} tests together"
-    return plot_parameters(title, list(names.values()), compared, width=width)
+    return plot_parameters(title, list(names.values()), panels, width=width)
 
 
 def _in_order(found: Joint) -> dict[str, str]:
