@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -28,7 +29,8 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     """Return what the command prints after a fit: one screen of 80 columns and 24 lines.
 
     Parameters that are not determined, and those of the record, stand in a line where the table has
-    no room for them; warnings are cut. `verbose` prints all of that, and what else is only in the
+    no room for them; if it still has none, several parameters stand side by side without their
+    intervals. Warnings are cut. `verbose` prints all of that, and what else is only in the
     report: the ladder, the reasons of each state, the checklist and the notes.
     """
     ladder, measured = result.ladder, result.measurement
@@ -66,30 +68,43 @@ def _screen(
     sure = [row for row in varied if row.state != "not determined"]
     springs = [row for row in sure if row.name not in NUISANCE]
     lines, kept = 10**6 if verbose else LINES, min(len(warnings), WARNING_LINES)
-    stages = [(varied, True), (varied, False), (sure, False), (springs, False)]
-    for shown, whole in stages:
+    stages = [(varied, True, 1), (varied, False, 1), (sure, False, 1)]
+    for shown, whole, across in [*stages, *((springs, False, i) for i in (1, 2, 3))]:
         left = [row for row in varied if row not in shown and row.name in NUISANCE]
         record = [f"{row.label} {row.with_unit(row.with_error)}" for row in left]
-        foot = words("short", part="foot", whole=whole, of_record=record, **given).split("\n")
-        room = lines - len(head) - len(foot) - (len(shown) + 2 if shown else 0)
+        more = {"whole": whole, "stated": across == 1, "of_record": record}
+        foot = words("short", part="foot", **more, **given).split("\n")
+        table = aligned(_table(shown, short=not verbose, across=across)) if shown else []
+        room = lines - len(head) - len(foot) - len(table) - 1
         if room >= kept:
             break
     yield from head
-    if shown:
-        yield from ("", *aligned(_table(shown, short=not verbose)))
+    yield from ("", *table) if table else ()
     for line in foot[:-1]:
         yield from wrapped(line) if verbose else [_cut(line)]
     yield from _fitting(warnings, max(room, min(kept, 1)))
     yield foot[-1]
 
 
-def _table(rows: list[Readable], *, short: bool) -> list[list[str]]:
-    """Table of parameters, its head first; in `short` the range takes the place of the error."""
+def _table(rows: list[Readable], *, short: bool, across: int) -> list[list[str]]:
+    """Table of parameters, its head first; in `short` the range takes the place of the error.
+
+    Several parameters `across` have their values alone, with errors where two have room.
+    """
     ranged = any(row.range for row in rows)
     value = {"value": "value"} if short and ranged else {"value ± stderr": "with_error"}
     columns = {"parameter": "label"} | value | {"unit": "unit", "95 % interval": "interval"}
     columns |= ({"range": "range"} if ranged else {}) | {"state": "state"}
-    return [[*columns], *([getattr(row, one) for one in columns.values()] for row in rows)]
+    if across == 1:
+        return [[*columns], *([getattr(row, one) for one in columns.values()] for row in rows)]
+    value = {"value ± stderr": "with_error"} if across == 2 else {"value": "value"}
+    columns = {"parameter": "label"} | value | {"unit": "unit"}
+    tall = -(-len(rows) // across)
+    blocks = [[*columns] * across]
+    for row in range(tall):
+        cells = ([getattr(one, c) for c in columns.values()] for one in rows[row::tall])
+        blocks.append([*itertools.chain(*cells)])
+    return [[*block, *[""] * (len(blocks[0]) - len(block))] for block in blocks]
 
 
 def _cut(line: str) -> str:
