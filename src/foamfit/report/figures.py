@@ -9,18 +9,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from foamfit.errors import InputError
 from foamfit.files import write_file
-from foamfit.report.readable import readable_unit
 from foamfit.text import wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-    from foamfit.arrays import Array
 
 GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # by Okabe and Ito
 INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of interior masses, from the base up
@@ -103,14 +99,6 @@ def tail(name: str, most: int) -> str:
     return name if len(name) <= most else f"…{name[1 - most :]}"
 
 
-def over_time(time: Array | None, size: int) -> tuple[Array, str]:
-    """Return what a curve is drawn over, and the label of that: its time, or its samples."""
-    if time is None:
-        return np.arange(size, dtype=float), "sample"
-    factor, unit = readable_unit(float(np.nanmax(np.abs(time))), "s")
-    return time / factor, f"time ({unit})"
-
-
 def grid_of(
     part: Figure | SubFigure, rows: int, columns: int, count: int, **more: Any
 ) -> list[Axes]:
@@ -149,17 +137,6 @@ def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
 
     with matplotlib.rc_context(STYLE):
         yield pyplot.subplots(figsize=(4.5, 3.2), layout="constrained")[1]
-
-
-def key_of(axes: Iterable[Axes]) -> dict[str, Any]:
-    """Return what is drawn by its label, less the "_" that keeps it off other legends."""
-    found: dict[str, Any] = {}
-    for artist in (one for ax in axes for one in (*ax.lines, *ax.collections, *ax.patches)):
-        label = str(artist.get_label())
-        empty = hasattr(artist, "get_xdata") and not len(artist.get_xdata())
-        if label.startswith("_") and not label.startswith("_child") and not empty:
-            found.setdefault(label[1:], artist)
-    return found
 
 
 def named_in(axes: Iterable[Axes]) -> dict[str, Any]:
@@ -227,43 +204,6 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
     with laid_out(figure, dpi), matplotlib.rc_context(STYLE), _unnamed_letters():
         figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
     return buffer.getvalue()
-
-
-def write_haloed(ax: Axes, name: str, at: Array, offset: tuple[float, float], **style: Any) -> None:
-    """Write a text at an offset (points) from a place, with a white rim."""
-    from matplotlib.patheffects import Stroke
-    from matplotlib.text import Annotation
-
-    class Haloed(Annotation):
-        """A text with a rim; matplotlib's own rim would turn its letters into outlines."""
-
-        def draw(self, renderer: Any) -> None:
-            self.set_path_effects([Stroke(linewidth=1.5, foreground="white")])
-            super().draw(renderer)
-            self.set_path_effects([])
-            super().draw(renderer)
-
-    text = Haloed(name, tuple(at), offset, textcoords="offset points", clip_on=False, **style)
-    ax.add_artist(text)
-
-
-def draw_estimates(
-    ax: Axes, points: Sequence[tuple[float, Any]], factor: float, size: float = 3.5
-) -> tuple[list[float], list[float]]:
-    """Draw values of a parameter, hollow if not determined, and their 95 % intervals.
-
-    `points` are (x, estimate), `factor` is the unit; with a size of 0 there are intervals alone.
-    Returns the values and the ends as drawn.
-    """
-    bars = [(x, *p.ci95) for x, p in points if p.ci95 is not None and np.all(np.isfinite(p.ci95))]
-    ends = np.array(bars, dtype=float).reshape(-1, 3) / (1.0, factor, factor)
-    ax.vlines(*ends.T, color=GREY, linewidth=0.8, zorder=1, label="_95 % interval")
-    for sure, face in ((True, BLUE), (False, "white")) if size else ():
-        chosen = [(x, p.value / factor) for x, p in points if (p.state == "determined") == sure]
-        style: Any = {"color": BLUE, "markerfacecolor": face, "markersize": size}
-        style["label"] = "_determined" if sure else "_not well determined"
-        ax.plot(*np.array(chosen).reshape(-1, 2).T, "o", **style)
-    return [p.value / factor for _, p in points], ends[:, 1:].ravel().tolist()
 
 
 def limits(values: Sequence[float], ends: Sequence[float]) -> tuple[float, float]:

@@ -444,7 +444,11 @@ class _Labels:
         _, at, offset, box = min(found, key=lambda one: one[0])
         self.taken.append(box)
         side = "left" if offset[0] > 0 else "right"
-        figures.write_haloed(self.ax, name, at, offset, zorder=6, ha=side, va="center", **style)
+        style |= {"ha": side, "va": "center", "zorder": 6, "annotation_clip": False}
+        back = {"fc": "white", "alpha": 0.75, "lw": 0.0, "pad": 0.5}
+        self.ax.annotate(
+            name, (at[0], at[1]), offset, textcoords="offset points", bbox=back, **style
+        )
 
 
 def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:

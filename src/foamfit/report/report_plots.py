@@ -38,7 +38,7 @@ def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
             ax.set_label(profile.name)
         if not profiles:
             figures.say_nothing_there(axes[0])
-        figures.legend_below(figure, figures.key_of(axes))
+        figures.legend_below(figure, figures.named_in(axes))
     return figures.save(figure, path)
 
 
@@ -48,18 +48,18 @@ def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> No
     top = 2.0 * profile.cut
     best = float(profile.values[np.argmin(profile.rises)])  # from the zero of the profile
     x = profile.values / factor
-    ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)), label="_95 % threshold")
-    ax.axvspan(*(end / factor for end in profile.ci95), color="0.92", lw=0, label="_95 % interval")
+    ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)), label="95 % threshold")
+    ax.axvspan(*(end / factor for end in profile.ci95), color="0.92", lw=0, label="95 % interval")
     fine = np.linspace(x.min(), x.max(), 200)
     if estimate.stderr:
         parabola = ((fine * factor - best) / estimate.stderr) ** 2
         below = np.where(parabola <= top, parabola, np.nan)
-        ax.plot(fine, below, color=GREY, lw=0.8, ls="--", label="_local covariance")
+        ax.plot(fine, below, color=GREY, lw=0.8, ls="--", label="local covariance")
     root = np.sign(profile.values - best) * np.sqrt(np.maximum(profile.rises, 0.0))
-    style: Any = {"color": BLUE, "lw": 1.1, "label": "_lowest cost, all others refitted"}
+    style: Any = {"color": BLUE, "lw": 1.1, "label": "lowest cost, all others refitted"}
     ax.plot(fine, np.interp(fine, x, root) ** 2, **style)
     ax.plot(x, profile.rises, "o", color=BLUE, ms=2.2)
-    ax.plot(best / factor, 0.0, "o", color=VERMILION, ms=3.5, label="_best fit")
+    ax.plot(best / factor, 0.0, "o", color=VERMILION, ms=3.5, label="best fit")
     ax.set_ylim(-0.04 * top, top)
     ax.locator_params(axis="x", nbins=4)
     name = f"{profile.name} ({unit})" if unit else profile.name

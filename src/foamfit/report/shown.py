@@ -28,10 +28,8 @@ def fit_shown(result: Fit, *, html: bool = False) -> str:
     off = ((name, one) for name, one in misfits(result).items() if one is not None)
     told = ", ".join(f"{name} {percent(one)}" for name, one in off)
     line = f"{result.law}, {result.drive} drive · status {result.status} · misfit: {told or '–'}"
-    rows = [readable(name, p) for name, p in result.parameters.items()]
-    return _shown(
-        result.measurement.name, line, [one for one in rows if one.state != "fixed"], html
-    )
+    rows = [readable(name, p) for name, p in result.parameters.items() if p.state != "fixed"]
+    return _shown(result.measurement.name, line, rows, html)
 
 
 def cycles_shown(found: FittedCycles, *, html: bool = False) -> str:
@@ -40,13 +38,8 @@ def cycles_shown(found: FittedCycles, *, html: bool = False) -> str:
     each = (one.misfit.get("stress_strain") for one in found.results.values())
     if known := [off for off in each if off is not None]:
         line += f" · misfit {percent(min(known))} to {percent(max(known))}"
-    table = {"first": "cycle", **cycles_by_test(found)} if html else None
-    return _shown(found.test, line, [], html, table)
-
-
-def cycles_by_test(found: FittedCycles) -> dict[str, Any]:
-    """Return head and rows of a table with a row for each cycle."""
-    return by_test(list(map(str, sorted(found.results))), found.varied)
+    table = by_test(list(map(str, sorted(found.results))), found.varied) if html else {}
+    return _shown(found.test, line, [], html, table and {"first": "cycle", **table})
 
 
 def _shown(title: str, line: str, rows: Sequence[Readable], html: bool, table: Any = None) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import re
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -18,15 +19,12 @@ from foamfit.springs.parameters import springs_first
 if TYPE_CHECKING:
     import pandas as pd
 
-_NAMES = (
-    r"\alpha \beta \gamma \delta \varepsilon \zeta \eta \theta \kappa \lambda \mu \nu \xi \pi "
-    r"\rho \sigma \tau \phi \chi \psi \omega \Gamma \Delta \Theta \Lambda \Xi \Pi \Sigma \Phi "
-    r"\Psi \Omega \mu "
-)
-_GREEK = zip("αβγδεζηθκλμνξπρστφχψωΓΔΘΛΞΠΣΦΨΩµ", re.findall(r"\S+ ", _NAMES), strict=True)
-_MATH = dict(_GREEK) | {
-    "−": "-", "·": r"\cdot ", "±": r"\pm ", "²": "^2", "³": "^3", "₀": "_0", "₊": "_+", "₋": "_-",
-}  # fmt: skip
+_MATH = {"−": "-", "·": r"\cdot ", "±": r"\pm ", "²": "^2", "³": "^3", "µ": r"\mu "}
+_MATH |= {"₀": "_0", "₊": "_+", "₋": "_-"}
+for _letter in "αβγδεζηθκλμνξπρστφχψωΓΔΘΛΞΠΣΦΨΩ":
+    _, _size, _, _name = unicodedata.name(_letter).replace("LAMDA", "LAMBDA").split()
+    _MATH[_letter] = f"\\{_name.lower() if _size == 'SMALL' else _name.capitalize()} "
+_MATH["ε"] = r"\varepsilon "
 _TEXT = {letter: f"${name.strip()}$" for letter, name in _MATH.items()}
 _TEXT |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
 _TEXT |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
@@ -37,6 +35,7 @@ _LAST_LETTER = "ſ"  # that pdfLaTeX sets without further packages
 MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
 PARTS = ("", "_stderr", "_lo", "_hi", "_state")  # of a parameter, in a row for each test
 Parameters = Mapping[str, ParameterEstimate]
+ByTest = Mapping[str, Sequence[ParameterEstimate | None]]
 
 
 def escaped(told: object) -> str:
@@ -50,21 +49,14 @@ def formula(pair: tuple[str, str]) -> str:
     stem, index = pair
     if len(stem) > 2:  # the name of a parameter that has no symbol
         return rf"$\mathrm{{{escaped(stem)}}}$"
-    stem = "".join(_MATH.get(c, c) for c in stem).strip()
-    index = "".join(_MATH.get(c, c) for c in index).strip()
-    return f"${stem}_{{{re.sub(r'[a-z]{2,}', roman, index)}}}$" if index else f"${stem}$"
-
-
-def roman(word: re.Match[str]) -> str:
-    """Return a word in a formula, upright."""
-    return rf"\mathrm{{{word[0]}}}"
+    stem, index = ("".join(_MATH.get(c, c) for c in part).strip() for part in pair)
+    index = re.sub(r"[a-z]{2,}", lambda word: rf"\mathrm{{{word[0]}}}", index)  # upright
+    return f"${stem}_{{{index}}}$" if index else f"${stem}$"
 
 
 def numbers(told: str) -> str:
     """Return "5.50 ± 0.01" or "1 to 2" as LaTeX."""
-    told = re.sub(r"e([-+]?)0*(\d+)", r"\\times 10^{\1\2}", told.replace("−", "-")).replace(
-        "{+", "{"
-    )
+    told = re.sub(r"e\+?(-?)0*(\d+)", r"\\times 10^{\1\2}", told.replace("−", "-"))
     told = re.sub(r"(\S+) ± (\S+times \S+)", r"\1 \\pm (\2)", told)
     return " to ".join(f"${one.replace('±', chr(92) + 'pm')}$" for one in told.split(" to ") if one)
 
@@ -109,9 +101,7 @@ def wide_cells(names: Iterable[str], parameters: Parameters) -> list[Any]:
     return list(plain(cells))
 
 
-def by_test(
-    tests: Sequence[str], parameters: Mapping[str, Sequence[ParameterEstimate | None]]
-) -> dict[str, Any]:
+def by_test(tests: Sequence[str], parameters: ByTest) -> dict[str, Any]:
     """Return heads and rows of a table: a row for each test, for each parameter a column."""
     heads, cells = [], []
     for own, (name, each) in zip(symbols(parameters), parameters.items(), strict=True):
@@ -121,9 +111,9 @@ def by_test(
     return {"heads": heads, "rows": list(zip(tests, *cells, strict=True))}
 
 
-def by_test_tex(first: str, table: Mapping[str, Any]) -> str:
+def by_test_tex(first: str, tests: Sequence[str], parameters: ByTest) -> str:
     """Return a table of `by_test` as LaTeX; `first` is the head of its first column."""
-    return _tex("by_test", first=first, **table)
+    return _tex("by_test", first=first, **by_test(tests, parameters))
 
 
 def symbols(names: Iterable[str]) -> list[tuple[str, str]]:
@@ -158,13 +148,9 @@ def _rows(parameters: Mapping[str, Any], more: Mapping[str, Any]) -> Iterator[di
         spans = zip(("ci95_low", "ci95_high", "range_low", "range_high"), ends, strict=True)
         row = {"parameter": name, "symbol": formula(own), "value": p.value}
         row |= {"stderr": p.stderr, **dict(spans), "systematic": getattr(p, "systematic", None)}
-        numbers = {key: _number(one) for key, one in row.items()}
-        others = {key: _number(values.get(name)) for key, values in more.items()}
-        yield numbers | others | {"unit": getattr(p, "unit", ""), "state": p.state}
-
-
-def _number(value: object) -> object:
-    return np.nan if value is None else value
+        row |= {key: values.get(name) for key, values in more.items()}
+        known = {key: np.nan if one is None else one for key, one in row.items()}
+        yield known | {"unit": getattr(p, "unit", ""), "state": p.state}
 
 
 def stacked(frames: Mapping[Any, pd.DataFrame], name: str) -> pd.DataFrame:

@@ -26,7 +26,7 @@ from foamfit.files import is_left, read_whole, reason, sweep
 from foamfit.fitting import nuisance
 from foamfit.one_model import Keywords, Options
 from foamfit.report.figures import TWO, inches
-from foamfit.report.folder import BATCH_FILES, MARKS, check_target, is_written
+from foamfit.report.folder import FILES, check_target, is_written
 from foamfit.report.studies import batch as tables
 from foamfit.report.studies.batch import Row
 from foamfit.results import law_in_words
@@ -348,7 +348,7 @@ def run(
     check_out(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        sweep(folder.resolve(), [*(name for name, _ in made.tests), *BATCH_FILES])
+        sweep(folder.resolve(), [*(name for name, _ in made.tests), *FILES["batch.json"]])
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {reason(error)}") from None
     with _executor(executor, jobs, made) as runner:
@@ -390,12 +390,12 @@ def check_out(out: Path) -> None:
     try:
         for path in sorted(out.iterdir()):
             name = path.name
-            if is_left(name) or (name in BATCH_FILES and path.is_file()):
+            if is_left(name) or (name in FILES["batch.json"] and path.is_file()):
                 continue
             if path.is_dir() and not path.is_symlink():
                 inside = list(path.iterdir())
                 foreign = [inner.name for inner in inside if not is_written(inner)]
-                if not inside or (not foreign and any(one.name in MARKS for one in inside)):
+                if not inside or (not foreign and any(one.name in FILES for one in inside)):
                     continue
                 name = "/".join([name, *foreign[:1]])
             raise InputError(

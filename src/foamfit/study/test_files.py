@@ -10,21 +10,14 @@ from pathlib import Path
 
 from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError
-from foamfit.report.folder import (
-    BATCH_FILES,
-    CYCLES_FILES,
-    JOINT_FILES,
-    MARKS,
-    PREDICTION_FILES,
-    RESULT_FILES,
-)
+from foamfit.report.folder import FILES
 from foamfit.text import listed
 
 ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
 WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
 # Stems of tables that say what the specimens are, beside the tests.
 _SPECIMENS = ("specimen", "specimens")
-_WRITTEN = (*RESULT_FILES, *CYCLES_FILES, *BATCH_FILES, *JOINT_FILES, *PREDICTION_FILES)
+_WRITTEN = set[str]().union(*FILES.values())
 
 
 def find_tests(
@@ -102,7 +95,7 @@ def _is_test(path: Path) -> bool:
         return False
     if path.name.startswith((".", "~$")):
         return False
-    marks = ((path.parent / mark).is_file() for mark in (*MARKS, "summary.html"))
+    marks = ((path.parent / mark).is_file() for mark in (*FILES, "summary.html"))
     return not (path.name in _WRITTEN and any(marks))
 
 

@@ -2,40 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, TWO
+from foamfit.report.figures import TWO
 from foamfit.report.folder import save_whole, write_json, write_result, write_table, write_text
-from foamfit.report.readable import own_name, readable_unit
+from foamfit.report.plots import draw_loops
+from foamfit.report.readable import own_name
 from foamfit.report.render import words
-from foamfit.report.shown import cycles_by_test
+from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
 from foamfit.report.tables import by_test_tex
+from foamfit.results import ParameterEstimate
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from foamfit.report.result_figures import Mapped
-    from foamfit.results import Fit
     from foamfit.study.cycle_fits import FittedCycles
 
-COLUMNS, PANEL = 4, (1.85, 1.5)  # of the picture; inches
-LEAST = 1.55  # in, of a panel
 MOST_LOOPS = 12
 MOST_NAMES = 12  # of parameters on the terminal; those of a chain are in cycles.csv
 DPI = 200
 # Panels beside the parameters: columns of cycles.csv (SI), and what these are multiplied with.
 BY_CYCLE = {
-    "start strain (%)": ("start_strain", 100.0),
-    "dissipated (kJ/m³)": ("dissipated_energy", 1e-3),
-    "misfit of the loop (%)": ("misfit_stress_strain", 100.0),
+    "start\nstrain (%)": ("start_strain", 100.0),
+    "dissipated\n(kJ/m³)": ("dissipated_energy", 1e-3),
+    "misfit of\nthe loop (%)": ("misfit_stress_strain", 100.0),
 }
-FAR = 20  # a last cycle that is so many times the first is drawn on a logarithmic axis
 
 
 def save_cycles(
@@ -65,7 +62,8 @@ def write_cycles(
         write_result(result, inner, pages=pages, width=width, mapped=mapped)
     write_table(folder / "cycles.csv", found.rows())
     write_json(folder / "cycles.json", found.to_json_dict())
-    write_text(folder / "table.tex", by_test_tex("Cycle", cycles_by_test(found)))
+    numbers = [str(number) for number in sorted(found.results)]
+    write_text(folder / "table.tex", by_test_tex("Cycle", numbers, found.varied))
     if pages:
         figures.write_both(plot_cycles(found, width=width), folder / "cycles", DPI)
 
@@ -77,62 +75,35 @@ def cycles_text(found: FittedCycles) -> str:
 
 
 def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
-    """Draw the loops laid over each other, and start strain, energy, misfit, parameters by cycle.
+    """Draw the loops over each other, and start strain, energy, misfit and parameters by cycle.
 
-    Bars are 95 % intervals; a hollow mark is a parameter that its cycle does not determine well.
-    `width` is "one" or "two" columns, or a length such as "85 mm".
+    For the parameters and `width` see `plot_parameters`; of very many loops some are drawn.
     """
-    results, varied = dict(sorted(found.results.items())), found.varied
+    results = dict(sorted(found.results.items()))
+    loops = [
+        loop._replace(
+            name=f"cycle {number}",
+            along=loop.along + one.measurement.start_strain,
+            label="strain from the first contact",
+        )
+        for number, one in results.items()
+        if (loop := one.loop) is not None and loop.label == "strain"
+    ]
+    keep = np.unique(np.geomspace(1, max(len(loops), 1), MOST_LOOPS).astype(int)) - 1
     head, *table = map(list[Any], found.rows())
-    panels, wide = len(BY_CYCLE) + len(varied), figures.inches(width)
-    columns = max(figures.abreast(wide, COLUMNS, LEAST), 2)
-    rows = 2 + max(0, -(-(panels - 2 * (columns - 2)) // columns))
-    told = f"{found.test} · {found.model}"
-    lines = figures.title_lines(wide, told, titled=figures.is_titled(width))
-    with figures.drawing(wide, rows * PANEL[1] + 0.13 * len(lines) + 0.4, lines) as figure:
-        grid = figure.add_gridspec(rows, columns)
-        _loops(figure.add_subplot(grid[:2, :2]), results)
-        places = [(i, j) for i in range(rows) for j in range(columns) if i > 1 or j > 1]
-        axes = [figure.add_subplot(grid[place]) for place in places[:panels]]
-        for ax, (title, (column, factor)) in zip(axes, BY_CYCLE.items(), strict=False):
-            pairs = ((row[0], row[head.index(column)]) for row in table)
-            there = [(number, factor * value) for number, value in pairs if value is not None]
-            style: dict[str, Any] = {"color": BLUE, "markersize": 3, "linewidth": 0.8}
-            if there:
-                ax.plot(*np.array(there).T, "o-", label="_each cycle alone", **style)
-            ax.set_title(title)
-        for ax, (name, each) in zip(axes[len(BY_CYCLE) :], varied.items(), strict=True):
-            points = [(n, p) for n, p in zip(results, each, strict=True) if p is not None]
-            factor, unit = readable_unit(max(abs(p.value) for _, p in points), points[0][1].unit)
-            ax.set_title(own_name(name, found.model) + (f" ({unit})" if unit else ""))
-            ax.set_ylim(figures.limits(*figures.draw_estimates(ax, points, factor)))
-        numbers = list(results)
-        for ax in axes:
-            ax.set_xlabel("cycle")
-            if numbers and numbers[-1] >= FAR * numbers[0]:
-                ax.set_xscale("log")
-            elif len(numbers) <= 8:
-                ax.set_xticks(numbers)
-        figures.legend_below(figure, figures.key_of(figure.axes))
-    return figure
-
-
-def _loops(ax: Axes, results: Mapping[int, Fit]) -> None:
-    """Measured loops over each other, from light to dark; the first and the last one fitted."""
-    import matplotlib
-
-    there = [n for n, one in results.items() if one.curves.measured_displacement is not None]
-    keep = np.unique(np.geomspace(1, max(len(there), 1), MOST_LOOPS).astype(int)) - 1
-    shown = [there[i] for i in keep if i < len(there)]
-    colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, max(len(shown), 1)))
-    for number, colour in zip(shown, colours, strict=False):
-        if (one := results[number].loop) is None:
-            continue
-        strain, label = one.along + results[number].measurement.start_strain, f"cycle {number}"
-        ax.plot(strain, one.measured / 1e3, color=colour, linewidth=0.9, label=label)
-        if one.fitted is not None and number in (shown[0], shown[-1]):
-            label = "_fitted, first and last cycle"
-            ax.plot(strain, one.fitted / 1e3, ":", color="black", linewidth=0.8, label=label)
-    ax.set(xlabel="strain from the first contact", ylabel="stress (kPa)")
-    if shown:
-        ax.legend(loc="upper left", fontsize=6.5, handlelength=1.2, labelspacing=0.25)
+    panels = list[Panel]()
+    for title, (column, factor) in BY_CYCLE.items():
+        values = {
+            f"cycle {row[0]}": ParameterEstimate(factor * x, None, None, "", True, "determined", "")
+            for row in table
+            if (x := row[head.index(column)]) is not None
+        }
+        panels.append(Panel(column, title, values))
+    names = [f"cycle {number}" for number in results]
+    return plot_parameters(
+        f"{found.test} · {found.model}",
+        names,
+        [*panels, *panels_of(names, found.varied)],
+        width=width,
+        above=partial(draw_loops, [loops[i] for i in keep[: len(loops)]]),
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from os.path import commonprefix
 from typing import TYPE_CHECKING, Any
@@ -12,16 +12,16 @@ import numpy as np
 from foamfit.fitting.links import RATES
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
-from foamfit.report.tables import unit_of_all
+from foamfit.report.tables import ByTest, formula, symbols, unit_of_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
     from foamfit.results import ParameterEstimate
 
 LEAST_PANEL, LETTER = 0.62, 0.052  # in, of a panel and of a letter of a name
-TALLEST, ROW, MOST_ROWS = 7.5, 0.17, 60  # in; tests beyond which none is named
+TALLEST, ROW, ABOVE, MOST_ROWS = 7.5, 0.17, 2.5, 60  # in; most tests that are named
 DPI, ROOMY = 200, 0.8  # in, of a panel with more numbers
 # Edge and inside of a mark.
 _MARKS = {"determined": (BLUE, BLUE), "weak": (BLUE, "white"), "not determined": (GREY, "white")}
@@ -44,34 +44,50 @@ class Panel:
     scatter: float | None = None
 
 
+def panels_of(tests: Sequence[str], parameters: ByTest) -> list[Panel]:
+    """Return panels of parameters that have a value, or None, for each of some tests."""
+    return [
+        Panel(name, formula(own), {t: p for t, p in zip(tests, each, strict=True) if p is not None})
+        for own, (name, each) in zip(symbols(parameters), parameters.items(), strict=True)
+    ]
+
+
 def plot_parameters(
-    title: str, tests: Sequence[str], panels: Sequence[Panel], *, width: str = TWO
+    title: str,
+    tests: Sequence[str],
+    panels: Sequence[Panel],
+    *,
+    width: str = TWO,
+    above: Callable[[Axes], object] | None = None,
 ) -> Figure:
     """Draw values with 95 % intervals by test, a panel for each parameter, tests named at the left.
 
     A band is the 95 % interval of a common value, dashed its spread between specimens, a tick a
     reference. Wide intervals run out of a panel; an arrow at its edge is a value beyond. `width` is
-    "one" or "two" columns, or a length such as "85 mm".
+    "one" or "two" columns, or a length such as "85 mm"; `above` draws a panel above the others.
     """
     wide, count, n = figures.inches(width), len(tests), max(len(panels), 1)
-    named = count <= MOST_ROWS
-    names = _short(tests, int(min(0.28 * wide, 1.3) / LETTER)) if named else []
+    step = max(-(-count // MOST_ROWS), 1)  # of very many tests some are named
+    names = _short(tests, int(min(0.28 * wide, 1.3) / LETTER))[::step]
     margin = LETTER * max(map(len, names), default=3) + 0.1
     across = figures.abreast(wide - margin, n, LEAST_PANEL)
     rows = -(-n // across)
     across = -(-n // rows)  # rows of equal length
-    tall = min(max(ROW * count, 0.5), max(TALLEST / rows, 0.1 * count if named else 1.5)) + 0.55
+    tall = min(max(ROW * count, 0.5), max(TALLEST / rows, 0.1 * len(names))) + 0.55
+    heights = [ABOVE if above else 0.0, rows * tall]
     lines = figures.title_lines(wide, title, titled=figures.is_titled(width))
-    with figures.drawing(wide, rows * tall + 0.16 * len(lines) + 0.3, lines) as figure:
-        axes = figures.grid_of(figure, rows, across, n, sharey=True)
-        size = min(6.5, 0.62 * 72.0 * (tall - 0.55) / max(count, 1))
+    with figures.drawing(wide, sum(heights) + 0.16 * len(lines) + 0.3, lines) as figure:
+        part: Figure | SubFigure = figure
+        if above is not None:
+            top, part = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
+            above(top.subplots())
+        axes = figures.grid_of(part, rows, across, n, sharey=True)
+        size = min(6.5, 0.62 * 72.0 * (tall - 0.55) / max(len(names), 1))
         for ax, panel in zip(axes, panels, strict=False):
             _draw(ax, panel, tests, (wide - margin) / across > ROOMY)
             ax.tick_params(axis="y", length=0, labelsize=size)
         axes[0].set_ylim(count - 0.4, -0.6)
-        axes[0].set_yticks(range(count) if named else [], names, parse_math=False)
-        for ax in [] if named else axes[::across]:
-            ax.set_ylabel(f"{count} tests")
+        axes[0].set_yticks(range(0, count, step), names, parse_math=False)
         if not panels:
             figures.say_nothing_there(axes[0], "no parameter to compare")
         entries, order = figures.named_in(axes), list(_MARKS)

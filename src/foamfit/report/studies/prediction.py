@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.arrays import Array
     from foamfit.study.prediction.predicted import PredictedCurve, PredictedTest
 
 PANEL = (2.6, 2.2)  # inches
@@ -32,12 +31,9 @@ COLOURS: dict[str, tuple[str, Any]] = {
     "law_error": (INSIDE[0], (0, (5, 1.2, 1, 1.2))),
 }
 # Styles of the lines and of the band; the key of the figure takes their labels.
-LINES: dict[str, Any] = {
-    "measured": {"color": MEASURED, "linewidth": 1.4, "label": "_measured"},
-    "predicted": {"color": VERMILION, "linewidth": 0.9, "label": "_predicted"},
-    "all": {"color": "black", "ls": ":", "lw": 0.9, "zorder": 3, "label": "_half width: all"},
-}
-BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0, "label": "_95 % band"}
+SEEN: Any = {"color": MEASURED, "linewidth": 1.4, "label": "measured"}
+PREDICTED: Any = {"color": VERMILION, "linewidth": 0.9, "label": "predicted"}
+BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0, "label": "95 % band"}
 
 
 def save_prediction(
@@ -66,7 +62,7 @@ def check_replaceable(folder: str | Path) -> None:
     results.check_target(folder)
     place = Path(folder)
     there = sorted(path.name for path in place.iterdir()) if place.is_dir() else []
-    if others := [name for name in there if name not in results.PREDICTION_FILES]:
+    if others := [name for name in there if name not in results.FILES["prediction.json"]]:
         raise InputError(
             f"{folder} holds {others[0]}, which is no part of a prediction, so it is not replaced; "
             "choose a new or an empty folder"
@@ -74,10 +70,7 @@ def check_replaceable(folder: str | Path) -> None:
 
 
 def prediction_text(found: PredictedTest) -> str:
-    """Return what the command prints of a prediction.
-
-    Its table has misfit, share inside and half widths of each curve, over its measured range.
-    """
+    """Return what the command prints: misfit, share inside and half widths over the range."""
     there = [part for part in COLOURS if any(part in one.parts for one in found.curves.values())]
     return words("prediction", found=found, parts=there)
 
@@ -111,9 +104,8 @@ def plot_prediction(found: PredictedTest, *, width: str = TWO) -> Figure:
             _in_time(upper, lower, found, curve)
         for ax in (key, *above[len(curves) :], *below[len(curves) :]):
             ax.set_axis_off()
-        told = figures.key_of(figure.axes)
-        style: Any = {"loc": "upper left", "fontsize": 7, "borderaxespad": 0.0}
-        key.legend(list(told.values()), list(told), **style)
+        told = figures.named_in(figure.axes)
+        key.legend(told.values(), told, loc="upper left", fontsize=7, borderaxespad=0.0)
         figure.align_ylabels()
     return figure
 
@@ -129,32 +121,33 @@ def _loop(ax: Axes, found: PredictedTest) -> None:
     pressed = m.stress if stress is None else stress.predicted
     height = m.specimen.height
     factor, unit = readable_unit(float(np.max(m.stress)), "Pa")
-    ax.plot(m.displacement / height, m.stress / factor, **LINES["measured"])
-    ax.plot(motion / height, pressed / factor, **LINES["predicted"])
+    ax.plot(m.displacement / height, m.stress / factor, **SEEN)
+    ax.plot(motion / height, pressed / factor, **PREDICTED)
     if stress is not None and moved is None:
         turn = int(np.argmax(motion))
         for part in (slice(None, turn + 1), slice(turn, None)):
-            _band(ax, motion[part] / height, stress, factor, part)
+            ends = stress.lo[part] / factor, stress.hi[part] / factor
+            ax.fill_between(motion[part] / height, *ends, **BAND)
     ax.set(xlabel="strain", ylabel=f"stress ({unit})")
-
-
-def _band(ax: Axes, x: Array, curve: PredictedCurve, factor: float, part: slice) -> None:
-    ax.fill_between(x, curve.lo[part] / factor, curve.hi[part] / factor, **BAND)
 
 
 def _in_time(above: Axes, below: Axes, found: PredictedTest, curve: PredictedCurve) -> None:
     """One curve with its band, and the half width of each part."""
-    x, label = figures.over_time(found.measurement.time, curve.measured.size)
+    x, label = np.arange(curve.measured.size, dtype=float), "sample"
+    if (time := found.measurement.time) is not None:
+        scale, unit = readable_unit(float(np.nanmax(np.abs(time))), "s")
+        x, label = time / scale, f"time ({unit})"
     factor, unit = readable_unit(float(np.max(np.abs(curve.measured))), curve.unit)
-    _band(above, x, curve, factor, slice(None))
-    above.plot(x, curve.measured / factor, **LINES["measured"])
-    above.plot(x, curve.predicted / factor, **LINES["predicted"])
+    above.fill_between(x, curve.lo / factor, curve.hi / factor, **BAND)
+    above.plot(x, curve.measured / factor, **SEEN)
+    above.plot(x, curve.predicted / factor, **PREDICTED)
     above.set_ylabel(f"{curve.channel.replace('_', ' ')} ({unit})")
-    below.plot(x, 0.5 * (curve.hi - curve.lo) / factor, **LINES["all"])
+    style: Any = {"color": "black", "ls": ":", "lw": 0.9, "zorder": 3}
+    below.plot(x, 0.5 * (curve.hi - curve.lo) / factor, label="half width: all", **style)
     for part, (colour, dashes) in COLOURS.items():
         if part in curve.parts and np.any(curve.parts[part]):
-            style: Any = {"color": colour, "linestyle": dashes, "linewidth": 0.9}
-            told = f"_half width: {part.replace('_', ' ')}"
+            style = {"color": colour, "ls": dashes, "lw": 0.9}
+            told = f"half width: {part.replace('_', ' ')}"
             below.plot(x, curve.parts[part] / factor, label=told, **style)
     below.set_ylim(bottom=0.0)
     below.set(xlabel=label, ylabel=f"half width ({unit})")
