@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 
 Result = Fit | Mapping[str, Any] | str | Path
 
+_GIVEN: dict[str, Any] = dict.fromkeys(
+    ("drive", "status", "stopped", "data_sha256", "correlation")
+)  # which a published set lacks, or an older fit.json
 NOTHING = 3.0  # standard error over value beyond which a difference is meaningless
 WORST_FIRST = ("not determined", "weak", "determined", "fixed")
 VAGUE = "its standard error is many times its value, so the test does not determine it"
@@ -124,17 +127,17 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
     sides = [side_of(result) for result in results]
     if not sides:
         raise InputError("nothing to compare; give at least one result folder")
-    belongs = [published or (None if _unpublished(s) else recognised(s.test)) for s in sides]
+    belongs = [published or (None if s.unpublished else recognised(s.given["test"])) for s in sides]
     found = [published_side(name) for name in belongs if name is not None]
     if len(found) == len(sides):
         pairs = zip(sides, found, strict=True)
         return Comparison(tuple(_pair(one, other) for one, other in pairs), with_published=True)
     if len(sides) == 1:
-        kind = _unpublished(sides[0])
+        kind, test = sides[0].unpublished, sides[0].given["test"]
         raise InputError(
             f"no published set has {kind} springs; give a second result to compare with"
             if kind
-            else f"the test '{sides[0].test}' names no published set; choose one by --published "
+            else f"the test '{test}' names no published set; choose one by --published "
             f"({', '.join(published_sets)}), or give a second result"
         )
     return Comparison(tuple(_pair(side, sides[0]) for side in sides[1:]), with_published=False)
@@ -160,17 +163,17 @@ class Side:
     """The parameters of one side of a comparison: of a fit, or published."""
 
     label: str
-    kinds: tuple[str, ...]
+    model: Model
     estimates: Mapping[str, ParameterEstimate]
     numbers: Mapping[str, Any]  # the values with their errors, correlated
-    correlated: bool = False
-    drive: str = ""
-    status: str = ""
-    stopped: str | None = None
-    test: str = ""
-    sha: str = ""
+    given: Mapping[str, Any]  # content of fit.json
     source: PublishedSet | None = None
-    relaxation: int = 0  # terms of each hysteretic spring
+
+    @property
+    def unpublished(self) -> str:
+        """The first kind of spring that has no published parameters, or ""."""
+        laws = map(law, self.model.kinds)
+        return next((one.kind for one in laws if one.hysteretic and not one.published), "")
 
     def evaluate(
         self, names: Sequence[str], formula: Callable[..., Any]
@@ -200,23 +203,13 @@ def side_of(result: Result) -> Side:
     else:
         given = result if isinstance(result, Mapping) else load_result(result)
     with reading(str(result) if isinstance(result, str | Path) else "the result"):
-        model, drive = Model.of_result(given), str(given["drive"])
+        model, about = Model.of_result(given), (given["test"], given["drive"], given["status"])
         estimates = {n: build(ParameterEstimate, p, {}) for n, p in given["parameters"].items()}
         known = given.get("correlation") or {"names": (), "matrix": ()}
-        law_name = law_in_words(model.name, model.relaxation)
-        return Side(
-            label=f"{given['test']}: {law_name}, {drive} drive",
-            kinds=model.kinds,
-            relaxation=model.relaxation,
-            estimates=estimates,
-            numbers=_with_errors(estimates, known["names"], known["matrix"]),
-            correlated=len(known["names"]) > 0,
-            drive=drive,
-            status=given["status"],
-            stopped=given.get("stopped"),
-            test=given["test"],
-            sha=str(given.get("data_sha256", "")),
-        )
+        numbers = _with_errors(estimates, known["names"], known["matrix"])
+        told = law_in_words(model.name, model.relaxation)
+        label = f"{about[0]}: {told}, {about[1]} drive"
+        return Side(label, model, estimates, numbers, _GIVEN | dict(given))
 
 
 def _with_errors(
@@ -247,31 +240,27 @@ def published_side(name: str) -> Side:
         name: ParameterEstimate(value, None, None, "", False, "published", "")
         for name, value in values.items()
     }
-    kinds = tuple(spring.law.kind for spring in item.chain.springs)
-    return Side(f"published {name}", kinds, estimates, values, source=item)
-
-
-def _unpublished(side: Side) -> str:
-    """Return the first kind of spring that has no published parameters, or ""."""
-    laws = map(law, side.kinds)
-    return next((one.kind for one in laws if one.hysteretic and not one.published), "")
+    given = {"model": "+".join(spring.law.kind for spring in item.chain.springs)}
+    return Side(f"published {name}", Model.of_result(given), estimates, values, _GIVEN, item)
 
 
 # ---------------------------------------------------------------- one result, row by row
 
 
 def _pair(side: Side, other: Side) -> Pair:
-    families = [[_family(kind) for kind in one.kinds] for one in (side, other)]
-    unpublished = _unpublished(side) if other.source is not None else ""
+    families = [[_family(kind) for kind in one.model.kinds] for one in (side, other)]
+    unpublished = side.unpublished if other.source is not None else ""
     about: dict[str, Any] = {"side": side, "other": other}
     differ = families[0] != families[1]
     nothing = words("incomparable", unpublished=unpublished, differ=differ, **about)
     rows = tuple(_rows(side, other, nothing))
     ratios = any("/" in row.name for row in rows)
     remarks = sentences("remarks", nothing=nothing, ratios=ratios, **about)
-    status = f"{side.status}, stopped by {side.stopped}" if side.stopped else side.status
-    model = law_in_words("+".join(side.kinds), side.relaxation)
-    return Pair(side.test, model, side.drive, status, other.label, rows, remarks)
+    status, stopped = side.given["status"], side.given.get("stopped")
+    status = f"{status}, stopped by {stopped}" if stopped else status
+    model = law_in_words(side.model.name, side.model.relaxation)
+    drive = str(side.given["drive"])
+    return Pair(side.given["test"], model, drive, status, other.label, rows, remarks)
 
 
 def _family(kind: str) -> str:
@@ -297,7 +286,8 @@ def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
 
 def _rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
     """Give what is compared: spring by spring, then the damping of the striker's motion."""
-    several, item = len(side.kinds) > 1, other.source
+    kinds, theirs, item = side.model.kinds, other.model.kinds, other.source
+    several = len(kinds) > 1
 
     def row(
         at: tuple[int, str, str],
@@ -314,9 +304,9 @@ def _rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
         told = nothing or words("remark", **given)
         return Row(*at, value.value, value.stderr, value.state, theirs, error, told)
 
-    for i, kind in enumerate(side.kinds, start=1):
-        alike = i <= len(other.kinds) and _family(other.kinds[i - 1]) == _family(kind)
-        for one in _quantities(kind, side.relaxation):
+    for i, kind in enumerate(kinds, start=1):
+        alike = i <= len(theirs) and _family(theirs[i - 1]) == _family(kind)
+        for one in _quantities(kind, side.model.relaxation):
             eta = one.of == (ETA.name,)
             names = [f"s{i}_{part}" for part in one.of]
             value = side.evaluate(names, one.formula)
@@ -327,15 +317,15 @@ def _rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
             if not (eta and reference is None and (value.state, value.value) == ("fixed", 0.0)):
                 yield row((i if several else 0, one.label, one.unit), value, reference, eta)
     names = [n for n in ("site_eta", "s1_eta")[: 1 if several else 2] if n in side.estimates]
-    theirs = [n for n in names if n in other.estimates] if item is None else ["site_eta"]
-    value, reference = side.evaluate(names, _total), other.evaluate(theirs, _total)
+    same = [n for n in names if n in other.estimates] if item is None else ["site_eta"]
+    value, reference = side.evaluate(names, _total), other.evaluate(same, _total)
     if value is None:
         return
     if item is None and value.value == 0.0 and not (reference and reference.value):
         return
     damping = row((0, "site η" if several else "η", "Pa·s"), value, reference, True)
     yield damping
-    soft = [i for i, kind in enumerate(side.kinds, 1) if law(kind).hysteretic]
+    soft = [i for i, kind in enumerate(kinds, 1) if law(kind).hysteretic]
     if item is None or len(soft) != 1 or nothing:
         return
     # The paper's ratio: ρ H = m/A, so that 2 H √(ρ k_c) = 2 √(m H k_c/A).

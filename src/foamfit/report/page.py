@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from foamfit.fitting.branches import covered
 from foamfit.report.plots import origin_word
-from foamfit.report.readable import quantity, readable
+from foamfit.report.readable import readable
 from foamfit.report.render import page
 from foamfit.report.result_figures import Images, draw_all
 from foamfit.report.summary import ANSWERS, conclusions, determined, misfits, tables
@@ -37,7 +37,6 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
         seen={name: covered(result.visited.get(name, ())) for name in springs},
         parameters=[readable(name, p) for name, p in result.parameters.items()],
         rule=RULE,
-        quantity=quantity,
         energy={k: x for k, x in plain["energy"].items() if type(x) in (int, float)},
         energy_sentences=plain["energy"].get("sentences") or [],
         answers=ANSWERS,

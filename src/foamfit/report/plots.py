@@ -454,7 +454,7 @@ class _Labels:
 def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
     """Mark what happens to the springs, and name each mark where it first stands."""
     at: dict[str, list[tuple[float, float]]] = {}
-    for spring, point, x, y in (*_switches(panel, result), *_halves(panel, result)):
+    for spring, point, x, y in _points(panel, result):
         name = f"{spring} {point}" if len(result.chain.springs) > 1 else point
         at.setdefault(name, []).append((x / labels.fx, y / labels.fy))
     wanted = IN_LOOP if panel.is_loop else IN_TIME
@@ -464,23 +464,17 @@ def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
         labels.write(name, [np.array(places[0])], wanted.get(name[-2:], (5, 5)), fontsize=7)
 
 
-def _switches(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
-    """Give the points at which a spring changes its branch: spring, name and place, SI."""
+def _points(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
+    """Give where a spring changes its branch, and where half of its micro-springs have snapped."""
     for switch in result.switches:
-        ends = switch.source, switch.target
+        ends, x = (switch.source, switch.target), switch.time
         name = POINTS.get("".join(ends))
-        if name is None and result.chain.springs[switch.spring - 1].law.remembers:
-            continue
-        x = switch.time
         if panel.is_loop:
             x = switch.displacement / result.measurement.specimen.height
-        if x is not None:
+        remembers = result.chain.springs[switch.spring - 1].law.remembers
+        if x is not None and not (name is None and remembers):
             y = switch.displacement if panel.key == "displacement_time" else switch.stress
             yield f"s{switch.spring}", name or "→".join(ends), x, y
-
-
-def _halves(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
-    """Give where half of the micro-springs have snapped, and snapped back."""
     for spring, snapped in result.snapping.items():
         for symbol, sample in zip(("σ₊", "σ₋"), snapped.halves, strict=True):
             if sample is not None and (on := panel.fitted) is not None and sample < on.x.size:

@@ -100,12 +100,6 @@ def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = 
     return Readable(name, symbol(name), shown, stderr, interval, unit, *told)
 
 
-def quantity(value: float, unit: str) -> tuple[str, str]:
-    """Return a number in the unit in which it reads well, and that unit; "–" for none."""
-    factor, name = readable_unit(value, unit)
-    return number(value / factor), name or "–"
-
-
 def own_name(name: str, model: str) -> str:
     """Name of a parameter, without the spring where there is only one."""
     return name if "+" in model else name.removeprefix("s1_")
