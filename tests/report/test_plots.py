@@ -250,7 +250,8 @@ def test_a_response_has_three_panels(name: str, tmp_path: Path) -> None:
     assert np.allclose(
         motion.lines[len(chain.springs) - 1].get_ydata(), 1e6 * response.displacement[-1]
     )
-    assert (motion.get_legend() is not None) == (len(chain.springs) > 1)
+    key = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert set(key) == {*labelled, "end of contact"}
     # Past the end of contact the striker flies: that is no stress-strain curve.
     assert response.contact_end is not None
     assert len(loop.lines[0].get_xdata()) == int(np.sum(time <= response.contact_end))

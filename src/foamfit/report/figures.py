@@ -54,12 +54,12 @@ def inches(width: str) -> float:
     """Return the width of a figure that "one" or "two" columns or a length ("85 mm") name."""
     from foamfit.data.units import parse_quantity
 
-    length, words = _parted(width)
+    length, *words = _parts(width)
     wide = COLUMNS.get(length)
     if wide is None:
         metres = parse_quantity(length, "m", "the width of figures", "85 mm")
         wide = round(metres / 0.0254, 6)
-    if not NARROWEST <= wide <= WIDEST or words - {UNTITLED, PDF}:
+    if not NARROWEST <= wide <= WIDEST or {*words} - {UNTITLED, PDF}:
         low, high = (f"{25.4 * end:.0f}" for end in (NARROWEST, WIDEST))
         raise InputError(
             f"the width of figures = {width!r} is not admissible; it must be one, two (columns) or "
@@ -68,20 +68,19 @@ def inches(width: str) -> float:
     return wide
 
 
-def _parted(width: str) -> tuple[str, set[str]]:
+def _parts(width: str) -> list[str]:
     """Split "two, untitled" into the width and the words behind it."""
-    length, *words = (part.strip().lower() for part in width.split(","))
-    return length, set(words)
+    return [part.strip().lower() for part in width.split(",")]
 
 
 def is_titled(width: str) -> bool:
     """Whether a figure of such a width has a title: all but "two, untitled" and its like."""
-    return UNTITLED not in _parted(width)[1]
+    return UNTITLED not in _parts(width)
 
 
 def all_as_pdf(width: str) -> bool:
     """Whether all figures of a report are written as PDF too, as by "two, pdf"."""
-    return PDF in _parted(width)[1]
+    return PDF in _parts(width)
 
 
 def abreast(width: float, panels: int, least: float = 2.1) -> int:

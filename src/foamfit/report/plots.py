@@ -138,12 +138,8 @@ def plot_response(
         if end is not None:
             at = end / panels[0].scale()[0]
             for ax in axes[:2]:
-                ax.axvline(at, color=GREY, lw=0.6, ls=(0, (2, 2)), label="_end of contact")
-            style: Any = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
-            style |= {"ha": "right", "va": "top", "rotation": 90, "color": GREY, "fontsize": 6.5}
-            axes[0].annotate("end of contact", (at, 1.0), (-3, -3), **style)
-        if len(nodes) > 1:
-            axes[1].legend(loc="best", handlelength=1.4)
+                ax.axvline(at, color=GREY, lw=0.6, ls=(0, (2, 2)), label="end of contact")
+        figures.legend_below(figure, figures.named_in(axes))
     return figures.save(figure, path)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page
-from foamfit.report.summary import misfits
+from foamfit.report.summary import compared
 from foamfit.report.tables import by_test, frame, stacked
 from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
@@ -25,8 +25,7 @@ Joint = Any  # `foamfit.study.joint_result.JointData`, or `foamfit.saved.SavedJo
 
 def fit_shown(result: Fit, *, html: bool = False) -> str:
     """Return status, model, misfit and parameters of a fit."""
-    off = ((name, one) for name, one in misfits(result).items() if one is not None)
-    told = ", ".join(f"{name} {percent(one)}" for name, one in off)
+    told = ", ".join(f"{name} {percent(off)}" for name, off in compared(result).items())
     line = f"{result.law}, {result.drive} drive · status {result.status} · misfit: {told or '–'}"
     rows = [readable(name, p) for name, p in result.parameters.items() if p.state != "fixed"]
     return _shown(result.measurement.name, line, rows, html)

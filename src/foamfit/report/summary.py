@@ -39,7 +39,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
         "result": result,
         "m": measured,
         "ladder": ladder,
-        "shown": [(name, percent(off)) for name, off in _compared(result).items()],
+        "shown": [(name, percent(off)) for name, off in compared(result).items()],
         "fixed": [f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed"],
         "determined": determined(result),
         "unknown": _unknown({n: p for n, p in result.parameters.items() if n not in NUISANCE}),
@@ -132,7 +132,8 @@ def misfits(result: Fit) -> dict[str, float | None]:
     return {name: result.misfit.get(key) for key, name in names.items()}
 
 
-def _compared(result: Fit) -> dict[str, float]:
+def compared(result: Fit) -> dict[str, float]:
+    """Return the misfits of the curves that are compared."""
     return {name: off for name, off in misfits(result).items() if off is not None}
 
 
@@ -142,7 +143,7 @@ def conclusions(result: Fit) -> tuple[str, ...]:
     Further sentences say what the ± of the TOML add and, for microscale springs and relaxation,
     what the identified law does.
     """
-    shown = _compared(result)
+    shown = compared(result)
     timed = {name: off for name, off in shown.items() if name != CURVES["stress_strain"]} or shown
     springs = {name: p for name, p in result.parameters.items() if name not in NUISANCE}
     found = {name: p for name, p in springs.items() if p.state == "determined"}
