@@ -215,7 +215,7 @@ def side_of(result: Result) -> Side:
 def _with_errors(
     estimates: Mapping[str, ParameterEstimate], names: Sequence[str], matrix: Sequence[Any]
 ) -> dict[str, Any]:
-    """Return values with their errors; what the matrix does not hold is independent."""
+    """Return values with correlated errors; parameters outside of the matrix are independent."""
     every = list(estimates)
     correlation, at = np.eye(len(every)), [every.index(name) for name in names if name in every]
     if names:
@@ -272,7 +272,7 @@ def _total(*parts: Any) -> Any:
 
 
 def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
-    """Give what is compared of a kind of spring: as its record says, or each parameter as it is."""
+    """Give the compared quantities of a law: those of its record, or each parameter."""
     own, hysteretic = law(kind), law(kind).hysteretic
     for param in () if own.compared else own.params:
         factor, unit = (1e6, "MPa") if param.unit == "Pa" else (1.0, param.unit)
@@ -285,7 +285,7 @@ def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
 
 
 def _rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
-    """Give what is compared: spring by spring, then the damping of the striker's motion."""
+    """Give the rows: spring by spring, then the damping of the striker's motion."""
     kinds, theirs, item = side.model.kinds, other.model.kinds, other.source
     several = len(kinds) > 1
 

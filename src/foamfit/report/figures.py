@@ -1,4 +1,4 @@
-"""What all figures share: colours, style, one layout for all images, saving."""
+"""Colours, style, layout and saving of all figures."""
 
 from __future__ import annotations
 
@@ -42,8 +42,7 @@ STYLE: Any = {  # matplotlib types its keys one by one
 }
 NO_LAYOUT = {"figure.autolayout": False, "figure.constrained_layout.use": False}
 DPI = 250  # of a PNG
-# Widths of a figure in inches by what they are called: one column of the Journal of Applied
-# Mechanics, and both.
+# Width of one and of two columns of the Journal of Applied Mechanics, in.
 TWO = "two"
 COLUMNS = {"one": 3.25, TWO: 7.0}
 NARROWEST, WIDEST = 2.5, 20.0
@@ -94,14 +93,14 @@ def title_lines(wide: float, *parts: str, titled: bool = True) -> list[str]:
 
 
 def tail(name: str, most: int) -> str:
-    """Return a name, or the end of one that has more letters than there is room for."""
+    """Return a name, or its end if it is too long."""
     return name if len(name) <= most else f"…{name[1 - most :]}"
 
 
 def grid_of(
     part: Figure | SubFigure, rows: int, columns: int, count: int, **more: Any
 ) -> list[Axes]:
-    """Return so many panels, row by row; the other places of the grid stay empty."""
+    """Return `count` panels, row by row; the rest of the grid stays empty."""
     every: list[Axes] = part.subplots(rows, columns, squeeze=False, **more).ravel().tolist()
     for ax in every[count:]:
         ax.set_axis_off()
@@ -127,7 +126,7 @@ def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[
 
 @contextmanager
 def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
-    """Give axes of the user's, or those of a new pyplot figure in the style of all figures."""
+    """Give the axes of the caller, or those of a new pyplot figure in the style of all figures."""
     if ax is not None:
         yield ax
         return
@@ -139,7 +138,7 @@ def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
 
 
 def named_in(axes: Iterable[Axes]) -> dict[str, Any]:
-    """Return what is drawn by its label, as a legend of all axes has it."""
+    """Return labelled artists by their label, as for a legend of all axes."""
     each = (zip(*reversed(ax.get_legend_handles_labels()), strict=True) for ax in axes)
     return {name: artist for pairs in each for name, artist in pairs}
 
@@ -206,7 +205,7 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
 
 
 def limits(values: Sequence[float], ends: Sequence[float]) -> tuple[float, float]:
-    """Return limits of an axis out of which wide intervals run rather than flatten the values."""
+    """Return limits of an axis; wide intervals run out of it, so that values stay apart."""
     low, high = min(values), max(values)
     room = max(1.5 * (high - low), 0.1 * max(abs(low), abs(high)), 1e-12)
     bottom, top = max(min([low, *ends]), low - room), min(max([high, *ends]), high + room)

@@ -1,4 +1,4 @@
-"""The folder of a result: written whole, replaced whole, and read again."""
+"""Result folders: written and replaced as a whole, and read again."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from foamfit.report.samples import write_samples
 from foamfit.report.tables import parameters_tex
 from foamfit.results import SCHEMA, Fit, ParameterEstimate, plain
 
-# All files of each kind of result, by the one that is in every result of the kind. Older versions
-# wrote tables of what was plotted: their folders are replaced as well.
+# Files of each kind of result, by the file that marks it. Folders of older versions, which wrote
+# other files too, are replaced as well.
 _OLDER = {"fit.csv", "residuals.csv", "sensitivities.csv", "residuals.pdf", "information.pdf"}
 _TABLES = {"fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "budget.csv"}
 _DRAWN = {"fit.png", "fit.pdf", "report.html", "snapping.pdf", "profiles.pdf"}

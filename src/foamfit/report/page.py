@@ -15,7 +15,7 @@ from foamfit.trust.covariance import RULE
 
 
 def render_report(result: Fit, figures: Mapping[str, Images | None] | None = None) -> str:
-    """Return the report as one HTML page that needs nothing else.
+    """Return the report as one self-contained HTML page.
 
     `figures` are those of `draw_all`, if they are drawn already.
     """

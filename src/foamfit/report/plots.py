@@ -30,22 +30,22 @@ if TYPE_CHECKING:
 
 # Points at which a spring changes between two branches, in either order.
 POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"}
-# Where the name of a point stands, in points from it: beside its curve, off the others.
+# Preferred offset of the name of a switching point, in typographic points.
 IN_LOOP = {"A1": (-4, 5), "C1": (-5, 3), "C2": (5, -3), "A2": (4, -7), "σ₊": (-4, 5), "σ₋": (5, -5)}
 IN_TIME = {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4), "σ₊": (5, -4), "σ₋": (5, 4)}
-# The same of a branch, if not to the upper left; of an elastic one that is drawn lightly, behind
-# the share of its length at which the name stands.
+# The same for a branch, if not to the upper left; for an elastic branch, after the share of its
+# length at which its name stands.
 BESIDE = {"c": (7.0, -3.0), "e": (4.0, -7.0), "snap-back": (7.0, -6.0)}
 LIGHT = {"a": (0.9, (-4.0, 3.0)), "c": (0.5, (5.0, -4.0))}
 MARKERS = 60  # markers on a measured curve; more would blot
 PALE = "#A6CEE3"
 MOST_NAMED = 12  # loops that a legend names
 STOOD = "#F2DC6B"  # where the gauge stood still
-# Dashes and marks of interior masses, from the base up, for readers without colour.
+# Dashes and marks of interior masses, from the base up, to be told apart without colour.
 DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)))
 MARKS = ("^", "v", "D", "p")
-# Typographic points: height of a panel beside others and above others, and of a residual below it,
-# what its labels take beside and below it, and what title and legend take.
+# Typographic points: height of panels side by side, of stacked ones and of a residual; room for the
+# labels beside and below a panel, and for title and legend.
 HEIGHT, STACKED, STRIP, BESIDE_IT, BELOW_IT, AROUND = 133.0, 112.0, 40.0, 31.0, 26.0, 39.0
 MOST_WIDE = {0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}  # in, by the number of panels
 LOOP, WIDER = 165.0, 1.45  # of a known motion: height of the loop, its width over that of others
@@ -151,7 +151,7 @@ def origin_word(result: Fit) -> str | None:
 
 
 def is_known(result: Fit) -> bool:
-    """Whether the motion is the input and nothing else of it is compared."""
+    """Whether the motion is prescribed, and no motion of interior masses is compared."""
     return result.drive == "displacement" and not result.curves.interior
 
 
@@ -160,7 +160,7 @@ def is_known(result: Fit) -> bool:
 
 @dataclass(frozen=True)
 class _Line:
-    """A curve of a panel, SI; of a measured one `off` is fitted − measured in % of its range."""
+    """A curve of a panel, SI; of a measured curve, `off` is the residual in % of its range."""
 
     x: Array
     y: Array
@@ -219,7 +219,7 @@ def _panels(result: Fit) -> list[_Panel]:
     loop = _measured(strain, c.measured_stress, compared("stress_strain", c.stress_along), motion)
     loop += _fitted(None if moved is None else moved / height, pushed)
     if strain is not None and c.stress_along is not None and not is_known(result):
-        # Wide and pale below the others, with which it coincides where the fit is good.
+        # Wide and pale below the others, because it coincides with them where the fit is good.
         pale = {"color": PALE, "lw": 3.2, "zorder": 2}
         loop.append(_Line(strain, c.stress_along, "springs along measured strain", pale))
     panels = [
@@ -329,7 +329,7 @@ def _draw_residuals(ax: Axes, strip: Axes, panel: _Panel) -> None:
 
 
 def _evenly(x: Array, y: Array, n: int) -> NDArray[np.intp]:
-    """Return up to `n` samples even along the curve; even in time they would crowd at its turns."""
+    """Return up to `n` samples, evenly spaced along the curve, not in time."""
     there = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if there.size <= n:
         return there
@@ -339,7 +339,7 @@ def _evenly(x: Array, y: Array, n: int) -> NDArray[np.intp]:
 
 
 def _annotate(ax: Axes, panel: _Panel, result: Fit, size: tuple[float, float]) -> None:
-    """Write into a panel of about a size (points) all but its curves."""
+    """Add to a panel of about this size (points) all but its curves."""
     _mark_outliers(ax, panel, result)
     _shade_standstills(ax, panel, result)
     labels = _Labels(ax, panel, size)
@@ -351,7 +351,7 @@ def _annotate(ax: Axes, panel: _Panel, result: Fit, size: tuple[float, float]) -
 
 
 def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
-    """Cross what the file has at samples that are not fitted, at the edge if it is beyond."""
+    """Mark outliers, which are not fitted, by crosses; those beyond the panel at its edge."""
     test = result.measurement
     fx, _, fy, _ = panel.scale()
     own = "displacement" if panel.key == "displacement_time" else "stress"
@@ -372,7 +372,7 @@ def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
 
 
 def _shade_standstills(ax: Axes, panel: _Panel, result: Fit) -> None:
-    """Shade where the displacement is bridged: a span of time, a stretch of the measured loop."""
+    """Shade where the gauge stood still: a span of time, a part of the measured loop."""
     test = result.measurement
     fx, _, fy, _ = panel.scale()
     style: Any = {"color": STOOD, "zorder": 0.5, "label": "gauge stands still, bridged"}
@@ -391,7 +391,7 @@ def _shade_standstills(ax: Axes, panel: _Panel, result: Fit) -> None:
 
 
 class _Labels:
-    """Places names in a panel: on no other name, and on little of the fitted curves and marks."""
+    """Places names in a panel so that they cover no other name and little of curves and marks."""
 
     def __init__(self, ax: Axes, panel: _Panel, size: tuple[float, float]) -> None:
         """Take a panel and about how large it will be, typographic points."""
@@ -448,7 +448,7 @@ class _Labels:
 
 
 def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
-    """Mark what happens to the springs, and name each mark where it first stands."""
+    """Mark where springs switch, and name each kind of mark once."""
     at: dict[str, list[tuple[float, float]]] = {}
     for spring, point, x, y in _points(panel, result):
         name = f"{spring} {point}" if len(result.chain.springs) > 1 else point
@@ -461,7 +461,7 @@ def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
 
 
 def _points(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
-    """Give where a spring changes its branch, and where half of its micro-springs have snapped."""
+    """Give where springs change branches, and where half of the micro-springs have snapped."""
     for switch in result.switches:
         ends, x = (switch.source, switch.target), switch.time
         name = POINTS.get("".join(ends))
@@ -499,7 +499,7 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
 
 
 def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
-    """Write beside the curve of the only spring on which branch it is."""
+    """Write the names of the branches beside the curve of a single spring."""
     springs, fitted = result.chain.springs, panel.fitted
     if len(springs) > 1 or not springs[0].law.hysteretic or fitted is None:
         return
@@ -514,7 +514,7 @@ def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
 
 
 def _longest_visits(result: Fit, fitted: _Line) -> dict[str, slice]:
-    """Return the samples of the longest stretch of the only spring on each branch, in strain."""
+    """Return the samples of the longest visit, in strain, of a single spring to each branch."""
     ends = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
     at_rest = next(iter(result.chain.springs[0].law.branches))
     branches = [switch.source for switch in result.switches[:1]] or [at_rest]
@@ -552,7 +552,7 @@ def _head(figure: Figure, result: Fit, *, titled: bool) -> None:
     # No line begins with a dot.
     title = "\u00a0· ".join([name, result.law, f"{result.drive} drive", *more])
     title = textwrap.fill(title, int(12 * figure.get_figwidth()))
-    # A name may hold a dollar sign: it is no formula.
+    # A dollar sign in a name begins no formula.
     if titled:
         figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, parse_math=False)
     lines = figures.legend_below(figure, figures.named_in(figure.axes))

@@ -24,7 +24,7 @@ SNAPPED, STANDING = "#7FB2D9", "#E6EEF4"  # shades of a spring
 
 
 def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
-    """Draw the profile of each parameter that was followed, with its 95 % cut and its interval.
+    """Draw each profile of the cost with its 95 % threshold and interval.
 
     Four panels a row; dashed is the parabola of the local covariance.
     """
@@ -43,7 +43,7 @@ def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
 
 
 def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> None:
-    """One profile, its cut, its interval, and the parabola of the standard error."""
+    """Draw one profile: threshold, interval, and the parabola of the standard error."""
     factor, unit = readable_unit(float(np.max(np.abs(profile.values))), estimate.unit)
     top = 2.0 * profile.cut
     best = float(profile.values[np.argmin(profile.rises)])  # from the zero of the profile

@@ -1,4 +1,4 @@
-"""The figures of a result: each is drawn once for all files of it, in whatever process."""
+"""The figures of a result, each drawn once for all its files, in any process."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 Mapped = Callable[..., Iterable[Any]]  # as the built-in `map`
 SHOWN = 200  # dots per inch of figures that are only on the page, to save time
-# In the order in which they are begun: what takes longest first. Those on the screen are the fit on
-# the page, which has its title in the text, also on a phone.
+# In the order in which they are begun. Those on the screen show the fit on the page, which has its
+# own title, and on a phone.
 _ON_SCREEN = ("shown", "narrow")
 _NAMES = ("fit", *_ON_SCREEN, "snapping", "profiles")
 

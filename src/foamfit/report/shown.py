@@ -1,4 +1,4 @@
-"""Results as Python and notebooks show them: a few lines of text, or one line and a table."""
+"""How Python and notebooks show results: a few lines of text, or one line and a table."""
 
 from __future__ import annotations
 

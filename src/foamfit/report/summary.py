@@ -20,7 +20,7 @@ CURVES = {
     "stress_strain": "stress-strain",
 }
 ANSWERS = {True: "yes", False: "no", None: "–"}
-# The screen of a fit, of which two lines say where the result is; lines kept for its warnings.
+# Lines of the screen of a fit (two more say where the result is), and lines kept for warnings.
 LINES, COLUMNS, WARNING_LINES = 22, 80, 3
 LONGEST = 180  # characters of the reasons for a state; longer ones are left to the report
 
@@ -59,7 +59,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
 def _screen(
     result: Fit, rows: list[Readable], given: dict[str, Any], *, verbose: bool
 ) -> Iterator[str]:
-    """Give the lines of one screen: as much as it has room for, all with `verbose`."""
+    """Give the lines that have room on one screen, with `verbose` all."""
     head = words("short", part="head", **given).split("\n")
     head = [line for one in head for line in wrapped(one, 2, COLUMNS)[:2]]
     states = [w for check in result.checklist if check.key == "determined" for w in check.warnings]
@@ -112,7 +112,7 @@ def _cut(line: str) -> str:
 
 
 def _fitting(warnings: list[str], room: int) -> list[str]:
-    """Return the lines of warnings for which there is room: the last are cut, then left out."""
+    """Return the warnings in `room` lines: the last ones are cut, then left out."""
     told = [wrapped(f"warning: {warning}", 2, COLUMNS) for warning in warnings]
     for i in reversed(range(len(told))):
         if sum(map(len, told)) > room:
@@ -195,7 +195,7 @@ def _unknown(parameters: dict[str, ParameterEstimate]) -> dict[str, dict[str, li
 
 
 def _moved(result: Fit) -> tuple[str, float] | None:
-    """Parameter that the unfitted ± of the TOML move farthest, and by which share of its scale."""
+    """Return the parameter that the unfitted ± of the TOML move most, and by which share."""
     if (budget := result.budget) is None or not budget.contributions:
         return None
     shares = {

@@ -39,7 +39,7 @@ ByTest = Mapping[str, Sequence[ParameterEstimate | None]]
 
 
 def escaped(told: object) -> str:
-    """Return a text as LaTeX sets it; "?" stands for a letter that its fonts lack."""
+    """Escape a text for LaTeX; "?" stands for a letter that its fonts lack."""
     letters = (c if c.isprintable() else " " for c in str(told))
     return "".join(_TEXT.get(c, c if c <= _LAST_LETTER else "?") for c in letters)
 

@@ -1,4 +1,4 @@
-"""The summary of a batch: a row for each test, as CSV and as one page to read."""
+"""The summary of a batch: a row for each test, as CSV and as an HTML page."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from foamfit.text import counted, listed
 if TYPE_CHECKING:
     import pandas as pd
 
-# What a row says of a test without a result.
+# Status of a test without a result.
 REFUSED, OPEN = "refused", "not fitted"
 _STATUS = {
     "ok": "fitted",

@@ -89,7 +89,7 @@ def _write_test(one: Callable[[], Fit] | Fit, folder: Path, report: bool, width:
 
 
 def _told(found: Joint) -> dict[str, Any]:
-    """Return what text and page say alike: of joint.json, and the law in words."""
+    """Return what text and page have in common."""
     content = found.to_json_dict()
     tests, evidence = content["tests"].values(), dict[str, list[Mapping[str, Any]]]()
     for one in content["evidence"]:
@@ -109,7 +109,7 @@ def joint_text(found: Joint) -> str:
     told = _told(found)
     tests = list(told["found"]["tests"].items())[:MOST_ROWS]
     parameters = [
-        # The median of a parameter of single records means nothing.
+        # The median of a contact time or a zero means nothing.
         (name, one, "" if name in NUISANCE else in_unit((one.value,), one.unit), between(one))
         for name, one in found.parameters.items()
         if one.kind != "fixed" or one.value

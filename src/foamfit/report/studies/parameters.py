@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 LEAST_PANEL, LETTER = 0.62, 0.052  # in, of a panel and of a letter of a name
 TALLEST, ROW, ABOVE, MOST_ROWS = 7.5, 0.17, 2.5, 60  # in; most tests that are named
 DPI, ROOMY = 200, 0.8  # in, of a panel with more numbers
-# Edge and inside of a mark.
+# Colour of the edge and of the face of a mark.
 _MARKS = {"determined": (BLUE, BLUE), "weak": (BLUE, "white"), "not determined": (GREY, "white")}
 
 
@@ -98,7 +98,7 @@ def plot_parameters(
 
 
 def _short(tests: Sequence[str], most: int) -> list[str]:
-    """Names of so many letters at most: the end that all have is left out, then the beginning."""
+    """Shorten names to so many letters: without their common end, then without their beginning."""
     if all(len(name) <= most for name in tests):
         return list(tests)
     end = len(commonprefix([name[::-1] for name in tests])) if len(tests) > 1 else 0  # noqa: RUF071

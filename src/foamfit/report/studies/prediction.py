@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from foamfit.study.prediction.predicted import PredictedCurve, PredictedTest
 
 PANEL = (2.6, 2.2)  # inches
-# Colour of each part of the band, and its dashes, for who sees or prints grey.
+# Colour and dashes of each part of the band; dashes tell them apart in grey.
 COLOURS: dict[str, tuple[str, Any]] = {
     "parameters": (BLUE, "-"),
     "scatter": (INSIDE[1], (0, (5, 1.2))),
@@ -76,7 +76,7 @@ def prediction_text(found: PredictedTest) -> str:
 
 
 def plot_prediction(found: PredictedTest, *, width: str = TWO) -> Figure:
-    """Draw each curve with its band, the loop, and what makes the band.
+    """Draw each curve with its band, the loop, and the parts of the band.
 
     Above are the loop and each curve in time, below the half width that each part alone would give.
     `width` is "one" or "two" columns, or a length such as "85 mm"; what has no room beside the
