@@ -253,7 +253,7 @@ def _pair(side: Side, other: Side) -> Pair:
     about: dict[str, Any] = {"side": side, "other": other}
     differ = families[0] != families[1]
     nothing = words("incomparable", unpublished=unpublished, differ=differ, **about)
-    rows = tuple(_rows(side, other, nothing))
+    rows = (*_spring_rows(side, other, nothing), *_damping_rows(side, other, nothing))
     ratios = any("/" in row.name for row in rows)
     remarks = sentences("remarks", nothing=nothing, ratios=ratios, **about)
     status, stopped = side.given["status"], side.given.get("stopped")
@@ -284,26 +284,27 @@ def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
             yield Compared(f"{param.symbol[0]}_{k}", param.unit, (f"{param.name}{k}",), _total)
 
 
-def _rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
-    """Give the rows: spring by spring, then the damping of the striker's motion."""
-    kinds, theirs, item = side.model.kinds, other.model.kinds, other.source
+def _row(
+    at: tuple[int, str, str],
+    value: ParameterEstimate,
+    reference: ParameterEstimate | None,
+    about: tuple[Side, Side, str],
+    *,
+    eta: bool = False,
+) -> Row:
+    """Make a row of spring, name and unit; `about` are both sides and why nothing is compared."""
+    side, other, nothing = about
+    size = max(abs(value.value), abs(reference.value) if reference else 0.0)
+    vague = reference is not None and (value.stderr or 0.0) > NOTHING * size
+    given: dict[str, Any] = {"value": value, "reference": reference, "side": side, "other": other}
+    told = nothing or words("remark", eta=eta, vague=VAGUE if vague else "", **given)
+    theirs, error = (reference.value, reference.stderr) if reference else (None, None)
+    return Row(*at, value.value, value.stderr, value.state, theirs, error, told)
+
+
+def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
+    kinds, theirs = side.model.kinds, other.model.kinds
     several = len(kinds) > 1
-
-    def row(
-        at: tuple[int, str, str],
-        value: ParameterEstimate,
-        reference: ParameterEstimate | None,
-        eta: bool,
-    ) -> Row:
-        size = max(abs(value.value), abs(reference.value) if reference else 0.0)
-        vague = reference is not None and (value.stderr or 0.0) > NOTHING * size
-        given: dict[str, Any] = {"side": side, "other": other, "eta": eta}
-        given |= {"value": value, "reference": reference, "vague": VAGUE if vague else ""}
-        theirs = reference.value if reference else None
-        error = reference.stderr if reference else None
-        told = nothing or words("remark", **given)
-        return Row(*at, value.value, value.stderr, value.state, theirs, error, told)
-
     for i, kind in enumerate(kinds, start=1):
         alike = i <= len(theirs) and _family(theirs[i - 1]) == _family(kind)
         for one in _quantities(kind, side.model.relaxation):
@@ -315,15 +316,22 @@ def _rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
             if value is None or (eta and not several):
                 continue
             if not (eta and reference is None and (value.state, value.value) == ("fixed", 0.0)):
-                yield row((i if several else 0, one.label, one.unit), value, reference, eta)
-    names = [n for n in ("site_eta", "s1_eta")[: 1 if several else 2] if n in side.estimates]
+                at = (i if several else 0, one.label, one.unit)
+                yield _row(at, value, reference, (side, other, nothing), eta=eta)
+
+
+def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
+    """Give the damping of the striker's motion, and its ratio as the paper defines it."""
+    kinds, item = side.model.kinds, other.source
+    names = [n for n in ("site_eta", "s1_eta")[: 1 if len(kinds) > 1 else 2] if n in side.estimates]
     same = [n for n in names if n in other.estimates] if item is None else ["site_eta"]
     value, reference = side.evaluate(names, _total), other.evaluate(same, _total)
     if value is None:
         return
     if item is None and value.value == 0.0 and not (reference and reference.value):
         return
-    damping = row((0, "site η" if several else "η", "Pa·s"), value, reference, True)
+    at = (0, "site η" if len(kinds) > 1 else "η", "Pa·s")
+    damping = _row(at, value, reference, (side, other, nothing), eta=True)
     yield damping
     soft = [i for i, kind in enumerate(kinds, 1) if law(kind).hysteretic]
     if item is None or len(soft) != 1 or nothing:

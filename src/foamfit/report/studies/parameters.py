@@ -131,8 +131,17 @@ def _draw(ax: Axes, panel: Panel, tests: Sequence[str], roomy: bool) -> None:
     if bars:
         y, left, right = np.array(bars).T
         ax.hlines(y, left / factor, right / factor, color=GREY, lw=0.9, label="95 % interval")
-    size = 3.4 if len(tests) <= 25 else 2.4 if len(tests) <= MOST_ROWS else 1.4
-    for state, (edge, face) in {} if panel.kind in RATES else _MARKS.items():
+    if panel.kind not in RATES:
+        size = 3.4 if len(tests) <= 25 else 2.4 if len(tests) <= MOST_ROWS else 1.4
+        _draw_values(ax, there, factor, size)
+
+
+def _draw_values(
+    ax: Axes, there: Sequence[tuple[int, ParameterEstimate]], factor: float, size: float
+) -> None:
+    """Draw values by row and state; those beyond the panel as arrows at its edge."""
+    low, high = ax.get_xlim()
+    for state, (edge, face) in _MARKS.items():
         style: Any = {"color": edge, "mfc": face, "ls": "none", "ms": size, "mew": 0.8, "zorder": 4}
         points = [(p.value / factor, y) for y, p in there if p.state == state]
         if inside := [at for at in points if low <= at[0] <= high]:
