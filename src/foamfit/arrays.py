@@ -1,4 +1,4 @@
-"""The type of an array of numbers, and the threads of linear algebra."""
+"""The types of arrays, and the threads of linear algebra."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 _Given = ParamSpec("_Given")
 _Result = TypeVar("_Result")
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Integers
 from foamfit.data.measurement import Measurement, Record
 from foamfit.data.noise import noise_level, smooth
 from foamfit.errors import InputError
@@ -125,7 +124,7 @@ def _choose(cycles: list[Cycle], number: int | None) -> Cycle | None:
     raise InputError(f"cycle {number} cannot be taken: the file {wrong}; give one that it has.")
 
 
-def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> tuple[Record, list[str]]:
+def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
     """Keep one loading and unloading of a slow test, and say what is cut."""
     w, n, number = record.displacement, len(cycles), cycle.number
     assert w is not None  # it has cycles
@@ -150,12 +149,10 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> tuple[Rec
     if end == len(record) and w[last] - w[last:].min() <= _UNLOADED * size:
         notes.append("The record has no unloading, so nothing in it determines unloading.")
     after = f"after cycle {number if cycle.last is None else cycle.last}"
-    return record.between(start, end, f"before cycle {number}", after), notes
+    return record.noted(*notes).between(start, end, f"before cycle {number}", after)
 
 
-def cut_to_reload(
-    record: Record, cycles: list[Cycle], cycle: Cycle, height: float, origins: dict[str, float]
-) -> tuple[Record, list[str]]:
+def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: float) -> Record:
     """Cut a later cycle to its contact, with time, displacement and stress zero where it starts.
 
     The specimen is free or least loaded at the lowest displacements between the cycles. Contact is
@@ -187,7 +184,6 @@ def cut_to_reload(
     time = passed(record.instants)
     moment = "" if record.time is None else f" {engineering(time, 's')} in the file,"
     notes = [
-        *cut_to_cycle(record, cycles, cycle)[1],
         f"Contact of cycle {number} starts{moment} where the stress rises from its level between "
         f"the cycles, at a strain of {percent(contact / height)} from the first contact (start "
         f"strain, not recovered), which is taken off; {first - cycle.first} samples before and "
@@ -204,21 +200,23 @@ def cut_to_reload(
             "Check: the specimen stays under load between the cycles, by "
             f"{percent(loaded)} of the peak stress."
         )
+    origins = record.origins | {"start_strain": contact / height}
+    origins["stress_zero"] += offset
+    origins["displacement_zero"] += contact
+    origins |= {} if record.time is None else {"contact_time": time}
     moved = replace(
         record,
         time=None if record.time is None else record.time - time,
         stress=stress - offset,
         displacement=w - contact,
         interior={node: values - passed(values) for node, values in record.interior.items()},
+        origins=origins,
+        notes=(*cut_to_cycle(record, cycles, cycle).notes, *notes),
     )
     cut = moved.without(slice(cycle.end, None), f"after cycle {end_of}")
     cut = cut.without(slice(end, None), "after contact ends")
     cut = cut.without(slice(cycle.first, first), "before contact starts")
-    origins["start_strain"] = contact / height
-    origins["stress_zero"] += offset
-    origins["displacement_zero"] += contact
-    origins |= {} if record.time is None else {"contact_time": time}
-    return cut.without(slice(0, cycle.first), f"before cycle {number}"), notes
+    return cut.without(slice(0, cycle.first), f"before cycle {number}")
 
 
 def _hinge(w: Array, stress: Array) -> float:
@@ -232,7 +230,7 @@ def _hinge(w: Array, stress: Array) -> float:
     return float(places[int(np.argmin(left))])
 
 
-def find_turns(values: Array, back: float | None = None) -> NDArray[np.int64]:
+def find_turns(values: Array, back: float | None = None) -> Integers:
     """Samples at which a motion turns round: peaks and valleys by turns, the first a peak.
 
     Only what goes back by more than `back`, by default a twentieth of the range and more than the

@@ -22,20 +22,18 @@ class EnergyAudit:
 
     Attributes
     ----------
-    striker_energy : float or None
+    striker_energy
         Kinetic energy of the striker at contact per volume of foam, J/m³.
-    absorbed_energy, dissipated_energy : float or None
+    absorbed_energy, dissipated_energy
         ∫σ dε up to the largest strain, and over the whole history, J/m³.
-    dissipated_fraction, absorbed_over_striker : float or None
+    dissipated_fraction, absorbed_over_striker
         Dissipated over absorbed energy, and absorbed over the striker's energy.
-    rebound_velocity : float or None
+    rebound_velocity
         Velocity with which the top leaves, m/s, positive away from the specimen.
-    impulse, momentum_change, impulse_ratio : float or None
+    impulse, momentum_change, impulse_ratio
         ∫F dt over contact and m (v_in + v_out), N·s, and the first over the second.
-    motion : str or None
-        Where the displacement came from.
-    missing : tuple of str
-        What could not be computed and what it would need, one sentence each.
+    motion, missing
+        Where the displacement came from; a sentence for each thing that could not be computed.
     """
 
     striker_energy: float | None = None
@@ -52,8 +50,8 @@ class EnergyAudit:
 
     def as_dict(self) -> dict[str, float | str | None]:
         """Return the audit as plain values; `missing` and `warnings` are joined to one text."""
-        values: dict[str, float | str | None] = asdict(self)
-        return values | {"missing": " ".join(self.missing), "warnings": " ".join(self.warnings())}
+        told = {"missing": " ".join(self.missing), "warnings": " ".join(self.warnings())}
+        return asdict(self) | told
 
     def warnings(self) -> list[str]:
         """Return one sentence for each balance that does not close."""
@@ -91,16 +89,15 @@ class EnergyAudit:
 
     def sentences(self) -> list[str]:
         """Return what was found, what does not close, and what is missing."""
-        brought, taken, lost = (
-            None if value is None else engineering(value, "J/m³")
-            for value in (self.striker_energy, self.absorbed_energy, self.dissipated_energy)
-        )
         ratio, share, told = self.absorbed_over_striker, self.dissipated_fraction, list[str]()
-        told += [f"The striker brings {brought}."] * (brought is not None)
-        if taken is not None:
+        if self.striker_energy is not None:
+            told.append(f"The striker brings {engineering(self.striker_energy, 'J/m³')}.")
+        if self.absorbed_energy is not None:
             more = "" if ratio is None else f", {ratio:.2f} of what the striker brings"
+            taken = engineering(self.absorbed_energy, "J/m³")
             told.append(f"The foam absorbs {taken} up to the largest strain{more}.")
-        if share is not None:
+        if self.dissipated_energy is not None and share is not None:
+            lost = engineering(self.dissipated_energy, "J/m³")
             told.append(f"It dissipates {lost}, {percent(share)} of that.")
         if self.rebound_velocity is not None:
             told.append(f"The striker leaves at {self.rebound_velocity:.3g} m/s.")
@@ -112,13 +109,9 @@ class EnergyAudit:
         return [*told, *self.warnings(), *self.missing]
 
 
-def audit(measurement: Measurement) -> EnergyAudit:
-    """Compare what the striker brings with what the specimen takes.
-
-    Whatever a test lacks is left None and named in `missing`.
-    """
-    test, missing = measurement, list[str]()
-    striker, specimen = test.striker or Striker(), test.specimen
+def audit(test: Measurement) -> EnergyAudit:
+    """Compare what the striker brings with what the specimen takes; name what a test lacks."""
+    striker, specimen, missing = test.striker or Striker(), test.specimen, list[str]()
     stress, w, time = test.stress, test.displacement, test.time
     brought = absorbed = dissipated = rebound = impulse = change = None
     if striker.mass and striker.velocity:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Integers, Mask
 from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Record
 from foamfit.data.noise import averaged
 from foamfit.data.outliers import find_outliers
@@ -49,7 +49,7 @@ class Frames:
         )
 
 
-def join(record: Record, frames: Frames) -> tuple[Record, list[str]]:
+def join(record: Record, frames: Frames) -> Record:
     """Give a record of a force the motion of frames that have a clock of their own.
 
     Where frames are the rarer ones, a cubic spline through them gives the motion at every sample;
@@ -103,7 +103,7 @@ def join(record: Record, frames: Frames) -> tuple[Record, list[str]]:
             )
         else:
             record = record.changed(channel, _averaged(at[good], values[good], time))
-    return record, notes
+    return record.noted(*notes)
 
 
 def _nearest(time: Array, at: Array) -> NDArray[np.intp]:
@@ -135,7 +135,7 @@ def _averaged(at: Array, values: Array, time: Array) -> Array:
     return _through(at, values, time)
 
 
-def frames_of_blocks(record: Record, thinned: Record, edges: NDArray[np.int64]) -> Record:
+def frames_of_blocks(record: Record, thinned: Record, edges: Integers) -> Record:
     """Put channels that were not taken at every sample into the blocks that begin at `edges`.
 
     The value of a block is interpolated at its time, so that no average bends it, or, where each
@@ -156,7 +156,7 @@ def frames_of_blocks(record: Record, thinned: Record, edges: NDArray[np.int64]) 
     return thinned
 
 
-def noise_of_blocks(level: NoiseLevel, block: int, taken: NDArray[np.bool_] | None) -> NoiseLevel:
+def noise_of_blocks(level: NoiseLevel, block: int, taken: Mask | None) -> NoiseLevel:
     """Noise of blocks of samples, some of which were `taken`; see `frames_of_blocks`."""
     if taken is None:
         return averaged(level, block)

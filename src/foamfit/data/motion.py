@@ -1,11 +1,10 @@
 """The motion behind a noisy displacement, smooth between its turns, and how sure it is.
 
-A penalised spline with kinks goes through the samples; the likelihood says how many and where. The
-spline is of the fifth degree, and the square of its third derivative is penalised: what is free is
-a parabola. A kink a (x − s)+ is a jump of the velocity; neither its height nor its instant is
-penalised. Penalty and number of kinks are those of the largest marginal likelihood, in which the
-spline is a random function and each kink has a price; the final penalty is that of the restricted
-likelihood (REML).
+A penalised spline of the fifth degree with kinks goes through the samples; the square of its third
+derivative is penalised. A kink a (x − s)+ is a jump of the velocity; neither its height nor its
+instant is penalised. Penalty and number of kinks are those of the largest marginal likelihood, in
+which the spline is a random function and each kink has a price; the final penalty is that of the
+restricted likelihood (REML).
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class _Samples:
     """Samples (n,) in units of record and noise, and a basis (n, b) in which all is diagonal.
 
     A rotation takes the spline's coefficients to coordinates b, of which the fit has the normal
-    equations `data` and the penalty `rough`.
+    equations `data`, the penalty `rough` and the right side `y_onto`.
     """
 
     x: Array
@@ -58,6 +57,7 @@ class _Samples:
     basis: Array
     data: Array
     rough: Array
+    y_onto: Array
 
     @classmethod
     def of(cls, x: Array, y: Array, pieces: int) -> _Samples:
@@ -74,13 +74,10 @@ class _Samples:
         little = 1e-9 * np.trace(gram) / np.trace(penalty)  # for pieces without samples
         rough, rotation = linalg.eigh(penalty, gram + little * penalty)
         rough[:_ORDER] = 0.0
-        return cls(x, y, knots, rotation, basis @ rotation, 1.0 - little * rough, rough)
+        basis, data = basis @ rotation, 1.0 - little * rough
+        return cls(x, y, knots, rotation, basis, data, rough, basis.T @ y)
 
     @cached_property
-    def y_onto(self) -> Array:
-        return np.asarray(self.basis.T @ self.y)
-
-    @property
     def price(self) -> float:
         """What a kink, two unknowns, has to add to twice the log-likelihood (BIC)."""
         return 2.0 * float(np.log(self.x.size))
@@ -97,26 +94,13 @@ def _kinks(x: Array, instants: Array) -> Array:
     return np.maximum(x[:, None] - instants, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
 class _Fit:
     """Normal equations of a spline and columns (n, k) beside it, by default those of kinks."""
 
-    samples: _Samples
-    instants: Array
-    beside: Array | None = None
-
-    @cached_property
-    def columns(self) -> Array:
-        kinks = _kinks(self.samples.x, self.instants)
-        return kinks if self.beside is None else self.beside
-
-    @cached_property
-    def onto(self) -> Array:
-        return np.asarray(self.samples.basis.T @ self.columns)
-
-    @cached_property
-    def gram(self) -> Array:
-        return np.asarray(self.columns.T @ self.columns)
+    def __init__(self, samples: _Samples, instants: Array, columns: Array | None = None) -> None:
+        self.samples, self.instants = samples, instants
+        self.columns = _kinks(samples.x, instants) if columns is None else columns
+        self.onto, self.gram = samples.basis.T @ self.columns, self.columns.T @ self.columns
 
     def reduced(self, penalties: Array) -> tuple[Array, Array, Array]:
         """Weights (p, b) of the spline's coordinates, and equations of the columns without it.
@@ -151,11 +135,10 @@ class _Fit:
         dof = float((s.data / (s.data + penalty * s.rough)).sum()) + 2.0 * self.instants.size
         return float(np.sqrt(residual @ residual / max(s.x.size - dof, 1.0)))
 
-    @cached_property
+    @property
     def apart(self) -> bool:
         """Whether there are samples between any two kinks: without, there is no telling them."""
-        cells = np.searchsorted(self.samples.x, self.instants)
-        return bool(np.all(np.diff(cells) > 0))
+        return bool(np.all(np.diff(np.searchsorted(self.samples.x, self.instants)) > 0))
 
     @cached_property
     def best(self) -> tuple[float, float]:
@@ -195,15 +178,15 @@ class _Fit:
         return fit
 
     def settled(self, penalty: float) -> _Fit:
+        """Move the kinks at a stiff spline first, then at the best penalty."""
         fit = self.refined(_STIFF * penalty, 4)
         return fit.refined(fit.best[1], 6)
 
     def covariance(self, penalty: float, share: float) -> tuple[Array, Array, float]:
-        """What stays uncertain of the spline's coordinates, of the kinks' jumps and instants.
+        """Uncertainty of the spline's coordinates and of the kinks' jumps and instants.
 
-        Returns changes by one standard deviation each (unknowns, m), the largest first, so many
-        that they hold a share of the variance at the samples; the standard errors of the instants;
-        the effective number of parameters.
+        Returns changes by one standard deviation each (unknowns, m), the largest first, which hold
+        a share of the variance at the samples; standard errors of the instants; parameters in use.
         """
         s, k, size = self.samples, self.instants.size, self.samples.rough.size
         jumps, late = self.solve(penalty)[1], s.x[:, None] - self.instants
@@ -297,9 +280,8 @@ def _fitted(x: Array, y: Array, pieces: int) -> tuple[_Fit, float]:
 class _Modes:
     """Changes of the motion by one standard deviation each, by parts x of the record's duration.
 
-    They are those of the `spline`, of the `jumps` (k, m) of the velocity at the kinks, and of the
-    `instants` (k, m) of these. `kinks` (4, k) holds instants, their standard errors, jumps, and the
-    velocities before them.
+    They are those of the `spline`, and of the `jumps` (k, m) and `instants` (k, m) of its kinks.
+    `kinks` (4, k) holds instants, their standard errors, jumps, and the velocities before them.
     """
 
     spline: BSpline
@@ -339,8 +321,9 @@ class SmoothMotion:
 
     def at(self, times: Array) -> Array:
         """Displacement (m) at times inside the record; monotone between two turns."""
-        inside = self._part(times)
-        past = (np.asarray(times, float) - self._start) / self._duration - inside
+        part = (times - self._start) / self._duration
+        inside = np.clip(part, 0.0, 1.0)
+        past = part - inside
         ends = self._curve(np.array([0.0, 1.0]), 1)  # it goes straight on past what was measured
         return np.asarray(self._curve(inside) + past * np.where(past < 0.0, ends[0], ends[1]))
 
@@ -350,10 +333,7 @@ class SmoothMotion:
         The covariance of the motion at these times is `modes @ modes.T`. At a turn itself they are
         the changes of its height, wherever its instant moves to.
         """
-        return self._modes(self._part(times))
-
-    def _part(self, times: Array) -> Array:
-        return np.clip((np.asarray(times, float) - self._start) / self._duration, 0.0, 1.0)
+        return self._modes(np.clip((times - self._start) / self._duration, 0.0, 1.0))
 
 
 def follow(

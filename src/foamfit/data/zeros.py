@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,35 +34,26 @@ class Span:
     leaves: int
     returned: bool = True
 
-    @classmethod
-    def of_impact(cls, record: Record, start: Start, levels: Levels) -> Span:
-        """Keep a tenth of the rows of contact before it, a fiftieth after it.
 
-        The rows kept from before contact show no zeros: the estimate of contact may be late. A
-        derived stress shows its end less well: a quarter is kept after it.
-        """
-        first, stress = start.first, record.stress
-        before = stress[: max(0, first - 2)]
-        zero = float(before.mean()) if before.size >= _FEWEST else 0.0
-        if before.size < _FEW and (tail := tail_level(stress, levels["stress"])):
-            zero = tail.value
-        found, returned = contact_end(stress[first:] - zero, levels["stress"])
-        after = found // (4 if "stress" in record.derived else 50)
-        end = min(len(record), first + found + max(3, after)) if returned else len(record)
-        # Of few rows before contact half are kept and half show the zeros.
-        lead = min(max(_LEAST_LEAD, found // 10), first // 2 if first >= 2 * _FEWEST else first)
-        late = int(3 * start.error / float(np.median(np.diff(record.instants))))
-        rest = first - max(lead, min(late, 2 * first // 3))
-        return cls(first - lead, end, rest, first + found, returned)
+def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
+    """Keep a tenth of the rows of contact before it, a fiftieth after it.
 
-
-@dataclass
-class Zeros:
-    """What was taken off the channels, and the standard errors of the zeros that were measured."""
-
-    origins: dict[str, float] = field(default_factory=dict)
-    errors: dict[str, float] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    The rows kept from before contact show no zeros: the estimate of contact may be late. A derived
+    stress shows its end less well: a quarter is kept after it.
+    """
+    first, stress = start.first, record.stress
+    before = stress[: max(0, first - 2)]
+    zero = float(before.mean()) if before.size >= _FEWEST else 0.0
+    if before.size < _FEW and (tail := tail_level(stress, levels["stress"])):
+        zero = tail.value
+    found, returned = contact_end(stress[first:] - zero, levels["stress"])
+    after = found // (4 if "stress" in record.derived else 50)
+    end = min(len(record), first + found + max(3, after)) if returned else len(record)
+    # Of few rows before contact half are kept and half show the zeros.
+    lead = min(max(_LEAST_LEAD, found // 10), first // 2 if first >= 2 * _FEWEST else first)
+    late = int(3 * start.error / float(np.median(np.diff(record.instants))))
+    rest = first - max(lead, min(late, 2 * first // 3))
+    return Span(first - lead, end, rest, first + found, returned)
 
 
 def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
@@ -95,13 +86,13 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
 
 def take_zeros(
     record: Record, first: Record, start: Start, span: Span, levels: Levels, *, impact: bool
-) -> tuple[Record, Zeros]:
+) -> Record:
     """Take off what the channels of `first` show before contact, or a motion at contact.
 
     Where hardly a row lies before the contact of an impact, the end of the record shows the zero of
     a force that has left; where neither does, the file's own zero of the channel stands.
     """
-    done, n = Zeros(), span.rest
+    origins, errors, n = dict[str, float](), dict[str, float](), span.rest
     for name, values in first.curves("acceleration").items():
         if name in record.derived:
             continue
@@ -124,21 +115,20 @@ def take_zeros(
                     f"{name} stands."
                 )
             if zero.samples:
-                done.errors[name] = zero.error
+                errors[name] = zero.error
         else:
             zero, source = _zero_of_motion(name, first, start, n, noise, impact=impact)
             top = name == "displacement"
             if top and start.gauge == "rest" and n >= _FEWEST:
-                done.errors[name] = zero.error
+                errors[name] = zero.error
             if abs(zero.value) > (0.0 if top else 1e-3 * np.ptp(values)):
                 label, size = "The displacement" if top else name, engineering(zero.value, "m")
                 note = f"{label} at contact, {size}, is taken off ({source})."
-        done.notes += [note] * bool(note)
         whole = record.channel(name)
         assert whole is not None  # the record has the channels of its first cycle
-        record = record.changed(name, whole - zero.value)
-        done.origins[f"{name}_zero"] = zero.value
-    return record, done
+        record = record.changed(name, whole - zero.value).noted(*[note] * bool(note))
+        origins[f"{name}_zero"] = zero.value
+    return replace(record, origins=origins, zeros=errors)
 
 
 def _zero_at_rest(
@@ -216,7 +206,7 @@ def mark_flight(record: Record, start: Start, span: Span) -> Record:
     moves = record.instants > max(2.5 * step, 2 * start.error)
     if start.gauge == "rest":
         moves[span.leaves - span.first :] = False
-    kept = record.sampled.get("displacement", np.ones(len(record), dtype=np.bool_))
+    kept = record.sampled.get("displacement", np.ones(len(record), dtype=bool))
     return replace(record, sampled=record.sampled | {"displacement": kept & moves})
 
 
