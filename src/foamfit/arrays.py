@@ -1,4 +1,4 @@
-"""The types of arrays, and the threads of linear algebra."""
+"""Types and means of arrays, and the threads of linear algebra."""
 
 from __future__ import annotations
 
@@ -14,6 +14,11 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 _Given = ParamSpec("_Given")
 _Result = TypeVar("_Result")
+
+
+def means(values: Array, starts: Integers) -> Array:
+    """Means of the parts of a signal that begin at `starts`."""
+    return np.asarray(np.add.reduceat(values, starts) / np.diff(np.append(starts, len(values))))
 
 
 def single_threaded(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from foamfit.arrays import Array, Integers
+from foamfit.arrays import Array, Integers, means
 from foamfit.data.frames import Frames, join
 from foamfit.data.measurement import (
     MIN_ROWS,
@@ -344,7 +344,7 @@ def _averaged(
 ) -> tuple[dict[str, Array], Integers]:
     """Average neighbouring rows with the same time stamp; each is counted with its reason."""
     time = numbers["time"]
-    starts, counts = fresh_samples(time)
+    starts, _ = fresh_samples(time)
     again = np.delete(rows, starts)
     if not again.size:
         return numbers, rows
@@ -354,8 +354,8 @@ def _averaged(
         f"in row {again[0]}; rows with the same stamp are averaged (or refused by [data] "
         'duplicates = "refuse").'
     )
-    means = {c: np.add.reduceat(values, starts) / counts for c, values in numbers.items()}
-    return means | {"time": time[starts]}, rows[starts]
+    averages = {channel: means(values, starts) for channel, values in numbers.items()}
+    return averages | {"time": time[starts]}, rows[starts]
 
 
 def _check_time(time: Array, name: str, rows: Integers) -> None:

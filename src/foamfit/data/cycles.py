@@ -1,4 +1,4 @@
-"""The cycles of a slow test: where its motion turns round, and which loading is looked at."""
+"""The cycles of a slow test: where its motion turns round, and which of them are used."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from foamfit.data.noise import noise_level, smooth
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
-# Shares of the largest displacement: what a reversal goes back at least, what is left of it at
-# rest, what counts as unloading, and a cycle that is named for being small.
+# Shares of the largest displacement: the least way back of a reversal, the most that is left at
+# rest, the least that counts as unloading, and the peak below which a cycle is called small.
 _TURN, _REST, _UNLOADED, _SMALLER = 0.05, 0.35, 0.1, 0.9
-# Share of the range of the displacement that is lowest between cycles; shares of the peak stress
-# that are a load at all, and from which it is said that a later cycle never was without load.
+# Lowest share of the displacement between cycles; shares of the peak stress that count as a load,
+# and from which a later cycle is said to start under load.
 _LOWEST, _LOADED, _STILL_LOADED = 0.02, 0.01, 0.05
-# Share of its peak stress up to which the rise of a later cycle is taken for straight, the fewest
-# samples of it, and the places that are tried for its foot.
+# Share of its peak stress up to which the rise of a later cycle is straight, the fewest samples of
+# it, and the number of places that are tried for its foot.
 _EARLY, _FEWEST, _PLACES = 0.1, 5, 400
 _BEGUN = 3.0  # times the least load: above it the first rise has certainly begun
 
@@ -29,7 +29,7 @@ class Cycle:
     """One loading and unloading among the samples of a slow test: `first` up to `end`.
 
     `number` is that of the record's own column of cycles, or counts from 1; `place` counts from 0.
-    Several as one history are one with a `last` number, whose last peak is at `turn`.
+    Several cycles as one history have a `last` number and their last peak at `turn`.
     """
 
     number: int
@@ -55,9 +55,9 @@ class Cycle:
 def find_cycles(record: Record) -> list[Cycle]:
     """List the cycles of a slow test; none if it has no displacement.
 
-    A cycle ends where the motion has gone back most of the way of the smaller of the peaks on
-    either side; a reversal that goes back less is part of its cycle, and so is motion without load,
-    as an approach. It runs from the last rest before its rise to its first return to rest.
+    A cycle ends where the motion has gone back most of the way from the smaller of the peaks on
+    either side; a reversal that goes back less is part of its cycle, as is motion without load,
+    such as an approach. It runs from the last rest before its rise to its first return to rest.
     """
     w, stress = record.displacement, record.stress
     if w is None:
@@ -125,7 +125,7 @@ def _choose(cycles: list[Cycle], number: int | None) -> Cycle | None:
 
 
 def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
-    """Keep one loading and unloading of a slow test, and say what is cut."""
+    """Keep one loading and unloading of a slow test, or several cycles."""
     w, n, number = record.displacement, len(cycles), cycle.number
     assert w is not None  # it has cycles
     size, start, top, end = float(np.ptp(w)), cycle.first, cycle.top, cycle.end
@@ -155,10 +155,10 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
 def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: float) -> Record:
     """Cut a later cycle to its contact, with time, displacement and stress zero where it starts.
 
-    The specimen is free or least loaded at the lowest displacements between the cycles. Contact is
-    where a straight line through the early rise meets the level there; it ends where the stress is
-    back at that level. A level below zero is the sensor's: a foam does not pull its platen long.
-    What is taken off joins the `origins`, the strain that has not recovered as "start_strain".
+    The specimen is free or least loaded at the lowest displacements between the cycles. Contact
+    starts where a straight line through the early rise meets the level of the stress there, and
+    ends where the stress is back at that level. A level below zero is an offset of the sensor: a
+    foam does not pull its platen for long. The strain not recovered is `origins["start_strain"]`.
     """
     w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
     turn, end_of = cycle.last_top, number if cycle.last is None else cycle.last
@@ -238,22 +238,14 @@ def find_turns(values: Array, back: float | None = None) -> Integers:
     """
     if back is None:
         back = max(_TURN * float(np.ptp(values)), 8.0 * noise_level(values))
-    # The extremes of short blocks are all that counts.
-    block = max(1, len(values) // 20_000)
-    parts = values[: len(values) // block * block].reshape(-1, block)
-    first, rest = np.arange(len(parts)) * block, np.arange(parts.size, len(values))
-    at = np.unique(
-        np.concatenate([first + parts.argmin(axis=1), first + parts.argmax(axis=1), rest])
-    )
-    turns: list[int] = []
-    up, best = True, int(at[0])
-    for i, value in zip(at.tolist(), values[at].tolist(), strict=True):
-        ahead = value - values[best] if up else values[best] - value
+    turns, up, best, most = list[int](), True, 0, float(values[0])
+    for i, value in enumerate(values.tolist()):
+        ahead = value - most if up else most - value
         if ahead > 0.0:
-            best = i
+            best, most = i, value
         elif ahead < -back:
             turns.append(best)
-            up, best = not up, i
+            up, best, most = not up, i, value
     if up or not turns:  # the record ends on its way up
         turns.append(best)
     return np.array(turns, dtype=np.int64)

@@ -1,9 +1,9 @@
 """Samples to leave out: spikes, short gaps, a clipped force, a gauge that stands still.
 
 A sample is judged by its neighbours, not by a model. A gauge that stands still while the stress
-goes on, and then jumps, shows its play where a motion turns round, or a display that is not
-renewed there. A true hold has another end: the motion goes on smoothly from where it stood, and the
-stress follows.
+changes, and then jumps, has play where the motion turns round, or a display that is not renewed
+there. A true hold ends otherwise: the motion goes on smoothly from where it stood, and the stress
+follows.
 """
 
 from __future__ import annotations
@@ -18,44 +18,44 @@ from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Outliers, Record
 from foamfit.data.noise import estimated_noise, noise_level, quantum, robust_variance
 from foamfit.text import counted, engineering, percent
 
-# An outlier is off by this many standard deviations of its leave-one-out residual, and by this
-# many of what its neighbours are off when it is gone (at a kink they are off too).
+# An outlier is off by so many standard deviations of its leave-one-out residual, and by so many of
+# the residuals of its neighbours without it (at a kink they are off too).
 _OFF, _ALONE = 4.0, 2.5
 _LEAST = 5e-3  # of the range: what is less far off is no outlier
-_MOST = 0.02  # of the samples: if more stand out, they are no exceptions
-# A gap is entered and left by a jump so many times the median one of the samples nearby.
+_MOST = 0.02  # of the samples: if more stand out, none is an outlier
+# A gap begins and ends with a jump of so many times the median jump nearby; its longest, samples.
 _JUMP, _NEARBY, _MAX_RUN = 10.0, 31, 5
 _WIDTH, _HALF = 9, 4  # samples of a cubic, and on either side of its middle
-# Samples count as even if their steps differ by this share at most; a pause is so many times the
-# usual step; a middle sample is judged if its neighbours hold so much of the cubic.
+# Share by which the steps of even samples differ at most; usual steps that make a pause; least
+# leverage that the neighbours of a sample must have for it to be judged.
 _EVEN, _PAUSE, _OPEN = 0.02, 6.0, 0.1
 _CHUNK = 50_000
 # A force may be clipped where so many samples are equal at its top; a parabola falls by so many
 # steps of its digits within half that length on either side.
 _FLAT, _PARABOLA = 5, 3
-# A gauge stands still for at least so many of the steps in which it is read, and so many samples.
-_STEPS, _SAMPLES = 4, 8
+_STEPS, _SAMPLES = 4, 8  # a gauge stands still for at least so many of its readings, and samples
 # A jump is at least this share of the range, so many deviations of the noise and so many steps of
-# the digitiser; it takes so many samples at most; after it the motion goes on by less than a share.
+# the digitiser; it takes so many samples at most; then the motion goes on by less than a share.
 _LEAP, _ABOVE_NOISE, _DIGITS, _LONGEST, _GOES_ON = 0.003, 12.0, 2.5, 3, 0.75
-# While it stands the gauge moves by less than this share of its jump, and so many deviations; it
-# stands as soon as it is so near its level.
+# A gauge that stands moves by less than this share of its jump, and so many deviations of the
+# noise; it stands as soon as it is so near its level.
 _STANDS, _SCATTER, _NEAR = 0.1, 5.0, 0.02
-# Of the range of the stress: what a specimen in contact bears, by how much the stress changes while
-# the gauge stands, and what a motion as large as the jump would change.
+# Shares of the range of the stress: least stress of a specimen in contact, least change while the
+# gauge stands, and least change that a motion as large as the jump would cause.
 _CONTACT, _CHANGE, _FELT = 0.1, 0.005, 0.004
-# Of what such a motion would change, the stress changes by less than this share, and what is
-# missing is so many standard errors. The stiffness is taken over so many jumps on either side.
+# The stress follows by less than this share of that change, and what is missing is so many standard
+# errors. The stiffness is taken over so many jumps on either side.
 _FOLLOWS, _SURE, _AROUND = 0.5, 3.0, 3.0
 
 
 def find_outliers(values: Array, time: Array | None = None) -> Mask:
-    """Isolated samples that no smooth signal with this noise can hold: spikes and gaps.
+    """Isolated samples that cannot belong to a smooth signal with this noise: spikes and gaps.
 
     Gaps are up to five samples between two opposite jumps of ten times the median jump nearby. A
     spike is off the cubic through its eight neighbours by four standard deviations, while these
-    agree among themselves and the lines from either side do not lead to it. Nothing is judged
-    across a pause, and of a held channel only gaps. If more than 2 % stand out, none is an outlier.
+    agree among themselves and the lines from either side do not lead to it. Samples across a pause
+    are not judged, and of a held channel only gaps are found. If more than 2 % stand out, none is
+    an outlier.
     """
     n = values.size
     if n < 30:
@@ -164,8 +164,8 @@ def bridge_outliers(record: Record) -> Record:
 def mark_clipped(record: Record) -> Record:
     """Find the samples at which the force is clipped: a flat top at one value, with steep flanks.
 
-    A top whose values are rounded shows equal samples, too, but it is about a parabola, which falls
-    by three more steps of the digits within half the length of the flat; a clipped force by more.
+    A rounded top of a smooth curve has equal samples too, but is nearly a parabola, which falls by
+    three more steps of the digits within half the length of the flat; a clipped force by more.
     """
     stress = record.stress
     top = float(stress.max())
@@ -183,12 +183,11 @@ def mark_clipped(record: Record) -> Record:
     if top - max(around) < 4 * _PARABOLA * step:
         return record
     lines = record.row_numbers[at_top]
-    note = (
+    return replace(record, clipped=at_top).noted(
         f"Check: the force is clipped: {lines.size} samples have one and the same value at its "
         f"top, a stress of {engineering(top, 'Pa')} (rows {lines[0]} to {lines[-1]}); they are not "
         "fitted, the true peak is not known, and energy and impulse come out too small."
     )
-    return replace(record, clipped=at_top).noted(note)
 
 
 def outliers_of_blocks(record: Record, block: int) -> dict[str, Outliers]:
@@ -251,17 +250,16 @@ def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
         elif name != "stress" and is_staircase(values):
             fresh = values[fresh_samples(values)[0]]
             if len(fresh) >= MIN_ROWS:
-                levels[name] = replace(
-                    estimated_noise(fresh, "fresh samples"), time=len(values) / len(fresh)
-                )
+                level = estimated_noise(fresh, "fresh samples")
+                levels[name] = replace(level, time=len(values) / len(fresh))
     return levels
 
 
 def fill_staircase(record: Record) -> Record:
-    """Interpolate displacements that are held while the stress goes on.
+    """Interpolate displacements that are held while the stress changes.
 
-    The instants where a value is fresh are kept, and only these count as measured. A hold of more
-    than three usual steps is a real one: it lasts until one usual step before the next fresh value.
+    The instants at which a value is new are kept, and only these count as measured. A hold of more
+    than three usual steps is real: it lasts until one usual step before the next new value.
     """
     time = record.instants
     for name, values in record.curves().items():
@@ -285,9 +283,9 @@ def fill_staircase(record: Record) -> Record:
 def find_standstills(record: Record) -> list[tuple[int, int]]:
     """Find where the gauge of a slow test stands still and then jumps.
 
-    Returns the last sample before each stretch and the first after its jump: the specimen is in
-    contact and its stress changes, but does not follow the jump, with which the motion does not go
-    on. A displacement that is held at each reading is not yet interpolated.
+    Returns the last sample before each stretch and the first after its jump. Meanwhile the specimen
+    is in contact and its stress changes, but the stress does not follow the jump, and the motion
+    does not go on with it. A displacement held at each reading must not be interpolated yet.
     """
     w, stress, found = record.displacement, record.stress, list[tuple[int, int]]()
     if w is None or len(w) < 4 * _SAMPLES:
@@ -348,7 +346,7 @@ def _change(stress: Array) -> tuple[float, int]:
 def _follows(
     w: Array, stress: Array, noise: float, step: int, before: int, last: int, after: int
 ) -> bool:
-    """Whether the stress leaves its trend as by a motion as large as the jump, or this is unknown.
+    """Whether the stress leaves its trend as if the jump were a motion, or this is unknown.
 
     A gauge that is read at steps may show a motion a step late.
     """

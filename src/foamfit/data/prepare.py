@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, means
 from foamfit.data import contact, cycles, frames, zeros
 from foamfit.data import outliers as spoilt
 from foamfit.data.measurement import (
@@ -240,8 +240,8 @@ def stress_of_motion(
 ) -> Array:
     """Stress that brakes a striker, `ratio` (mass over area, kg/m²) times its deceleration.
 
-    That is read off a smoothing spline through the motion, to which it is as close as the noise
-    demands. A gauge that rests before contact, and perhaps after it, is followed in between.
+    The deceleration is that of a spline through the motion, smooth within the noise. A gauge that
+    rests before contact, and perhaps after it, is followed in between.
     """
     from scipy.interpolate import make_smoothing_spline
 
@@ -251,16 +251,15 @@ def stress_of_motion(
     if velocity is None:
         top = int(np.argmax(values))
         found = contact.leave_rest(time[: top + 1], values[: top + 1], noise, contact.STILL_MOTION)
-        first = int(np.searchsorted(time, found.time)) if found else 0
+        first = int(np.searchsorted(time, found[0])) if found else 0
         found = contact.leave_rest(
             -time[top:][::-1], values[top:][::-1], noise, contact.STILL_MOTION
         )
-        end = int(np.searchsorted(time, -found.time)) if found else end
+        end = int(np.searchsorted(time, -found[0])) if found else end
     n = end - first
     block = max(1, min(round(noise.time), n // 50), n // 1000)
     edges = np.arange(first, end, block)
-    counts = np.diff(np.append(edges, end))
-    t, y = (np.add.reduceat(x[:end], edges) / counts for x in (time, values))
+    t, y = (means(x[:end], edges) for x in (time, values))
     t, step = t - t[0], (t[-1] - t[0]) / len(t)
     # An estimate that is a little too small would have the curve follow the noise.
     sigma, low, high = 1.1 * averaged(noise, block).sigma, -6.0, 14.0
@@ -358,12 +357,11 @@ def thin(record: Record) -> Record:
         return record
     size = -(-n // _BLOCKS)
     edges = np.arange(0, n, size)
-    counts = np.diff(np.append(edges, n))
-    time = None if record.time is None else np.add.reduceat(record.time, edges) / counts
+    time = None if record.time is None else means(record.time, edges)
     note = f"{n} samples are averaged in {len(edges)} blocks of {size}."
     thinned = Record(time, record.stress, None, notes=(*record.notes, note))
     for name, values in record.curves("acceleration").items():
-        thinned = thinned.changed(name, np.add.reduceat(values, edges) / counts)
+        thinned = thinned.changed(name, means(values, edges))
     return frames.frames_of_blocks(record, thinned, edges)
 
 

@@ -84,11 +84,10 @@ def parse_quantity(value: object, si: str, where: str, example: str) -> float:
 def parse_uncertain(
     value: object, si: str, where: str, example: str, *, zero: bool = False
 ) -> tuple[float, float | None]:
-    """Read a quantity and its standard deviation, None where it has none, in the unit `si`.
+    """Read a quantity in the unit `si` and its standard deviation, None where it has none.
 
     It is written like "1.75 ± 0.01 m/s", "1.19 mm +/- 5 um" or "5 mm ± 1 %" (of the value). The
-    standard deviation must be less than the value, unless that may be `zero`. The InputError names
-    the place by `where`, and gives the `example`.
+    standard deviation must be less than the value, unless that may be `zero`.
     """
     text, spread = split_uncertain(value)
     number = _in_si(text, si)

@@ -1,4 +1,4 @@
-"""What the rows around contact show: zeros of the channels, and the flight of a striker."""
+"""What the rows around contact show: zeros of the channels, and the flight of the striker."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from foamfit.data.noise import MIN_REST, NOTHING, Level, level_on_line, line_at,
 from foamfit.text import engineering, percent
 
 _LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
-_FEW = 20  # rows before contact below which the end of a record that is flat shows the zero better
+_FEW = 20  # with fewer rows before contact, a flat end of the record shows the zero better
 _TAIL, _HIGHEST = 0.04, 0.1  # share of a record that is its end; of the range, its highest level
 _GRAVITY = 9.81  # m/s²
-# How a note begins to say which velocity a motion contradicts.
+# Part of a note on a velocity that the motion contradicts.
 CONTRADICTED = "but the striker's velocity is given as"
 
 
@@ -24,8 +24,7 @@ CONTRADICTED = "but the striker's velocity is given as"
 class Span:
     """Rows around contact: `first` up to `end` are kept, those before `rest` show zeros.
 
-    From the row `leaves` on there is no contact any more. `returned` says whether the stress has
-    returned to zero at the end.
+    Contact ends at the row `leaves`; `returned` says whether the stress is back at zero there.
     """
 
     first: int
@@ -57,11 +56,11 @@ def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
 
 
 def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
-    """Level of a force at the end of an impact's record, if it is flat there and the striker left.
+    """Level of a force at the end of an impact's record, if it is flat there: the striker has left.
 
     The end grows backwards as long as the rows before it lie at its level within a standard error:
-    a contact that ends softly presses for long by less than its noise. Of few rows the correlation
-    is not known: their mean counts as one row.
+    a soft end of contact stays below the noise for long. The correlation of few rows is unknown:
+    their mean counts as one row.
     """
     size = max(8, int(_TAIL * len(values)))
     step, n = max(4, size // 2), size
@@ -77,7 +76,7 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
             break
         n += step
         level = mean_level(values[-n:], noise)
-    # The rows next to the end of contact may still press.
+    # The rows next to the end of contact may still be loaded.
     level = mean_level(values[step - n :], noise) if n > 2 * step else level
     if level.samples < MIN_REST:
         level = level._replace(error=max(level.error, noise.sigma))
@@ -89,8 +88,8 @@ def take_zeros(
 ) -> Record:
     """Take off what the channels of `first` show before contact, or a motion at contact.
 
-    Where hardly a row lies before the contact of an impact, the end of the record shows the zero of
-    a force that has left; where neither does, the file's own zero of the channel stands.
+    With too few rows before the contact of an impact, the end of the record shows the zero of the
+    force; without those, the file's own zero of the channel stands.
     """
     origins, errors, n = dict[str, float](), dict[str, float](), span.rest
     for name, values in first.curves("acceleration").items():
@@ -110,10 +109,8 @@ def take_zeros(
             elif n >= _FEWEST:
                 zero, note = _zero_at_rest(name, values[:n], unit, np.ptp(values), noise)
             elif start.first:
-                note = (
-                    f"Only {n} rows certainly lie before contact: the file's own zero of the "
-                    f"{name} stands."
-                )
+                note = f"Only {n} rows certainly lie before contact: the file's own zero of the "
+                note += f"{name} stands."
             if zero.samples:
                 errors[name] = zero.error
         else:
@@ -134,7 +131,7 @@ def take_zeros(
 def _zero_at_rest(
     name: str, rest: Array, unit: str, size: float, noise: NoiseLevel
 ) -> tuple[Level, str]:
-    """Zero of a stress or acceleration at rest; one that drifts more than it is off is kept."""
+    """Zero of a stress or acceleration at rest; none is taken off if it drifts by more."""
     n, zero, scatter, told = len(rest), mean_level(rest, noise), float(rest.std()), ""
     slope = level_on_line(np.arange(n, dtype=np.float64), rest, 0.0, noise)[1]
     rise = slope.value * n
@@ -159,8 +156,8 @@ def _zero_of_motion(
 ) -> tuple[Level, str]:
     """Value of a motion at contact: the mean of its rest, or else that of a line there.
 
-    Where nothing was recorded before contact, the file's zero stands unless it lies elsewhere; a
-    slow test whose record starts under load has its own zero, too.
+    Where nothing was recorded before contact, the file's zero stands unless it is clearly wrong;
+    it also stands in a slow test whose record starts under load.
     """
     time, values, first = record.instants, record.channel(name), start.first
     assert values is not None  # asked for by its name
@@ -199,7 +196,7 @@ def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker)
 
 
 def mark_flight(record: Record, start: Start, span: Span) -> Record:
-    """Mark rows in which the motion is not the striker's, or may not be yet, as not measured."""
+    """Mark rows in which the motion is not, or perhaps not yet, the striker's as not measured."""
     if record.displacement is None or start.gauge in ("flight", ""):
         return record
     step = float(np.median(np.diff(record.instants)))
@@ -213,7 +210,7 @@ def mark_flight(record: Record, start: Start, span: Span) -> Record:
 def flight_notes(
     record: Record, start: Start, span: Span, levels: Levels, striker: Striker, spread: float
 ) -> list[str]:
-    """Compare the striker's flight with its velocity ± `spread`, m/s; name gravity if it acts."""
+    """Compare the flight of the striker with its velocity ± `spread`, m/s, and with gravity."""
     n, w, given, notes = start.first - 2, record.displacement, striker.velocity, list[str]()
     if w is None or not given or n < 8:
         return notes
@@ -245,15 +242,14 @@ def contact_end(stress: Array, noise: NoiseLevel) -> tuple[int, bool]:
     """Index after the last sample of the contact with the highest stress, and if it was reached.
 
     The end is the last return to zero of a moving mean, whose noise is half a percent of the peak
-    if the pulse is long enough. A stress that soon rises again has not ended, nor one whose mean
-    over the next quarter of the time since the peak is not zero within its error.
+    if the pulse is long enough. Contact goes on if the stress soon rises again, or if its mean over
+    the next quarter of the time since the peak is not zero within its error.
     """
     top = int(np.argmax(stress))
     peak = float(stress[top])
-    below = np.flatnonzero(stress[top:] < 0.5 * peak)
     loaded = int(np.count_nonzero(stress > 0.1 * peak))
     needed = noise.time * (2 * noise.sigma / (0.005 * peak)) ** 2
-    steep = int(below[0]) if below.size else 0
+    steep = int(np.argmax(stress[top:] < 0.5 * peak))  # 0 if it never falls so far
     width = max(1, steep // 12, int(min(needed, loaded // 24)))
     mean = smooth(stress, width)
 
