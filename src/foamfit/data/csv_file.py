@@ -1,8 +1,8 @@
 """A test file and its TOML become a `Measurement` in SI.
 
 A file holds one table, one row per sample; the unit of a channel is in its header, in a row of
-units beneath it, or in the ``[columns]`` table of the TOML. The motion may stand in a second file,
-which ``[motion]`` of the TOML names.
+units beneath it, or in ``[columns]`` of the TOML. The motion may be in a second file, which
+``[motion]`` of the TOML names.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def read_test(
         Where the file, its TOML or what they hold cannot be used.
     """
     path = Path(path)
-    read_bytes(path, "give the CSV file of a test", 0)  # missed before its TOML is
+    read_bytes(path, "give the CSV file of a test", 0)  # refuses a missing file before its TOML
     toml = Path(specimen) if specimen is not None else toml_beside(path)
     if specimen is None and not os.path.lexists(toml):
         raise without_toml(toml, read_text(path, "the CSV file of a test"))
@@ -302,7 +302,7 @@ def _compare(source: Source, numbers: dict[str, Array], settings: Settings) -> l
             values = read_numbers(table, {channel: k})[0][channel]
             values = values * si_factor(table, channel, k, None)
             values = _nominal(table.headers[k].measure(channel), values)
-        except InputError:  # it could not have been read
+        except InputError:  # no alternative
             continue
         used = TWINS.get(channel, channel)
         one, name = numbers[used] * as_used.get(used, 1.0), table.name(k)

@@ -193,7 +193,8 @@ class Record:
     def stood_still(self) -> Mask:
         """Samples at which the gauge stood still, shape (n,)."""
         none = np.zeros(len(self), dtype=bool)
-        return np.logical_or.reduce([none, *self.standstills.values()])
+        still: Mask = np.logical_or.reduce([none, *self.standstills.values()])
+        return still
 
     def curves(self, *more: str) -> dict[str, Array]:
         """Stress, displacement, `more` and displacements inside, as far as they are there."""

@@ -1,7 +1,7 @@
 """From the samples of a file to one loading and unloading, with time zero where contact starts.
 
-`condition` holds the steps in their order. Each returns a new `Record` and a sentence for each
-thing that it changed or left out.
+`condition` holds the steps in their order. Each returns a new `Record`, with a note on each thing
+that was changed or left out.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, 
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
-# What tests of specimens have, in SI; beyond it a unit is wrong, seldom the specimen.
+# Usual range of each quantity, SI; beyond it a unit is probably wrong.
 _USUAL = {
     "height": (1e-5, 1.0, "m"),
     "area": (1e-10, 1.0, "m²"),
@@ -42,7 +42,7 @@ _USUAL = {
     "modulus (peak stress over peak strain)": (10.0, 1e11, "Pa"),
     "duration": (1e-6, 1e7, "s"),
 }
-_MAX_ROWS, _BLOCKS = 1500, 1000  # above so many samples they are averaged in so many blocks
+_MAX_ROWS, _BLOCKS = 1500, 1000  # more samples than this are averaged in so many blocks
 
 
 def condition(
@@ -261,7 +261,7 @@ def stress_of_motion(
     edges = np.arange(first, end, block)
     t, y = (means(x[:end], edges) for x in (time, values))
     t, step = t - t[0], (t[-1] - t[0]) / len(t)
-    # An estimate that is a little too small would have the curve follow the noise.
+    # With an estimate that is a little too small the curve would follow the noise.
     sigma, low, high = 1.1 * averaged(noise, block).sigma, -6.0, 14.0
     for _ in range(24):
         middle = 0.5 * (low + high)

@@ -1,14 +1,13 @@
 """The TOML beside a test: specimen, striker, columns, noise, window and data, checked and in SI.
 
 [columns] names the column of a channel where its header does not: ``column`` (its header or its
-number), ``unit``, ``scale`` (a number, or a quantity such as "4444.4 N/V"; negative turns a sign
-round) and, for displacements, ``counts_down = true`` (a gap or a position that gets smaller in
+number), ``unit``, ``scale`` (a number, or a quantity such as "4444.4 N/V"; a negative one changes
+the sign) and, for displacements, ``counts_down = true`` (a gap or a position that gets smaller in
 compression). [data] ``duplicates`` is "average" (neighbouring rows with one time stamp make one
 sample) or "refuse", ``sheet`` that of a workbook. A quantity may have a standard deviation, "1.75 ±
-0.01 m/s"; `Measurement.uncertainties` says of which it is used.
-[motion] names a ``file`` that has the motion by a clock of its own, relative to the TOML, the
-``delay`` of that clock, and in [motion.columns] its columns. [priors] names parameters of the model
-and what is known of them before the fit, "5.5 ± 0.1 MPa".
+0.01 m/s"; `Measurement.uncertainties` lists those that are used. [motion] names a ``file`` with a
+clock of its own, relative to the TOML, the ``delay`` of that clock, and in [motion.columns] its
+columns. [priors] gives what is known of parameters before the fit, "5.5 ± 0.1 MPa".
 """
 
 from __future__ import annotations
@@ -91,8 +90,8 @@ MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
 class Column:
     """What [columns] says of one channel: its header, or number from 1, its unit and its scale.
 
-    `spread` is the relative standard deviation of the scale; one that `counts_down` gets smaller in
-    compression.
+    `spread` is the relative standard deviation of the scale; a column that `counts_down` gets
+    smaller in compression.
     """
 
     column: str | int
@@ -191,7 +190,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         if len(name) > LONGEST:
             raise InputError(f"name has {len(name)} characters; it must have {LONGEST} at most.")
         priors, window = _table(document, "priors"), values["window"]
-        for key, value in priors.items():  # the model, which is not known here, says which
+        for key, value in priors.items():  # which keys there are depends on the model
             if not isinstance(value, str):
                 raise InputError(f'[priors] {key} = {value!r} must be like "5.5 ± 0.1 MPa".')
         if {"cycle", "cycles"} <= window.keys():
@@ -264,7 +263,7 @@ def motion_file(toml: Path) -> Path | None:
     """Return the file that [motion] of a TOML names; None if it names none or cannot be read."""
     try:
         return _file(toml, load_toml(toml, "").get("motion"))
-    except InputError:  # who reads the test says it
+    except InputError:  # `read_settings` says what is wrong
         return None
 
 

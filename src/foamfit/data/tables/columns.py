@@ -52,12 +52,9 @@ class Source:
         forced, moved = bool(has & {"stress", "force"}), bool(has & set(_MOTIONS))
         braked = bool(has & {"acceleration", "velocity"} or (moved and striker.velocity))
         if not forced and not ("time" in has and braked and striker.mass):
-            entries = entries_of(table, has, "force", "displacement", "time")
-            raise InputError(
-                f"no column is a stress or a force (there are {table.listed}); name one like "
-                f"'stress (MPa)', or write {entries} in [columns]; with a time and the [striker] "
-                "mass an acceleration or a velocity will do, and with its velocity a displacement."
-            )
+            more = "with a time and the [striker] mass an acceleration or a velocity will do, and "
+            wanted, others = ("stress", "force"), ("displacement", "time")
+            raise self._lacks(wanted, others, f"; {more}with its velocity a displacement")
         if motion is not None:
             own = [c for c in self.columns if c in _MOTIONS or interior_node(c)]
             if own:
@@ -83,25 +80,28 @@ class Source:
         )
         if "time" not in has or not sources:
             timed = "" if "time" in has else f"{entries_of(table, has, 'time')} there, and "
-            raise InputError(
-                f"no column is a displacement or a strain (there are {table.listed}); name one "
-                f"like 'displacement (mm)', or write {entries_of(table, has, 'displacement')} in "
-                f"[columns], or give {timed}the [striker] mass and velocity to integrate the "
-                "motion."
-            )
+            more = f", or give {timed}the [striker] mass and velocity to integrate the motion"
+            raise self._lacks(_MOTIONS, (), more)
         return self.only(has)
 
     def of_motion(self) -> Source:
         """Choose time and displacements of a file of [motion]; refuse one that lacks them."""
         there = {c for c in self.columns if c in ("time", *_MOTIONS) or interior_node(c)}
-        for wanted, names in (("time", ["time"]), ("displacement", _MOTIONS)):
-            if not there & set(names):
-                entry = entries_of(self.table, set(), wanted)
-                raise InputError(
-                    f"no column is a {' or a '.join(names)} (there are {self.table.listed}); name "
-                    f"one like '{example(wanted)}', or write {entry} in [columns]."
-                )
+        for wanted in (("time",), _MOTIONS):
+            if not there & set(wanted):
+                raise self._lacks(wanted)
         return self.only(there)
+
+    def _lacks(
+        self, wanted: tuple[str, ...], others: tuple[str, ...] = (), more: str = ""
+    ) -> InputError:
+        """Say that no column is one of the `wanted` channels, and how to name one."""
+        entry = "force" if "force" in wanted else wanted[0]
+        entries = entries_of(self.table, set(self.columns), entry, *others)
+        return InputError(
+            f"no column is a {' or a '.join(wanted)} (there are {self.table.listed}); name one "
+            f"like '{example(wanted[0])}', or write {entries} in [columns]{more}."
+        )
 
     def left_out(self) -> dict[str, int]:
         """Columns that could be read instead of those that are: the twins and other times."""

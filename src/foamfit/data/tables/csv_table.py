@@ -106,12 +106,12 @@ def find_table(text: Text, names: set[str | int]) -> Table:
     """Find separator, header row and decimal sign; `names` are the columns given in the TOML."""
     lines = io.TextIOWrapper(io.BytesIO(text.raw), text.encoding, newline=None)
     head = [line.rstrip("\r\n") for line, _ in zip(lines, range(_HEAD_ROWS), strict=False)]
-    grids = {s: [cells for _, cells in _cells(head, s)] for s in _SEPARATORS}
+    grids = {s: [[c.strip() for c in cells] for _, cells in _cells(head, s)] for s in _SEPARATORS}
     whole = text.path, text.raw, text.encoding, text.sha256
     scope = scope_of(grids[","])
     if scope is not None:
         headers, first = tuple(map(parse_header, scope.headers)), scope.rows
-        row, cells = (1, tuple(c.strip() for c in grids[","][0])) if first else (0, ())
+        row, cells = (1, tuple(grids[","][0])) if first else (0, ())
         return Table(*whole, ",", ".", row, cells, first, headers, scope.clock)
     found = _header_row(grids, {n for n in names if isinstance(n, str)})
     if found is None or not any(map(_is_sample, grids[found[0]][found[1] :])):
@@ -136,12 +136,11 @@ def find_table(text: Text, names: set[str | int]) -> Table:
         told = f"row {i + 1}: the name of a column has {longest} characters"
         raise InputError(f"{told}; it must have {LONGEST} at most.")
     first, texts = _unit_row(grid, i)
-    body = [cells for cells in grid[first:] if any(c.strip() for c in cells)]
+    body = [cells for cells in grid[first:] if any(cells)]
     if not body:
         raise InputError(f"has a header in row {i + 1} but no rows of numbers below it.")
-    decimal, cells = _decimal_sign(body, len(texts), separator), tuple(c.strip() for c in grid[i])
-    headers = tuple(map(parse_header, texts))
-    return Table(*whole, separator, decimal, i + 1, cells, first, headers)
+    decimal, headers = _decimal_sign(body, len(texts), separator), tuple(map(parse_header, texts))
+    return Table(*whole, separator, decimal, i + 1, tuple(grid[i]), first, headers)
 
 
 def _cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -179,7 +178,7 @@ def _above_numbers(grids: dict[str, list[list[str]]], names: set[str | int]) -> 
         rows = [k for k, cells in enumerate(grid) if _is_sample(cells)]
         if len(rows) < 3 or len({len(grid[k]) for k in rows[:3]}) > 1:
             continue
-        above = [k for k in range(rows[0]) if sum(c.strip() != "" for c in grid[k]) > 1]
+        above = [k for k in range(rows[0]) if sum(map(bool, grid[k])) > 1]
         if above and _unit_row(grid, above[-1] - 1)[0] == above[-1] + 1:
             above.pop()
         if above and above[-1] >= rows[0] - 3:
@@ -203,7 +202,7 @@ def _score(cells: list[str], names: set[str]) -> int:
     """How many channels and given names a row holds; 0 for a row with numbers."""
     if len(cells) < 2 or any(map(_is_number, cells)):
         return 0
-    headers = [parse_header(cell) for cell in cells if cell.strip()]
+    headers = list(map(parse_header, filter(None, cells)))
     channels = {c for c in CHANNELS for h in headers if h.rank(c) is not None}
     return len(channels) + len({n for n in names for h in headers if h.is_named(n)})
 
@@ -214,18 +213,18 @@ def _is_number(cell: str) -> bool:
 
 def _holds_numbers(cells: list[str]) -> bool:
     """Whether a row is one of numbers: two at least, and nothing else."""
-    full = [cell for cell in cells if cell.strip()]
+    full = list(filter(None, cells))
     return len(full) > 1 and all(map(_is_number, full))
 
 
 def _is_sample(cells: list[str]) -> bool:
     """Whether a row may be a sample: two numbers at least, and less of anything else."""
-    return 2 * sum(map(_is_number, cells)) > max(sum(c.strip() != "" for c in cells), 3)
+    return 2 * sum(map(_is_number, cells)) > max(sum(map(bool, cells)), 3)
 
 
 def _decimal_sign(body: list[list[str]], width: int, separator: str) -> str:
     """Comma or point; where the comma separates cells too, the numbers stand in quotation marks."""
-    values = [value.strip() for row in body for value in row[:width]]
+    values = [value for row in body for value in row[:width]]
     commas = [v for v in values if re.fullmatch(r"[+-]?\d*(?:,\d+)+(?:[eE][+-]?\d+)?", v)]
     if not commas or separator != ",":
         return "," if commas else "."
@@ -242,21 +241,21 @@ def _decimal_sign(body: list[list[str]], width: int, separator: str) -> str:
 def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
     """First row of numbers, and the headers with the units of the row beneath, if there is one."""
     texts = list(grid[i])
-    said = {cells[0].strip().casefold(): cells[1:] for cells in grid[:i] if len(cells) > 1}
+    said = {cells[0].casefold(): cells[1:] for cells in grid[:i] if len(cells) > 1}
     above = [*said.get("horizontal units", [])[:1], *said.get("vertical units", [])]
     for k, unit in enumerate(above[: len(texts)]):  # of a Tektronix MSO
-        if unit.strip() and parse_header(texts[k]).unit is None:
-            texts[k] = f"{texts[k].strip()} ({unit.strip()})"
+        if unit and parse_header(texts[k]).unit is None:
+            texts[k] = f"{texts[k]} ({unit})"
     first = _below_rule(grid, i + 1)
-    below = [cell.strip().strip("()[]") for cell in grid[first]] if first < len(grid) else []
-    units = [cell for cell in below if cell]
+    below = [cell.strip("()[]") for cell in grid[first]] if first < len(grid) else []
+    units = list(filter(None, below))
     known = [unit for unit in units if is_unit(unit, any_case=True) and not _is_number(unit)]
     if not known or 2 * len(known) < len(units) or any(map(_is_number, units)):
         return first, texts
     for k, unit in enumerate(below[: len(texts)]):
         own = parse_header(texts[k]).unit
-        if unit and texts[k].strip() and (own is None or not texts[k].strip().endswith((")", "]"))):
-            texts[k] = f"{texts[k].strip()} ({unit})"
+        if unit and texts[k] and (own is None or not texts[k].endswith((")", "]"))):
+            texts[k] = f"{texts[k]} ({unit})"
     return _below_rule(grid, first + 1), texts
 
 
