@@ -34,14 +34,7 @@ from foamfit.data.tables.columns import TWINS, Source, si_factor
 from foamfit.data.tables.csv_table import read_numbers, read_text, without_cut_row
 from foamfit.data.tables.draft import without_toml
 from foamfit.data.tables.headers import CHANNELS, example
-from foamfit.data.toml_file import (
-    Column,
-    Settings,
-    is_range,
-    read_bytes,
-    read_settings,
-    toml_beside,
-)
+from foamfit.data.toml_file import Column, Settings, is_range, read_settings, toml_beside
 from foamfit.data.units import LARGEST
 from foamfit.errors import InputError, naming
 from foamfit.text import engineering, percent
@@ -94,7 +87,6 @@ def read_test(
         Where the file, its TOML or what they hold cannot be used.
     """
     path = Path(path)
-    read_bytes(path, "give the CSV file of a test", 0)  # refuses a missing file before its TOML
     toml = Path(specimen) if specimen is not None else toml_beside(path)
     if specimen is None and not os.path.lexists(toml):
         raise without_toml(toml, read_text(path, "the CSV file of a test"))

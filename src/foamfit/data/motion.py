@@ -14,12 +14,11 @@ from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 from scipy.interpolate import BSpline, PPoly
 from scipy.special import ndtr
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Integers, Mask
 from foamfit.data.cycles import find_turns
 from foamfit.data.measurement import NoiseLevel
 from foamfit.data.noise import quantum, residual_noise
@@ -337,10 +336,7 @@ class SmoothMotion:
 
 
 def follow(
-    time: Array | None,
-    displacement: Array,
-    noise: NoiseLevel,
-    counts: NDArray[np.bool_] | None = None,
+    time: Array | None, displacement: Array, noise: NoiseLevel, counts: Mask | None = None
 ) -> SmoothMotion:
     """Find the motion behind a displacement (n,), m, at times (n,), s, or samples.
 
@@ -348,23 +344,17 @@ def follow(
     data contradict, is estimated again from what the motion leaves. Motions found are kept: every
     model of a record, and every resampling of its other curves, goes by the same one.
     """
-    raw = (None if given is None else given.tobytes() for given in (time, displacement, counts))
-    return _found(*raw, noise)
+    times = np.arange(displacement.size, dtype=float) if time is None else time
+    taken = slice(None) if counts is None else counts
+    return _found(times[taken].tobytes(), displacement[taken].tobytes(), noise)
 
 
 @lru_cache(maxsize=32)
-def _found(
-    raw_time: bytes | None, raw_displacement: bytes, raw_counts: bytes | None, noise: NoiseLevel
-) -> SmoothMotion:
+def _found(raw_times: bytes, raw_motion: bytes, noise: NoiseLevel) -> SmoothMotion:
     """Find the motion from the bytes of the arrays of `follow`."""
-    displacement = np.frombuffer(raw_displacement)
-    time = None if raw_time is None else np.frombuffer(raw_time)
-    counts = None if raw_counts is None else np.frombuffer(raw_counts, bool)
-    taken = np.ones(displacement.size, bool) if counts is None else counts
-    times = np.arange(displacement.size, dtype=float) if time is None else time
-    own, w = times[taken], displacement[taken]
-    start, duration = float(own[0]), float(np.ptp(own))
-    x = (own - start) / duration
+    times, w = np.frombuffer(raw_times), np.frombuffer(raw_motion)
+    start, duration = float(times[0]), float(np.ptp(times))
+    x = (times - start) / duration
     middle, size = float(np.mean(w)), max(float(np.ptp(w)), 1e-300)
     pieces, finest = max(4, min(x.size // _PIECE, _PIECES)), min(_MANY, x.size // 2)
     slow, shown, digital = np.sqrt(max(noise.time, 1.0)), residual_noise(w)[0], quantum(w) / 12**0.5
@@ -374,7 +364,7 @@ def _found(
         sigma = noise.sigma
     for _ in range(8):
         if sigma <= _LITTLE * size:
-            return _exact(times[taken], w, max(sigma, _ROUNDING * size))
+            return _exact(times, w, max(sigma, _ROUNDING * size))
         unit = sigma * slow
         fit, penalty = _fitted(x, (w - middle) / unit, pieces)
         left = fit.left(penalty) * unit
@@ -431,8 +421,8 @@ def _exact(times: Array, values: Array, sigma: float) -> SmoothMotion:
     corners = [corner for i in turns if (corner := _corner(x, values, int(i), 4.0 * sigma))]
     if corners:
         more, heights = np.array(corners).T
-        order = np.argsort(np.append(x, more), kind="stable")
-        x, values = np.append(x, more)[order], np.append(values, heights)[order]
+        places = np.searchsorted(x, more)
+        x, values = np.insert(x, places, more), np.insert(values, places, heights)
     turns, slopes = _turns(x, values, modes, bounds), np.gradient(values, x)
     curve, at = _monotone(x, values, (slopes, slopes), turns), start + duration * x[turns[1:-1]]
     return SmoothMotion(at, sigma, float(x.size), curve, modes, start, duration)
@@ -456,9 +446,7 @@ def _corner(x: Array, y: Array, i: int, off: float) -> tuple[float, float] | Non
     return None
 
 
-def _turns(
-    x: Array, values: Array, modes: _Modes, bounds: tuple[float, float]
-) -> NDArray[np.int64]:
+def _turns(x: Array, values: Array, modes: _Modes, bounds: tuple[float, float]) -> Integers:
     """Return the places between which the motion goes back significantly, with both ends.
 
     Standard errors of differences are taken within `bounds`.
@@ -484,9 +472,7 @@ def _turns(
     return at
 
 
-def _monotone(
-    x: Array, values: Array, velocities: tuple[Array, Array], turns: NDArray[np.int64]
-) -> PPoly:
+def _monotone(x: Array, values: Array, velocities: tuple[Array, Array], turns: Integers) -> PPoly:
     """Return the curve through the values, in cubic pieces that go nowhere back between turns."""
     y = values.copy()
     for first, last in pairwise(turns):

@@ -210,20 +210,24 @@ def outliers_of_blocks(record: Record, block: int) -> dict[str, Outliers]:
     return found
 
 
-def outlier_note(name: str, count: int, found: Outliers | None, timed: bool) -> str:
-    """Name a channel's outliers: how many, and where those of the part that is used are."""
-    note = f"Check: {counted(count, 'sample')} of the {name} stood out as spikes or gaps and"
-    if found is None or not found.at.size:
-        return f"{note} were bridged, none of them in the part that is used."
-    unit = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}.get(name, "m")
-    told = [
-        f"{engineering(value, unit)} at {engineering(at, 's') if timed else f'sample {at:.0f}'}"
-        for at, value in zip(found.at[:4], found.values[:4], strict=True)
-    ]
-    used = found.at.size
-    more = f" and {used - 4} more" if used > 4 else ""
-    part = "" if used == count else f", {used} of them in the part that is used"
-    return f"{note} are not fitted{part}: {', '.join(told)}{more}."
+def notes_on(record: Record, spikes: dict[str, int], found: dict[str, Outliers]) -> list[str]:
+    """Count the `spikes` and gaps of each channel; name those of the used part and standstills."""
+    notes = []
+    for name, count in spikes.items():
+        note = f"Check: {counted(count, 'sample')} of the {name} stood out as spikes or gaps and"
+        one = found.get(name)
+        if one is None or not one.at.size:
+            notes.append(f"{note} were bridged, none of them in the part that is used.")
+            continue
+        unit = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}.get(name, "m")
+        told, used = list[str](), one.at.size
+        for at, value in zip(one.at[:4], one.values[:4], strict=True):
+            where = f"sample {at:.0f}" if record.time is None else engineering(at, "s")
+            told.append(f"{engineering(value, unit)} at {where}")
+        more = f" and {used - 4} more" if used > 4 else ""
+        part = "" if used == count else f", {used} of them in the part that is used"
+        notes.append(f"{note} are not fitted{part}: {', '.join(told)}{more}.")
+    return notes + [note for note, rows in record.standstills.items() if rows.any()]
 
 
 def fresh_samples(

@@ -102,17 +102,14 @@ def condition(
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
     outliers = spoilt.outliers_of_blocks(whole, block)
-    timed = record.time is not None
-    told = [spoilt.outlier_note(c, n, outliers.get(c), timed) for c, n in spikes.items()]
-    told += [note for note, rows in whole.standstills.items() if rows.any()]
-    instants = whole.instants if timed else whole.instants // block
+    instants = whole.instants if whole.time is not None else whole.instants // block
     stood = [instants[rows] for rows in whole.standstills.values() if rows.any()]
     channels = record.time, record.stress, record.displacement
     return Measurement(
         *("", None, "", *channels, specimen, striker),  # no name and no file
         noise=Noise(estimated=noise),
         motion=whole.motion,
-        notes=(*record.notes, *told),
+        notes=(*record.notes, *spoilt.notes_on(whole, spikes, outliers)),
         interior=record.interior,
         outliers=outliers,
         contact="stress" if used.place else start.by,
@@ -206,10 +203,8 @@ def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> Re
     time = record.time
     assert time is not None  # without a time the file has been refused
     if record.clipped is not None and record.acceleration is None and record.velocity is None:
-        raise InputError(
-            "the force is clipped, so the motion cannot be integrated from it; give a "
-            "displacement, an acceleration or a velocity."
-        )
+        wrong = "the force is clipped, so the motion cannot be integrated from it"
+        raise InputError(f"{wrong}; give a displacement, an acceleration or a velocity.")
     if record.acceleration is not None and striker.velocity:
         rate, source = -record.acceleration, "acceleration"
     elif record.velocity is not None:
@@ -246,16 +241,15 @@ def stress_of_motion(
     from scipy.interpolate import make_smoothing_spline
 
     values = displacement if velocity is None else velocity
-    assert values is not None  # see needed_columns
+    assert values is not None  # see `Source.needed`
     noise, first, end = estimated_noise(values), 0, len(time)
     if velocity is None:
         top = int(np.argmax(values))
-        found = contact.leave_rest(time[: top + 1], values[: top + 1], noise, contact.STILL_MOTION)
-        first = int(np.searchsorted(time, found[0])) if found else 0
-        found = contact.leave_rest(
-            -time[top:][::-1], values[top:][::-1], noise, contact.STILL_MOTION
-        )
-        end = int(np.searchsorted(time, -found[0])) if found else end
+        there, back = (time[: top + 1], values[: top + 1]), (-time[top:][::-1], values[top:][::-1])
+        if found := contact.leave_rest(*there, noise, contact.STILL_MOTION):
+            first = int(np.searchsorted(time, found[0]))
+        if found := contact.leave_rest(*back, noise, contact.STILL_MOTION):
+            end = int(np.searchsorted(time, -found[0]))
     n = end - first
     block = max(1, min(round(noise.time), n // 50), n // 1000)
     edges = np.arange(first, end, block)
