@@ -207,8 +207,9 @@ def _record(source: Source, settings: Settings) -> Record:
             stress, acceleration = acceleration * ratio, None
             notes.append("The force is the striker's mass times its acceleration.")
         else:
-            motion = displacement, numbers.get("velocity")
-            stress, derived = stress_of_motion(numbers["time"], *motion, ratio), ("stress",)
+            motion = numbers["time"], displacement, numbers.get("velocity")
+            stress = stress_of_motion(*motion, ratio, striker.gravity or 0.0)
+            derived = ("stress",)
             notes.append(
                 "The force is the striker's mass times the deceleration of its motion, read off a "
                 "smoothing spline; it is no measurement of its own."

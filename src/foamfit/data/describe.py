@@ -86,7 +86,8 @@ def _given(test: Measurement) -> list[tuple[str, list[str]]]:
     if striker is None:
         return [("specimen", [specimen]), ("striker", ["none given"])]
     own = f" ± {spread['velocity']:.2g}" if "velocity" in spread else ""
-    velocity = f"{striker.velocity:.4g}{own} m/s" if striker.velocity else "velocity unknown"
+    own += " m/s" + ", falling" * bool(striker.gravity)
+    velocity = f"{striker.velocity:.4g}{own}" if striker.velocity else "velocity unknown"
     mass = given(striker.mass, "g", "striker_mass", 1e3) if striker.mass else "mass unknown"
     return [("specimen", [specimen]), ("striker", [f"{mass}, {velocity}"])]
 

@@ -20,6 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from scipy.constants import g as standard_gravity
+
 from foamfit.data.measurement import Noise, Specimen, Striker, Window, interior_node
 from foamfit.data.units import (
     is_unit,
@@ -68,6 +70,7 @@ _SECTIONS: dict[str, dict[str, _Quantity | _Other]] = {
     "striker": {
         "mass": _Quantity("kg", "7 g", "striker_mass"),
         "velocity": _Quantity("m/s", "1.75 m/s", "velocity"),
+        "gravity": _Other(lambda v: type(v) is bool, "true or false"),
     },
     "noise": {"stress": _Quantity("Pa", "20 kPa"), "displacement": _Quantity("m", "2 um")},
     "window": {
@@ -200,7 +203,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         return Settings(
             name=name,
             specimen=_specimen(values["specimen"], spreads),
-            striker=Striker(**values["striker"]) if values["striker"] else None,
+            striker=_striker(values["striker"]),
             noise=Noise(**values["noise"]),
             window=Window(**window),
             columns=_columns(_table(document, "columns"), channels),
@@ -238,6 +241,12 @@ def _value(section: str, key: str, value: Any, spreads: dict[str, float]) -> Any
             raise InputError(f'{where} = "{v}" must be positive.')
         numbers.append(number)
     return tuple(numbers) if several else numbers[0]
+
+
+def _striker(values: dict[str, Any]) -> Striker | None:
+    if "gravity" in values:
+        values["gravity"] = standard_gravity if values["gravity"] else 0.0
+    return Striker(**values) if values else None
 
 
 def _specimen(values: dict[str, Any], spreads: dict[str, float]) -> Specimen:

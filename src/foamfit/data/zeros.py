@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.constants import g as gravity
 
 from foamfit.arrays import Array
 from foamfit.data.contact import ELSEWHERE, Levels, Start
@@ -15,7 +16,6 @@ from foamfit.text import engineering, percent
 _LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
 _FEW = 20  # with fewer rows before contact, a flat end of the record shows the zero better
 _TAIL, _HIGHEST = 0.04, 0.1  # share of a record that is its end; of the range, its highest level
-_GRAVITY = 9.81  # m/s²
 # Part of a note on a velocity that the motion contradicts.
 CONTRADICTED = "but the striker's velocity is given as"
 
@@ -207,26 +207,34 @@ def mark_flight(record: Record, start: Start, span: Span) -> Record:
     return replace(record, sampled=record.sampled | {"displacement": kept & moves})
 
 
-def flight_notes(
+def flight_of(
     record: Record, start: Start, span: Span, levels: Levels, striker: Striker, spread: float
-) -> list[str]:
-    """Compare the flight of the striker with its velocity ± `spread`, m/s, and with gravity."""
+) -> tuple[Striker, list[str]]:
+    """Compare the striker's flight with its velocity ± `spread`, m/s, and find whether it falls.
+
+    Returns the striker, with the gravity that its flight shows where nothing is known of it.
+    """
     n, w, given, notes = start.first - 2, record.displacement, striker.velocity, list[str]()
     if w is None or not given or n < 8:
-        return notes
+        return striker, notes
     noise, t = levels["displacement"], record.instants[:n] - start.time
     (half, speed, _), variance = np.polyfit(t, w[:n], 2, cov="unscaled")
     sigma = noise.sigma * float(np.sqrt(noise.time))
-    gravity, error = 2.0 * float(half), 2.0 * sigma * float(np.sqrt(variance[0, 0]))
-    falls = gravity > 4.0 * error and abs(gravity - _GRAVITY) < 0.2 * _GRAVITY + 2.0 * error
+    shown, error = 2.0 * float(half), 2.0 * sigma * float(np.sqrt(variance[0, 0]))
+    falls = shown > 4.0 * error and abs(shown - gravity) < 0.2 * gravity + 2.0 * error
     if falls:
         error = sigma * float(np.sqrt(variance[1, 1]))
         gain = gravity * float(record.instants[span.end - 1] - start.time) / given
-        notes.append(
-            f"Check: before contact the striker is still accelerated by gravity, by "
-            f"{engineering(gravity, 'm/s²')}, {gravity * 1e-3:.3g} m/s per ms; the law has no "
-            f"gravity in it, which over the contact is {percent(gain)} of its velocity."
+        told = (
+            f"before contact the striker accelerates by {engineering(shown, 'm/s²')}: it falls, "
+            f"and gains {percent(gain)} of its velocity over the contact"
         )
+        if striker.gravity is None:
+            striker = replace(striker, gravity=gravity)
+        if striker.gravity:
+            notes.append(f"{told[0].upper()}{told[1:]}. The fit includes gravity.")
+        else:
+            notes.append(f"Check: {told}, but [striker] gravity is false.")
     else:
         speed, error = level_on_line(t, w[:n], 0.0, noise)[1][:2]
     off, error = abs(speed - given), float(np.hypot(error, spread))
@@ -235,7 +243,7 @@ def flight_notes(
             f"Check: before contact the displacement moves at {speed:.4g} ± {error:.2g} m/s, "
             f"{CONTRADICTED} {given:.4g} m/s."
         )
-    return notes
+    return striker, notes
 
 
 def contact_end(stress: Array, noise: NoiseLevel) -> tuple[int, bool]:
