@@ -331,12 +331,22 @@ def test_a_striker_whose_flight_shows_gravity_is_said_to_fall(acts, given):
     done = run(record(level=1e-4, before=4000, gravity=acts), striker)
     notes = [note for note in done.notes if "it falls" in note]
     assert len(notes) == (acts > 0.0)
-    assert done.striker.gravity == (9.80665 if acts and given is None else given)
+    assert done.striker.gravity == ((9.80665 if acts else 0.0) if given is None else given)
     if acts:
         contradicted = given == 0.0
         assert notes[0].startswith("Check:") == contradicted
         assert ("[striker] gravity is false" in notes[0]) == contradicted
         assert ("The fit includes gravity." in notes[0]) != contradicted
+
+
+@pytest.mark.parametrize(("given", "asks"), [(None, True), (0.0, False), (9.80665, False)])
+def test_where_gravity_matters_and_the_record_does_not_show_it_the_toml_is_asked(given, asks):
+    done = run(record(channels="FW", before=4), replace(STRIKER, gravity=given))
+    notes = [note for note in done.notes if "write gravity = true or false" in note]
+    assert len(notes) == asks
+    assert done.striker.gravity == given
+    if asks:
+        assert notes[0].startswith("Check: a striker that falls gains 2 % of its velocity")
 
 
 @pytest.mark.parametrize("channels", ["FW", "AW"])
