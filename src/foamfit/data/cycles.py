@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement, Record
 from foamfit.data.noise import noise_level, smooth
+from foamfit.data.zeros import Zeros
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
@@ -22,6 +23,7 @@ _LOWEST, _LOADED, _STILL_LOADED = 0.02, 0.01, 0.05
 # Share of its peak stress up to which the rise of a later cycle is taken for straight, the fewest
 # samples of it, and the places that are tried for its foot.
 _EARLY, _FEWEST, _PLACES = 0.1, 5, 400
+_SURE = 4.0  # standard errors by which a stress is below zero
 _BEGUN = 3.0  # times the least load: above it the first rise has certainly begun
 
 
@@ -166,9 +168,7 @@ def cut_to_reload(
     w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
     turn, end_of = cycle.last_top, number if cycle.last is None else cycle.last
     assert w is not None  # it has cycles
-    before = slice(cycles[cycle.place - 1].top, top)
-    lowest = w[before] <= w[before].min() + _LOWEST * np.ptp(w)
-    free = float(np.median(stress[before][lowest]))
+    free = float(np.median(_stress_between(record, cycles, cycle.place - 1)))
     mean = smooth(stress, max(1, (top - cycle.first) // 100))
     rise = float(mean[top]) - free
     early = cycle.first + int(np.argmax(mean[cycle.first : top + 1] >= free + _EARLY * rise))
@@ -219,6 +219,37 @@ def cut_to_reload(
     origins["displacement_zero"] += contact
     origins |= {} if record.time is None else {"contact_time": time}
     return cut.without(slice(0, cycle.first), f"before cycle {number}"), notes
+
+
+def zero_between(
+    record: Record, cycles: list[Cycle], cycle: Cycle, found: Zeros
+) -> tuple[Record, list[str]]:
+    """Take a stress below zero after the first cycle of a history for the zero of the stress.
+
+    A specimen that is pressed a little before its first contact and is free after it shows its zero
+    there.
+    """
+    if cycle.last is None:
+        return record, []
+    rest = _stress_between(record, cycles, cycle.place)
+    zero, error = float(np.median(rest)), float(np.std(rest)) / float(np.sqrt(rest.size))
+    if zero > -_SURE * error:
+        return record, []
+    found.origins["stress_zero"] += zero
+    found.errors["stress"] = error
+    note = (
+        f"The stress between the first two cycles, {engineering(zero, 'Pa')}, is taken off as the "
+        "sensor's offset: without contact the specimen bears none."
+    )
+    return replace(record, stress=record.stress - zero), [note]
+
+
+def _stress_between(record: Record, cycles: list[Cycle], place: int) -> Array:
+    """Stresses at the lowest displacements between the peaks of a cycle and of the next one."""
+    w, between = record.displacement, slice(cycles[place].top, cycles[place + 1].top)
+    assert w is not None  # it has cycles
+    lowest = w[between] <= w[between].min() + _LOWEST * np.ptp(w)
+    return np.asarray(record.stress[between][lowest])
 
 
 def _hinge(w: Array, stress: Array) -> float:

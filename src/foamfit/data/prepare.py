@@ -28,6 +28,7 @@ from foamfit.data.cycles import (
     cut_to_reload,
     find_cycles,
     inner_reversals,
+    zero_between,
 )
 from foamfit.data.frames import frames_of_blocks, noise_of_blocks
 from foamfit.data.measurement import (
@@ -112,6 +113,7 @@ def condition(
     if used.place:  # with a contact of its own
         record = done(cut_to_reload(record, cycles, used, specimen.height, found.origins))
     else:
+        record = done(zero_between(record, cycles, used, found))
         record = done(cut_to_cycle(record, cycles, chosen)) if chosen else record
         record = done(cut_to_contact(record, start, span, found.origins))
     if impact:

@@ -35,6 +35,7 @@ from foamfit.fitting.curves import (
     interior_curves,
     later,
     moved_at,
+    without_tension,
 )
 from foamfit.fitting.losses import LOSSES, Weighing, soften, softness
 from foamfit.solve.plan import AnyPlan, Motion
@@ -53,10 +54,8 @@ OF_DRIVE = ("those of the drive",)  # nuisance parameters, where none are named
 MODEL_ERROR = 0.005
 MAX_STEPS = 20_000  # a trial that needs more is too stiff to be worth waiting for
 RTOL_OF_ANY_LAW = 1e-5  # of a registered law, whose halved steps cost more
-# Standard deviation of normal residuals over the median of their sizes.
-NORMAL = 1.4826
-# Most instants that are simulated for each sample that averages rows of the file.
-FINEST = 8
+NORMAL = 1.4826  # standard deviation of normal residuals over the median of their sizes
+FINEST = 8  # most instants that are simulated for each sample that averages rows of the file
 # Steps of differences: of the velocity and the mass, relative, of times over the instants' gap, and
 # of the zero of a motion over its range.
 RELATIVE_STEP, STEP_OF_TIME, STEP_OF_ZERO = 1e-3, 0.02, 1e-4
@@ -418,8 +417,9 @@ class Objective:
             )
 
         motion = run(plan, everywhere)
-        late = at.get(nuisances.TIME_SHIFT, 0.0)
-        shown = motion
+        if self._driven and self.measurement.last_cycle is not None:
+            motion = without_tension(motion)
+        late, shown = at.get(nuisances.TIME_SHIFT, 0.0), motion
         if late != 0.0 and self.drive == "impact":
             shown = run(plan._replace(time=plan.time - late), everywhere)
         along = motion if self._driven else None
