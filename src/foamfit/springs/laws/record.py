@@ -366,8 +366,10 @@ STRENGTH = Param(
     "g", ("g", ""), "", "strength of a relaxation term", (0.2, "one"), (0.0, 10.0), "one",
     "value", inner=(0.0, 1.0), least_size=0.1, admissible="zero or positive", example="0.5",
 )  # fmt: skip
+# The least time is about that of a sample, of which a record has 1500 at most: what relaxes faster
+# acts as a dashpot, and explicit steps would have to follow it.
 RELAXATION_TIME = Param(
-    "tau", ("τ", ""), "s", "time of a relaxation term", (0.05, "duration"), (1e-4, 30.0),
+    "tau", ("τ", ""), "s", "time of a relaxation term", (0.05, "duration"), (1e-3, 30.0),
     "duration", inner=(math.log(0.002), math.log(1.0)), example="0.2 s",
 )  # fmt: skip
 HEIGHT = Param(
