@@ -70,7 +70,7 @@ def batch(
     if jobs is not None and scheduler is not None:
         raise InputError("--jobs and --scheduler exclude each other; leave one of them out")
     output.check()
-    search, (alone, several) = keywords_of(asked), cycles_of(asked["cycle"])
+    search, (alone, several) = keywords_of(asked), cycles_of(asked)
     from foamfit.study import processes
 
     if scheduler is None:
@@ -79,13 +79,10 @@ def batch(
     from foamfit.study.batch import run
     from foamfit.study.batch_work import Recipe
 
-    cycles = alone if several is None else several
-    if asked["cycles"] is not None and asked["cycle"] is not None:
-        raise InputError("give either --cycle or --cycles, not both")
     recipe = Recipe(
         model=asked["model"],
         options={},
-        cycles=cycles,
+        cycles=alone if several is None else several,
         fix=asked["fix"] or None,
         vary=asked["vary"],
         pages=not output.no_report,

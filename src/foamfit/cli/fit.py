@@ -88,8 +88,14 @@ def model_name(asked: Mapping[str, Any]) -> str:
     return "auto" if model == "auto" else Model.parse(model, asked["relaxation"]).words
 
 
-def cycles_of(text: str | None) -> tuple[int | None, tuple[int, ...] | None]:
-    """Read --cycle: the one cycle that is named, or the several that are ("all" names none)."""
+def cycles_of(asked: Mapping[str, Any]) -> tuple[int | None, tuple[int, ...] | None]:
+    """Read --cycle: the one cycle that is named, or the several that are ("all" names none).
+
+    InputError if it is wrong, or --cycles is given too.
+    """
+    text = asked["cycle"]
+    if text is not None and asked["cycles"] is not None:
+        raise InputError("give either --cycle or --cycles, not both")
     if text is None or text.strip().lower() == "all":
         return None, None if text is None else ()
     parts = text.split(",")
@@ -125,11 +131,8 @@ def fit_as_asked(
 
     search = keywords_of(asked)
     model = model_name(asked)
-    alone, several = cycles_of(asked["cycle"])
-    together = asked.get("cycles")
-    if together is not None and asked["cycle"] is not None:
-        raise InputError("give either --cycle or --cycles, not both")
-    measurement = read_test(test, specimen, alone, cycles=together)
+    alone, several = cycles_of(asked)
+    measurement = read_test(test, specimen, alone, cycles=asked["cycles"])
     for number in set(several or ()).difference(measurement.cycles):
         last = f"its cycles are {min(measurement.cycles)} to {max(measurement.cycles)}"
         raise InputError(f"--cycle {asked['cycle']}: {test} has no cycle {number}; {last}")

@@ -17,6 +17,7 @@ from typing import Any
 
 import panel as pn
 
+from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.page.curves import Curves, grid, misfits_text
 from foamfit.page.desk import BUSY, FIRST, LARGEST, QUANTITIES, Checked, Desk
@@ -31,10 +32,11 @@ from foamfit.springs.model import Model
 # Where a checkout of the repository may be: the working directory, or around an editable install.
 CHECKOUTS = (Path(), Path(__file__).parents[3])
 # Options that are shown, and those that are folded away; --fix and --vary have ticks.
-SHOWN = ("model", "drive", "relaxation", "cycle")
+CYCLES = ("cycle", "cycles")  # shown where a record has several
+SHOWN = ("model", "drive", "relaxation", *CYCLES)
 FOLDED = (
     *laws.OPTIONS,
-    *("cycles", "starts", "max_time", "seed", "loss", "interior_mass", "time_shift"),
+    *("starts", "max_time", "seed", "loss", "interior_mass", "time_shift"),
     *("profile", "bootstrap", "mcmc"),
 )
 # Options on which the curves of a model depend.
@@ -49,7 +51,7 @@ COMPILING = (
     "machine is busy, a whole one. Meanwhile a test can be dropped and its specimen filled in."
 )
 TEXT, FIELD = style("text"), style("field")
-WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: #fdeeed; }"
+WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: var(--bad); }"
 WIDE: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
 STYLE: dict[str, Any] = {
     "stylesheets": [FIELD],
@@ -142,14 +144,15 @@ class Window:
         self.check = button("Check the test", self._check)
         lists = {"model": models(), "relaxation": [*range(RELAXATIONS)]}
         self.options = {name: Field(name, lists.get(name), **STYLE) for name in (*SHOWN, *FOLDED)}
-        self.model, _, self.relaxation, self.cycle = (self.options[n].widget for n in SHOWN)
-        self.cycle.visible = False
+        self.model, _, self.relaxation, *self.cycles = (self.options[n].widget for n in SHOWN)
+        for field in self.cycles:
+            field.visible = False
         self.run = button("Fit", self._run, "primary", disabled=True)
         self.stop = button("Stop, and keep the best", self._stop, "danger", visible=False)
         self.back = button("Back to the fit", self._back, visible=False)
         self.report_of = select(name="Report and curves of cycle", options=[0], visible=False)
         self.report_of.param.watch(self._back, "value")
-        self.fields = (*self.quantities.values(), self.rest, self.cycle)
+        self.fields = (*self.quantities.values(), self.rest, *self.cycles)
         for field in self.fields:
             field.param.watch(self._edited, "value")
         for name in ("model", *OF_CURVES):
@@ -245,7 +248,9 @@ class Window:
         self._filling = True  # one check after all of them
         if self.desk.worker is None:  # what is shown of a fit is of another test
             self._hide_result("There is no fit yet.")
-            self.curves.held, self.curves.found, self.cycle.value = {}, {}, ""
+            self.curves.held, self.curves.found = {}, {}
+            for field in self.cycles:
+                field.value = ""
         if found is not None or self.desk.replaced:
             quantities, self.rest.value = found or ({}, "")
             for name, field in self.quantities.items():
@@ -265,10 +270,11 @@ class Window:
 
     def _check(self, event: Any = None) -> None:
         """Check the test as it is filled in, and show what is understood or wrong."""
-        (given, rest), cycle = self._given(), self.cycle.value or ""
+        given, rest = self._given()
+        which = [argument for name in CYCLES for argument in self.options[name].arguments()]
         self.run.disabled = True
         self._asked[PREPARING] += 1  # curves in preparation are of the old test
-        self._beside(READING, lambda: self.desk.check(given, rest, cycle), self._show_checked)
+        self._beside(READING, lambda: self.desk.check(given, rest, which), self._show_checked)
 
     def _show_checked(self, checked: Checked | Exception) -> None:
         if isinstance(checked, Exception):
@@ -286,8 +292,9 @@ class Window:
         self._allow()
         if self.desk.measurement is not None:
             there = len(self.desk.measurement.cycles)
-            self.cycle.visible = there > 1
-            self.cycle.name = f"{self.options['cycle'].label} This record has {there}."
+            for field in self.cycles:
+                field.visible = there > 1
+            self.cycles[0].name = f"{self.options['cycle'].label} This record has {there}."
         self._model_chosen()
 
     # ------------------------------------------------------------------------------- the curves
@@ -305,20 +312,28 @@ class Window:
         except InputError:  # said when it is fitted
             asked = parsed([])
         model = models()[1] if auto else self.model.value
-        self._turn_model(model, self.desk.measurement.cycle, **keywords(asked))
+        self._turn_model(model, self.desk.measurement, **keywords(asked))
 
     def _hide_curves(self, why: str = "") -> None:
         self.curves.hide()
         self.misfit.object = wrong(why)
 
     def _turn_model(
-        self, model: str, cycle: int, values: Mapping[str, float] | None = None, **options: Any
+        self,
+        model: str,
+        of: Measurement | News,
+        values: Mapping[str, float] | None = None,
+        **options: Any,
     ) -> None:
-        """Show other sliders under the curves, at these values or at values read off the loop."""
+        """Show other sliders under the curves, at these values or at values read off the loop.
+
+        The cycles are those of a test or of a report.
+        """
 
         def make() -> Turning:
             self.first_use.needed(model, options["relaxation"]).result()
-            made = Turning(self.desk.measured(cycle), model, values, **options)
+            test = self.desk.measured(of.cycle, of.last_cycle)
+            made = Turning(test, model, values, **options)
             made.turn({})  # loads the compiled code
             return made
 
@@ -342,7 +357,7 @@ class Window:
     def _arguments(self, ticked: bool = True) -> list[str]:
         """Return the arguments of `foamfit fit` for what is filled in."""
         auto = self.model.value == "auto"
-        hidden = {"relaxation": auto, "cycle": not self.cycle.visible}
+        hidden = {"relaxation": auto} | dict.fromkeys(CYCLES, not self.cycles[0].visible)
         shown = (field for name, field in self.options.items() if not hidden.get(name))
         given = [argument for field in shown for argument in field.arguments()]
         if auto or not ticked:
@@ -402,8 +417,10 @@ class Window:
         if not news.values or self.desk.measurement is None:
             return
         now = self.curves.turning
-        there = None if now is None else (now.law, now.drive, now.problem.measurement.cycle)
-        if there != (law_in_words(news.model, news.relaxation), news.drive, news.cycle):
+        test = None if now is None else now.problem.measurement
+        there = now and test and (now.law, now.drive, test.cycle, test.last_cycle)
+        law = law_in_words(news.model, news.relaxation)
+        if there != (law, news.drive, news.cycle, news.last_cycle):
             self._turn_fitted(news)
         else:
             self.curves.put(news.values)
@@ -411,11 +428,9 @@ class Window:
     def _turn_fitted(self, news: News) -> None:
         """Show the curves of the last fit at the values of a report."""
         assert self.desk.worker is not None
-        assert self.desk.measurement is not None
         options = keywords(parsed(self.desk.worker.job.arguments))
         options |= {"relaxation": news.relaxation, "drive": news.drive}
-        cycle = news.cycle or self.desk.measurement.cycle
-        self._turn_model(news.model, cycle, news.values, **options)
+        self._turn_model(news.model, news, news.values, **options)
 
     def _ended(self) -> None:
         """Show the result of the fit, or why it failed."""
@@ -452,8 +467,8 @@ class Window:
         self.curves.found = fit["parameters"]
         values = {name: one["value"] for name, one in fit["parameters"].items()}
         place = {name: fit[name] for name in ("relaxation", "drive")}
-        model = Model.of_result(fit).name
-        self._turn_fitted(News(cycle=cycle, values=values, model=model, **place))
+        place |= {name: fit["data"][name] for name in ("cycle", "last_cycle")}
+        self._turn_fitted(News(values=values, model=Model.of_result(fit).name, **place))
 
 
 def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,9 +12,10 @@ import shutil
 import tomllib
 import unicodedata
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import tomli_w
 
@@ -131,10 +132,12 @@ class Desk:
 
     # ------------------------------------------------------------------------------- the test
 
-    def check(self, quantities: Mapping[str, str], rest: str, cycle: str = "") -> Checked:
+    def check(
+        self, quantities: Mapping[str, str], rest: str, arguments: Sequence[str] = ()
+    ) -> Checked:
         """Read the test as `foamfit check` does, and say what was understood or what is wrong.
 
-        `cycle` is as the command takes it; of several the first is read.
+        `arguments` are those of `foamfit fit` on cycles; of several apart the first is read.
         """
         if self.running:
             return Checked(error=BUSY)
@@ -144,8 +147,10 @@ class Desk:
         toml = self.csv.with_suffix(".toml")
         try:
             toml.write_text(join_toml(quantities, rest), encoding="utf-8")
-            alone, several = cycles_of(cycle.strip() or None)
-            measurement = read_test(self.csv, toml, several[0] if several else alone)
+            asked = parsed([*arguments])
+            alone, several = cycles_of(asked)
+            first = several[0] if several else alone
+            measurement = read_test(self.csv, toml, first, cycles=asked["cycles"])
             # By its own name: the folder of the window means nothing to a user.
             text = describe(replace(measurement, path=Path(self.csv.name)), audit(measurement))
         except InputError as error:
@@ -157,13 +162,14 @@ class Desk:
         self.measurement = measurement
         return Checked(text)
 
-    def measured(self, cycle: int) -> Measurement:
-        """Return a cycle of the test that was checked last."""
+    def measured(self, cycle: int, last: int | None) -> Measurement:
+        """Return a cycle of the test that was checked last, or with a `last` one a history."""
         assert self.csv is not None
-        assert self.measurement is not None
-        if cycle == self.measurement.cycle:
-            return self.measurement
-        return read_test(self.csv, self.csv.with_suffix(".toml"), cycle)
+        there = self.measurement
+        if there is not None and (cycle, last) == (there.cycle, there.last_cycle):
+            return there
+        which: Any = {"cycles": (cycle, last)} if last else {"cycle": cycle}
+        return read_test(self.csv, self.csv.with_suffix(".toml"), **which)
 
     @property
     def toml(self) -> bytes:

@@ -74,6 +74,15 @@ class Sliders(JSComponent):
         self._send_msg({"drawn": True})
 
 
+class Chain(JSComponent):
+    """The chain as it deforms along its loop, at an instant that is chosen or played."""
+
+    frames = param.Dict({})
+
+    _esm = TEMPLATES / "chain.js"
+    _stylesheets: ClassVar[list[str]] = [style("inputs"), style("chain")]
+
+
 def message(event: Any) -> dict[str, Any]:
     """Return what a browser sent, which may be anything, as a dictionary."""
     return event.data if isinstance(event.data, dict) else {}

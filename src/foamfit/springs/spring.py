@@ -155,6 +155,10 @@ class Spring(ABC):
         """Fraction of micro-springs that has snapped along a stress history (Pa), if it has any."""
         return None
 
+    def snapped_along(self, strain: ArrayLike) -> Array | None:
+        """Fraction that has snapped along a strain history, (n,); None where the law has none."""
+        return None
+
     def stress(self, strain: ArrayLike) -> Array:
         """Stress (Pa) along a strain history, shape (n,), from rest.
 

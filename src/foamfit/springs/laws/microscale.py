@@ -149,6 +149,15 @@ class MicroscaleSpring(Spring):
             snapped[j], ever[j] = p, most
         return snapped, ever
 
+    def snapped_along(self, strain: ArrayLike) -> Array:
+        """Fraction that has snapped along a strain history, (n,), from none."""
+        from scipy.special import ndtr
+
+        from foamfit.springs import microscale_kernels
+
+        ranks = microscale_kernels.stress_along(self.row, self._along(strain)[0])[1]
+        return np.asarray(ndtr(ranks[0]))
+
     def elastic_branches(self, stress: Array) -> dict[str, Array]:
         """Strains of branches a (none has snapped) and c (all have) at these stresses (Pa).
 
