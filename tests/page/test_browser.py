@@ -7,6 +7,7 @@ import shutil
 import time
 import zipfile
 from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -332,7 +333,8 @@ def test_everyone_can_use_it_at_once(window):
     """A checker finds nothing serious, nothing is cut off, keys reach all, a move is drawn soon."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is missing")
     load(window)
-    for width in (390, 1280):  # of a phone and a laptop
+    for width, colours in product((390, 1280), ("dark", "light")):  # of a phone and a laptop
+        window.emulate_media(color_scheme=colours)
         window.set_viewport_size({"width": width, "height": 900})
         window.wait_for_function(f"document.documentElement.scrollWidth <= {width}")
         found = axe.Axe().run(window).response

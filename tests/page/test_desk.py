@@ -23,7 +23,7 @@ from foamfit.data.measurement import Measurement, Specimen
 from foamfit.errors import InputError
 from foamfit.page import desk as desk_module
 from foamfit.page import worker as worker_module
-from foamfit.page.desk import Desk, join_toml, safe_name, split_toml
+from foamfit.page.desk import Desk, join_toml, safe_name, split_toml, wrong_quantity
 from foamfit.page.turning import INSTANTS, Turning
 from foamfit.page.worker import Worker
 from foamfit.report.folder import load_result
@@ -49,7 +49,7 @@ def desk(tmp_path):
 def ready(desk):
     """A desk with a test that can be fitted."""
     desk.take(TEST)
-    assert not desk.check(*desk.dropped_toml()).error
+    desk.check(*desk.dropped_toml())
     return desk
 
 
@@ -106,10 +106,11 @@ def test_two_desks_share_nothing(tmp_path):
     one.take(TEST)
     quantities, rest = one.dropped_toml()
     assert two.dropped_toml() is None
-    assert "no test yet" in two.check(quantities, rest).error
-    assert not one.check(quantities, rest).error
+    with pytest.raises(InputError, match="no test yet"):
+        two.check(quantities, rest)
+    one.check(quantities, rest)
     two.close()
-    assert not one.check(quantities, rest).error
+    one.check(quantities, rest)
 
 
 # -------------------------------------------------------------------------------------- TOML
@@ -149,10 +150,11 @@ def test_a_quantity_that_is_given_twice_is_refused():
 )
 def test_a_wrong_quantity_is_named(desk, quantity, value, told):
     desk.take(TEST)
-    checked = desk.check(GOOD | {quantity: value}, "")
-    assert told in checked.error
-    assert checked.quantity == quantity
-    assert str(desk.folder) not in checked.error
+    with pytest.raises(InputError, match=told) as refused:
+        desk.check(GOOD | {quantity: value}, "")
+    assert wrong_quantity(str(refused.value)) == quantity
+    assert str(desk.folder) not in str(refused.value)
+    assert desk.measurement is None
 
 
 # --------------------------------------------------------------------------------------- fits
@@ -175,13 +177,13 @@ def test_a_fit_is_that_of_the_command(ready):
 def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkeypatch):
     record = write_record(tmp_path)
     desk.take(record)
-    assert not desk.check(*desk.dropped_toml(), ["--cycle", "3,2"]).error
+    desk.check(*desk.dropped_toml(), ["--cycle", "3,2"])
     assert (desk.measurement.cycle, desk.measurement.cycles) == (3, (1, 2, 3))
     asked = ["--cycle", "3,2", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "1"]
     wait(desk.fit(asked))
     assert desk.ending() == ""
     assert desk.command == f"foamfit fit synthetic.csv {' '.join(asked)}"
-    assert "2 of 3 cycles fitted" in desk.told
+    assert "2 of 3 cycles fitted" in desk.worker.told
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
@@ -202,7 +204,7 @@ def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkey
 def test_several_cycles_are_one_history(desk, tmp_path):
     desk.take(write_record(tmp_path))
     quantities, rest = desk.dropped_toml()
-    assert not desk.check(quantities, rest, ["--cycles", "1-3"]).error
+    desk.check(quantities, rest, ["--cycles", "1-3"])
     record = desk.measurement
     assert (record.cycle, record.last_cycle) == (1, 3)
     assert desk.measured(1, 3) is record
@@ -216,9 +218,9 @@ def test_several_cycles_are_one_history(desk, tmp_path):
         (["--cycles", "1-9"], "the file has cycles 1 to 3"),
         (["--cycles", "1-3", "--cycle", "2"], "give either --cycle or --cycles, not both"),
     ):
-        found = desk.check(quantities, rest, wrong)
-        assert told in found.error
-        assert "\n" not in found.error
+        with pytest.raises(InputError, match=told) as refused:
+            desk.check(quantities, rest, wrong)
+        assert "\n" not in str(refused.value)
 
 
 def test_watching_a_fit_changes_nothing():
@@ -242,7 +244,8 @@ def test_a_fit_that_is_stopped_keeps_the_best(ready):
     # What it is fitted to cannot change beneath it.
     with pytest.raises(InputError, match="A fit is running"):
         ready.receive("other.csv", b"1,2\n")
-    assert "A fit is running" in ready.check(GOOD, "").error
+    with pytest.raises(InputError, match="A fit is running"):
+        ready.check(GOOD, "")
     worker.stop()
     wait(worker)
     assert worker.ended == ""
@@ -345,24 +348,24 @@ def test_a_history_is_drawn_as_a_whole_with_what_springs_remember(tmp_path):
     stresses = np.interp(loading, np.arange(len(stress)), drawn.curves["stress_strain"][1])
     assert stresses[1] < 0.95 * stresses[0]
     # The chain goes through all cycles, and is snapped most where it is compressed most.
-    turns = find_turns(drawn.chain.strain, 0.1)
+    turns = find_turns(drawn.chain["strain"], 0.1)
     assert len(turns) >= 5
-    snapped = drawn.chain.snapped[0]
+    snapped = drawn.chain["snapped"][0]
     assert snapped[0] == 0.0
-    assert snapped[drawn.chain.strain.argmax()] == pytest.approx(snapped.max(), abs=0.02)
+    assert snapped[drawn.chain["strain"].argmax()] == pytest.approx(snapped.max(), abs=0.02)
 
 
 @pytest.mark.parametrize("model", ["bistable", "linear+bistable", "microscale+microscale"])
 def test_a_chain_is_drawn_with_the_fraction_snapped_of_each_spring(model):
     turning = Turning(ff.read_test(TEST), model)
     chain, kinds = turning.turn({}).chain, model.split("+")
-    assert [one is None for one in chain.snapped] == [kind == "linear" for kind in kinds]
-    assert len(chain.strain) <= INSTANTS
-    tall = chain.heights.sum(axis=0)
-    pressed = chain.top < 1.0
-    np.testing.assert_allclose(tall[pressed], chain.top[pressed], atol=0.01)
+    assert np.isnan(chain["snapped"]).any(axis=1).tolist() == [kind == "linear" for kind in kinds]
+    assert len(chain["strain"]) <= INSTANTS
+    tall = chain["heights"].sum(axis=0)
+    pressed = chain["top"] < 1.0
+    np.testing.assert_allclose(tall[pressed], chain["top"][pressed], atol=0.01)
     np.testing.assert_allclose(tall[0], 1.0)  # the striker is above it
-    for shares in filter(lambda one: one is not None, chain.snapped):
+    for shares in chain["snapped"][np.isfinite(chain["snapped"][:, 0])]:
         assert shares[0] == 0.0
         assert 0.0 <= shares.min() < shares.max() <= 1.0
 

@@ -20,9 +20,9 @@ import panel as pn
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.page.curves import Curves, grid, misfits_text
-from foamfit.page.desk import BUSY, FIRST, LARGEST, QUANTITIES, Checked, Desk
+from foamfit.page.desk import BUSY, FIRST, LARGEST, QUANTITIES, Desk, wrong_quantity
 from foamfit.page.turning import Turning
-from foamfit.page.widgets import RELAXATIONS, TEMPLATES, Field, Upload, message, piece, style
+from foamfit.page.widgets import RELAXATIONS, TEMPLATES, WIDE, Field, Upload, message, piece, style
 from foamfit.page.worker import FirstUse, News, parsed
 from foamfit.report.folder import load_result
 from foamfit.results import law_in_words
@@ -52,7 +52,6 @@ COMPILING = (
 )
 TEXT, FIELD = style("text"), style("field")
 WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: var(--bad); }"
-WIDE: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
 STYLE: dict[str, Any] = {
     "stylesheets": [FIELD],
     "sizing_mode": "stretch_width",
@@ -78,23 +77,19 @@ class Window:
         self._outputs()
         self._inputs(address)
         self.template = pn.Template((TEMPLATES / "page.html").read_text(encoding="utf-8"))
-        first, others = (
-            [field for name, field in self.quantities.items() if (name in FIRST) == shown]
-            for shown in (True, False)
-        )
-        asked = grid(first, 8.0)
-        asked.visible = True
-        result_parts = [self.saves, self.ending, self.report_of]
+        fields = [*self.quantities.values()]
+        first = grid(fields[:FIRST], 8.0)
+        first.visible = True
         parts = {
-            "test": [self.upload, self.chosen, asked],
-            "specimen": [*others, self.rest],
+            "test": [self.upload, self.chosen, first],
+            "specimen": [*fields[FIRST:], self.rest],
             "check": [self.check, self.problem],
             "model": [self.options[name].widget for name in SHOWN],
             "more": [self.options[name].widget for name in FOLDED],
             "run": [self.run, self.stop, self.progress],
             "curves": [self.compiling, self.misfit, self.curves.view, self.back],
             "understood": [self.understood],
-            "result": [*result_parts, self.report],
+            "result": [self.saves, self.ending, self.report_of, self.report],
         }
         for name, widgets in parts.items():
             self.template.add_panel(name, pn.Column(*widgets, **WIDE))
@@ -158,16 +153,14 @@ class Window:
         for name in ("model", *OF_CURVES):
             self.options[name].widget.param.watch(self._model_chosen, "value")
         save = partial(pn.widgets.FileDownload, embed=False, auto=True, **STYLE)
-        saves = {
-            "the result folder": ("result.zip", lambda: BytesIO(self.desk.zipped())),
-            "the report": ("report.html", lambda: BytesIO(self._report().encode())),
-            "the TOML": ("test.toml", lambda: BytesIO(self.desk.toml)),
-        }
-        parts = [
-            save(label=f"Save {what}", filename=name, callback=content)
-            for what, (name, content) in saves.items()
-        ]
-        self.saves = grid(parts, 11.0)
+        saves = (
+            ("the result folder", "result.zip", lambda: BytesIO(self.desk.zipped())),
+            ("the report", "report.html", lambda: BytesIO(self._report().encode())),
+            ("the TOML", "test.toml", lambda: BytesIO(self.desk.toml)),
+        )
+        self.saves = grid(
+            [save(label=f"Save {s}", filename=n, callback=c) for s, n, c in saves], 11.0
+        )
 
     def _report(self) -> str:
         """Return the report of the fit, or of the chosen cycle."""
@@ -201,18 +194,17 @@ class Window:
         self._asked[pool] += 1
         asked, document = self._asked[pool], pn.state.curdoc
 
-        def done(found: Any) -> None:
-            if asked == self._asked[pool]:
-                then(found)
+        def last() -> bool:
+            return asked == self._asked[pool]
 
         def run() -> None:
-            if asked != self._asked[pool]:
+            if not last():
                 return
             try:
                 found = work()
             except Exception as error:  # shown, not lost in a thread
                 found = error
-            document.add_next_tick_callback(partial(done, found))
+            document.add_next_tick_callback(lambda: then(found) if last() else None)
 
         pool.submit(run)
 
@@ -259,36 +251,27 @@ class Window:
         self._filling = False
         self._check()
 
-    def _given(self) -> tuple[dict[str, str], str]:
-        """The quantities and the further TOML as they are filled in."""
-        given = {name: field.value or "" for name, field in self.quantities.items()}
-        return given, self.rest.value or ""
-
     def _edited(self, event: Any) -> None:
         if not self._filling and self.desk.csv is not None:
             self._check()
 
     def _check(self, event: Any = None) -> None:
         """Check the test as it is filled in, and show what is understood or wrong."""
-        given, rest = self._given()
+        given = {name: field.value or "" for name, field in self.quantities.items()}
         which = [argument for name in CYCLES for argument in self.options[name].arguments()]
-        self.run.disabled = True
+        rest, self.run.disabled = self.rest.value or "", True
         self._asked[PREPARING] += 1  # curves in preparation are of the old test
         self._beside(READING, lambda: self.desk.check(given, rest, which), self._show_checked)
 
-    def _show_checked(self, checked: Checked | Exception) -> None:
-        if isinstance(checked, Exception):
-            checked = Checked(error=defect(checked))
-        self.problem.object = wrong(checked.error)
+    def _show_checked(self, found: str | Exception) -> None:
+        error = found if isinstance(found, Exception) else ""
+        self.problem.object = wrong(error)
         for name, field in self.quantities.items():
-            field.stylesheets = [WRONG if name == checked.quantity else FIELD]
-        if checked.error == BUSY:
+            field.stylesheets = [WRONG if name == wrong_quantity(str(error)) else FIELD]
+        if str(error) == BUSY:
             return
-        if checked.error:
-            told = "The test cannot be read yet: see what is wrong with it."
-            self.understood.object = soft(told)
-        else:
-            self.understood.object = piece("verbatim", checked.text)
+        told = "The test cannot be read yet: see what is wrong with it."
+        self.understood.object = soft(told) if error else piece("verbatim", found)
         self._allow()
         if self.desk.measurement is not None:
             there = len(self.desk.measurement.cycles)
@@ -314,7 +297,7 @@ class Window:
         model = models()[1] if auto else self.model.value
         self._turn_model(model, self.desk.measurement, **keywords(asked))
 
-    def _hide_curves(self, why: str = "") -> None:
+    def _hide_curves(self, why: object = "") -> None:
         self.curves.hide()
         self.misfit.object = wrong(why)
 
@@ -346,8 +329,7 @@ class Window:
 
     def _show_turning(self, made: Turning | Exception) -> None:
         if isinstance(made, Exception):
-            known = isinstance(made, InputError | SimulationError)
-            self._hide_curves(str(made) if known else defect(made))
+            self._hide_curves(made)
             return
         self.misfit.object = ""
         self.curves.show(made)
@@ -442,7 +424,8 @@ class Window:
         if self.desk.result is None:
             self.ending.object = wrong(self.desk.ending())
             return
-        told, picture = self.desk.told, self.desk.result / "cycles.png"
+        assert self.desk.worker is not None
+        told, picture = self.desk.worker.told, self.desk.result / "cycles.png"
         self.ending.object = soft(f"In a terminal: {self.desk.command}")
         if told:
             self.ending.object += piece("verbatim", told)
@@ -498,10 +481,10 @@ def soft(text: str) -> str:
 
 
 def wrong(error: object) -> str:
-    """Write an error as a paragraph, nothing for none."""
-    return piece("paragraph", str(error), "error") if str(error) else ""
-
-
-def defect(error: Exception) -> str:
-    """Say that an error is a defect."""
-    return f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."
+    """Write an error as a paragraph, nothing for none; one of no input is a defect."""
+    told = str(error)
+    if isinstance(error, Exception) and not isinstance(
+        error, InputError | SimulationError | OSError
+    ):
+        told = f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."
+    return piece("paragraph", told, "error") if told else ""

@@ -16,8 +16,8 @@ from bokeh.models import Band, ColumnDataSource, LabelSet, Range1d
 from bokeh.plotting import figure
 
 from foamfit.arrays import Array
-from foamfit.page.turning import PANELS, Chained, Drawn, Row, Turning
-from foamfit.page.widgets import Chain, Sliders, message, piece
+from foamfit.page.turning import PANELS, Drawn, Row, Turning
+from foamfit.page.widgets import WIDE, Chain, Sliders, message, piece
 from foamfit.report.figures import GREY, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
@@ -42,8 +42,7 @@ def grid(parts: list[Any], width: float) -> pn.Column:
         f"grid-template-columns: repeat(auto-fit, minmax(min(100%, {width}rem), 1fr)); }} "
         ".scroll-button { display: none; }"  # would take the place of a part
     )
-    wide: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
-    return pn.Column(pn.Column(*parts, stylesheets=[style], **wide), visible=False, **wide)
+    return pn.Column(pn.Column(*parts, stylesheets=[style], **WIDE), visible=False, **WIDE)
 
 
 class Curves:
@@ -63,15 +62,13 @@ class Curves:
         self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
         # With the lock of the document, which not every message holds.
         self.sliders.on_msg(lambda event: pn.state.execute(partial(self._moved, event), True))
-        wide: dict[str, Any] = {"sizing_mode": "stretch_width"}
-        ink = [":host { color: var(--ink, inherit); }"]
-        legend = pn.pane.HTML(piece("legend", GREY, VERMILION), stylesheets=ink, margin=0, **wide)
+        legend = pn.pane.HTML(piece("legend", GREY, VERMILION), **WIDE)
         loop_first = sorted(PANELS, key=lambda name: name != "stress_strain")
-        self._panes = {n: pn.pane.Bokeh(self._figures[n], **wide) for n in loop_first}
+        self._panes = {n: pn.pane.Bokeh(self._figures[n], **WIDE) for n in loop_first}
         self._panels = grid([*self._panes.values()], 14.5)
         self._panels.insert(0, legend)  # a figure's own would be redrawn each time
-        self.chain = Chain(margin=(4, 0), visible=False, **wide)
-        self.view = pn.Column(self._panels, self.sliders, self.chain, margin=0, **wide)
+        self.chain = Chain(visible=False, **WIDE)
+        self.view = pn.Column(self._panels, self.sliders, self.chain, **WIDE)
         if turning is not None:
             self.show(turning)
 
@@ -215,13 +212,10 @@ class Curves:
         self._draw_chain(drawn.chain)
         test = self.turning.problem.measurement
         told = f"{self.turning.law}, {self.turning.drive} drive"
-        if len(test.cycles) > 1:
-            several = test.last_cycle is not None
-            told += (
-                f", cycles {test.cycle} to {test.last_cycle}"
-                if several
-                else f", cycle {test.cycle}"
-            )
+        if test.last_cycle is not None:
+            told += f", cycles {test.cycle} to {test.last_cycle}"
+        elif len(test.cycles) > 1:
+            told += f", cycle {test.cycle}"
         told += f": misfit {misfits_text(drawn.misfit)}"
         self.sliders.tell(drawn.error or told, wrong=bool(drawn.error))
 
@@ -235,24 +229,11 @@ class Curves:
             aside, up = np.array(beside).reshape(-1, 2).T
             self._points.data = {"x": x / fx, "y": y / fy, "name": names, "aside": aside, "up": up}
 
-    def _draw_chain(self, chain: Chained | None) -> None:
-        if chain is None:
-            self.chain.frames = {}
-            return
-        factor, unit = readable_unit(float(np.ptp(chain.stress)), "Pa")
-        self.chain.frames = {
-            "strain": rounded(chain.strain),
-            "stress": rounded(chain.stress / factor),
-            "unit": unit,
-            "top": rounded(chain.top),
-            "heights": [rounded(one) for one in chain.heights],
-            "snapped": [None if one is None else rounded(one) for one in chain.snapped],
-        }
-
-
-def rounded(values: Array) -> list[float]:
-    """Return values as they are sent to be drawn."""
-    return [float(f"{value:.4g}") for value in values.tolist()]
+    def _draw_chain(self, chain: Mapping[str, Array]) -> None:
+        factor, unit = readable_unit(float(np.ptp(chain.get("stress", 0.0))), "Pa")
+        scaled = {name: one / factor if name == "stress" else one for name, one in chain.items()}
+        frames: dict[str, Any] = {name: np.round(one, 4).tolist() for name, one in scaled.items()}
+        self.chain.frames = frames | {"unit": unit} if frames else {}
 
 
 def misfits_text(misfit: Mapping[str, float | None]) -> str:

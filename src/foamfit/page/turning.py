@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Unpack
@@ -26,7 +27,7 @@ from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.springs.spring import Spring
 
 WIDE = 4.0  # a slider reaches to so many times the value
-INSTANTS = 80  # at which a chain is drawn along one cycle
+INSTANTS = 60  # at which a chain is drawn along one cycle
 PANELS = tuple(CURVES)
 
 
@@ -49,30 +50,19 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Chained:
-    """The chain at instants that are even along its motion, (m,).
-
-    Strain and stress (Pa) are those of the loop; `top` and the `heights` of the springs are shares
-    of the specimen's height at rest. `snapped` is the fraction of each spring that has snapped,
-    None where its law does not say.
-    """
-
-    strain: Array
-    stress: Array
-    top: Array
-    heights: Array  # (n_springs, m)
-    snapped: tuple[Array | None, ...]
-
-
-@dataclass(frozen=True)
 class Drawn:
-    """Curves (x, y) by the name of their panel at some parameters, or why there are none."""
+    """Curves (x, y) by the name of their panel at some parameters, or why there are none.
+
+    `chain` is the chain at instants along its loop: "strain" and "stress" (Pa) of the loop, "top"
+    and "heights" (n_springs, m) of the springs over the specimen's height at rest, and "snapped",
+    the fraction of each spring that has snapped, NaN where its law does not say.
+    """
 
     curves: dict[str, tuple[Array, Array]]
     misfit: dict[str, float | None]
     values: dict[str, float]
     points: dict[str, tuple[float, float]] = field(default_factory=dict)  # strain, stress
-    chain: Chained | None = None
+    chain: dict[str, Array] = field(default_factory=dict)
     error: str = ""
 
 
@@ -117,12 +107,9 @@ class Turning:
 
         The contact time, for example, is of the record.
         """
-        if name in NUISANCE and name != "time_shift":
-            return False
-        given = self.problem.measurement.specimen.heights is not None
-        if given and split_name(name)[1] == "height":
-            return False
-        return self.problem.params[name].expr is None
+        heights, short = self.problem.measurement.specimen.heights, split_name(name)[1]
+        of_record = name in NUISANCE or (short == "height" and heights is not None)
+        return name == "time_shift" or not (of_record or self.problem.params[name].expr)
 
     def _at(self, values: Array, moves: Mapping[str, float]) -> Array:
         """Put some values into a vector; parameters that depend on them by expressions follow."""
@@ -156,22 +143,22 @@ class Turning:
 
     def _chained(
         self, springs: Sequence[Spring], motion: Motion, strain: Array, stress: Array
-    ) -> Chained:
+    ) -> dict[str, Array]:
         """Return the chain along its loop; before contact and after it the springs are at rest."""
         problem, total = self.problem, self.problem.measurement.specimen.height
-        own = problem.model.heights(self.values[: len(problem.model.names)], total)[:, None]
-        strains = np.maximum(np.diff(motion.displacement, axis=0, prepend=0.0) / own, 0.0)
+        heights = problem.model.heights(self.values[: len(problem.model.names)], total)[:, None]
+        strains = np.maximum(np.diff(motion.displacement, axis=0, prepend=0.0) / heights, 0.0)
         along = np.cumsum(np.abs(np.diff(strain, prepend=strain[0])))
         steps = np.linspace(0.0, along[-1], INSTANTS * self.cycles)
         at = np.unique(np.searchsorted(along, steps))
-        snapped = [s.snapped_along(e) for s, e in zip(springs, strains, strict=True)]
-        return Chained(
-            strain[at],
-            stress[at],
-            1.0 - motion.displacement[-1, at] / total,
-            (own / total * (1.0 - strains))[:, at],
-            tuple(one if one is None else one[at] for one in snapped),
-        )
+        snapped = np.full(strains.shape, np.nan)
+        for row, spring, own in zip(snapped, springs, strains, strict=True):
+            with suppress(SimulationError):  # at the end of a branch
+                shares = spring.snapped_along(own)
+                row[:] = np.nan if shares is None else shares
+        parts = {"strain": strain, "stress": stress, "top": 1.0 - motion.displacement[-1] / total}
+        parts |= {"heights": heights / total * (1.0 - strains), "snapped": snapped}
+        return {name: part[..., at] for name, part in parts.items()}
 
     @cached_property
     def measured(self) -> dict[str, tuple[Array, Array]]:

@@ -19,6 +19,7 @@ from panel.custom import JSComponent
 from foamfit.cli.fit import fit as fit_command
 
 TEMPLATES = Path(__file__).with_name("templates")
+WIDE: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
 RELAXATIONS = 4  # numbers of terms that are listed
 OPTIONS = {
     one.name: one for one in fit_command.params if isinstance(one, click.Option) and one.name

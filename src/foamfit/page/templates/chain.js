@@ -30,15 +30,16 @@ export function render({ model, el }) {
       top -= tall;
       cell.setAttribute("y", top);
       cell.setAttribute("height", tall);
-      cell.setAttribute("fill-opacity", snapped[k] ? 0.06 + 0.84 * snapped[k][i] : 0);
+      cell.setAttribute("fill-opacity", 0.06 + 0.84 * (snapped[k][i] || 0));
       const turns = [30, -30, 30, -30, 30, -30].map((dx, j) => `L${45 + dx * 0.7} ${top + (j + 1.5) * part}`);
       coil.setAttribute("d", `M45 ${top}V${top + part}${turns.join("")}L45 ${top + 7 * part}V${top + tall}`);
     });
     striker.setAttribute("y", Math.min(top, BASE - TALL * of.top[i]) - 6);
     point.setAttribute("cx", places[i][0]);
     point.setAttribute("cy", places[i][1]);
-    const shares = snapped.map((one, k) => one && `${snapped.length > 1 ? `s${k + 1} ` : ""}${Math.round(100 * one[i])} %`);
-    const some = shares.filter(Boolean).join(", ");
+    const name = (k) => (snapped.length > 1 ? `s${k + 1} ` : "");
+    const shares = snapped.map((one, k) => `${name(k)}${Math.round(100 * one[i])} %`);
+    const some = shares.filter((_, k) => Number.isFinite(snapped[k][i])).join(", ");
     told.textContent = `strain ${(100 * strain[i]).toFixed(1)} %, ${stress[i].toPrecision(3)} ${unit}` + (some && `; snapped ${some}`);
     slider.setAttribute("aria-valuetext", told.textContent);
   }
