@@ -40,9 +40,9 @@ class Impact:
     time `tau` in samples. `before` is the share of the record before contact (None: drawn up to
     0.6), `samples` those during contact (None: 150 to 3000, where 20 kHz to 2 MHz allow it). A
     record that is `trimmed` begins at contact, at time zero, with all zeros right. A `gauge` on the
-    specimen rests until contact. `gravity` acts on the striker before, during and after contact.
-    `velocity_sd` is what the TOML says of its velocity, as a share: the velocity there is off by so
-    much, at random.
+    specimen rests until contact. `gravity` acts on the striker before, during and after contact;
+    the TOML says so if it is `said`. `velocity_sd` is what the TOML says of its velocity, as a
+    share: the velocity there is off by so much, at random.
     """
 
     law: str = "bistable"
@@ -58,6 +58,7 @@ class Impact:
     gauge: bool = False
     gravity: bool = False
     velocity_sd: float = 0.0
+    said: bool = True
 
 
 @dataclass(frozen=True)
@@ -359,6 +360,7 @@ def write(record: Record, folder: Path, name: str = "test") -> Path:
         lines.append("heights = [" + ", ".join(f'"{h} m"' for h in rig.heights) + "]")
     if isinstance(setup, Impact):
         lines += ["[striker]", f'mass = "{rig.mass} kg"', f'velocity = "{record.toml_velocity}"']
+        lines += ["gravity = true"] * (setup.gravity and setup.said)
     elif setup.noise_given:
         lines += ["[noise]", f'stress = "{record.noise["force"] / rig.area} Pa"',
                   f'displacement = "{record.noise["displacement"]} m"']  # fmt: skip

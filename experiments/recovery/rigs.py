@@ -73,6 +73,7 @@ IMPACTS = {
     "all three": Impact(channels=(*BOTH, "acceleration")),
     "gauge on the specimen": Impact(gauge=True),
     "gravity": Impact(gravity=True),
+    "gravity, not said": Impact(gravity=True, said=False),
     "velocity ± 1 %": Impact(velocity_sd=0.01),
     "microscale": Impact(law="microscale"),
     "microscale, force only": Impact(law="microscale", channels=("force",)),

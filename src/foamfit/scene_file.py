@@ -29,6 +29,7 @@ Made = TypeVar("Made")
 _UNITS = {  # key: SI unit and an example, of what is no parameter of a spring
     "mass": ("kg", "7 g"),
     "velocity": ("m/s", "1.75 m/s"),
+    "gravity": ("m/s**2", "9.81 m/s^2"),
     "diameter": ("m", "5 mm"),
     "area": ("m**2", "19.6 mm^2"),
     "site_damping": ("Pa*s", "0 Pa*s"),
@@ -153,8 +154,9 @@ def _drive(path: Path, document: dict[str, Any]) -> tuple[Drive, Array]:
     given = _table(path, document, "drive")
     kind, file = given.table.get("kind"), given.table.get("file")
     if kind == "impact":
-        given.only("kind", "mass", "velocity")
-        impact = given.made(Impact, given.number("mass"), given.number("velocity"))
+        given.only("kind", "mass", "velocity", "gravity")
+        gravity = given.number("gravity", default=0.0)
+        impact = given.made(Impact, given.number("mass"), given.number("velocity"), gravity)
         return impact, _samples(_table(path, document, "time"))
     if kind not in ("stress", "displacement"):
         told = f"kind = {kind!r}; it must be impact, stress or displacement"

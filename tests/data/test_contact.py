@@ -324,14 +324,29 @@ def test_a_velocity_that_the_flight_contradicts_is_told(given, spread, told):
         assert re.search(r"moves at (2|2\.00\d|1\.99\d) ± ", notes[0])
 
 
-@pytest.mark.parametrize(("gravity", "told"), [(0.0, 0), (9.81, 1)])
-def test_a_striker_that_gravity_still_accelerates_is_told(gravity, told):
-    done = run(record(level=1e-4, before=4000, gravity=gravity))
-    notes = [note for note in done.notes if "accelerated by gravity" in note]
-    assert len(notes) == told
-    if told:
-        assert "m/s per ms" in notes[0]
-        assert "no gravity in it" in notes[0]
+@pytest.mark.parametrize("acts", [0.0, 9.81])
+@pytest.mark.parametrize("given", [None, 0.0, 9.80665])
+def test_a_striker_whose_flight_shows_gravity_is_said_to_fall(acts, given):
+    striker = replace(STRIKER, gravity=given)
+    done = run(record(level=1e-4, before=4000, gravity=acts), striker)
+    notes = [note for note in done.notes if "it falls" in note]
+    assert len(notes) == (acts > 0.0)
+    assert done.striker.gravity == ((9.80665 if acts else 0.0) if given is None else given)
+    if acts:
+        contradicted = given == 0.0
+        assert notes[0].startswith("Check:") == contradicted
+        assert ("[striker] gravity is false" in notes[0]) == contradicted
+        assert ("The fit includes gravity." in notes[0]) != contradicted
+
+
+@pytest.mark.parametrize(("given", "asks"), [(None, True), (0.0, False), (9.80665, False)])
+def test_where_gravity_matters_and_the_record_does_not_show_it_the_toml_is_asked(given, asks):
+    done = run(record(channels="FW", before=4), replace(STRIKER, gravity=given))
+    notes = [note for note in done.notes if "write gravity = true or false" in note]
+    assert len(notes) == asks
+    assert done.striker.gravity == given
+    if asks:
+        assert notes[0].startswith("Check: a striker that falls gains 2 % of its velocity")
 
 
 @pytest.mark.parametrize("channels", ["FW", "AW"])

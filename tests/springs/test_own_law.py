@@ -107,7 +107,7 @@ def steps_agree(kind: str, relaxation: list[tuple[float, float]], drive: str) ->
     time = np.linspace(0.0, 1.2e-3, 121)
     shape = np.sin(np.pi * time / time[-1]) ** 2
     given = {
-        "impact": ff.Impact(7e-3, 1.5),
+        "impact": ff.Impact(7e-3, 1.5, gravity=200.0),
         "stress": ff.StressDrive(1.5e6 * shape),
         "displacement": ff.DisplacementDrive(3.5e-4 * shape),
     }[drive]

@@ -238,8 +238,9 @@ def _record(table: Table, columns: dict[str, int], settings: Settings) -> tuple[
             stress, acceleration = acceleration * ratio, None
             notes.append("The force is the striker's mass times its acceleration.")
         else:
-            motion = displacement, numbers.get("velocity")
-            stress, derived = stress_of_motion(numbers["time"], *motion, ratio), ("stress",)
+            motion = numbers["time"], displacement, numbers.get("velocity")
+            stress = stress_of_motion(*motion, ratio, striker.gravity or 0.0)
+            derived = ("stress",)
             notes.append(
                 "The force is the striker's mass times the deceleration of its motion, read off a "
                 "smoothing spline; it is no measurement of its own."

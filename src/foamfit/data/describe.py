@@ -91,7 +91,7 @@ def _given(test: Measurement) -> list[tuple[str, list[str]]]:
         mass = given(striker.mass, "g", "striker_mass", 1e3)
     if striker.velocity:
         own = f" ± {spread['velocity']:.2g}" if "velocity" in spread else ""
-        velocity = f"{striker.velocity:.4g}{own} m/s"
+        velocity = f"{striker.velocity:.4g}{own} m/s" + ", falling" * bool(striker.gravity)
     return [("specimen", [specimen]), ("striker", [f"{mass}, {velocity}"])]
 
 

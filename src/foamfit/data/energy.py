@@ -134,6 +134,9 @@ def audit(measurement: Measurement) -> EnergyAudit:
         absorbed = before + float(np.trapezoid(stress[: top + 1], strain[: top + 1]))
         # The sum ends at a noisy strain, where the stress is highest; the true end is the turn.
         absorbed += float(stress[top]) * (largest / specimen.height - float(strain[top]))
+        if brought is not None and striker.mass and striker.gravity:
+            weight = striker.mass * striker.gravity
+            brought += weight * largest / (specimen.area * specimen.height)
         dissipated = before + float(np.trapezoid(stress, strain)) if unloaded else None
     if absorbed is None:
         missing.append("The absorbed energy needs stress and displacement.")
@@ -148,7 +151,8 @@ def audit(measurement: Measurement) -> EnergyAudit:
             last = shown[-max(5, len(shown) // 20) :]
             rebound = -line_at(time[last], w[last], time[last[-1]])[1]
             if striker.mass and striker.velocity and test.motion != INTEGRATED:
-                change = striker.mass * (striker.velocity + rebound)
+                fall = (striker.gravity or 0.0) * float(time[-1])
+                change = striker.mass * (striker.velocity + rebound + fall)
     if test.motion == INTEGRATED:
         missing.append("The motion comes from the force, so the balances check nothing here.")
     elif change is None:

@@ -44,10 +44,14 @@ class Specimen:
 
 @dataclass(frozen=True)
 class Striker:
-    """Mass, kg, and velocity at contact, m/s, of the striker; either may be unknown."""
+    """Mass, kg, and velocity at contact, m/s, of the striker; either may be unknown.
+
+    `gravity`, m/s², accelerates it; None: as its flight before contact shows.
+    """
 
     mass: float | None = None
     velocity: float | None = None
+    gravity: float | None = None
 
 
 @dataclass(frozen=True)

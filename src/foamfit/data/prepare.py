@@ -102,7 +102,8 @@ def condition(
         start = start_of_impact(first, levels)
         start = replace(start, gauge=zeros.gauge_before(first, start, levels, known))
         span = zeros.Span.of_impact(first, start, levels)
-        notes += zeros.flight_notes(first, start, span, levels, known, spread)
+        known, told = zeros.flight_of(first, start, span, levels, known, spread)
+        notes += told
     else:  # its first cycle shows the start
         start = start_of_slow_test(first, levels)
         end = len(first) if used.place else used.end - used.first
@@ -130,7 +131,7 @@ def condition(
     notes += spoilt.standstill_notes(whole, specimen.height)
     channels = record.time, record.stress, record.displacement
     return Measurement(
-        *("", None, "", *channels, specimen, striker),  # no name and no file
+        *("", None, "", *channels, specimen, known if striker else None),  # no name and no file
         noise=Noise(estimated=noise),
         motion=motion,
         notes=tuple(notes),
@@ -222,7 +223,7 @@ def check_signs(record: Record, advice: Callable[[str], str] | None) -> None:
 
 
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tuple[Record, str]:
-    """Integrate a motion that was not measured: w(0) = 0, w'(0) = v, and w'' = −a or −σA/m.
+    """Integrate a motion that was not measured: w(0) = 0, w'(0) = v, and w'' = g − a or g − σA/m.
 
     A channel is linear between samples.
     """
@@ -242,12 +243,13 @@ def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tu
     else:
         assert striker.mass  # likewise
         rate, source = -record.stress * specimen.area / striker.mass, "force"
+    gravity = striker.gravity or 0.0
     # Time zero, which may lie between two samples or before the first, is a point of its own.
     at = int(np.searchsorted(time, 0.0))
     if source == "velocity":
         start = float(np.interp(0.0, time, rate))
     else:
-        start, rate = 0.0, np.where(time < 0.0, 0.0, rate)
+        start, rate = gravity, gravity + np.where(time < 0.0, 0.0, rate)
     t, r = np.insert(time, at, 0.0), np.insert(rate, at, start)
     dt = np.diff(t)
     w = np.append(0.0, np.cumsum(0.5 * dt * (r[1:] + r[:-1])))
@@ -261,11 +263,11 @@ def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tu
 
 
 def stress_of_motion(
-    time: Array, displacement: Array | None, velocity: Array | None, ratio: float
+    time: Array, displacement: Array | None, velocity: Array | None, ratio: float, gravity: float
 ) -> Array:
-    """Stress that brakes a striker, `ratio` (mass over area, kg/m²) times its deceleration.
+    """Stress that brakes a striker, `ratio` (mass over area, kg/m²) times g − w''.
 
-    That is read off a smoothing spline through the motion, to which it is as close as the noise
+    The second derivative w'' is that of a smoothing spline, as close to the motion as the noise
     demands. A gauge that rests before contact, and perhaps after it, is followed in between.
     """
     from scipy.interpolate import make_smoothing_spline
@@ -293,7 +295,7 @@ def stress_of_motion(
         close = float(np.std(curve(t / step) - y)) <= sigma
         low, high = (middle, high) if close else (low, middle)
     order = 2 if velocity is None else 1
-    braked = -ratio * curve.derivative(order)(t / step) / step**order
+    braked = ratio * (gravity - curve.derivative(order)(t / step) / step**order)
     stress = np.zeros(len(time))
     stress[first:end] = np.interp(time[first:end] - time[first], t, braked)
     return stress

@@ -21,6 +21,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from scipy.constants import g as standard_gravity
+
 from foamfit.data.measurement import Noise, Specimen, Striker, Window, interior_node
 from foamfit.data.units import (
     is_unit,
@@ -72,6 +74,7 @@ def is_range(cycles: Any) -> bool:
 
 # Keys that are no quantities: what they may be, and how that is told.
 _OTHERS: dict[str, dict[str, tuple[Callable[[Any], bool], str]]] = {
+    "striker": {"gravity": (lambda v: type(v) is bool, "true or false")},
     "window": {
         "cycle": (lambda v: type(v) is int and v > 0, "a whole number from 1 up"),
         "cycles": (is_range, "the numbers of the first and the last one, like [1, 3]"),
@@ -200,7 +203,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         return Settings(
             name=name,
             specimen=_specimen(values["specimen"], spreads),
-            striker=Striker(**values["striker"]) if values["striker"] else None,
+            striker=_striker(values["striker"]),
             noise=Noise(**values["noise"]),
             window=Window(**window),
             columns=_columns(_table(document, "columns"), channels),
@@ -239,6 +242,12 @@ def _value(section: str, key: str, value: Any, spreads: dict[str, float]) -> Any
             raise InputError(f'{where} = "{v}" must be positive.')
         numbers.append(number)
     return tuple(numbers) if several else numbers[0]
+
+
+def _striker(values: dict[str, Any]) -> Striker | None:
+    if "gravity" in values:
+        values["gravity"] = standard_gravity if values["gravity"] else 0.0
+    return Striker(**values) if values else None
 
 
 def _specimen(values: dict[str, Any], spreads: dict[str, float]) -> Specimen:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.constants import g as gravity
 
 from foamfit.arrays import Array
 from foamfit.data.contact import ELSEWHERE, Levels, Start
@@ -15,7 +16,7 @@ from foamfit.text import engineering, percent
 _LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
 _FEW = 20  # rows before contact below which the end of a record that is flat shows the zero better
 _TAIL, _HIGHEST = 0.04, 0.1  # share of a record that is its end; of the range, its highest level
-_GRAVITY = 9.81  # m/s²
+_MATTERS = 0.01  # share of a striker's velocity from which on its gain by gravity is asked for
 # How a note begins to say which velocity a motion contradicts.
 CONTRADICTED = "but the striker's velocity is given as"
 
@@ -220,35 +221,51 @@ def mark_flight(record: Record, start: Start, span: Span) -> Record:
     return replace(record, sampled=record.sampled | {"displacement": kept & moves})
 
 
-def flight_notes(
+def flight_of(
     record: Record, start: Start, span: Span, levels: Levels, striker: Striker, spread: float
-) -> list[str]:
-    """Compare the striker's flight with its velocity ± `spread`, m/s; name gravity if it acts."""
+) -> tuple[Striker, list[str]]:
+    """Compare the striker's flight with its velocity ± `spread`, m/s, and find whether it falls.
+
+    Returns the striker, with the gravity that its flight shows where the TOML does not say it, and
+    what to tell.
+    """
     n, w, given, notes = start.first - 2, record.displacement, striker.velocity, list[str]()
-    if w is None or not given or n < 8:
-        return notes
-    noise, t = levels["displacement"], record.instants[:n] - start.time
-    (half, speed, _), variance = np.polyfit(t, w[:n], 2, cov="unscaled")
-    sigma = noise.sigma * float(np.sqrt(noise.time))
-    gravity, error = 2.0 * float(half), 2.0 * sigma * float(np.sqrt(variance[0, 0]))
-    falls = gravity > 4.0 * error and abs(gravity - _GRAVITY) < 0.2 * _GRAVITY + 2.0 * error
-    if falls:
-        error = sigma * float(np.sqrt(variance[1, 1]))
-        gain = gravity * float(record.instants[span.end - 1] - start.time) / given
+    if not given:
+        return striker, notes
+    gain = percent(share := gravity * float(record.instants[span.end - 1] - start.time) / given)
+    if w is not None and n >= 8:
+        noise, t = levels["displacement"], record.instants[:n] - start.time
+        (half, speed, _), variance = np.polyfit(t, w[:n], 2, cov="unscaled")
+        sigma = noise.sigma * float(np.sqrt(noise.time))
+        shown, error = 2.0 * float(half), 2.0 * sigma * float(np.sqrt(variance[0, 0]))
+        none = start.gauge == "flight" and 4.0 * error < gravity
+        if falls := shown > 4.0 * error and abs(shown - gravity) < 0.2 * gravity + 2.0 * error:
+            error = sigma * float(np.sqrt(variance[1, 1]))
+            told = (
+                f"before contact the striker accelerates by {engineering(shown, 'm/s²')}: it "
+                f"falls, and gains {gain} of its velocity over the contact"
+            )
+            if striker.gravity == 0.0:
+                notes.append(f"Check: {told}, but [striker] gravity is false.")
+            else:
+                notes.append(f"{told[0].upper()}{told[1:]}. The fit includes gravity.")
+        else:
+            speed, error = level_on_line(t, w[:n], 0.0, noise)[1][:2]
+        if striker.gravity is None and (falls or none):
+            striker = replace(striker, gravity=gravity if falls else 0.0)
+        off, error = abs(speed - given), float(np.hypot(error, spread))
+        if off > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
+            notes.append(
+                f"Check: before contact the displacement moves at {speed:.4g} ± {error:.2g} m/s, "
+                f"{CONTRADICTED} {given:.4g} m/s."
+            )
+    if striker.gravity is None and share > _MATTERS:
         notes.append(
-            f"Check: before contact the striker is still accelerated by gravity, by "
-            f"{engineering(gravity, 'm/s²')}, {gravity * 1e-3:.3g} m/s per ms; the law has no "
-            f"gravity in it, which over the contact is {percent(gain)} of its velocity."
+            f"Check: a striker that falls gains {gain} of its velocity over the contact, and the "
+            "record does not show whether this one does; write gravity = true or false under "
+            "[striker]."
         )
-    else:
-        speed, error = level_on_line(t, w[:n], 0.0, noise)[1][:2]
-    off, error = abs(speed - given), float(np.hypot(error, spread))
-    if off > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
-        notes.append(
-            f"Check: before contact the displacement moves at {speed:.4g} ± {error:.2g} m/s, "
-            f"{CONTRADICTED} {given:.4g} m/s."
-        )
-    return notes
+    return striker, notes
 
 
 def contact_end(stress: Array, noise: NoiseLevel) -> tuple[int, bool]:

@@ -238,7 +238,7 @@ class Objective:
             assert striker is not None
             assert striker.mass is not None
             assert striker.velocity is not None
-            return Impact(striker.mass, striker.velocity)
+            return Impact(striker.mass, striker.velocity, striker.gravity or 0.0)
         if self.drive == "stress":
             return StressDrive(driving_stress(self._stress, self.model))
         return DisplacementDrive(self._moved)
@@ -485,8 +485,10 @@ class Objective:
             return plan
         mass = plan.mass.copy()
         mass[-1] = at[nuisances.STRIKER_MASS] / self.measurement.specimen.area
-        time = self._clock - at[nuisances.CONTACT_TIME]
-        return plan._replace(time=time, speed=at[nuisances.VELOCITY], mass=mass)
+        time, weight = self._clock - at[nuisances.CONTACT_TIME], plan.values * mass[-1:]
+        return plan._replace(
+            time=time, speed=at[nuisances.VELOCITY], mass=mass, values=weight / plan.mass[-1]
+        )
 
     def _followed(self, plan: AnyPlan, at: dict[str, float]) -> AnyPlan:
         """Plan of the measured motion of an impact: its zero taken off, none before contact."""
@@ -542,14 +544,18 @@ class Objective:
         """Deceleration of the striker, m/s², and its derivatives: eq. of motion of the top mass.
 
         A (Σ_N + η_site/H dw/dt)/m; with masses inside the second derivative of the motion itself.
+        A sensor on the striker does not feel gravity, nor does its zero before contact show it.
         """
         drag = float(values[-1]) / self.measurement.specimen.height
         per_mass = self.measurement.specimen.area / at[nuisances.STRIKER_MASS]
+        striker = self.measurement.striker
+        gravity = (striker.gravity if striker else None) or 0.0
 
         def of(stress: Array, top: Array) -> Array:
             speed = np.gradient(top, self._clock, axis=-1)
             if self.interior_mass:
-                return -np.gradient(speed, self._clock, axis=-1)
+                felt = 0.0 if top.ndim > 1 else gravity
+                return felt - np.gradient(speed, self._clock, axis=-1)
             flying = self._clock < at[nuisances.CONTACT_TIME]
             return np.asarray(per_mass * (stress + np.where(flying, 0.0, drag * speed)))
 

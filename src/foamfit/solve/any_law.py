@@ -2,7 +2,8 @@
 
 Between samples a drive is linear, and each step takes every spring to a new strain by the functions
 of its law (`springs.laws.followed`). Springs in series carry one stress, which is sought at each
-step. A striker of areal mass M follows M dv/dt = -(Σ + η_site v/H) by the velocity Verlet method.
+step. A striker of areal mass M follows M dv/dt = -(Σ + η_site v/H) by the velocity Verlet method
+(gravity, where it acts, adds to dv/dt).
 Every part is of second order in the step: where time counts, steps are halved until two runs agree.
 """
 
@@ -142,7 +143,8 @@ def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
 
     @compiled
     def strike(
-        springs: Springs, mass: float, drag: float, speed: float, t: Array, parts: int,
+        springs: Springs, mass: float, drag: float, speed: float, gravity: float, t: Array,
+        parts: int,
         nodes: Array, stress: Array, branches: NDArray[np.int64],
     ) -> tuple[float, bool]:  # fmt: skip
         """Follow a striker from contact, at t = 0; returns when contact ends."""
@@ -157,27 +159,30 @@ def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
         for j in range(t.size):
             if t[j] <= 0.0:
                 nodes[:, j], stress[j], branches[:, j] = 0.0, sigma if t[j] == 0.0 else 0.0, 0
-                nodes[count - 1, j] = speed * t[j]
+                nodes[count - 1, j] = (speed + 0.5 * gravity * t[j]) * t[j]
                 continue
             h = (t[j] - now) / parts
             for _ in range(parts if end != end else 0):
-                half = v - 0.5 * h * (sigma + drag * v) / mass
+                half = v + 0.5 * h * (gravity - (sigma + drag * v) / mass)
                 after = elongate(springs, sigma, w + h * half, h)
                 if not math.isfinite(after):
                     return math.nan, False
                 if after <= 0.0 and half < 0.0:
                     share = sigma / (sigma - after) if sigma > after else 0.0
                     end = now + share * h
-                    w, v = w + share * h * half, half
+                    w += share * h * half  # the velocity is that of half of the step
+                    v = half + (share - 0.5) * h * (gravity - drag * half / mass)
                     break
                 w += h * half
-                v = (half - 0.5 * h * after / mass) / (1.0 + 0.5 * h * drag / mass)
+                v = half + 0.5 * h * (gravity - after / mass)
+                v /= 1.0 + 0.5 * h * drag / mass
                 sigma = after
                 now += h
             if end == end:
                 stress[j] = 0.0
                 note(springs, j, nodes, branches)
-                shift = w + v * (t[j] - end) - nodes[count - 1, j]
+                flown = t[j] - end
+                shift = w + (v + 0.5 * gravity * flown) * flown - nodes[count - 1, j]
                 for i in range(count):
                     nodes[i, j] += shift
             else:
@@ -263,8 +268,8 @@ class AnyLawPlan(NamedTuple):
         springs.terms[:, :, MEMORY] = 0.0
         filled = parts, nodes, stress, branches
         if self.speed > 0.0:
-            strike = struck(self.laws)
-            end, fine = strike(springs, self.mass[-1], drag, self.speed, self.time, *filled)
+            striker = self.mass[-1], drag, self.speed, self.values[0] / self.mass[-1]
+            end, fine = struck(self.laws)(springs, *striker, self.time, *filled)
         else:
             end, fine = driven(self.laws)(springs, self.top, self.time, self.values, *filled)
         if not fine:

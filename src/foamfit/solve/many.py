@@ -362,7 +362,7 @@ def integrate_aggregate(
     )  # fmt: skip
     s_scale, w_scale = _scales(group, mass, drag, speed)
     effort[0] += 1
-    done = before_contact(curves, t, speed)
+    done = before_contact(curves, t, speed, 0.0)
     begin, switches, stalled, horizon = 0.0, 0, 0, t[t.size - 1]
     now.v[0] = speed
     for step in range(max_steps):
@@ -395,7 +395,7 @@ def integrate_aggregate(
         if side < 0 and stress <= 0.0:
             w_end = np.zeros(curves.shape[0] - 1)
             _shape(group, 0.0, w_end)
-            fly(curves, t, done, begin, w_end, velocity)
+            fly(curves, t, done, begin, w_end, velocity, 0.0)
             return DONE, begin, step + 1, switches
         s_scale = max(s_scale, stress)
         w_scale = max(w_scale, now.w[0])

@@ -96,7 +96,7 @@ class Plan(NamedTuple):
     top : int
         What is known of the top; see `solve.scene`.
     values, time : (n,) arrays
-        The drive and its samples.
+        The drive and its samples; of an impact, values (1,) is the weight of the striker, Pa.
     speed : float
         Velocity of the striker, m/s; 0 = no impact.
     margin : float
@@ -170,6 +170,7 @@ class Plan(NamedTuple):
         stiff = not bounces and self._is_stiff(self.given(rows, heights, drag))
         one = self.speed > 0.0 and self.top == scenes.FREE and len(self.ends) == 1
         one = one and p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE
+        one = one and self.values[0] == 0.0  # springs that count as one know no weight
         if one and many.holds(rows):
             return self._aggregate(self.given(rows, heights, drag), rtol, out)
         start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
@@ -461,6 +462,7 @@ def plan(
     above = chain.masses[-1]
     if isinstance(drive, Impact):
         above += drive.mass
+        values = np.array([above * drive.gravity / chain.area])
     elif isinstance(drive, DisplacementDrive):
         above, top = 0.0, scenes.MOTION
     elif above == 0.0:

@@ -32,7 +32,8 @@ class Scene(NamedTuple):
     areal mass m/A, mass (groups,), kg/m². `drag` is the onsite damping of the top, η_site/H,
     Pa·s/m, and `top` what is known of it. values (n,) is the prescribed stress (Pa) or, for MOTION,
     displacement (m) of the top at the samples t (n,), s. `speed` is the velocity of a striker, m/s,
-    at the time 0; 0 = no impact, and every other drive starts at t[0].
+    at the time 0, and values (1,) its weight over the area, Pa; 0 = no impact, and every other
+    drive starts at t[0].
     """
 
     rows: Array
@@ -117,14 +118,14 @@ def first_past(t: Array, first: int, end: float, last: bool) -> int:
 
 
 @inner
-def fill_line(at: float, rate: float, t: Array, now: float, out: Array) -> None:
-    """Write at + rate (t - now) to `out`."""
+def fill_flight(at: float, rate: float, gravity: float, t: Array, now: float, out: Array) -> None:
+    """Write at + rate (t - now) + gravity (t - now)²/2 to `out`."""
     for j in range(t.size):
-        out[j] = at + rate * (t[j] - now)
+        out[j] = at + (rate + 0.5 * gravity * (t[j] - now)) * (t[j] - now)
 
 
 @inner
-def before_contact(curves: Array, t: Array, speed: float) -> int:
+def before_contact(curves: Array, t: Array, speed: float, gravity: float) -> int:
     """Fill the samples before contact, at time 0, and return how many these are.
 
     Nothing presses and only the striker moves.
@@ -133,13 +134,18 @@ def before_contact(curves: Array, t: Array, speed: float) -> int:
     none = rows - rows  # not the literals, which are types: compiled anew
     done = first_past(t, none, 0.0, none > 0)
     for i in range(rows):
-        fill_line(0.0, speed if i == rows - 1 else 0.0, t[:done], 0.0, curves[i, :done])
+        for j in range(done):
+            curves[i, j] = 0.0
+    fill_flight(0.0, speed, gravity, t[:done], 0.0, curves[rows - 1, :done])
     return done
 
 
 @inner
-def fly(curves: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float) -> None:
+def fly(
+    curves: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float, gravity: float
+) -> None:
     """After contact the chain keeps its shape and moves with the striker; nothing presses."""
-    fill_line(0.0, 0.0, t[first:], t_end, curves[0, first:])
+    for j in range(first, t.size):
+        curves[0, j] = 0.0
     for i in range(curves.shape[0] - 1):
-        fill_line(w_end[i], speed, t[first:], t_end, curves[1 + i, first:])
+        fill_flight(w_end[i], speed, gravity, t[first:], t_end, curves[1 + i, first:])

@@ -186,15 +186,20 @@ def _samples(values: ArrayLike, name: str) -> Array:
 
 @dataclass(frozen=True)
 class Impact:
-    """A striker of `mass` (kg) meets the top of the chain with `velocity` (m/s) at t = 0."""
+    """A striker of `mass` (kg) meets the top of the chain with `velocity` (m/s) at t = 0.
+
+    `gravity` (m/s²) accelerates it before, during and after contact.
+    """
 
     mass: float
     velocity: float
+    gravity: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse what is not admissible, by name."""
         object.__setattr__(self, "mass", _finite(self.mass, "mass", 0.0, True))
         object.__setattr__(self, "velocity", _finite(self.velocity, "velocity", 0.0, True))
+        object.__setattr__(self, "gravity", _finite(self.gravity, "gravity", 0.0, False))
 
 
 @dataclass(frozen=True, eq=False)

@@ -368,7 +368,8 @@ def _shift_of_motion(problem: Problem) -> float | None:
     for late in shifts:
         when = time - late
         columns = np.column_stack([np.interp(when, time, braked), np.ones(time.size)])
-        free = motion - striker.velocity * when
+        fall = 0.5 * (striker.gravity or 0.0) * when
+        free = motion - (striker.velocity + fall) * when
         left.append(float(np.linalg.lstsq(columns, free, rcond=None)[1].sum()))
     best, none = int(np.argmin(left)), left[shifts.size // 2]
     floor = 4.0 * problem.objective.noise("displacement_time").sigma ** 2 * time.size

@@ -106,6 +106,7 @@ def depart(
     more: int,
     span: float,
     now: float,
+    gravity: float,
     out: Samples,
     done: int,
     scratch: Array,
@@ -118,7 +119,7 @@ def depart(
     late, rate, place = scratch[0], scratch[1], scratch[2]
     law, nodes, groups = links.law, out.curves.shape[0] - 1, links.ends.size
     count, top = law.shape[0], groups - 1
-    pull = slope_at(s[V, top], order, span)
+    pull = slope_at(s[V, top], order, span) - gravity
     speed = moved = 0.0
     for i in range(count):
         speed += law[i, HEIGHT] * slope_at(s[EPS, i], order, span)
@@ -129,7 +130,7 @@ def depart(
         moved += law[i, HEIGHT] * s[EPS, i, 0]
         place[min(i, nodes - 1)] = moved
     away = s[V, top, 0]
-    fly(out.curves, out.t, done, now, place, away)
+    fly(out.curves, out.t, done, now, place, away, gravity)
     for p in range(d.drag.size):
         moved = 0.0
         for i in range(count):
@@ -138,4 +139,4 @@ def depart(
         for node in range(nodes):
             place[node] += (rate[node] - away) * late[p]
         faster = d.series[p, V, top, 0] + pull * late[p]
-        fly(out.slopes[p], out.t, done, now, place, faster)
+        fly(out.slopes[p], out.t, done, now, place, faster, 0.0)

@@ -318,7 +318,9 @@ def first_lift(s: Array, order: int, first: bool, pressed: bool, span: float) ->
 
 
 @inner
-def begin(run: Run, heights: Array, start: Array, speed: float, memory: Memory | None) -> int:
+def begin(
+    run: Run, heights: Array, start: Array, speed: float, gravity: float, memory: Memory | None
+) -> int:
     """Write the state at the first sample; returns how many samples lie before an impact."""
     rows, branches, law, s, d = run.rows, run.branches, run.links.law, run.s, run.d
     for i in range(branches.size):
@@ -341,8 +343,8 @@ def begin(run: Run, heights: Array, start: Array, speed: float, memory: Memory |
         return 0
     s[V, run.links.ends.size - 1, 0] = speed
     for p in range(d.drag.size):
-        before_contact(run.out.slopes[p], run.out.t, 0.0)
-    return before_contact(run.out.curves, run.out.t, speed)
+        before_contact(run.out.slopes[p], run.out.t, 0.0, 0.0)
+    return before_contact(run.out.curves, run.out.t, speed, gravity)
 
 
 @inner
@@ -419,7 +421,11 @@ def _integrated(
     scratch = np.zeros((6, max(order + 1, max(size, out.shape[1]))))
     late, c, push, motion = scratch[0], scratch[3], scratch[4], scratch[5]
     sizes = np.zeros((size, 2))
-    done = begin(run, heights, start, speed, memory)
+    gravity = 0.0
+    if struck:
+        push[0] = values[0]
+        gravity = values[0] / mass[mass.size - 1]
+    done = begin(run, heights, start, speed, gravity, memory)
     lagging = memory is not None
     bare = is_bare(links, memory)
     # Whether the base stress may be much smaller than the springs' stresses, or change faster: a
@@ -493,7 +499,7 @@ def _integrated(
             if leaves or spring >= 0:  # the base stress may end with this step
                 delay(s, d, more, span, late)
         if leaves:
-            depart(links, s, d, order, more, span, end, samples, done, scratch)
+            depart(links, s, d, order, more, span, end, gravity, samples, done, scratch)
             return DONE, end, step + 1, switches
         now = end
         _carry(run, order, more, span, push, shared, memory)

@@ -103,6 +103,8 @@ class _Run:
             self.control.proposed = 0.02 * duration
         self.steps = self.switches = self.knot = self.done = 0
         self.now, self.fall, self.pressed = 0.0 if self.struck else float(self.t[0]), 0.0, False
+        self.weight = float(scene.values[0]) if self.struck else 0.0
+        self.gravity = self.weight / float(scene.mass[-1]) if self.struck else 0.0
         self._begin(start)
 
     def _begin(self, start: Array) -> None:
@@ -134,7 +136,8 @@ class _Run:
             self.done = int(np.searchsorted(self.t, 0.0))
             before = slice(0, self.done)
             self.out.curves[:, before], self.out.slopes[:, :, before] = 0.0, 0.0
-            self.out.curves[-1, before] = self.scene.speed * self.t[before]
+            falling = self.scene.speed + 0.5 * self.gravity * self.t[before]
+            self.out.curves[-1, before] = falling * self.t[before]
 
     def follow(self, max_steps: int) -> None:
         """Step from event to event until the run ends."""
@@ -142,7 +145,7 @@ class _Run:
         while self.steps < max_steps:
             if self.done == self.t.size:
                 raise _EndError(scenes.DONE, math.nan)
-            horizon, push, push_rate = float(self.t[-1]), 0.0, 0.0
+            horizon, push, push_rate = float(self.t[-1]), self.weight, 0.0
             if not self.struck:
                 horizon, push, push_rate = self._drive(self.steps == 0 and stalled == 0)
             step.settle()
@@ -362,6 +365,7 @@ class _Run:
         later = self.t[done] - self.now
         curves[0, done] = 0.0
         curves[1:, done] = step.w[self.nodes, None] + step.v[-1] * later
+        curves[1:, done] += 0.5 * self.gravity * later**2
         if not len(slopes):
             return
         pull = -(float(step.total[-1, -1]) + step.drag * step.v[-1]) / step.mass[-1]
