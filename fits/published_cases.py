@@ -56,7 +56,7 @@ In the stress drive the measured stress is the input, and its noise would be tak
 acted: where the foam is soft, on branch e above all, the fitted slope would come out too steep. The
 driving stress is therefore smoothed. Nothing measured enters the impact drive.
 
-![deviations in standard errors](comparison.png)
+![fitted parameters beside the published ones](comparison.png)
 
 ```text
 {text}

@@ -173,10 +173,10 @@ def synthetic_impact(
 
 
 @functools.cache
-def refused(path: Path, *words: str) -> None:
+def refused(path: Path, *words: str, specimen: Path | None = None) -> None:
     """A test is refused in one sentence that has these words."""
     with pytest.raises(ff.InputError) as caught:
-        ff.read_test(path)
+        ff.read_test(path, specimen)
     message = str(caught.value)
     assert "\n" not in message
     for word in words:

@@ -12,12 +12,9 @@ from matplotlib.figure import Figure
 
 import fabricated
 import foamfit as ff
-from conftest import synthetic_impact
 from foamfit.data.measurement import Outliers
 from foamfit.report.comparison import compare, plot_comparison
 from foamfit.report.plots import plot_fit, plot_response
-from foamfit.report.report_plots import plot_insight
-from foamfit.trust.identifiability import Insight
 
 
 def with_outliers(result: ff.FitResult) -> ff.FitResult:
@@ -55,15 +52,6 @@ def response() -> Any:
 
 
 @functools.cache
-def insight() -> Insight:
-    """What a synthetic impact determines."""
-    _, test = synthetic_impact()
-    found = ff.fit(test, starts=2, intervals="local").insight
-    assert found is not None
-    return found
-
-
-@functools.cache
 def figures(width: str = "two") -> tuple[tuple[str, Figure], ...]:
     """All figures that can be made of little; they are not to be changed."""
     return tuple(_figures(width))
@@ -73,7 +61,6 @@ def _figures(width: str) -> Iterator[tuple[str, Figure]]:
     for name, make in RESULTS.items():
         yield name, plot_fit(make(), width=width)
     yield "response", plot_response(response(), width=width)
-    yield "insight", plot_insight(insight(), width=width)
     one = fabricated.result()
     named = replace(one, measurement=replace(one.measurement, name="foam-1/model-1"))
     yield "comparison", plot_comparison(compare([named]), width=width)

@@ -234,6 +234,6 @@ def no_figures() -> dict[str, Images | None]:
     """What stands for the figures of a report, of which drawing takes longest."""
     few = b"\x89PNG" + bytes(20)
     there = {"fit": Images(few, 250, b"%PDF")} | dict.fromkeys(
-        ("shown", "narrow", "residuals"), Images(few, 250)
+        ("shown", "narrow"), Images(few, 250)
     )
-    return there | dict.fromkeys(("information", "snapping", "profiles"))
+    return there | dict.fromkeys(("snapping", "profiles"))

@@ -92,6 +92,7 @@ def tried(residual, columns):
         residual=residual,
         sizes=(residual.size,),
         curves=[residual],
+        n_eff=residual.size / evidence.autocorrelation_time(residual),
         taus=[evidence.autocorrelation_time(residual)],
         chisqr=float(residual @ residual),
         grams=np.array([columns.T @ columns]),
@@ -494,17 +495,17 @@ def test_only_the_chosen_rung_gets_the_intervals_that_were_asked_for(monkeypatch
     original = one_model.judge
 
     def watched(found, choice, *rest):
-        given.append((found.problem.model.name, choice.method, found.problem.objective.loss))
+        given.append((found.problem.model.name, choice.method, found.record.seed))
         return original(found, choice, *rest)
 
     monkeypatch.setattr(auto.one_model, "judge", watched)
     loop = synthetic_loop()[1]
-    result = ff.fit(loop, model="auto", starts=4, intervals="profile", loss="huber")
-    assert given == [("bistable", "local", "huber"), ("bistable", "profile", "huber")]
+    result = ff.fit(loop, model="auto", starts=4, intervals="profile", seed=3)
+    assert given == [("bistable", "local", 3), ("bistable", "profile", 3)]
     known = [p for p in result.parameters.values() if p.ci95 is not None]
     assert {p.ci95_method for p in known} == {"profile likelihood"}
     assert result.ladder.chosen.model == result.model
-    assert result.loss == "huber"
+    assert result.seed == 3
 
 
 def test_outliers_leave_the_ladder_standing():

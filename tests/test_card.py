@@ -18,7 +18,6 @@ import fabricated
 import foamfit as ff
 from conftest import DATA, needs_data, thinned
 from foamfit.cards import curves as card_curves
-from foamfit.cards import replay
 from foamfit.cards.card import FORMATS, UNITS
 from foamfit.cli import main
 from foamfit.data.measurement import Specimen
@@ -138,17 +137,17 @@ def test_a_curve_ends_where_the_foam_is_solid(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------- unloading
 
 
-def replayed(style: str, strain: np.ndarray, unloading: replay.Unloading) -> np.ndarray:
+def replayed(style: str, strain: np.ndarray, unloading: card_curves.Unloading) -> np.ndarray:
     """A card of one curve, σ = ε² MPa, along a strain in steps of a second."""
     x = np.linspace(0.0, 1.0, 4001)
     curves = card_curves.Curves(np.array([1e-3]), x, 1e6 * x[None] ** 2, 1.0)
     first = strain >= np.maximum.accumulate(strain)
-    motion = replay.Motion(strain, np.gradient(strain), first)
-    return replay.REPLAYS[style](curves, motion)(unloading)
+    motion = card_curves.Motion(strain, np.gradient(strain), first)
+    return card_curves.REPLAYS[style](curves, motion)(unloading)
 
 
 def test_unloading_follows_the_formula_of_the_solvers() -> None:
-    hu, shape, expon = unloading = replay.Unloading(0.1, 1.7, 0.6)
+    hu, shape, expon = unloading = card_curves.Unloading(0.1, 1.7, 0.6)
     down, up = np.linspace(0.8, 0.2, 61), np.linspace(0.2, 0.9, 71)[1:]
     strain = np.concatenate([np.linspace(0.0, 0.8, 81), down[1:], up])
     # W goes with ε³.
@@ -165,9 +164,9 @@ def test_unloading_follows_the_formula_of_the_solvers() -> None:
 @pytest.mark.parametrize("style", FORMATS)
 def test_the_unloading_of_a_card_is_found_again(style: str) -> None:
     strain = np.concatenate([np.linspace(0.0, 1.0, 101), np.linspace(1.0, 0.0, 101)[1:]])
-    true = replay.Unloading(0.15, 2.3, 1.0 if style == "mat057" else 0.7)
+    true = card_curves.Unloading(0.15, 2.3, 1.0 if style == "mat057" else 0.7)
     target = replayed(style, strain, true)
-    found = replay.fit_unloading(
+    found = card_curves.fit_unloading(
         [lambda one: replayed(style, strain, one)], [target], expon=style != "mat057"
     )
     np.testing.assert_allclose(found, true, rtol=1e-3)

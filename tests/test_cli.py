@@ -688,7 +688,7 @@ def test_a_json_that_is_nested_too_deeply_is_no_defect(here: Path) -> None:
 def test_compare_and_fit_keep_what_they_read(here: Path, fitted: tuple[Path, Result]) -> None:
     folder = here / "old"
     shutil.copytree(next(fitted[0].rglob("fit.json")).parent, folder)
-    args = ("--published", "foam-1/model-1", "--csv", folder / "fit.json")
+    args = ("--published", "foam-1/model-1", "--plot", folder / "fit.json")
     refused(here, "compare", folder, *args, words=("fit.json is read by this command",))
     write(folder)
     refused(here, "fit", folder / "test.csv", "--out", folder, words=("old holds test.csv",))

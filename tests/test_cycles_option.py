@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,12 @@ import pytest
 from click.testing import CliRunner
 
 import foamfit as ff
+from foamfit import Chain
 from foamfit.cli import main
 from foamfit.data.cycles import cycles_of
+from foamfit.data.measurement import Measurement
+from foamfit.fitting.curves import default_weights
+from foamfit.fitting.objective import Objective
 from foamfit.springs.model import Model
 
 TRUTH = ff.MicroscaleSpring(
@@ -148,3 +153,69 @@ def test_a_branch_of_the_first_sample_was_reached(record: Path) -> None:
     )
     assert "snap-through" in found.visited["s1"]
     assert "never reached" not in found.parameters["s1_sigma_plus"].why
+
+
+@pytest.fixture(scope="module")
+def lifted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Chain]:
+    """Two cycles of a spring that recovers more slowly than its platen; pressed a little before."""
+    folder, rng = tmp_path_factory.mktemp("lifted"), np.random.default_rng(3)
+    spring = replace(TRUTH, relaxation=((0.8, 0.5),))
+    chain = ff.Chain([spring], [HEIGHT], AREA)
+    t = np.arange(0.0, 8.0, 0.01)
+    strain = np.interp(t, [0.4, 2.0, 3.6, 3.9, 5.5, 7.1], [0.0, 0.55, 0.0, 0.0, 0.55, 0.0])
+    stress = ff.simulate(chain, ff.DisplacementDrive(HEIGHT * strain), t).base_stress
+    assert stress.min() < -2e3  # it would have to pull
+    stress = np.maximum(stress, 0.0) + np.where(t < 0.4, 2e3, 0.0)
+    force = AREA * (stress + rng.normal(0.0, 100.0, t.size)) + 0.05
+    table = np.column_stack([t, force, 1e3 * HEIGHT * strain + 3.0])
+    np.savetxt(
+        folder / "foam.csv", table, "%.6f", ",", header="time (s),force (N),displacement (mm)",
+        comments="",
+    )  # fmt: skip
+    (folder / "foam.toml").write_text('[specimen]\nheight = "10 mm"\narea = "50 mm^2"\n')
+    return folder / "foam.csv", chain
+
+
+def test_the_stress_between_cycles_is_the_zero_of_a_specimen_that_was_pressed(
+    lifted: tuple[Path, Chain],
+) -> None:
+    offset = 0.05 / AREA
+    history = ff.read_test(lifted[0], cycles=(1, 2))
+    assert history.origins["stress_zero"] == pytest.approx(offset, abs=50.0)
+    assert 5.0 < history.zeros["stress"] < 100.0
+    assert any("between the first two cycles" in note for note in history.notes)
+    one = ff.read_test(lifted[0])  # which shows no stress after it
+    assert one.origins["stress_zero"] == pytest.approx(offset + 2e3, abs=50.0)
+
+
+def test_a_specimen_that_has_lost_contact_bears_no_tension(lifted: tuple[Path, Chain]) -> None:
+    file, chain = lifted
+    history = ff.read_test(file, cycles=(1, 2))
+    law = "microscale, stiffening, mullins"
+    test = replace(history, noise=replace(history.noise, stress=100.0))
+    spring = chain.springs[0]
+    own = [getattr(spring, name) for name in Model((law,)).laws[0].own]
+    values = np.array([*own, 0.0, 0.8, 0.5, 0.0])
+
+    def of(one: Measurement) -> tuple[Objective, np.ndarray]:
+        made = Objective(
+            one, Model((law,), 1), "displacement", default_weights(one, "displacement")
+        )
+        return made, np.append(values, [made.usual[name] for name in made.nuisance])
+
+    made, point = of(test)
+    curve = made.simulate(point).curves["stress_strain"]
+    lost = curve == 0.0
+    assert curve.min() == 0.0
+    assert lost.sum() > 20
+    assert np.std(made.residual(point)[: made.n_data]) == pytest.approx(1.0, abs=0.2)
+    pulling, there = of(replace(test, last_cycle=None))
+    assert pulling.simulate(there).curves["stress_strain"].min() < -2e3
+    # What bears nothing does not change; derivatives elsewhere are those of differences.
+    places = np.arange(len(own))
+    slopes = made.jacobian(point, places)
+    assert not slopes[: lost.size][lost].any()
+    step = 1e-4 * point[3]
+    sides = [made.residual(point + side * step * (np.arange(point.size) == 3)) for side in (-1, 1)]
+    differences = (sides[1] - sides[0]) / (2.0 * step)
+    assert np.abs(slopes[:, 3] - differences).max() < 1e-2 * np.abs(differences).max()

@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -26,7 +25,6 @@ from conftest import EXPERIMENTS, without_pictures
 from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.files import check_file, csv_bytes, replacing, sweep, write_file
-from foamfit.report.comparison import compare, write_csv
 from foamfit.report.folder import check_target, load_result
 from foamfit.report.plots import plot_fit
 from foamfit.report.result_figures import Images
@@ -176,8 +174,7 @@ def test_a_long_name_leaves_room_for_what_is_beside_it(here: Path) -> None:
 def test_a_full_disk_leaves_the_older_file(
     here: Path, monkeypatch: pytest.MonkeyPatch, failure: OSError
 ) -> None:
-    fabricated.result().save("r")
-    comparison = compare(["r"], "foam-1/model-1")
+    row = row_of("a", "a.csv", fabricated.result())
     write = Path.write_bytes
 
     def full(path: Path, content: bytes) -> int:
@@ -186,14 +183,14 @@ def test_a_full_disk_leaves_the_older_file(
 
     monkeypatch.setattr(Path, "write_bytes", full)
     for path, make in (
-        (here / "a.csv", lambda path: write_csv(comparison, path)),
+        (here / "summary.csv", lambda path: write_summary([row], path.parent)),
         (here / "b.png", lambda path: plot_fit(fabricated.result(), path)),
     ):
         path.write_text("older")
         with pytest.raises(InputError, match="No space left on device"):
             make(path)
         assert path.read_text() == "older"
-    assert names(here) == ["a.csv", "b.png", "r"]
+    assert names(here) == ["b.png", "summary.csv"]
 
 
 def test_no_text_of_a_table_is_a_formula(here: Path) -> None:
@@ -201,13 +198,10 @@ def test_no_text_of_a_table_is_a_formula(here: Path) -> None:
     texts = ("=1+1", "@SUM(1)", "+1+1", "-1+1", "\t=1", "a=1", "-2.5e-3", "-", "-inf")
     told = csv_bytes([texts, (-1.5, None, "")]).decode().splitlines()
     assert told == ["'=1+1,'@SUM(1),'+1+1,'-1+1,'\t=1,a=1,-2.5e-3,'-,-inf", "-1.5,,"]
-    one = fabricated.result()
-    named = replace(one, measurement=replace(one.measurement, name="=foam-1/model-1"))
-    write_csv(compare([named], "foam-1/model-1"), "c.csv")
-    write_summary([row_of("=1+1", "=1+1.csv", one)], here)
-    for name in ("c.csv", "summary.csv"):
-        assert all(line[0] == "'" for line in Path(name).read_text().splitlines()[1:])
-        assert ",=" not in Path(name).read_text()
+    write_summary([row_of("=1+1", "=1+1.csv", fabricated.result())], here)
+    text = Path("summary.csv").read_text()
+    assert all(line[0] == "'" for line in text.splitlines()[1:])
+    assert ",=" not in text
 
 
 def test_a_full_disk_loses_no_numbers(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

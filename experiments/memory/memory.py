@@ -25,8 +25,9 @@ import numpy as np
 import pandas as pd
 
 import foamfit as ff
-from foamfit.data.cycles import cycles_of
+from foamfit.data.cycles import cycles_of, find_turns
 from foamfit.data.measurement import Measurement
+from foamfit.data.noise import noise_level
 from foamfit.report.figures import DPI, GREY
 from foamfit.results import Fit
 
@@ -35,12 +36,19 @@ sys.path.insert(0, str(HERE.parent))
 import real_foams  # noqa: E402
 import studies  # noqa: E402
 
-TABLE, PARAMETERS = HERE / "memory.csv", HERE / "parameters.csv"
+TABLE, PARAMETERS, BACK = (HERE / f"{name}.csv" for name in ("memory", "parameters", "ways_back"))
 SHOWN = "new-heel-comp-3"  # in the picture
 FIRST, HISTORY, PREDICTED = "first cycle", "cycles 1 to 3", "predicted"
 # Specimens on which the growth of the band was chosen.
 CHOSEN = [f"new-heel-comp-{i}" for i in (1, 2, 4, 5)]
 BARS = {FIRST: (0.56, 0.75), HISTORY: (0.90, 1.10), PREDICTED: (1.0, 1.25)}  # mean, worst, %
+# Columns of the motion and of the force in the files that are looked through for partial unloading.
+MOTIONS = "Gap (um)", "Position(Linear:Position) (mm)", "displacement_m", "Strain"
+FORCES = (
+    "Normal force (N)", "Force(Linear:Load) (kN)", "force_N", "specific_force_N_per_kg",
+    "Stress (MPa)",
+)  # fmt: skip
+LOADED, WHOLE = 0.05, 0.35  # shares of the largest force, and of the motion, that count
 MEMORY: dict[str, Any] = {"model": "microscale", "stiffening": True, "mullins": True}
 
 
@@ -63,6 +71,34 @@ def misfits(test: Measurement, result: Fit) -> dict[int, float]:
         number: float(np.sqrt(np.mean((fitted - measured)[part] ** 2)) / np.ptp(measured[part]))
         for number, part in spans.items()
     }
+
+
+def turned_back(data: Path) -> Iterator[dict[str, Any]]:
+    """How far the motion of each record goes back while loaded, on its ways up and down.
+
+    A way ends where at least `WHOLE` of the motion is taken back; what is less is an inner loop.
+    """
+    for file in sorted(data.glob("*/*.*")):
+        if file.stem in ("specimens", "test_1_raw"):  # no record; the raw form of test_1_impact
+            continue
+        table = pd.read_csv(file, sep="\t" if file.suffix == ".txt" else ",", index_col=False)
+        columns = (next(c for c in names if c in table) for names in (MOTIONS, FORCES))
+        w, force = (table[column].to_numpy(float) for column in columns)
+        force = force * np.sign(force[np.argmax(np.abs(force))])  # compression is positive
+        w = w * np.sign(np.corrcoef(w, force)[0, 1]) / np.ptp(w)
+        ends = [0, *find_turns(w, WHOLE).tolist(), w.size]
+        back = 0.0
+        for i, part in enumerate(map(slice, ends, ends[1:])):
+            way = w[part][force[part] > LOADED * force.max()] * (-1) ** i
+            back = max(back, float(np.max(np.maximum.accumulate(way) - way, initial=0.0)))
+        yield {"folder": file.parent.name, "record": file.stem, "ways": len(ends) - 1,
+               "back": back, "noise": noise_level(w)}  # fmt: skip
+
+
+def turned_back_table(table: pd.DataFrame) -> str:
+    made = table.groupby("folder").agg({"record": "count", "ways": "sum", "back": "max"})
+    rows = ([name, n, ways, f"{100.0 * back:.1g} %"] for name, n, ways, back in made.itertuples())
+    return studies.markdown("folder | records | loadings, unloadings | most taken back", rows)
 
 
 def fitted(test: Measurement, **more: Any) -> tuple[Fit, float]:
@@ -205,12 +241,14 @@ def main() -> None:
     parser = studies.arguments(__doc__)
     parser.add_argument("--page", action="store_true", help="only write the page, from the tables")
     if not parser.parse_args().page:
-        study(studies.measurements("shoe-foam", "shoe-foam-twins"))
+        data = studies.measurements("shoe-foam", "shoe-foam-twins")
+        studies.write_csv(turned_back(data), BACK)
+        study(data)
     table, values = pd.read_csv(TABLE), pd.read_csv(PARAMETERS)
     studies.write_page(
         HERE, source=real_foams.SOURCE, summary=summary(table), specimens=per_specimen(table),
         values=values_table(values), inside=coverage(table), seconds=seconds(table),
-        verified=coverage(table, chosen=False),
+        verified=coverage(table, chosen=False), back=turned_back_table(pd.read_csv(BACK)),
     )  # fmt: skip
 
 

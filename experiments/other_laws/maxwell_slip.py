@@ -12,6 +12,7 @@ Iwan 1966, J. Appl. Mech. 33, 893; Segalman 2005, J. Appl. Mech. 72, 752.
 """
 
 import numpy as np
+from bouc_wen_foam import begin, leaves, switch
 from ogden import CURVE, curve, read_curve
 
 import foamfit as ff
@@ -26,21 +27,6 @@ def fill(values, row):
     for j in range(N):
         row[7 + j] = values[5] * ((j + 0.5) / N) ** values[6]
     return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4:].min() > 0.0
-
-
-def begin(row, state):
-    """Rest: no slider is strained."""
-    state[:] = 0.0
-
-
-def leaves(row, state, strain):
-    """Whether the strain turns."""
-    return strain != state[EPS] and (strain > state[EPS]) != (state[BRANCH] == 0.0)
-
-
-def switch(row, state, up):
-    """Loading is branch 0, unloading branch 1."""
-    state[BRANCH] = 0.0 if up else 1.0
 
 
 def settle(row, state, strain):

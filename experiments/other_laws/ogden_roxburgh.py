@@ -12,7 +12,7 @@ Ogden & Roxburgh 1999, Proc. R. Soc. A 455, 2861, equation (51).
 import math
 
 import numpy as np
-from ogden import CURVE, curve, read_curve
+from ogden import CURVE, begin, curve, leaves, read_curve, switch
 
 import foamfit as ff
 
@@ -23,20 +23,6 @@ def fill(values, row):
     """Copy the parameters; refuse what no spring has."""
     row[:] = values
     return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4] >= 1.0 and values[5] > 0.0
-
-
-def begin(row, state):
-    """Rest: nothing was stored yet."""
-    state[:] = 0.0
-
-
-def leaves(row, state, strain):
-    """There is one branch: the softening is continuous."""
-    return False
-
-
-def switch(row, state, up):
-    """There is no other branch."""
 
 
 def settle(row, state, strain):

@@ -52,14 +52,14 @@ test = foamfit.read_test(sys.argv[1])
 marks.append(time.perf_counter())
 from foamfit import api
 from foamfit.report.folder import save_result
-from foamfit.cli.options import drawing_beside
-with drawing_beside() as drawers:
-    if drawers is not None:
-        drawers.begin()
+from contextlib import closing
+from foamfit.cli.options import Drawers
+with closing(Drawers()) as drawers:
+    drawers.begin()
     marks.append(time.perf_counter())
     result = api.fit(test)
     marks.append(time.perf_counter())
-    save_result(result, sys.argv[2], **({} if drawers is None else {"mapped": drawers.map}))
+    save_result(result, sys.argv[2], mapped=drawers.map)
     marks.append(time.perf_counter())
 print(*(after - before for before, after in zip(marks, marks[1:])))
 gc.freeze()  # as the command: what is left goes with the process

@@ -18,7 +18,8 @@ from foamfit.report.samples import dataset
 from foamfit.report.shown import fit_shown
 from foamfit.report.tables import frame
 from foamfit.results import Fit
-from foamfit.springs.model import with_options
+from foamfit.solve.precompile import at_first_use
+from foamfit.springs.model import Model
 from foamfit.trust.intervals import Announce
 
 if TYPE_CHECKING:
@@ -116,9 +117,6 @@ def fit(
         Whether branch a of every microscale spring stiffens as the test says: s1_stiffening.
     mullins : bool
         Whether what has snapped once softens and weakens: s1_softening, s1_weakening.
-    loss : str
-        "linear" (least squares), or one that reduces the weight of large residuals: "soft_l1",
-        "huber" or "cauchy".
     intervals : str
         Method of the 95 % intervals: "auto" (local covariance, and profiles of the parameters
         along which the cost is not parabolic), "local", "profile", "bootstrap" or "mcmc".
@@ -131,6 +129,10 @@ def fit(
     watch : callable, optional
         Called with the problem and the best parameters so far whenever these improve; it must be
         quick.
+    fix : mapping, optional
+        Parameters to hold at a value (SI), where `params` is not given.
+    vary : sequence of str
+        Names of parameters to vary though they are held by default.
 
     Returns
     -------
@@ -155,6 +157,26 @@ def fit(
     chosen = Options.of("fit", options)
     progress, tell = progress or (lambda *_: None), tell or (lambda _: None)
     if model != "auto":
+        Model.parse(model, chosen.relaxation)
+    with at_first_use(model, chosen.relaxation) as compile_rest:
+
+        def shown(share: float, what: str) -> None:
+            compile_rest()  # before the first trial, after what is wrong in the call was refused
+            progress(share, what)
+
+        return _fit(measurement, model, params, chosen, shown, tell)
+
+
+def _fit(
+    measurement: Measurement,
+    model: str,
+    params: lmfit.Parameters | None,
+    chosen: Options,
+    progress: Progress,
+    tell: Announce,
+) -> FitResult:
+    """Identify as `fit` does, which see."""
+    if model != "auto":
 
         def search(share: float, what: str) -> None:
             progress(SEARCHED * share, what)
@@ -166,16 +188,7 @@ def fit(
         found, _ = judge(searched, chosen.choice, tell, assess)
         progress(1.0, "done")
         return FitResult(**vars(found))
-    if params is not None:
-        raise InputError("params belong to one model; name it instead of 'auto'")
-    if chosen.relaxation:
-        raise InputError(
-            f"relaxation = {chosen.relaxation} belongs to one model; name it instead of 'auto', "
-            "which tries relaxation by itself"
-        )
-    if chosen.priors or measurement.priors:
-        raise InputError("priors belong to one model; name it instead of 'auto'")
-    with_options(model, **chosen.of_springs)
+    chosen.check_auto(params=params is not None, priors=measurement.priors)
     from foamfit.auto import compare_models
 
     return FitResult(**vars(compare_models(measurement, chosen, progress, tell)))

@@ -1,4 +1,4 @@
-"""The type of an array of numbers, and the threads of linear algebra."""
+"""Types and means of arrays, and the threads of linear algebra."""
 
 from __future__ import annotations
 
@@ -10,8 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 _Given = ParamSpec("_Given")
 _Result = TypeVar("_Result")
+
+
+def means(values: Array, starts: Integers) -> Array:
+    """Means of the parts of a signal that begin at `starts`."""
+    return np.asarray(np.add.reduceat(values, starts) / np.diff(np.append(starts, len(values))))
 
 
 def single_threaded(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:

@@ -12,7 +12,9 @@ import math
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import lmfit
 import numpy as np
@@ -32,7 +34,6 @@ from foamfit.springs.model import Model, with_options
 from foamfit.springs.parameters import NUISANCE, family, split_name
 from foamfit.text import percent
 from foamfit.trust import evidence
-from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import input_first
 from foamfit.trust.evidence import BLOCKS, MARGIN, SHARE, Tried, misfit_of, predicted_misfit
 from foamfit.trust.intervals import Announce, Choice
@@ -188,31 +189,33 @@ class _Comparison:
         They have as many springs as heights are given, or one, and every mass whose motion was
         measured; relaxation needs the time.
         """
-        test = self.measurement
+        test, groups = self.measurement, []
         heights, inside = test.specimen.heights, max(test.interior, default=0)
-        groups = []
         impact = self.options.drive == "impact"
         for group in LADDER if test.last_cycle is None else HISTORY:
             allowed = []
             for model in sorted(group, key=lambda one: not (impact or one.relaxation)):
-                count = len(model.kinds)
+                why, count = "", len(model.kinds)
                 if inside >= count:
-                    self._skip(model, f"it has no mass {inside} inside, whose motion was measured")
+                    why = f"it has no mass {inside} inside, whose motion was measured"
                 elif heights is not None and count not in (1, len(heights)):
-                    self._skip(model, f"[specimen] heights are those of {len(heights)} springs")
+                    why = f"[specimen] heights are those of {len(heights)} springs"
                 elif model.relaxation and test.time is None:
-                    self._skip(model, "relaxation needs a time column")
-                else:
-                    allowed.append(model)
-            if allowed:
-                groups.append(allowed)
+                    why = "relaxation needs a time column"
+                allowed += [] if why else [model]
+                self._skip(model, why)
+            groups += [allowed] if allowed else []
         if not groups:
             told = "; ".join(self.skipped)
             raise InputError(f"{test.name}: no model of the ladder fits this test: {told}")
         return groups
 
-    def _skip(self, model: Model, why: str) -> None:
-        self.skipped.append(f"{rung_name(model.name, 'none', model.relaxation)}: {why}")
+    def _skip(self, model: Model, why: str) -> bool:
+        """Note why a model is not tried, if there is a reason."""
+        if why:
+            named = rung_name(model.name, "none", model.relaxation)
+            self.skipped.append(f"{named}: {why}")
+        return bool(why)
 
     def climb(self) -> None:
         """Fit group after group until one model holds, two groups gain nothing, or time is up."""
@@ -221,9 +224,7 @@ class _Comparison:
             below = len(self.tried)
             for model in group:
                 self.number += 1
-                if why := _hopeless(model, self.tried, self.unpromising):
-                    self._skip(model, why)
-                else:
+                if not self._skip(model, _hopeless(model, self.tried, self.unpromising)):
                     self._family(model)
                 if any(one.structureless for one in self.tried):
                     self.ended = "the residuals are random"
@@ -246,11 +247,8 @@ class _Comparison:
                 return
             try:
                 one = self._fit(model, damping, left, i / len(dampings), 1.0 / len(dampings))
-            except _UnpromisingError as error:
-                self.unpromising.append(model)
-                self._skip(model, str(error))
-                return
-            except SimulationError as error:  # a dashpot would not help
+            except (_UnpromisingError, SimulationError) as error:  # a dashpot would not help
+                self.unpromising += [model] if isinstance(error, _UnpromisingError) else []
                 self._skip(model, str(error).removeprefix(f"{self.measurement.name}: "))
                 return
             self.tried.append(one)
@@ -280,8 +278,10 @@ class _Comparison:
         options = replace(self.options, max_time=left, relaxation=model.relaxation)
         look = self._look if len(model.kinds) > 1 else None
         found = one_model.identify(self.measurement, model.name, params, options, tell, look)
-        result, best = one_model.judge(found, COMPARED, lambda _: None)
-        predicted = None if result.stopped else self._predicted(best)
+        (result, best), predicted = one_model.judge(found, COMPARED, lambda _: None), None
+        if not result.stopped:
+            with suppress(SearchStoppedError):
+                predicted = predicted_misfit(best, self.deadline)
         self.fits.append(found)
         return Tried(result, damping, best, time.perf_counter() - began, predicted)
 
@@ -297,19 +297,12 @@ class _Comparison:
                 f"{best.name} by {percent(best.misfit)}"
             )
 
-    def _predicted(self, best: BestPoint) -> float | None:
-        """Return the misfit of samples that are held back; None if the time is up."""
-        try:
-            return predicted_misfit(best, self.deadline)
-        except SearchStoppedError:
-            return None
-
 
 def _hopeless(model: Model, tried: Sequence[Tried], unpromising: Sequence[Model] = ()) -> str:
     """Say why a model that takes long cannot win; "" where it may, and of others."""
 
     def least(kinds: Sequence[str], most: float = math.inf) -> tuple[float, str]:
-        """Misfit of one spring of these kinds with no more relaxation terms, and its name."""
+        """Misfit of one spring of these kinds with no more relaxation terms, in words too."""
         alone = (t for t in tried if t.result.model in kinds and t.result.relaxation <= most)
         found = min(alone, key=lambda one: one.misfit, default=None)
         if found is None:
@@ -358,33 +351,32 @@ def _conclude(state: _Comparison) -> Fit:
     decision = evidence.choose(tried)
     best, criteria = tried[decision.best], decision.criteria
     result, ended = best.result, f"it was stopped by {stopped}" if stopped else state.ended
-    told = {"tried": tried, "decision": decision, "best": best, "ended": ended, "stopped": stopped}
-    others, lost = [], best.states("not determined")
+    told: dict[str, Any] = {"tried": tried, "decision": decision, "best": best, "ended": ended}
+    told |= {"stopped": stopped, "lost": best.states("not determined"), "sound": None, "left": None}
+    others = []
     for name in ("AICc", "BIC"):
         values = [getattr(one, name.lower()) for one in criteria]
         least = int(np.argmin(values))
         if (off := values[least] - values[decision.best]) < -MARGIN:
             others.append((name, tried[least].name, _signed(off)))
-    said = render.sentences(
-        "choice", part="choice", others=others, blocks=BLOCKS, share=SHARE, **told
-    )
     sound = [i for i, one in enumerate(tried) if not one.states("not determined")]
-    if lost and sound:
-        misfits, bics = [one.misfit for one in tried], [one.bic for one in criteria]
-        costs = misfits if decision.by_prediction else bics
-        nearest = min(sound, key=lambda i: costs[i])
-        told |= {"sound": tried[nearest], "higher": bics[nearest] - bics[decision.best]}
+    if told["lost"] and sound:
+        costs = [tried[i].misfit if decision.by_prediction else criteria[i].bic for i in sound]
+        nearest = sound[int(np.argmin(costs))]
+        higher = criteria[nearest].bic - criteria[decision.best].bic
+        told |= {"sound": tried[nearest], "higher": higher}
     if result.at_noise is False and not any(one.structureless for one in tried):
         tests = [min(runs_test(part), neighbours_test(part)) for part in best.curves]
         worst = int(np.argmin(tests))
         left = find_structure(best.curves[worst], best.places[worst])
         told |= {"left": left, "curve": best.counted[worst], "size": left.size / best.spans[worst]}
-    defaults = {"sound": None, "left": None}
-    warned = render.sentences("choice", part="cautions", lost=lost, bent=BENT, **(defaults | told))
+    told |= {"others": others, "blocks": BLOCKS, "share": SHARE, "bent": BENT}
+    said = render.sentences("choice", part="choice", **told)
+    warned = render.sentences("choice", part="cautions", **told)
     reference = evidence.reference_of(tried)
     ladder = Ladder(
         rungs=tuple(_rung(i, tried, decision) for i in range(len(tried))),
-        n_eff=evidence.effective_samples(reference),
+        n_eff=reference.n_eff,
         noise_from=reference.name,
         ended=ended,
         stopped=stopped,
@@ -405,7 +397,7 @@ def _conclude(state: _Comparison) -> Fit:
 
 def _rung(i: int, tried: Sequence[Tried], decision: evidence.Decision) -> Rung:
     """Return what was found of the `i`-th model, and why it was chosen or not."""
-    one, best = tried[i], tried[decision.best]
+    one, best, result = tried[i], tried[decision.best], tried[i].result
     found, chosen = decision.criteria[i], decision.criteria[decision.best]
     before, ruler = (
         None if j is None else tried[j] for j in (decision.before[i], decision.ruled_out_by[i])
@@ -413,38 +405,32 @@ def _rung(i: int, tried: Sequence[Tried], decision: evidence.Decision) -> Rung:
     gain = None
     if before and one.predicted is not None and before.predicted is not None:
         gain = 1.0 - one.predicted / before.predicted
-    why = render.words(
-        "why",
-        one=one,
-        best=best,
-        before=before,
-        ruler=ruler,
-        gain=gain,
-        by_prediction=decision.by_prediction,
-        chosen=one is best,
-        more=one.varied - before.varied if before else 0,
-        richest=one.varied >= max(each.varied for each in tried),
-        bic=_signed(found.bic - chosen.bic),
-        aicc=_signed(found.aicc - chosen.aicc),
-        worse=evidence.WORSE,
-        margin=MARGIN,
-        share=SHARE,
-    )
-    shared = ("damping", "chisqr", "runs_p", "neighbours_p", "seconds")
+    told: dict[str, Any] = {
+        "one": one,
+        "best": best,
+        "before": before,
+        "ruler": ruler,
+        "gain": gain,
+    }
+    told |= {"chosen": one is best, "more": one.varied - before.varied if before else 0}
+    told |= {"by_prediction": decision.by_prediction, "worse": evidence.WORSE, "share": SHARE}
+    told |= {"richest": one.varied >= max(each.varied for each in tried), "margin": MARGIN}
+    told |= {"bic": _signed(found.bic - chosen.bic), "aicc": _signed(found.aicc - chosen.aicc)}
     return Rung(
-        **{name: getattr(one, name) for name in shared},
+        **{name: getattr(result, name) for name in ("model", "relaxation", "stopped")},
+        **{name: getattr(one, name) for name in ("damping", "chisqr", "runs_p", "neighbours_p")},
         **{name: getattr(found, name) for name in ("rank", "aicc", "bic")},
-        **{name: getattr(one.result, name) for name in ("model", "relaxation", "stopped")},
-        misfit=dict(one.result.misfit),
+        seconds=one.seconds,
+        misfit=dict(result.misfit),
         n_vary=one.varied,
-        n_eff=evidence.effective_samples(one),
+        n_eff=one.n_eff,
         not_determined=one.states("not determined"),
         weak=one.states("weak"),
         chosen=one is best,
-        why=why.replace("\n", ""),
+        why=render.words("why", **told).replace("\n", ""),
         predicted_misfit=one.predicted,
         gain=gain,
-        gain_over=None if before is None else before.name,
+        gain_over=before.name if before else None,
     )
 
 

@@ -39,8 +39,11 @@ def reading(what: str) -> Iterator[None]:
     raise InputError(f"{what} cannot be read back: {fault}; fit again")
 
 
-def encode(value: Any, columns: Columns) -> Any:
-    """Return a value in the types of JSON; a number that is not finite is its name."""
+def encode(value: Any, columns: Columns | None = None) -> Any:
+    """Return a value in the types of JSON, dataclasses as objects of their fields.
+
+    A number that is not finite is its name, or None where there are no columns.
+    """
     if hasattr(value, "valuesdict"):  # lmfit's parameters, whose own writer pickles functions
         every = {
             name: {key: getattr(one, key) for key in _PARAMETER} for name, one in value.items()
@@ -54,14 +57,17 @@ def encode(value: Any, columns: Columns) -> Any:
     if is_dataclass(value):
         return {one.name: encode(getattr(value, one.name), columns) for one in fields(value)}
     if isinstance(value, np.ndarray):
-        same = (name for name, one in columns.items() if np.array_equal(one, value, equal_nan=True))
+        pairs = (columns or {}).items()
+        same = (name for name, one in pairs if np.array_equal(one, value, equal_nan=True))
         name = next(same, None)
         return encode(value.tolist(), columns) if name is None else {"column": name}
     if isinstance(value, np.generic | PurePath):
         return encode(value.item() if isinstance(value, np.generic) else str(value), columns)
     if isinstance(value, list | tuple):
         return [encode(item, columns) for item in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if columns is None else str(value)
+    return value
 
 
 def decode(hint: Any, value: Any, columns: Columns) -> Any:
@@ -100,12 +106,8 @@ def decode(hint: Any, value: Any, columns: Columns) -> Any:
 def build(made: type, content: Mapping[str, Any], columns: Columns, **names: Any) -> Any:
     """Make a dataclass of its encoded fields; one that has a default may be missing.
 
-    `names` are those in its annotations that its module imports for typing alone.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError, AttributeError
-        If a field is missing, or is not what the dataclass says.
+    `names` are those in its annotations that its module imports for typing alone. What is missing
+    or not as the dataclass says raises KeyError, TypeError, ValueError or AttributeError.
     """
     hints = get_type_hints(made, localns=names)
     given = {}

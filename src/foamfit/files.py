@@ -15,7 +15,6 @@ import platform
 import re
 import shutil
 import stat
-import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -38,10 +37,9 @@ def check_file(path: Path) -> None:
             raise InputError(f"{path} is a folder; name a file")
         if not path.parent.is_dir():
             raise InputError(f"{path} cannot be written: there is no folder {path.parent}")
-        special = path.exists() and not path.is_file()
-        if not special and not os.access(path.resolve().parent, os.W_OK | os.X_OK):
-            raise InputError(f"{path} cannot be written: permission denied")
-        if path.exists() and not os.access(path, os.W_OK):
+        there, special = path.exists(), path.exists() and not path.is_file()
+        free = special or os.access(path.resolve().parent, os.W_OK | os.X_OK)
+        if not free or (there and not os.access(path, os.W_OK)):
             raise InputError(f"{path} cannot be written: permission denied")
     except (OSError, RuntimeError) as error:  # a name that is too long, a link to itself
         raise InputError(f"{path} cannot be written: {reason(error)}") from None
@@ -127,19 +125,6 @@ def replacing(folder: Path, *, swept: bool = False) -> Iterator[Path]:
     finally:
         if folder.exists():  # else the old one is the last copy
             shutil.rmtree(old, ignore_errors=True)
-
-
-@contextmanager
-def scratch() -> Iterator[Path]:
-    """Give an empty temporary folder; what killed processes left of such folders is removed."""
-    place = Path(tempfile.gettempdir()).resolve() / "foamfit"
-    sweep(place.parent, [place.name])
-    folder = _beside(place, "new")
-    folder.mkdir(mode=0o700)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def reason(error: BaseException) -> str:

@@ -6,7 +6,7 @@ import difflib
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from numbers import Integral, Real
@@ -18,8 +18,9 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
+from foamfit.fitting.curves import check_time_shift, choose_drive
 from foamfit.fitting.minima import exchange_springs, in_order, scan_places, settle_ends
-from foamfit.fitting.problem import Problem, make_problem
+from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
 from foamfit.fitting.search import (
     REFINED,
     STOPPING,
@@ -41,10 +42,9 @@ from foamfit.trust.intervals import Announce, Choice, assess, evaluations_of
 from foamfit.trust.ranges import Open, left_open
 
 Progress = Callable[[float, str], None]
-# Called with the problem and the best point so far, many times a second; must be quick.
+# Called with the problem and the best point so far, many times a second, so it must be quick; or
+# with that of the first descents: what it then raises ends the fit.
 Watch = Callable[[Problem, Array], None]
-# Called with the problem and the best point of the first descents; what it raises ends the fit.
-Look = Callable[[Problem, Array], None]
 
 # Descents of the search for each spring, for each of several hysteretic springs in series, and at
 # most in all.
@@ -81,11 +81,12 @@ class Keywords(TypedDict, total=False):
     relaxation: int
     stiffening: bool
     mullins: bool
-    loss: str
     intervals: str
     draws: int | None
     priors: Mapping[str, str | tuple[float, float]] | None
     watch: Watch | None
+    fix: Mapping[str, float] | None
+    vary: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -105,11 +106,12 @@ class Options:
     relaxation: int = 0
     stiffening: bool = False
     mullins: bool = False
-    loss: str = "linear"
     intervals: str = "auto"
     draws: int | None = None
     priors: Mapping[str, str | tuple[float, float]] | None = None
     watch: Watch | None = None
+    fix: Mapping[str, float] | None = None
+    vary: Sequence[str] = ()
 
     @classmethod
     def of(cls, function: str, given: Mapping[str, Any]) -> Options:
@@ -134,15 +136,15 @@ class Options:
         limit = self.max_time
         if limit is not None and not (isinstance(limit, Real) and float(limit) > 0):
             raise InputError(f"max_time = {limit!r} is not admissible; it must be positive, in s")
-        if self.weights is not None and not isinstance(self.weights, Mapping):
-            raise InputError(
-                "weights must be a mapping of curves to numbers, like {'stress_time': 1}"
-            )
-        if not isinstance(self.priors or {}, Mapping):
-            raise InputError(
-                "priors must be a mapping of parameters to mean and standard deviation, like "
-                "{'s1_k0': '5.5 ± 0.1 MPa'}"
-            )
+        for name, what in (
+            ("weights", "curves to numbers, like {'stress_time': 1}"),
+            (
+                "priors",
+                "parameters to mean and standard deviation, like {'s1_k0': '5.5 ± 0.1 MPa'}",
+            ),
+        ):
+            if not isinstance(getattr(self, name) or {}, Mapping):
+                raise InputError(f"{name} must be a mapping of {what}")
         _ = self.choice
 
     @property
@@ -156,17 +158,53 @@ class Options:
         """Options that free more parameters of some springs."""
         return {name: getattr(self, name) for name in OPTIONS}
 
+    def check(self, measurement: Measurement, model: str) -> None:
+        """Refuse what the test or the model does not allow, before anything is simulated."""
+        if self.time_shift:
+            check_time_shift(measurement, self.drive or choose_drive(measurement))
+        if model == "auto":
+            self.check_auto()
+        else:
+            self.params(measurement, model)
+
+    def check_auto(self, **given: object) -> None:
+        """Refuse what belongs to one model where models are compared; `given` may be that too."""
+        own = ("priors", self.priors), ("fix and vary", self.fix or self.vary)
+        for name, value in (*given.items(), *own):
+            if value:
+                raise InputError(f"{name} belong to one model; name it instead of 'auto'")
+        if self.relaxation:
+            raise InputError(
+                f"relaxation = {self.relaxation} belongs to one model; name it instead of 'auto', "
+                "which tries relaxation by itself"
+            )
+        with_options("auto", **self.of_springs)
+
+    def params(self, measurement: Measurement, model: str) -> lmfit.Parameters | None:
+        """Return the parameters as `fix` and `vary` want them; None where nothing is asked."""
+        if not (self.fix or self.vary):
+            return None
+        more: dict[str, Any] = {"time_shift": self.time_shift, "relaxation": self.relaxation}
+        made = make_params(measurement, model, self.drive, **more, **self.of_springs)
+        return fix_and_vary(made, model, self.fix or {}, self.vary)
+
     def problem(
         self, measurement: Measurement, model: str, params: lmfit.Parameters | None = None
     ) -> Problem:
         """Set up the fit of one model."""
+        params = self.params(measurement, model) if params is None else params
         model = with_options(model, **self.of_springs)
-        more: dict[str, Any] = {
-            name: getattr(self, name) for name in ("time_shift", "loss", "relaxation")
-        }
-        given = (self.drive, params, self.weights, self.interior_mass)
-        more["priors"] = measurement.priors | dict(self.priors or {})
-        return make_problem(measurement, model, *given, **more)
+        return make_problem(
+            measurement,
+            model,
+            self.drive,
+            params,
+            self.weights,
+            self.interior_mass,
+            time_shift=self.time_shift,
+            relaxation=self.relaxation,
+            priors=measurement.priors | dict(self.priors or {}),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,11 +217,24 @@ class Found:
 
     def best(self) -> BestPoint:
         """Return the best point, springs in order, parameters within rounding of a limit on it."""
-        values = self.tracker.best_values
-        assert values is not None  # checked by identify
-        space = self.problem.space()
-        best = BestPoint(self.problem, in_order(space, self.problem.objective, values))
-        return _on_limits(best, self.tracker.best_cost)
+        problem, space, cost = self.problem, self.problem.space(), self.tracker.best_cost
+        assert self.tracker.best_values is not None  # checked by identify
+        values = in_order(space, problem.objective, self.tracker.best_values) + 0.0  # no -0
+        names = problem.free()
+        places = [problem.index[name] for name in names]
+        near, moved = AT_LIMIT * problem.sizes(names, values), values.copy()
+        for limits in (space.low, space.high):
+            close = np.abs(values[places] - limits[places]) <= near
+            moved[places] = np.where(close, limits[places], moved[places])
+        moved = space.complete(moved)
+        best = BestPoint(problem, values)
+        if np.array_equal(moved, values):
+            return best
+        there = BestPoint(problem, moved)
+        try:
+            return there if there.cost <= cost + 1e-6 * (1.0 + cost) else best
+        except SimulationError:
+            return best
 
 
 def identify(
@@ -192,7 +243,7 @@ def identify(
     params: lmfit.Parameters | None,
     options: Options,
     progress: Progress,
-    look: Look | None = None,
+    look: Watch | None = None,
 ) -> Found:
     """Search and refine; see `foamfit.fit` for the arguments and the errors."""
     began = time.perf_counter()
@@ -206,20 +257,16 @@ def identify(
     record = SearchRecord(options.seed, starts, began)
     record = _search(problem, tracker, record, progress)
     if tracker.best_values is None:
+        tried, why = problem.objective.evaluations, "check the drive, the heights and the bounds"
+        try:
+            problem.objective.simulate(problem.vector())
+        except SimulationError as error:
+            why = str(error)
         raise SimulationError(
-            f"{measurement.name}: none of the {problem.objective.evaluations} sets of parameters "
-            f"that were tried could be simulated; {_why_not(problem)}"
+            f"{measurement.name}: none of the {tried} sets of parameters that were tried could be "
+            f"simulated; {why}"
         )
     return Found(problem, tracker, record)
-
-
-def _why_not(problem: Problem) -> str:
-    """Say why the start values cannot be simulated."""
-    try:
-        problem.objective.simulate(problem.vector())
-    except SimulationError as error:
-        return str(error)
-    return "check the drive, the heights and the bounds"
 
 
 def judge(
@@ -232,18 +279,12 @@ def judge(
             if record.stopped is None:
                 found.tracker.pulse = _pulse(found, best, choice, progress)
                 best, record, intervals = _assess(found, best, choice, announce)
-            return _finish(found, best, record, intervals)
+            found.problem.put(best.values)
+            return conclude(best, record, intervals), best
     except KeyboardInterrupt as error:  # a late Ctrl-C keeps what was found
-        record = replace(found.record, stopped=what_stopped(error))
-        return _finish(found, found.best(), record, Intervals())
-
-
-def _finish(
-    found: Found, best: BestPoint, record: SearchRecord, intervals: Intervals
-) -> tuple[Fit, BestPoint]:
-    """Write the point into the parameters, and conclude."""
-    found.problem.put(best.values)
-    return conclude(best, record, intervals), best
+        best = found.best()
+        found.problem.put(best.values)
+        return conclude(best, replace(found.record, stopped=what_stopped(error))), best
 
 
 def _pulse(found: Found, best: BestPoint, choice: Choice, progress: Progress) -> Callable[[], None]:
@@ -252,11 +293,7 @@ def _pulse(found: Found, best: BestPoint, choice: Choice, progress: Progress) ->
     share = JUDGED if choice.ranges and best.misfits else JUDGED_NOISE
     expected = max(share * spent, 1.0) + evaluations_of(best, choice)
     progress(0.0, "intervals")
-
-    def tell() -> None:
-        progress(min((objective.evaluations - spent) / expected, 0.97), "intervals")
-
-    return tell
+    return lambda: progress(min((objective.evaluations - spent) / expected, 0.97), "intervals")
 
 
 def _assess(
@@ -281,15 +318,8 @@ def _assess(
                 better, there = left.better if other else None, best.cost
             made = Intervals(better=better)
             if better is None:
-                made = assess(
-                    best,
-                    choice,
-                    minima=[*tracker.ends, *left.minima],
-                    deadline=tracker.deadline,
-                    budget=budget,
-                    announce=announce,
-                    pulse=tracker.pulse,
-                )
+                minima = [*tracker.ends, *left.minima]
+                made = assess(best, choice, tracker, minima, budget, announce)
             if made.better is None:
                 return best, record, replace(made, ranges=left.ranges)
             tracker.consider(made.better)
@@ -364,32 +394,8 @@ def weigh_motion(problem: Problem, tracker: Tracker) -> None:
     The covariance depends on the best point, so this is done twice.
     """
     for _ in range(WEIGHED):
-        if tracker.best_values is None:
-            return
-        if not problem.objective.weigh_motion(tracker.best_values):
+        best = tracker.best_values
+        if best is None or not problem.objective.weigh_motion(best):
             return
         tracker.restart()
         _refine(problem, tracker)
-
-
-def _on_limits(best: BestPoint, cost: float) -> BestPoint:
-    """Move parameters within rounding of a limit onto it, if `cost` hardly rises."""
-    problem, space = best.problem, best.problem.space()
-    values = best.values + 0.0  # no -0
-    if np.any(np.signbit(best.values) & (values == 0.0)):
-        best = BestPoint(problem, values)
-    names = problem.free()
-    places = [problem.index[name] for name in names]
-    near = AT_LIMIT * problem.sizes(names, values)
-    moved = values.copy()
-    for limits in (space.low, space.high):
-        close = np.abs(values[places] - limits[places]) <= near
-        moved[places] = np.where(close, limits[places], moved[places])
-    moved = space.complete(moved)
-    if np.array_equal(moved, values):
-        return best
-    there = BestPoint(problem, moved)
-    try:
-        return there if there.cost <= cost + 1e-6 * (1.0 + cost) else best
-    except SimulationError:
-        return best

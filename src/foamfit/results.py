@@ -409,7 +409,6 @@ class Fit:
     checklist: tuple[Check, ...] = ()
     insight: Insight | None = None
     stopped: str | None = None  # what ended the search early: "the time limit", "Ctrl-C"
-    loss: str = "linear"
     noise: dict[str, dict[str, Any]] = field(default_factory=dict)  # of each counted curve
     intervals: Intervals | None = None
     ladder: Ladder | None = None
@@ -474,8 +473,7 @@ class Fit:
     @property
     def loop(self) -> Loop | None:
         """The loop measured and fitted; over time where no strain was measured."""
-        c, test = self.curves, self.measurement
-        return loop_of(test, c.stress_along, c.stress)
+        return loop_of(self.measurement, self.curves.stress_along, self.curves.stress)
 
     @property
     def snapping(self) -> dict[str, Snapping]:
@@ -491,9 +489,9 @@ class Fit:
         asked = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
         model = Model.parse(self.model)
         optional = {
-            "correlation": self.correlation and vars(self.correlation),
+            "correlation": self.correlation,
             "budget": self.budget and self.budget.contributions,
-            "ladder": self.ladder and asdict(self.ladder),
+            "ladder": self.ladder,
             "by_cycle": self.by_cycle,
             "priors": self.priors,
         }
@@ -512,12 +510,11 @@ class Fit:
                 "rate": loading_rate(test),
                 "notes": test.notes,
             },
-            "specimen": asdict(test.specimen),
-            **{name: getattr(self, name) for name in (*asked, "loss", "warnings", "notes")},
+            "specimen": test.specimen,
+            **{name: getattr(self, name) for name in (*asked, "warnings", "notes")},
             **model.options,
             "model": model.words,
-            "checklist": [asdict(check) for check in self.checklist],
-            "parameters": {name: asdict(one) for name, one in self.parameters.items()},
+            **{name: getattr(self, name) for name in ("checklist", "parameters")},
             "derived": self._derived(),
             **{name: getattr(self, name) for name in ("visited", "misfit", "weights")},
             **{name: getattr(self, name) for name in ("statistics", "noise", "energy")},
@@ -530,7 +527,7 @@ class Fit:
         }
         made: dict[str, Any] = plain(content)
         columns = self.columns
-        kept = vars(self) | {"insight": self.insight and self.insight.compact()}
+        kept = vars(self)
         fields = {name: encode(kept[name], columns) for name in KEPT}
         rest = _without(made, fields)
         rest["measurement"] = _without(made | made["data"], fields["measurement"])
@@ -585,12 +582,4 @@ def _without(told: Mapping[str, Any], fields: Mapping[str, Any]) -> dict[str, An
 
 def plain(value: Any) -> Any:
     """Return `value` in the types of JSON, with None for every number that is not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return encode(value)

@@ -21,10 +21,10 @@ from foamfit.report.samples import FILE as SAMPLES
 from foamfit.report.samples import read_samples
 from foamfit.report.shown import JointViews
 from foamfit.report.studies.batch import read_table
+from foamfit.report.studies.cycles import CycleFits
+from foamfit.report.studies.joint import JointParameter
 from foamfit.results import KEPT, Loop
-from foamfit.study.cycles import CycleFits
-from foamfit.study.joint import JointResult
-from foamfit.study.joint_result import JointParameter
+from foamfit.study.joint_result import JointResult
 from foamfit.trust.identifiability import Insight
 
 if TYPE_CHECKING:
@@ -32,18 +32,10 @@ if TYPE_CHECKING:
 
 
 def load(folder: str | Path) -> FitResult | SavedJoint | CycleFits | pd.DataFrame:
-    """Return what was saved in a result folder.
+    """Return what was saved in the folder of a fit, of a joint fit, of cycles or of a batch.
 
-    Parameters
-    ----------
-    folder : str or Path
-        The folder of a fit, of a joint fit, of cycles or of a batch.
-
-    Returns
-    -------
-    FitResult, SavedJoint, CycleFits or pandas.DataFrame
-        The same as was saved, and saved again to the same; of a batch its summary, as
-        `foamfit.batch` returns it.
+    It is the same as was saved, and is saved again to the same; of a batch its summary, as
+    `foamfit.batch` returns it.
 
     Raises
     ------
@@ -98,23 +90,7 @@ def _columns(path: Path, samples: object) -> dict[str, Array]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SavedJoint(JointViews):
-    """A joint fit read back.
-
-    Attributes
-    ----------
-    name, model, status, warnings, sentences
-        As joint.json has them.
-    tests : tuple of str
-        Names of the tests.
-    rates, rate0
-        Mean strain rate on loading of each, and of the median test, 1/s; None where unknown.
-    parameters : dict of str to JointParameter
-        SI; values by test are in `tests` of each.
-    results : dict of str to FitResult
-        The result of each test at the joint fit.
-    content : dict
-        All of joint.json.
-    """
+    """A joint fit read back; its fields are as joint.json has them."""
 
     name: str
     model: str
@@ -122,11 +98,11 @@ class SavedJoint(JointViews):
     warnings: tuple[str, ...]
     sentences: tuple[str, ...]
     tests: tuple[str, ...]
-    rates: tuple[float | None, ...]
-    rate0: float | None
-    parameters: dict[str, JointParameter]
-    results: dict[str, FitResult]
-    content: dict[str, Any]
+    rates: tuple[float | None, ...]  #: Mean strain rate on loading of each test, 1/s
+    rate0: float | None  #: That of the median test
+    parameters: dict[str, JointParameter]  #: SI; values by test are in `tests` of each
+    results: dict[str, FitResult]  #: Of each test at the joint fit
+    content: dict[str, Any]  #: All of joint.json
 
     @property
     def loops(self) -> tuple[Loop, ...]:

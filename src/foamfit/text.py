@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 
 # Characters of a line: those of the terminal, but not more or fewer than these.
 WIDTH, NARROWEST = 100, 40
+COLUMN = 10  # where a text behind its label begins
 _NO_BREAK = "\u00a0"  # a space at which no line ends
 _PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n"}
 
@@ -19,6 +20,11 @@ def engineering(value: float, unit: str) -> str:
     exponent = math.log10(abs(value)) if value and math.isfinite(value) else 0.0
     power = min(max(3 * math.floor(exponent / 3.0), -9), 9)
     return f"{value / 10.0**power:.4g} {_PREFIXES[power]}{unit}"
+
+
+def quantity(value: float, unit: str | None) -> str:
+    """Write a value with its unit and four digits; a pure number has none."""
+    return engineering(value, unit) if unit else f"{value:.4g}"
 
 
 def number(value: float) -> str:
@@ -104,11 +110,11 @@ def aligned(rows: Sequence[Sequence[str]], gap: str = "  ", right: Iterable[int]
     return lines
 
 
-def labelled(items: Iterable[tuple[str, Iterable[str]]], column: int = 10) -> str:
-    """Set each label before its texts, which are wrapped from `column` on, no last newline."""
+def labelled(items: Iterable[tuple[str, Iterable[str]]]) -> str:
+    """Set each label before its texts, which are wrapped from `COLUMN` on, no last newline."""
     lines = list[str]()
     for label, texts in items:
         for i, text in enumerate(texts):
             start = label if i == 0 else ""
-            lines += wrapped(f"{start:<{column}}{text}", column + 2)
+            lines += wrapped(f"{start:<{COLUMN}}{text}", COLUMN + 2)
     return "\n".join(lines)

@@ -1,16 +1,13 @@
 """What a test file may look like, and how one that cannot be used is refused."""
 
-import os
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from conftest import DATA, refused
 from foamfit.data.csv_file import read_test
-from foamfit.errors import InputError
 
-DATA = Path(os.environ.get("FOAMFIT_DATA", Path(__file__).parents[3] / "shared" / "data"))
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not here")
 
 SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
@@ -238,15 +235,6 @@ def test_without_a_mass_inside_there_is_none(tmp_path):
 
 
 # What is refused: one sentence that names what is wrong.
-
-
-def refused(path, *words, specimen=None):
-    with pytest.raises(InputError) as caught:
-        read_test(path, specimen)
-    message = str(caught.value)
-    assert "\n" not in message
-    for word in words:
-        assert word in message
 
 
 HEADER = "time (ms),stress (MPa),displacement (mm)"

@@ -185,7 +185,7 @@ def test_the_stretch_is_shaded_in_every_panel_and_has_a_key():
     figure = plot_fit(replace(result, measurement=replace(result.measurement, standstills=spans)))
     key = "gauge stands still, bridged"
     assert key in [text.get_text() for text in figure.legends[0].get_texts()]
-    for ax in figure.axes:
+    for ax in figure.axes[:3]:
         (shade,) = (a for a in (*ax.lines, *ax.patches) if a.get_label() == key)
         color = shade.get_facecolor() if shade in ax.patches else shade.get_color()
         assert to_hex(color).upper() == STOOD

@@ -69,16 +69,15 @@ def test_the_slopes_of_every_kind_are_those_of_the_cost():
     assert set(kinds.values()) == set(KINDS)
     links = Links(kinds, X, {"s1_kc": np.array([3.0, 5.0, 7.0])})
     layout = engine._Layout.of(tuple(tests), links)
-    squares = layout.squares
     point = layout.start(vectors(tests, changes))
     point = point + 0.01 * np.cos(np.arange(point.size)) * (np.abs(point) < 100.0)
-    at = Iterate(point, squares.residual(point), squares.jacobian(point))
+    at = Iterate(point, layout.residual(point), layout.jacobian(point))
     for j in range(point.size):
         costs = []
         for step in (-1e-6, 1e-6):
             moved = point.copy()
             moved[j] += step * max(abs(moved[j]), 1.0)
-            costs.append(float(np.sum(squares.residual(moved) ** 2)))
+            costs.append(float(np.sum(layout.residual(moved) ** 2)))
         slope = (costs[1] - costs[0]) / (2e-6 * max(abs(point[j]), 1.0))
         assert 2.0 * at.gradient[j] == pytest.approx(slope, rel=1e-3, abs=1.0)
 

@@ -7,11 +7,13 @@ import shutil
 import time
 import zipfile
 from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 
 import pytest
 
 from conftest import EXPERIMENTS
+from cycled import write_record
 from serving import served
 
 api = pytest.importorskip(
@@ -230,6 +232,36 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     archive.close()
 
 
+def test_several_cycles_and_their_chain_are_turned(window, tmp_path):
+    record, page = write_record(tmp_path), window
+    toml = record.with_suffix(".toml")
+    choose(page, (record.name, record.read_text()), ("any.toml", toml.read_text()))
+    page.get_by_label("Cycles (FIRST-LAST)").fill("1-3")
+    page.get_by_label("Cycles (FIRST-LAST)").press("Tab")
+    api.expect(page.get_by_text("cycles 1 to 3: misfit")).to_be_visible()
+    page.get_by_label("Model:").select_option("microscale")
+    more = page.get_by_text("More options")
+    if not page.get_by_label("Mullins:").is_visible():
+        more.click()
+    for option in ("Stiffening:", "Mullins:"):
+        page.get_by_label(option).check()
+    for name in ("stiffening", "softening", "weakening"):
+        page.get_by_label(f"s1_{name}", exact=True).wait_for()
+    api.expect(page.get_by_text("cycles 1 to 3: misfit")).to_be_visible()
+    # Played from rest, and stopped.
+    along = page.get_by_label("instant along the loop")
+    most = int(along.input_value())
+    api.expect(page.get_by_text(re.compile("strain 3[78].*snapped [1-9]"))).to_be_visible()
+    page.get_by_role("button", name="Play").click()
+    page.wait_for_timeout(300)
+    page.get_by_role("button", name="Pause").click()
+    assert 0 < int(along.input_value()) < most
+    for option in ("Stiffening:", "Mullins:"):
+        page.get_by_label(option).uncheck()
+    page.get_by_label("Model:").select_option("bistable")
+    more.click()
+
+
 def test_firefox_drops_fits_turns_and_saves(playwright, served, tmp_path):
     options = {"channel": "moz-firefox", "downloads_path": tmp_path}
     browser = launch(playwright.firefox, FIREFOX, **options)
@@ -301,7 +333,8 @@ def test_everyone_can_use_it_at_once(window):
     """A checker finds nothing serious, nothing is cut off, keys reach all, a move is drawn soon."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is missing")
     load(window)
-    for width in (390, 1280):  # of a phone and a laptop
+    for width, colours in product((390, 1280), ("dark", "light")):  # of a phone and a laptop
+        window.emulate_media(color_scheme=colours)
         window.set_viewport_size({"width": width, "height": 900})
         window.wait_for_function(f"document.documentElement.scrollWidth <= {width}")
         found = axe.Axe().run(window).response

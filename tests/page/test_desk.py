@@ -16,14 +16,15 @@ from click.testing import CliRunner
 
 import foamfit as ff
 from conftest import EXPERIMENTS, few_bytes, synthetic_impact, synthetic_loop, without_pictures
-from cycled import write_record
+from cycled import FRESH, write_record
 from foamfit.cli import main
+from foamfit.data.cycles import cycles_of, find_turns
 from foamfit.data.measurement import Measurement, Specimen
 from foamfit.errors import InputError
 from foamfit.page import desk as desk_module
 from foamfit.page import worker as worker_module
-from foamfit.page.desk import Desk, join_toml, safe_name, split_toml
-from foamfit.page.turning import Turning
+from foamfit.page.desk import Desk, join_toml, safe_name, split_toml, wrong_quantity
+from foamfit.page.turning import INSTANTS, Turning
 from foamfit.page.worker import Worker
 from foamfit.report.folder import load_result
 from foamfit.report.studies import cycles as cycles_report
@@ -48,7 +49,7 @@ def desk(tmp_path):
 def ready(desk):
     """A desk with a test that can be fitted."""
     desk.take(TEST)
-    assert not desk.check(*desk.dropped_toml()).error
+    desk.check(*desk.dropped_toml())
     return desk
 
 
@@ -105,10 +106,11 @@ def test_two_desks_share_nothing(tmp_path):
     one.take(TEST)
     quantities, rest = one.dropped_toml()
     assert two.dropped_toml() is None
-    assert "no test yet" in two.check(quantities, rest).error
-    assert not one.check(quantities, rest).error
+    with pytest.raises(InputError, match="no test yet"):
+        two.check(quantities, rest)
+    one.check(quantities, rest)
     two.close()
-    assert not one.check(quantities, rest).error
+    one.check(quantities, rest)
 
 
 # -------------------------------------------------------------------------------------- TOML
@@ -148,10 +150,11 @@ def test_a_quantity_that_is_given_twice_is_refused():
 )
 def test_a_wrong_quantity_is_named(desk, quantity, value, told):
     desk.take(TEST)
-    checked = desk.check(GOOD | {quantity: value}, "")
-    assert told in checked.error
-    assert checked.quantity == quantity
-    assert str(desk.folder) not in checked.error
+    with pytest.raises(InputError, match=told) as refused:
+        desk.check(GOOD | {quantity: value}, "")
+    assert wrong_quantity(str(refused.value)) == quantity
+    assert str(desk.folder) not in str(refused.value)
+    assert desk.measurement is None
 
 
 # --------------------------------------------------------------------------------------- fits
@@ -174,13 +177,13 @@ def test_a_fit_is_that_of_the_command(ready):
 def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkeypatch):
     record = write_record(tmp_path)
     desk.take(record)
-    assert not desk.check(*desk.dropped_toml(), "3,2").error
+    desk.check(*desk.dropped_toml(), ["--cycle", "3,2"])
     assert (desk.measurement.cycle, desk.measurement.cycles) == (3, (1, 2, 3))
     asked = ["--cycle", "3,2", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "1"]
     wait(desk.fit(asked))
     assert desk.ending() == ""
     assert desk.command == f"foamfit fit synthetic.csv {' '.join(asked)}"
-    assert "2 of 3 cycles fitted" in desk.told
+    assert "2 of 3 cycles fitted" in desk.worker.told
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
@@ -193,9 +196,31 @@ def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkey
         assert page["statistics"] == command[str(number)]["statistics"]
         assert page["parameters"]["s1_kh_minus"]["value"] == 2.2e6
         assert page["parameters"]["s1_eta"]["vary"]
-        assert desk.measured(number).cycle == number
+        assert desk.measured(number, None).cycle == number
     with zipfile.ZipFile(io.BytesIO(desk.zipped())) as archive:
         assert {"cycles.csv", "cycles.png", "cycle-3/fit.json"} <= {*archive.namelist()}
+
+
+def test_several_cycles_are_one_history(desk, tmp_path):
+    desk.take(write_record(tmp_path))
+    quantities, rest = desk.dropped_toml()
+    desk.check(quantities, rest, ["--cycles", "1-3"])
+    record = desk.measurement
+    assert (record.cycle, record.last_cycle) == (1, 3)
+    assert desk.measured(1, 3) is record
+    assert desk.measured(2, 3).last_cycle == 3
+    wait(desk.fit(["--cycles", "1-3", "--starts", "1", "--max-time", "2"]))
+    assert desk.ending() == ""
+    assert (desk.worker.news.cycle, desk.worker.news.last_cycle) == (1, 3)
+    assert [*desk.fits] == [0]
+    for wrong, told in (
+        (["--cycles", "3-1"], "'3-1' is not FIRST-LAST in that order, like 1-3"),
+        (["--cycles", "1-9"], "the file has cycles 1 to 3"),
+        (["--cycles", "1-3", "--cycle", "2"], "give either --cycle or --cycles, not both"),
+    ):
+        with pytest.raises(InputError, match=told) as refused:
+            desk.check(quantities, rest, wrong)
+        assert "\n" not in str(refused.value)
 
 
 def test_watching_a_fit_changes_nothing():
@@ -219,7 +244,8 @@ def test_a_fit_that_is_stopped_keeps_the_best(ready):
     # What it is fitted to cannot change beneath it.
     with pytest.raises(InputError, match="A fit is running"):
         ready.receive("other.csv", b"1,2\n")
-    assert "A fit is running" in ready.check(GOOD, "").error
+    with pytest.raises(InputError, match="A fit is running"):
+        ready.check(GOOD, "")
     worker.stop()
     wait(worker)
     assert worker.ended == ""
@@ -307,6 +333,51 @@ def test_turned_curves_are_those_of_a_simulation(drive):
     assert not np.allclose(stress, before.curves["stress_strain"][1], atol=1e-2 * size)
 
 
+def test_a_history_is_drawn_as_a_whole_with_what_springs_remember(tmp_path):
+    record = ff.read_test(write_record(tmp_path), cycles=(1, 3))
+    turning = Turning(record, "microscale", stiffening=True, mullins=True)
+    names = {row.name for row in turning.rows}
+    assert {"s1_stiffening", "s1_softening", "s1_weakening"} <= names
+    drawn = turning.turn({"s1_softening": 0.4, "s1_weakening": 0.3})
+    for curves in (turning.measured, drawn.curves):
+        strain, stress = curves["stress_strain"]
+        np.testing.assert_array_equal(strain, record.displacement / record.specimen.height)
+        assert len(stress) == len(record.stress)
+    # The second cycle is softer than the first, where the first loads.
+    loading = [part.start + (part.stop - part.start) // 4 for part in cycles_of(record).values()]
+    stresses = np.interp(loading, np.arange(len(stress)), drawn.curves["stress_strain"][1])
+    assert stresses[1] < 0.95 * stresses[0]
+    # The chain goes through all cycles, and is snapped most where it is compressed most.
+    turns = find_turns(drawn.chain["strain"], 0.1)
+    assert len(turns) >= 5
+    snapped = drawn.chain["snapped"][0]
+    assert snapped[0] == 0.0
+    assert snapped[drawn.chain["strain"].argmax()] == pytest.approx(snapped.max(), abs=0.02)
+
+
+@pytest.mark.parametrize("model", ["bistable", "linear+bistable", "microscale+microscale"])
+def test_a_chain_is_drawn_with_the_fraction_snapped_of_each_spring(model):
+    turning = Turning(ff.read_test(TEST), model)
+    chain, kinds = turning.turn({}).chain, model.split("+")
+    assert np.isnan(chain["snapped"]).any(axis=1).tolist() == [kind == "linear" for kind in kinds]
+    assert len(chain["strain"]) <= INSTANTS
+    tall = chain["heights"].sum(axis=0)
+    pressed = chain["top"] < 1.0
+    np.testing.assert_allclose(tall[pressed], chain["top"][pressed], atol=0.01)
+    np.testing.assert_allclose(tall[0], 1.0)  # the striker is above it
+    for shares in chain["snapped"][np.isfinite(chain["snapped"][:, 0])]:
+        assert shares[0] == 0.0
+        assert 0.0 <= shares.min() < shares.max() <= 1.0
+
+
+def test_the_fraction_snapped_of_a_bistable_spring_is_its_way_along_d_and_e():
+    spring = FRESH
+    strain = np.array([0.0, spring.eps_a, 0.5 * (spring.eps_a + spring.eps_hat_c), 0.4, 0.5])
+    strain = np.append(strain, [spring.eps_c, 0.5 * (spring.eps_c + spring.eps_hat_a), 0.0])
+    expected = [0.0, 0.0, 0.5, 1.0, 1.0, 1.0, 0.5, 0.0]
+    np.testing.assert_allclose(spring.snapped_along(strain), expected, atol=1e-9)
+
+
 def test_what_is_not_admissible_is_named():
     turning = Turning(ff.read_test(TEST), "bistable")
     before = turning.turn({}).values["s1_eps_c"]
@@ -364,6 +435,21 @@ def test_a_test_without_stress_and_motion_is_refused():
 
 
 # ------------------------------------------------------------------- what is fixed and varied
+
+
+def test_the_notebook_shows_a_history_and_its_chain(tmp_path):
+    pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
+    from foamfit.page.curves import Curves
+
+    record = ff.read_test(write_record(tmp_path), cycles=(1, 3))
+    curves = Curves(Turning(record, "microscale", mullins=True))
+    assert "cycles 1 to 3: misfit" in curves.sliders.told
+    assert np.isfinite(curves._turned.data["stress_strain_x"]).sum() > 600
+    before = curves.chain.frames
+    curves.put({"s1_sigma_plus": 0.5 * curves.turning.named["s1_sigma_plus"]})
+    assert max(curves.chain.frames["snapped"][0]) > max(before["snapped"][0])
+    curves.put({"s1_k0": -1.0})  # not admissible
+    assert curves.chain.frames == {}
 
 
 def test_ticks_say_what_a_fit_holds_and_varies():

@@ -20,7 +20,7 @@ from matplotlib.colors import to_rgb
 import foamfit.report
 from drawn import figures
 from foamfit.report.plots import DASHES, MARKS
-from foamfit.report.studies import cycles, joint, prediction
+from foamfit.report.studies import cycles, joint, parameters, prediction
 
 EYES = {
     "normal": np.eye(3),
@@ -95,9 +95,8 @@ def test_series_of_a_panel_are_told_apart_by_colour_or_shape() -> None:
     for name, figure in figures():
         for ax in figure.axes:
             lines = {str(line.get_label()): line for line in ax.lines}
-            rows = name == "insight"  # a line of each parameter, in a row that bears its name
             shown = [k for k in lines if not (k.startswith("_child") or "all samples" in k)]
-            named = {} if rows else {k: lines[k] for k in shown}
+            named = {k: lines[k] for k in shown}
             for (k, one), (m, other) in combinations(named.items(), 2):
                 by_name = one.get_marker() == "o" or k.startswith("_branch")
                 if cue(one) == cue(other) and not (by_name and k.startswith("_")):
@@ -118,7 +117,7 @@ def test_parts_of_a_band_have_dashes_of_their_own() -> None:
     [
         (prediction.MEASURED, prediction.VERMILION),
         (joint.MEASURED, joint.BLUE),
-        (cycles.BLUE, "white"),  # hollow marks
+        (parameters.BLUE, "white"),  # hollow marks
     ],
 )
 def test_measured_and_simulated_are_told_apart(one: str, other: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from dataclasses import replace
@@ -27,7 +26,6 @@ from foamfit.report.comparison import (
     comparison_text,
     plot_comparison,
     recognised,
-    write_csv,
 )
 from foamfit.results import Correlation
 from foamfit.springs import laws
@@ -298,20 +296,7 @@ def test_the_text_is_aligned_and_narrow() -> None:
         assert line[starts[0] :] in ("determined", "weak", "fixed")
 
 
-def test_the_csv_holds_every_row(tmp_path: Path) -> None:
-    comparison = compare([published_fit(off=2.0), published_fit("foam-2")])
-    write_csv(comparison, tmp_path / "c.csv")
-    with (tmp_path / "c.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == sum(len(section.rows) for section in comparison.pairs)
-    first = rows[0]
-    assert (first["parameter"], first["unit"]) == ("k0", "MPa")
-    assert float(first["standard_errors"]) == pytest.approx(2.0)
-    with pytest.raises(ff.InputError, match="cannot be written"):
-        write_csv(comparison, tmp_path / "none" / "c.csv")
-
-
-def test_the_figure_has_a_panel_for_each_reference_and_a_mark_for_each_deviation(
+def test_the_figure_has_a_panel_for_each_parameter_and_a_row_for_each_result(
     tmp_path: Path,
 ) -> None:
     one = published_fit(off=2.0)
@@ -319,29 +304,35 @@ def test_the_figure_has_a_panel_for_each_reference_and_a_mark_for_each_deviation
     comparison = compare([replace(one, drive="stress"), lost, published_fit("foam-2", off=5.0)])
     figure = plot_comparison(comparison, tmp_path / "c.png")
     assert (tmp_path / "c.png").stat().st_size > 10_000
-    assert [ax.get_title(loc="left") for ax in figure.axes] == [
-        "beside published foam-1/model-1", "beside published foam-2",
+    panels = {ax.get_label(): ax for ax in figure.axes if ax.axison}
+    rows = {r.label: r for r in comparison.pairs[0].rows}
+    assert {"k0", "k_c/k0", "s1 k0", "s2 ε_a"} <= set(panels)
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == [
+        "foam-1/model-1, stress", "foam-1/model-1, impact", "foam-2, impact",
     ]  # fmt: skip
-    first = figure.axes[0]
-    marks = [line.get_xdata() for line in first.lines if line.get_marker() in ("o", "s")]
-    drawn = [r.standard_errors for s in comparison.pairs[:2] for r in s.rows]
-    expected = [z for z in drawn if z is not None]
-    np.testing.assert_allclose(sorted(x[0] for x in marks if len(x)), sorted(expected))
-    assert "not determined" in [text.get_text() for text in first.texts]
-    low, high = figure.axes[1].get_xlim()
-    assert low < -5.0 < 5.0 < high
+    points = {line.get_label(): line.get_xydata() for line in panels["k_c/k0"].lines}
+    value = rows["k_c/k0"].value
+    np.testing.assert_allclose(points["determined"], [(value, 0)])
+    np.testing.assert_allclose(points["not determined"], [(value, 1)])
+    drawn = {one.get_label(): one for one in panels["k0"].collections}
+    ends = np.array(drawn["95 % interval"].get_segments())[:, :, 0]
+    half = 1.96 * rows["k0"].stderr
+    np.testing.assert_allclose(ends, 2 * [(rows["k0"].value - half, rows["k0"].value + half)])
+    assert drawn["published"].get_segments()[0][0, 0] == pytest.approx(5.5)
+    key = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert key == ["determined", "not determined", "published", "95 % interval"]
 
 
-def test_a_result_with_nothing_to_compare_has_no_lane(tmp_path: Path) -> None:
-    told, untold = published_fit(off=1.0), published_fit(off=1.0, drive="stress")
-    bare = {name: replace(p, stderr=None) for name, p in untold.parameters.items()}
-    alone = plot_comparison(compare([told]))
-    figure = plot_comparison(compare([told, replace(untold, parameters=bare)]))
-    assert figure.axes[0].get_ylim() == alone.axes[0].get_ylim()
-    assert figure.get_figheight() == alone.get_figheight()
-    (legend,) = figure.legends
-    labels = [text.get_text() for text in legend.get_texts()]
-    assert labels == ["impact drive", "stress drive: nothing to compare"]
+def test_a_result_with_nothing_to_compare_has_an_empty_row() -> None:
+    bare = published_fit(drive="stress")
+    bare = replace(
+        bare, parameters={n: replace(p, stderr=None) for n, p in bare.parameters.items()}
+    )
+    both = plot_comparison(compare([published_fit(off=1.0), bare])).axes[0]
+    assert [text.get_text() for text in both.get_yticklabels()][1] == "foam-1/model-1, stress"
+    assert {y for line in both.lines for y in line.get_ydata()} == {0}
+    (alone,) = plot_comparison(compare([bare])).axes
+    assert [text.get_text() for text in alone.texts] == ["no parameter to compare"]
 
 
 def test_a_real_fit_recovers_its_spring(tmp_path: Path) -> None:
@@ -356,15 +347,14 @@ def test_a_real_fit_recovers_its_spring(tmp_path: Path) -> None:
     assert only(compare([result], published="foam-1/model-1")) == section
 
 
-def test_the_command_prints_draws_and_writes(tmp_path: Path) -> None:
+def test_the_command_prints_and_draws(tmp_path: Path) -> None:
     (tmp_path / "one").mkdir()
     (tmp_path / "one" / "fit.json").write_text(json.dumps(published_fit().to_json_dict()))
-    one, plot, table = (str(tmp_path / name) for name in ("one", "c.svg", "c.csv"))
-    done = CliRunner().invoke(main, ["compare", one, "--plot", plot, "--csv", table])
+    one, plot = (str(tmp_path / name) for name in ("one", "c.svg"))
+    done = CliRunner().invoke(main, ["compare", one, "--plot", plot])
     assert done.exit_code == 0
     assert "beside published foam-1/model-1" in done.stdout
     assert Path(plot).is_file()
-    assert Path(table).is_file()
 
 
 @pytest.mark.parametrize(
@@ -401,11 +391,9 @@ def test_microscale_fits_stand_beside_each_other() -> None:
     rows = {row.label: row for row in pair.rows}
     assert (rows["σ₊"].reference, rows["σ₊"].unit) == (pytest.approx(0.106), "MPa")
     assert (rows["τ_1"].reference, rows["τ_1"].unit) == (0.25, "s")
-    ticks = [
-        tick.get_text() for tick in plot_comparison(compare([one, one])).axes[0].get_yticklabels()
-    ]
-    assert ticks[-2:] == ["$g_{1}$", "$τ_{1}$"]
-    assert "$σ_{+}$" in ticks
+    heads = [ax.get_title() for ax in plot_comparison(compare([one, one])).axes if ax.axison]
+    assert heads[-2:] == ["$g_{1}$", "$τ_{1}$ (ms)"]
+    assert "$σ_{+}$ (MPa)" in heads
 
 
 def test_a_law_that_relaxes_beside_one_that_does_not() -> None:

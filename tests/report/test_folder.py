@@ -28,7 +28,7 @@ KEYS = {
     "notes", "checklist", "data",
     "parameters", "relaxation", "stiffening", "mullins", "derived", "visited", "misfit", "weights",
     "specimen", "statistics", "energy",
-    "runtime_s", "stopped", "loss", "noise", "outliers", "load",
+    "runtime_s", "stopped", "noise", "outliers", "load",
 }  # fmt: skip
 
 

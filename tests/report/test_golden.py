@@ -68,6 +68,24 @@ def one_spring() -> Fit:
     )
 
 
+def two_bistable() -> Fit:
+    """Sixteen parameters that vary, of which fourteen are determined, and two of the record."""
+    one = fabricated.result()
+    made = {
+        f"s{i}_{name}": fabricated.estimate(f"s{i}_{name}", getattr(fabricated.SPRING, name) or 9.0)
+        for i in (1, 2)
+        for name in (*fabricated.SPRING.law.own, "eta")
+    }
+    for name in ("s1_kh_minus", "s2_kc"):
+        made[name] = replace(made[name], state="weak", why="its interval is wide")
+    made["contact_time"] = fabricated.estimate("contact_time", 3e-6, unit="s")
+    made["displacement_zero"] = fabricated.estimate("displacement_zero", 2e-6, unit="m")
+    warnings = tuple(f"The residuals of curve {i} are systematic." for i in (1, 2, 3))
+    return with_rows(
+        replace(one, model="bistable+bistable", parameters=made, warnings=warnings, switches=())
+    )
+
+
 def failed() -> Fit:
     warnings = tuple(
         f"The misfit of {name} is not acceptable: the model goes its own way, and what it gives "
@@ -108,6 +126,7 @@ CASES: dict[str, Callable[[], str]] = {
     "fit_one_spring": lambda: summary_text(one_spring()),
     "fit_one_spring_verbose": lambda: summary_text(one_spring(), verbose=True),
     "fit_two_springs": lambda: summary_text(with_rows(fabricated.chain_result())),
+    "fit_two_bistable": lambda: summary_text(two_bistable()),
     "fit_microscale": lambda: summary_text(with_rows(fabricated.microscale_result())),
     "fit_failed": lambda: summary_text(failed()),
     "fit_auto": lambda: summary_text(auto()),
@@ -129,6 +148,14 @@ def test_what_is_printed_is_the_golden_file(name: str, monkeypatch: pytest.Monke
     expected = path.read_text(encoding="utf-8").splitlines()
     for i, (was, now) in enumerate(zip_longest(expected, text.splitlines()), start=1):
         assert now == was, f"line {i} of {path.name} differs; {RENEW}=1 writes the files anew"
+
+
+def test_what_has_no_room_on_the_screen_is_in_the_verbose_text() -> None:
+    short, whole = (summary_text(two_bistable(), verbose=verbose) for verbose in (False, True))
+    assert "95 % interval" not in short
+    for name in ("s1_k0", "s2_eta", "contact time t₀"):
+        assert name in short
+        assert re.search(rf"{name} .* to .* determined", whole)
 
 
 def test_every_golden_file_is_of_a_case() -> None:

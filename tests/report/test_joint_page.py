@@ -16,10 +16,8 @@ from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import Together
 from foamfit.report.figures import STYLE, image, laid_out
 from foamfit.report.studies.joint import joint_page, joint_text, plot_compared, plot_joint
-from foamfit.study.joint import JointResult
-from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import Alternative, fit_jointly
-from foamfit.study.joint_result import JointData
+from foamfit.study.joint_result import JointResult, common_covariance, parameters_of
 from foamfit.study.study_file import Study
 
 RATES = (0.01, 0.1, 1.0)
@@ -30,7 +28,7 @@ KINDS = {
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory) -> JointData:
+def found(tmp_path_factory) -> JointResult:
     """A joint fit of three loops, started at the truth; one name would be HTML."""
     up = np.linspace(0.0, 0.5, 50)
     strain, names = np.concatenate([up, up[::-1][1:]]), ("first", "second", "<i>third</i>")
@@ -59,7 +57,7 @@ def found(tmp_path_factory) -> JointData:
         here, "a & b", tuple((name, here) for name in names), (None,) * 3, "microscale", 0,
         "displacement", KINDS, {}, 0, None, None,
     )  # fmt: skip
-    return JointData(
+    return JointResult(
         study=study, tests=names, files=(here,) * 3, rates=RATES, rate0=0.1, fit=fit,
         parameters=parameters_of(fit, names),
         covariance=common_covariance(fit),
@@ -171,7 +169,7 @@ def test_twins_whose_rates_differ_a_little_stand_in_their_order(found):
         n: p if p.tests is None else replace(p, tests=dict(zip(names, p.tests.values())))  # noqa: B905
         for n, p in parameters.items()
     }
-    shown = JointResult(**vars(replace(found, parameters=own)))
+    shown = replace(found, parameters=own)
     assert repr(shown).startswith("a & b: microscale · 3 tests together · status warnings")
     assert "a &amp; b" in shown._repr_html_()
     assert len(shown.plot(Figure().subplots()).lines) == 6

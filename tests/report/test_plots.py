@@ -15,7 +15,7 @@ import foamfit as ff
 from foamfit.api import FitResult
 from foamfit.errors import InputError
 from foamfit.report.figures import STYLE, image, laid_out
-from foamfit.report.plots import origin_word, plot_fit, plot_residuals, plot_response
+from foamfit.report.plots import origin_word, plot_fit, plot_response
 from foamfit.report.readable import readable_unit
 from foamfit.report.report_plots import plot_snapping
 from foamfit.results import Switch
@@ -23,6 +23,11 @@ from foamfit.results import Switch
 
 def with_curves(result: FitResult, **changed: Any) -> FitResult:
     return replace(result, curves=replace(result.curves, **changed))
+
+
+def panels(result: FitResult) -> list[Any]:
+    """The panels of a fit without their residuals."""
+    return [ax for ax in plot_fit(result).axes if not ax.get_label().endswith("residual")]
 
 
 def texts(ax: Any) -> list[str]:
@@ -35,17 +40,20 @@ def line(ax: Any, label: str) -> Any:
 
 def test_three_panels_with_units() -> None:
     figure = plot_fit(fabricated.result())
-    assert [(ax.get_xlabel(), ax.get_ylabel()) for ax in figure.axes] == [
-        ("time (µs)", "stress (MPa)"),
-        ("time (µs)", "displacement (µm)"),
-        ("strain (–)", "stress (MPa)"),
-    ]
+    stress, motion, loop, *residuals = figure.axes
+    assert [ax.get_ylabel() for ax in (stress, motion, loop)] == [
+        "stress (MPa)", "displacement (µm)", "stress (MPa)",
+    ]  # fmt: skip
+    assert len(residuals) == 2  # the misfit of the loop is None
+    for below in residuals:
+        assert (below.get_xlabel(), below.get_ylabel()) == ("time (µs)", "residual\n(% of range)")
+    assert loop.get_xlabel() == "strain (–)"
     assert figure.get_figwidth() == 7.0
 
 
 def test_the_curves_are_drawn_in_these_units() -> None:
     result = fabricated.result()
-    stress_time, displacement_time, loop = plot_fit(result).axes
+    stress_time, displacement_time, loop = panels(result)
     np.testing.assert_allclose(line(stress_time, "fitted").get_ydata(), result.curves.stress / 1e6)
     np.testing.assert_allclose(
         line(displacement_time, "fitted").get_xdata() / 1e6, result.curves.time
@@ -58,7 +66,7 @@ def test_a_motion_that_was_not_measured_says_so_in_the_legend() -> None:
     result = fabricated.result()
     moved = replace(result, measurement=replace(result.measurement, motion="integrated from force"))
     figure = plot_fit(moved)
-    stress_time, displacement_time, loop = figure.axes
+    stress_time, displacement_time, loop = figure.axes[:3]
     points = line(stress_time, "measured")
     for ax in (displacement_time, loop):
         other = line(ax, "measured, motion integrated from force")
@@ -72,28 +80,28 @@ def test_masses_inside_are_drawn_with_the_top() -> None:
     measured, fitted = 1e-4 * np.sin(time / time[-1]), 1.1e-4 * np.sin(time / time[-1])
     result = with_curves(fabricated.chain_result(), interior={1: (measured, fitted)})
     figure = plot_fit(result)
-    _, displacement_time, _ = figure.axes
+    displacement_time, residuals = figure.axes[1], figure.axes[-1]
     np.testing.assert_allclose(line(displacement_time, "mass 1").get_ydata(), fitted * 1e6)
     points = line(displacement_time, "_measured, mass 1")
     expected = np.interp(points.get_xdata() / 1e6, time, measured * 1e6)
     np.testing.assert_allclose(points.get_ydata(), expected, atol=1e-9)
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert legend == ["measured", "fitted", "mass 1", "springs along measured strain"]
-    titles = [ax.get_title(loc="left") for ax in plot_residuals(result).axes]
-    assert titles[-1] == "displacement-time of mass 1: fitted − measured"
+    colours = [one.get_color() for one in residuals.lines[:2]]
+    assert colours[1] == line(displacement_time, "mass 1").get_color() != colours[0]
     without = with_curves(result, time=None)
-    assert [ax.get_xlabel() for ax in plot_fit(without).axes] == ["strain (–)"]
+    assert [ax.get_xlabel() for ax in panels(without)] == ["strain (–)"]
 
 
 def test_switches_and_branches_are_named() -> None:
-    *in_time, loop = plot_fit(fabricated.result()).axes
+    *in_time, loop = panels(fabricated.result())
     for ax in in_time:
         assert texts(ax) == ["A1", "C1", "C2", "A2"]
     assert set(texts(loop)) == {"A1", "C1", "C2", "A2", "a", "d", "c", "e"}
 
 
 def test_branch_letters_stand_on_their_branches() -> None:
-    loop = plot_fit(fabricated.result()).axes[-1]
+    loop = panels(fabricated.result())[-1]
     at = {text.get_text(): text.xy[0] for text in loop.texts}
     spring = fabricated.SPRING
     assert 0 < at["a"] < spring.eps_a < at["d"] < spring.eps_hat_c
@@ -102,11 +110,11 @@ def test_branch_letters_stand_on_their_branches() -> None:
 
 def test_only_branches_of_the_response_are_lettered() -> None:
     result = fabricated.result(switches=fabricated.result().switches[:1])
-    assert {"c", "e"}.isdisjoint(texts(plot_fit(result).axes[-1]))
+    assert {"c", "e"}.isdisjoint(texts(panels(result)[-1]))
 
 
 def test_switches_of_a_chain_carry_their_spring() -> None:
-    for ax in plot_fit(fabricated.chain_result()).axes:
+    for ax in panels(fabricated.chain_result()):
         assert texts(ax) == ["s2 A1", "s2 C1", "s2 C2", "s2 A2"]
 
 
@@ -126,7 +134,7 @@ def test_names_of_springs_that_switch_together_do_not_overprint(later: float) ->
         switches.append(Switch(1, switch.source, switch.target, *map(float, place)))
     figure = plot_fit(replace(result, switches=tuple(switches)))
     image(figure, "png", 100)
-    for ax in figure.axes:
+    for ax in figure.axes[:3]:
         assert len(ax.texts) == 8
         boxes = [text.get_window_extent() for text in ax.texts]
         assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
@@ -134,14 +142,14 @@ def test_names_of_springs_that_switch_together_do_not_overprint(later: float) ->
 
 def test_curves_that_coincide_are_told_apart() -> None:
     result = fabricated.result()
-    loop = plot_fit(with_curves(result, stress_along=result.curves.stress)).axes[-1]
+    loop = panels(with_curves(result, stress_along=result.curves.stress))[-1]
     fitted, along = line(loop, "fitted"), line(loop, "springs along measured strain")
     assert along.get_linewidth() > 2.0 * fitted.get_linewidth()
     assert along.get_zorder() < line(loop, "measured").get_zorder() < fitted.get_zorder()
 
 
 @pytest.mark.parametrize(
-    ("missing", "panels"),
+    ("missing", "labels"),
     [
         (["time"], ["strain (–)"]),
         (["measured_displacement", "displacement", "stress_along"], ["time (µs)"]),
@@ -149,15 +157,16 @@ def test_curves_that_coincide_are_told_apart() -> None:
         (["measured_stress", "stress", "stress_along", "time"], []),
     ],
 )
-def test_a_panel_without_curves_is_left_out(missing: list[str], panels: list[str]) -> None:
+def test_a_panel_without_curves_is_left_out(missing: list[str], labels: list[str]) -> None:
     result = with_curves(fabricated.result(), **dict.fromkeys(missing))
     figure = plot_fit(result)
-    assert [ax.get_xlabel() for ax in figure.axes if ax.axison] == panels
+    assert [ax.get_xlabel() for ax in figure.axes if ax.axison and ax.get_xlabel()] == labels
     assert image(figure, "png")
 
 
 def test_the_loop_of_a_displacement_drive_without_time() -> None:
-    result = with_curves(fabricated.result(drive="displacement"), time=None, displacement=None)
+    result = fabricated.result(drive="displacement", misfit={"stress_strain": 0.02})
+    result = with_curves(result, time=None, displacement=None)
     switches = tuple(replace(s, time=None) for s in result.switches)
     loop, residual = plot_fit(replace(result, switches=switches)).axes
     assert residual.get_xlabel() == "strain (–)"
@@ -184,24 +193,12 @@ def test_a_name_is_no_formula_and_may_be_in_any_script() -> None:
 
 
 def test_residuals_are_in_percent_of_the_measured_range() -> None:
-    result = fabricated.result()
-    first, second = plot_residuals(result).axes  # the stress-strain misfit is None
+    result = fabricated.result(misfit={"stress_time": 0.012, "stress_strain": 0.02})
+    *_, first, last = plot_fit(result).axes
     c = result.curves
-    drawn = first.lines[1].get_ydata()
-    expected = 100 * (c.stress - c.measured_stress) / np.ptp(c.measured_stress)
-    np.testing.assert_allclose(drawn, expected)
-    assert second.get_xlabel() == "time (µs)"
-
-
-def test_residuals_without_time_are_over_the_sample() -> None:
-    misfit = {"stress_time": None, "displacement_time": None, "stress_strain": 0.02}
-    (strip,) = plot_residuals(with_curves(fabricated.result(misfit=misfit), time=None)).axes
-    assert strip.get_xlabel() == "sample"
-
-
-def test_nothing_to_compare_is_said() -> None:
-    (ax,) = plot_residuals(fabricated.result(misfit={})).axes
-    assert texts(ax) == ["no curve to compare"]
+    for strip, fitted in ((first, c.stress), (last, c.stress_along)):
+        expected = 100 * (fitted - c.measured_stress) / np.ptp(c.measured_stress)
+        np.testing.assert_allclose(strip.lines[0].get_ydata(), expected)
 
 
 def test_the_pdf_embeds_truetype_and_no_setting_leaks(tmp_path: Path) -> None:
@@ -253,7 +250,8 @@ def test_a_response_has_three_panels(name: str, tmp_path: Path) -> None:
     assert np.allclose(
         motion.lines[len(chain.springs) - 1].get_ydata(), 1e6 * response.displacement[-1]
     )
-    assert (motion.get_legend() is not None) == (len(chain.springs) > 1)
+    key = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert set(key) == {*labelled, "end of contact"}
     # Past the end of contact the striker flies: that is no stress-strain curve.
     assert response.contact_end is not None
     assert len(loop.lines[0].get_xdata()) == int(np.sum(time <= response.contact_end))
@@ -290,7 +288,7 @@ def test_a_prescribed_motion_is_not_drawn_and_residuals_stand_below_large_curves
     c = result.curves
     off = 100 * (c.stress - c.measured_stress) / np.ptp(c.measured_stress)
     for above, strip in zip((loop, stress_time), below, strict=True):
-        np.testing.assert_allclose(strip.lines[1].get_ydata(), off)
+        np.testing.assert_allclose(strip.lines[0].get_ydata(), off)
         assert strip.get_xlim() == above.get_xlim()
     with laid_out(figure):
         sizes = [ax.get_position().size for ax in figure.axes]

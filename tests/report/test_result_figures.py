@@ -39,10 +39,10 @@ def test_other_processes_draw_the_same(drawn_here: dict[str, Images | None]) -> 
 
 
 def test_all_figures_of_the_report_are_pdf_where_that_is_asked_for(tmp_path: Path) -> None:
-    result = fabricated.result()
+    result = fabricated.microscale_result()
     folder = result.save(tmp_path / "r", figure_width="one, untitled, pdf")
-    assert {path.name for path in folder.glob("*.pdf")} == {"fit.pdf", "residuals.pdf"}
-    assert (folder / "residuals.pdf").read_bytes().startswith(b"%PDF")
+    assert {path.name for path in folder.glob("*.pdf")} == {"fit.pdf", "snapping.pdf"}
+    assert (folder / "snapping.pdf").read_bytes().startswith(b"%PDF")
     result.save(folder)  # and may be replaced
     assert {path.name for path in folder.glob("*.pdf")} == {"fit.pdf"}
     with pytest.raises(InputError, match="behind a comma may stand untitled or pdf"):
@@ -83,7 +83,7 @@ def test_one_core_draws_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(foamfit.study.processes, "Processes")
     with closing(Drawers()) as drawers:
         drawers.begin()
-        assert list(drawers.map(str.upper, ["fit", "residuals"])) == ["FIT", "RESIDUALS"]
+        assert list(drawers.map(str.upper, ["fit", "shown"])) == ["FIT", "SHOWN"]
 
 
 def modules_after(code: str, *arguments: str) -> Iterator[str]:

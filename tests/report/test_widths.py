@@ -48,7 +48,7 @@ def test_panels_stand_above_each_other_in_one_column_and_letters_keep_their_size
     assert (narrow.get_figwidth(), wide.get_figwidth()) == (3.25, 7.0)
     assert narrow.get_figheight() < 9.0  # a page
     with laid_out(narrow):
-        boxes = [ax.get_position() for ax in narrow.axes]
+        boxes = [ax.get_position() for ax in narrow.axes[:3]]
     assert [round(box.x0, 3) for box in boxes] == [round(boxes[0].x0, 3)] * 3
     assert boxes[0].y0 > boxes[1].y1 > boxes[1].y0 > boxes[2].y1
 

@@ -90,7 +90,7 @@ def test_the_small_scenes_meet_every_loop_of_the_integrator() -> None:
     read = set(re.findall(r"\w+", body)) & set(vars(taylor))
     loops = {vars(taylor)[name] for name in read if hasattr(vars(taylor)[name], "py_func")}
     without = {loop for loop in loops if loop.__module__ != memory.__name__}
-    with_memory = {taylor.settle_together, taylor.expand_remembered}
+    with_memory = {taylor.settle_together}
     assert without - with_memory <= set(calls)
     for function, arguments in calls.items():
         made = [kinds for kinds in function.signatures if not any(map(is_other, kinds))]

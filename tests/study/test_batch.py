@@ -26,8 +26,8 @@ from click.testing import CliRunner
 import fabricated
 import foamfit as ff
 from conftest import HEIGHT, synthetic_impact, without_pictures
-from foamfit.cli import batch as command
 from foamfit.cli import main
+from foamfit.cli import many as command
 from foamfit.report.studies import batch as batch_report
 from foamfit.report.studies.batch import (
     MOST_ON_PAGE,
@@ -184,12 +184,10 @@ def test_figures_of_another_width_are_made_again_where_there_are_any(here, tried
 
 
 def test_a_cycle_is_a_row_and_its_folder_is_in_that_of_the_test(here, monkeypatch):
-    from foamfit.study.cycles import CycleFits
-
     def fit_cycles(path, specimen, *, cycles, **options):
         assert cycles is None
         results = {1: fabricated.result(), 2: fabricated.result(status="ok")}
-        return CycleFits("a", "bistable", (1, 2, 3), results, {3: "it is cut"})
+        return ff.CycleFits("a", "bistable", (1, 2, 3), results, {3: "it is cut"})
 
     monkeypatch.setattr(batch_work, "fit_cycles", fit_cycles)
     frame = again(cycle="all").set_index("test")
@@ -363,8 +361,8 @@ def test_what_is_killed_leaves_a_page_as_current_as_the_table(here, tried, monke
     monkeypatch.setattr(module, "SHARE", 0.0)
     seen = list[tuple[list[tuple[str, str]], list[str]]]()
 
-    def look(state):
-        if state.done > 1:
+    def look(made):
+        if len(made.rows) > 1:
             frame = pd.read_csv("out/summary.csv")
             seen.append((shown("out"), list(frame["status"])))
 
@@ -554,8 +552,9 @@ def test_progress_says_done_wrong_left_and_how_long(here, monkeypatch):
     monkeypatch.setattr(command, "progress_line", lambda *_: nullcontext(line))
 
     def fitted(*_, progress, **__):
-        progress(module.State(done=4, wrong=1, left=6, fitted=2))
-        progress(module.State(done=10, wrong=1, left=0, fitted=8))
+        tests = range(10)
+        progress(SimpleNamespace(rows=tests[:4], tests=tests, wrong=1, fitted=2))
+        progress(SimpleNamespace(rows=tests, tests=tests, wrong=1, fitted=8))
         return SimpleNamespace(summary=[], out=here)
 
     monkeypatch.setattr(module, "run", fitted)

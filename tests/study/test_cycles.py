@@ -118,22 +118,20 @@ def test_what_foamfit_did_not_write_is_not_replaced(found, tmp_path, monkeypatch
     assert (tmp_path / "out" / place).read_text() == "mine"
 
 
-def test_in_one_column_two_panels_stand_side_by_side(found):
-    figure = cycles_report.plot_cycles(found, width="one")
-    assert figure.get_figwidth() == 3.25
-    grid = figure.axes[1].get_subplotspec().get_gridspec()
-    assert grid.ncols == 2
-    assert len(figure.axes) == len(cycles_report.plot_cycles(found).axes)
-
-
-def test_the_picture_has_a_panel_for_each_parameter(found):
-    figure = cycles_report.plot_cycles(found)
-    titles = [ax.get_title() for ax in figure.axes]
-    assert titles[1:4] == ["start strain (%)", "dissipated (kJ/m³)", "misfit of the loop (%)"]
-    assert {"eps_a", "kh_plus (MPa)"} <= set(titles)
-    onset = next(ax for ax in figure.axes if ax.get_title() == "eps_a")
-    low, high = onset.get_ylim()
+def test_the_picture_has_a_panel_for_each_parameter_and_a_row_for_each_cycle(found):
+    loops, *panels = (ax for ax in cycles_report.plot_cycles(found).axes if ax.axison)
+    key = [text.get_text() for text in loops.get_legend().get_texts()]
+    assert key == ["cycle 1", "cycle 2", "cycle 3"]
+    ends = [line.get_xdata()[-1] for line in loops.lines if line.get_label().startswith("cycle")]
+    assert ends == sorted(ends)  # each starts where the one before left it
+    titles = [ax.get_title().replace("\n", " ") for ax in panels]
+    assert titles[:3] == ["start strain (%)", "dissipated (kJ/m³)", "misfit of the loop (%)"]
+    assert [text.get_text() for text in panels[0].get_yticklabels()] == key
+    by_name = {ax.get_label(): ax for ax in panels}
+    assert by_name["s1_kh_plus"].get_title().endswith(" (MPa)")
+    low, high = by_name["s1_eps_a"].get_xlim()
     assert low < 0.1 < 0.14 < high
+    assert cycles_report.plot_cycles(found, width="one").get_figwidth() == 3.25
 
 
 # -------------------------------------------------------------------------------- the command

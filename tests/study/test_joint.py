@@ -21,9 +21,9 @@ from foamfit.cli import main
 from foamfit.fitting.together import fit_linked
 from foamfit.report.folder import save_somewhere
 from foamfit.study import joint_fit, study_file
-from foamfit.study.joint_estimates import parameter_of
+from foamfit.study.identified import read_source
 from foamfit.study.joint_fit import open_slope
-from foamfit.study.prediction.identified import read_source
+from foamfit.study.joint_result import parameter_of
 
 joint_module = importlib.import_module("foamfit.study.joint")  # `foamfit.study` has its function
 HEIGHT, AREA, TOP = 10e-3, 1e-4, 0.5

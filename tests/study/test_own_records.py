@@ -18,7 +18,7 @@ from conftest import EXPERIMENTS, without_pictures
 from foamfit.fitting.nuisance import names_of
 from foamfit.fitting.problem import make_problem
 from foamfit.springs.parameters import NUISANCE
-from foamfit.study.prediction.identified import read_source
+from foamfit.study.identified import read_source
 
 sys.path.insert(0, str(EXPERIMENTS / "recovery"))
 import rig

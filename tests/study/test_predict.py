@@ -21,8 +21,7 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import make_problem
 from foamfit.report.studies import prediction as prediction_report
 from foamfit.report.studies.prediction import prediction_text
-from foamfit.study.prediction.identified import read_source
-from foamfit.study.prediction.population import Population
+from foamfit.study.identified import Population, read_source
 
 HEIGHT, AREA, SIGMA = 10e-3, 5e-5, 1e3
 LAW = {
@@ -81,7 +80,7 @@ def written(folder: Path, content: dict) -> Path:
 
 def population(content: dict, folder: Path, test: Measurement | None = None) -> Population:
     source = read_source(written(folder, content))
-    return Population(source, source.model.names, (test or loop()).specimen, 0.25)
+    return Population(source, (test or loop()).specimen, 0.25)
 
 
 # ------------------------------------------------------------------------------- the band

@@ -50,7 +50,7 @@ def point():
 
 
 def test_the_covariance_is_the_sandwich_of_all_residuals(point):
-    blocks, plain, s = point.uncertainty.blocks, point.uncertainty.plain, len(point.names)
+    blocks, plain, s = point.uncertainty.blocks, point.uncertainty, len(point.names)
     slopes = [block.jacobian @ block.through for block in blocks]
     hessian = sum(one.T @ one for one in slopes)
     meat = sum(

@@ -119,7 +119,7 @@ def test_the_curvature_that_a_residual_leaves_is_in_the_covariance():
         ),
         np.ones(1),
     )  # fmt: skip
-    found, plain = one.bent.covariance(one.scales), one.plain.covariance(one.scales)
+    found, plain = one.bent.sandwich, one.sandwich
     square = float(np.sum(jacobian**2))
     curvature = square + 2.0 * float(t @ left[:400])
     assert abs(curvature / square - 1.0) > 5e-3

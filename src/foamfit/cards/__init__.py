@@ -1,5 +1,5 @@
 """Material cards: the curves of a fitted law for finite elements, and what they lose.
 
-`curves` makes the loading curves, `replay` follows a card as its solver does and fits its
-unloading, `card` makes the files, `records` the picture. The texts of the cards are templates.
+`curves` makes the loading curves, follows a card as its solver does and fits its unloading, `card`
+makes the files. The texts of the cards are templates.
 """

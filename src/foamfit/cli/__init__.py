@@ -4,7 +4,7 @@ Heavy modules are imported inside the commands that need them. A newcomer reads 
 exit codes and errors, `options` what several commands share.
 """
 
-from foamfit.cli import batch, fit, joint, results, simulate, start  # noqa: F401
+from foamfit.cli import fit, many, results, start  # noqa: F401
 from foamfit.cli.group import main
 
 __all__ = ["main"]

@@ -20,19 +20,16 @@ from foamfit.springs.options import OPTIONS
 from foamfit.terminal import say
 
 if TYPE_CHECKING:
-    import lmfit
-
     from foamfit.api import FitResult
-    from foamfit.data.measurement import Measurement
-    from foamfit.study.cycles import CycleFits
+    from foamfit.report.studies.cycles import CycleFits
 
 # Options that `foamfit.fit` does not take as keywords, and those that become its `intervals`.
-OF_ONE_MODEL, WAYS = ("cycle", "cycles", "model", "fix", "vary"), ("profile", "bootstrap", "mcmc")
+NO_KEYWORDS, WAYS = ("cycle", "cycles", "model"), ("profile", "bootstrap", "mcmc")
 
 
 def _fixes(
     context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
-) -> dict[str, float]:
+) -> dict[str, float] | None:
     fixed = {}
     for text in values:
         name, _, number = text.partition("=")
@@ -42,7 +39,7 @@ def _fixes(
             value = math.nan
         if not math.isfinite(value):
             raise click.BadParameter(f"'{text}' is not NAME=VALUE in SI, as s1_eta=0.")
-    return fixed
+    return fixed or None
 
 
 fit_options = options.together(
@@ -65,12 +62,6 @@ fit_options = options.together(
     option("--time-shift", "Fit the delay of the motion against the force."),
     options.RELAXATION,
     *options.MORE,
-    option(
-        "--loss",
-        "All but linear weigh large residuals less.",
-        click.Choice(["linear", "soft_l1", "huber", "cauchy"]),
-        default="linear",
-    ),
     option("--profile", "95 % intervals by profile likelihood."),
     option(
         "--bootstrap", "95 % intervals by N >= 40 refits to resampled blocks.", int, metavar="N"
@@ -88,15 +79,21 @@ def model_name(asked: Mapping[str, Any]) -> str:
     return "auto" if model == "auto" else Model.parse(model, asked["relaxation"]).words
 
 
-def cycles_of(text: str | None) -> tuple[int | None, tuple[int, ...] | None]:
-    """Read --cycle: the one cycle that is named, or the several that are ("all" names none)."""
+def cycles_of(asked: Mapping[str, Any]) -> int | tuple[int, ...] | None:
+    """Read --cycle: the one cycle that is named, or the several that are ("all" names none).
+
+    InputError if it is wrong, or --cycles is given too.
+    """
+    text = asked["cycle"]
+    if text is not None and asked["cycles"] is not None:
+        raise InputError("give either --cycle or --cycles, not both")
     if text is None or text.strip().lower() == "all":
-        return None, None if text is None else ()
+        return None if text is None else ()
     parts = text.split(",")
     if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
         raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
     numbers = tuple(int(part) for part in parts)
-    return (None, numbers) if len(numbers) > 1 else (numbers[0], None)
+    return numbers if len(numbers) > 1 else numbers[0]
 
 
 def keywords_of(asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -105,7 +102,7 @@ def keywords_of(asked: Mapping[str, Any]) -> dict[str, Any]:
     if len(given) > 1:
         names = " and ".join(f"--{way}" for way in given)
         raise InputError(f"{names} exclude each other; choose one way to make the intervals")
-    search = {name: one for name, one in asked.items() if name not in (*OF_ONE_MODEL, *WAYS)}
+    search = {name: one for name, one in asked.items() if name not in (*NO_KEYWORDS, *WAYS)}
     way, draws = next(iter(given.items()), ("auto", None))
     return search | {"intervals": way, "draws": None if draws is True else draws}
 
@@ -125,45 +122,24 @@ def fit_as_asked(
 
     search = keywords_of(asked)
     model = model_name(asked)
-    alone, several = cycles_of(asked["cycle"])
-    together = asked.get("cycles")
-    if together is not None and asked["cycle"] is not None:
-        raise InputError("give either --cycle or --cycles, not both")
-    measurement = read_test(test, specimen, alone, cycles=together)
+    wanted = cycles_of(asked)
+    several = wanted if isinstance(wanted, tuple) else None
+    alone = None if isinstance(wanted, tuple) else wanted
+    measurement = read_test(test, specimen, alone, cycles=asked["cycles"])
     for number in set(several or ()).difference(measurement.cycles):
         last = f"its cycles are {min(measurement.cycles)} to {max(measurement.cycles)}"
         raise InputError(f"--cycle {asked['cycle']}: {test} has no cycle {number}; {last}")
     from foamfit import api
     from foamfit.one_model import Options
 
-    Options(**search)  # refuses what is not admissible before anything is compiled
-    params = _params(measurement, model, asked)
+    Options(**search).check(measurement, model)  # before anything is compiled
     with begin(search["max_time"] if several is None else None) as news:  # it limits each cycle
         search |= {"progress": news.progress, "watch": news.watch, "tell": news.tell}
         if several is None:
-            return api.fit(measurement, model=model, params=params, **search)
+            return api.fit(measurement, model=model, **search)
         from foamfit.study import cycles as study
 
-        search["params"] = lambda one: _params(one, model, asked)
         return study.fit_cycles(test, specimen, cycles=several or None, model=model, **search)
-
-
-def _params(
-    measurement: Measurement, model: str, asked: Mapping[str, Any]
-) -> lmfit.Parameters | None:
-    """Return the parameters of a model as --fix and --vary want them; None for auto."""
-    from foamfit.fitting.curves import check_time_shift, choose_drive
-    from foamfit.fitting.problem import fix_and_vary, make_params
-
-    drive, fix, vary = (asked[name] for name in ("drive", "fix", "vary"))
-    more = {name: asked[name] for name in ("time_shift", "relaxation", *OPTIONS)}
-    if asked["time_shift"]:
-        check_time_shift(measurement, drive or choose_drive(measurement))
-    if model != "auto":
-        return fix_and_vary(make_params(measurement, model, drive, **more), model, fix, vary)
-    if fix or vary:
-        raise InputError("--fix and --vary belong to one model; name it instead of --model auto")
-    return None
 
 
 @main.command()

@@ -23,11 +23,10 @@ WRONG, NOT_ACCEPTABLE, DEFECT, SIGNALLED = 1, 2, 70, 128
 
 def _load_laws(context: click.Context, option: click.Parameter, files: tuple[str, ...]) -> None:
     """Make the laws in the user's files known before anything else is done."""
-    if files:
+    for file in files:
         from foamfit.springs import laws
 
-        for file in files:
-            laws.load_file(file)
+        laws.load_file(file)
 
 
 class _Group(click.Group):

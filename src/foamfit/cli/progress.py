@@ -59,7 +59,7 @@ class Watcher(Progress):
         if self._best is None or (began := time.monotonic()) < self._next:
             return
         (problem, values), self._best = self._best, None
-        if (misfit := problem.objective.look(values, everything=True)) is not None:
+        if (misfit := problem.objective.look(values)) is not None:
             self.seen(problem, values, misfit)
         took = time.monotonic() - began if self._looked else 0.0  # the first one loads the solver
         self._next, self._looked = began + took + max(took / SHARE, APART), True

@@ -25,13 +25,11 @@ from foamfit.terminal import say
 )
 @options.PLOT
 @options.WIDTH
-@options.option("--csv table", "Also write a table.", options.FILE)
 def compare(
     results: tuple[Path, ...],
     name: str | None,
     plot: Path | None,
     figure_width: str,
-    table: Path | None,
 ) -> None:
     """Put result folders beside the published parameters, or beside the first of them.
 
@@ -41,18 +39,15 @@ def compare(
         foamfit compare fits/TEST/bistable --published foam-1/model-1 --plot comparison.png
     """
     from foamfit.report.comparison import compare as side_by_side
-    from foamfit.report.comparison import comparison_text, plot_comparison, write_csv
+    from foamfit.report.comparison import comparison_text, plot_comparison
 
     read = [path / "fit.json" if path.is_dir() else path for path in results]
-    options.check_files(table, plot, read)
+    options.check_files(None, plot, read)
     comparison = side_by_side(results, name)
     say(comparison_text(comparison))
     if plot is not None:
         plot_comparison(comparison, plot, width=figure_width)
         say(f"\ndrawn in {plot}")
-    if table is not None:
-        write_csv(comparison, table)
-        say(f"\nwritten to {table}")
 
 
 @main.command()
@@ -116,7 +111,7 @@ def predict(
     from foamfit.data.csv_file import read_test
     from foamfit.data.toml_file import toml_beside
     from foamfit.report.studies.prediction import check_replaceable, prediction_text
-    from foamfit.study.prediction.identified import read_source
+    from foamfit.study.identified import read_source
 
     toml = toml_beside(test)
     default = Path("predictions", toml.stem)
@@ -168,7 +163,7 @@ def card(result: Path, format: str, units: str, rates: str | None, out: Path | N
         foamfit card joint/new-heel --format law90 --units t-mm-s --rates 0.01,1,100 --out foam.rad
     """
     from foamfit.cards import card as cards
-    from foamfit.study.prediction.identified import read_source
+    from foamfit.study.identified import read_source
 
     asked = None if rates is None else rates.split(",")
     cards.check(format, units, asked)
@@ -186,4 +181,4 @@ def card(result: Path, format: str, units: str, rates: str | None, out: Path | N
     if out is None:
         file.parent.mkdir(exist_ok=True)
     made.save(file)
-    say(f"{made.summary()}\nwritten to {file}, with {file.name}.json, .png and .pdf beside it")
+    say(f"{made}\nwritten to {file}, with {file.name}.json, .png and .pdf beside it")

@@ -1,9 +1,8 @@
-"""Where contact starts: a first value for the fit of an impact, time zero of a slow test."""
+"""Where contact starts: a start value for the fit of an impact, time zero of a slow test."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,10 +12,9 @@ from foamfit.data.noise import MIN_REST, level_on_line
 
 # A signal rests where its slope is less than this share of the slope that follows: the branches of
 # a foam differ less on loading (6 times in the published sets), so that a soft start is no rest.
-# An impact, whose fit goes on from there, and a motion need less.
+# For an impact, whose fit refines the start, and for a motion a larger share will do.
 STILL, _STILL_IMPACT, STILL_MOTION = 0.15, 0.3, 0.5
-# A machine that travels farther than this share without a stress has not yet reached the specimen.
-_APPROACH = 0.02
+_APPROACH = 0.02  # share of its travel beyond which a machine without a stress is not in contact
 _BRAKED = 0.02  # share of the peak of a derived stress at which contact starts
 # Shares of the peak up to which a rise is taken for straight: the least that is so many standard
 # deviations of the noise, or else the largest.
@@ -24,6 +22,7 @@ _SHARES, _CLEAR, _LARGEST = (0.025, 0.05, 0.1, 0.2), 8.0, 0.5
 _ERRORS, ELSEWHERE = 2.0, 5.0  # standard errors: of a slope; of a motion whose zero lies elsewhere
 
 Levels = dict[str, NoiseLevel]
+Kink = tuple[float, float]  # where a signal starts to rise: time and standard error, s
 
 
 @dataclass(frozen=True)
@@ -31,9 +30,9 @@ class Start:
     """Where contact starts: at a `time` of the file, s, at or before its sample `first`.
 
     `error` is the standard error of that time; `how` says in words what shows it, `by` which
-    channel: "stress", "motion", or "file" where nothing was recorded from before contact. With
-    `free` nothing pressed on the specimen before. `gauge` says what the motion was before contact:
-    "rest", "flight" (at the velocity that it goes on with), "other", or "" where it is not shown.
+    channel: "stress", "motion", or "file" where nothing was recorded before contact. If `free`, the
+    specimen was unloaded before. `gauge` is the motion before contact: "rest", "flight" (at the
+    velocity that it goes on with), "other", or "" where none was recorded.
     """
 
     how: str
@@ -46,15 +45,8 @@ class Start:
 
     @property
     def resting(self) -> int:
-        """How many rows certainly show the specimen without load."""
+        """Number of rows that certainly show the specimen without load."""
         return max(0, self.first - 2) if self.free else 0
-
-
-class Kink(NamedTuple):
-    """Where a signal starts to rise: time and standard error, s."""
-
-    time: float
-    error: float
 
 
 def _kink(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
@@ -87,7 +79,7 @@ def _kink(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
         return None
     alike = int(np.count_nonzero(off <= best + variance))
     error = 0.5 * max(float(alike) - 1.0, 0.5) * float(coarse[1] - coarse[0])
-    return Kink(float(fine[int(np.argmin(near))]), error)
+    return float(fine[int(np.argmin(near))]), error
 
 
 def _reached(values: Array, share: float) -> tuple[int, int]:
@@ -115,23 +107,24 @@ def _onset(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
 def leave_rest(
     time: Array, values: Array, noise: NoiseLevel, still: float = STILL, drift: float = np.inf
 ) -> Kink | None:
-    """Where a signal leaves its rest, or None if none is shown before it rises.
+    """Where a signal leaves its rest, or None if the record shows no rest before the rise.
 
-    A line is extrapolated back from the first part of the rise. Before, the slope is surely less
+    A line is extrapolated back from the first part of the rise. At rest the slope is surely less
     than a share `still` of the mean slope that follows, up to 15 % of the peak, and the signal does
-    not significantly change by more than `drift`. A kink within a rise is passed over.
+    not change significantly by more than `drift`. A kink within a rise is passed over.
     """
     rows = len(time)
     while rows >= 10 and (found := _onset(time[:rows], values[:rows], noise)):
-        t, y, n = time[:rows], values[:rows], int(np.searchsorted(time, found.time))
+        at, t, y = found[0], time[:rows], values[:rows]
+        n = int(np.searchsorted(time, at))
         if n < max(5 * noise.time, 3) or n >= rows:
             return None
         own = n >= MIN_REST * noise.time  # else they do not show their own noise
-        slope = level_on_line(t[:n], y[:n], found.time, replace(noise, sigma=0.0) if own else noise)
+        slope = level_on_line(t[:n], y[:n], at, replace(noise, sigma=0.0) if own else noise)
         size, error, rest = abs(slope[1].value), _ERRORS * slope[1].error, float(y[:n].mean())
         high = _reached(y, 0.15)[0]
-        high = high if t[high] > found.time else int(np.argmax(y))
-        after = float(y[high : high + 3].mean() - rest) / (t[high] - found.time)
+        high = high if t[high] > at else int(np.argmax(y))
+        after = float(y[high : high + 3].mean() - rest) / (t[high] - at)
         if size + error < still * after and (size - error) * (t[n - 1] - t[0]) <= drift:
             return found
         rows = n
@@ -140,11 +133,11 @@ def leave_rest(
 
 def _at_kink(channel: str, time: Array, at: Kink, by: str, what: str = "rest") -> Start:
     how = f"where the {channel} leaves its {what}"
-    return Start(how, at.time, int(np.searchsorted(time, at.time)), at.error, by, free=True)
+    return Start(how, at[0], int(np.searchsorted(time, at[0])), at[1], by, free=True)
 
 
 def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool]:
-    """First value of a motion, by a line through its rise, and whether its zero is elsewhere."""
+    """First value of a motion, by a line through its rise, and whether it is clearly not zero."""
     top = int(np.argmax(w))
     early = slice(0, max(5, top // 12))
     first = level_on_line(time[early], w[early], time[0], noise)[0]
@@ -155,9 +148,9 @@ def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool
 def start_of_impact(record: Record, levels: Levels) -> Start:
     """Estimate where an impact starts: where the stress or the motion leaves its rest.
 
-    A motion that is followed in flight alone is braked from there. If none does, the first part
-    of the rise is extrapolated back to zero, by a few samples at most; a file whose first sample is
-    a step or so after its time zero has that right.
+    Without a force, contact starts where the flight is braked. Without a rest, the first part of
+    the rise is extrapolated back to zero, by a few samples at most, unless the first sample is a
+    step or two after the file's time zero.
     """
     time, stress, w = record.instants, record.stress, record.displacement
     drift, at, elsewhere = 0.01, None, False
@@ -172,14 +165,14 @@ def start_of_impact(record: Record, levels: Levels) -> Start:
         return start
     noise, up = levels["displacement"], slice(int(np.argmax(w)) + 1)
     if at := leave_rest(time[up], w[up], noise, STILL_MOTION):
-        # Far from the onset of the stress something else than contact has moved the gauge.
-        alike = abs(at.time - start.time) < 0.1 * (time[up][-1] - start.time)
-        if not start.free or (at.error < start.error and alike):
+        # Far from the onset of the stress, something other than contact has moved the gauge.
+        alike = abs(at[0] - start.time) < 0.1 * (time[up][-1] - start.time)
+        if not start.free or (at[1] < start.error and alike):
             start = _at_kink("displacement", time, at, "motion")
     elif "stress" in record.derived and elsewhere:  # it brakes a motion followed in flight
         below = np.flatnonzero(stress[: int(np.argmax(stress))] < _BRAKED * stress.max())
         last = int(below[-1]) if below.size else 0
-        at = Kink(float(time[last]), _BRAKED * float(np.ptp(time)))
+        at = float(time[last]), _BRAKED * float(np.ptp(time))
         start = _at_kink("displacement", time, at, "motion", "line") if last else start
     return start
 

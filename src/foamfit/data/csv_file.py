@@ -1,8 +1,8 @@
 """A test file and its TOML become a `Measurement` in SI.
 
 A file holds one table, one row per sample; the unit of a channel is in its header, in a row of
-units beneath it, or in the ``[columns]`` table of the TOML. The motion may stand in a second file,
-which ``[motion]`` of the TOML names.
+units beneath it, or in ``[columns]`` of the TOML. The motion may be in a second file, which
+``[motion]`` of the TOML names.
 """
 
 from __future__ import annotations
@@ -10,15 +10,12 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Integers, means
 from foamfit.data.frames import Frames, join
 from foamfit.data.measurement import (
     MIN_ROWS,
@@ -33,25 +30,11 @@ from foamfit.data.measurement import (
 from foamfit.data.noise import with_noise
 from foamfit.data.outliers import fresh_samples
 from foamfit.data.prepare import condition, stress_of_motion
-from foamfit.data.tables import columns as named
-from foamfit.data.tables.csv_table import (
-    Table,
-    Text,
-    find_table,
-    read_numbers,
-    read_text,
-    without_cut_row,
-)
+from foamfit.data.tables.columns import TWINS, Source, si_factor
+from foamfit.data.tables.csv_table import read_numbers, read_text, without_cut_row
 from foamfit.data.tables.draft import without_toml
 from foamfit.data.tables.headers import CHANNELS, example
-from foamfit.data.toml_file import (
-    Column,
-    Settings,
-    is_range,
-    read_bytes,
-    read_settings,
-    toml_beside,
-)
+from foamfit.data.toml_file import Column, Settings, is_range, read_settings, toml_beside
 from foamfit.data.units import LARGEST
 from foamfit.errors import InputError, naming
 from foamfit.text import engineering, percent
@@ -104,7 +87,6 @@ def read_test(
         Where the file, its TOML or what they hold cannot be used.
     """
     path = Path(path)
-    read_bytes(path, "give the CSV file of a test", 0)  # missed before its TOML is
     toml = Path(specimen) if specimen is not None else toml_beside(path)
     if specimen is None and not os.path.lexists(toml):
         raise without_toml(toml, read_text(path, "the CSV file of a test"))
@@ -112,24 +94,27 @@ def read_test(
     text = read_text(path, "the CSV file of a test", settings.sheet)
     window = _chosen(settings.window, cycle, cycles)
     with naming(path):
-        table, columns = _table(text, settings.columns)
-        record, notes = _record(table, columns, settings)
-    sha256, spreads = text.sha256, named.scale_spreads(columns, settings.columns)
-    of_force: Callable[[str], str] = partial(named.sign_advice, table, columns, settings.columns)
-    of_motion = of_force
+        source = Source.of(text, settings.columns)
+        record = _record(source, settings)
+    sha256, spreads, moved = text.sha256, source.scale_spreads(), source
     if settings.motion is not None:
-        frames, told, scales, digest, of_motion = _read_motion(path, toml, settings)
+        moved, frames, notes = _read_motion(path, toml, settings)
         with naming(toml):
-            record, more = join(record, frames)
-        notes, spreads = [*notes, *told, *more], spreads | scales
-        sha256 = hashlib.sha256(f"{sha256} {digest}".encode()).hexdigest()
+            record = join(record.noted(*notes), frames)
+        spreads |= moved.scale_spreads()
+        sha256 = hashlib.sha256(f"{sha256} {moved.table.sha256}".encode()).hexdigest()
+
+    def advice(channel: str) -> str:
+        of_motion = moved is not source and channel.startswith("displacement")
+        return _of_motion(moved.sign_advice(channel)) if of_motion else source.sign_advice(channel)
+
     with naming(path):
         test = condition(
             record,
             settings.specimen,
             striker=settings.striker,
             window=window,
-            advice=lambda c: (of_motion if c.startswith("displacement") else of_force)(c),
+            advice=advice,
             spread=settings.uncertainties.get("velocity", 0.0),
         )
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
@@ -148,15 +133,8 @@ def read_test(
         uncertainties=spreads | settings.uncertainties,
         noise=replace(settings.noise, estimated=test.noise.estimated),
         priors=settings.priors,
-        notes=(*notes, *test.notes),
     )
     return with_noise(test)
-
-
-def _table(text: Text, given: dict[str, Column]) -> tuple[Table, dict[str, int]]:
-    """Find the table of a file, and which column each channel is in."""
-    table = find_table(text, {column.column for column in given.values()})
-    return table, named.assign_columns(table, given)
 
 
 def read_history(path: Path, channel: str) -> tuple[Array, Array]:
@@ -164,25 +142,22 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
     wanted = f"a CSV with the columns 'time (ms)' and '{example(channel)}'"
     text = read_text(path, wanted)
     with naming(path):
-        table, found = _table(text, {})
+        source = Source.of(text, {}).only(("time", channel))
         for name in ("time", channel):
-            if name not in found:
+            if name not in source.columns:
                 raise InputError(f"has no column for the {name}; it must be {wanted}.")
-        columns = {name: found[name] for name in ("time", channel)}
-        numbers, rows, _ = read_numbers(table, columns)
-        _check_time(numbers["time"], table.headers[columns["time"]].text, rows)
-        for name, k in columns.items():
-            header = table.headers[k]
-            in_si = Column(header.text, CHANNELS[name].si) if header.unit is None else None
-            numbers[name] = numbers[name] * named.si_factor(table, name, k, in_si)
+        headers = source.table.headers
+        numbers, rows, _ = read_numbers(source.table, source.columns)
+        _check_time(numbers["time"], headers[source.columns["time"]].text, rows)
+        for name, k in source.columns.items():
+            in_si = None if headers[k].unit else Column(headers[k].text, CHANNELS[name].si)
+            numbers[name] *= si_factor(source.table, name, k, in_si)
     return numbers["time"], numbers[channel]
 
 
-def _read_motion(
-    path: Path, toml: Path, settings: Settings
-) -> tuple[Frames, list[str], dict[str, float], str, Callable[[str], str]]:
-    """Read the file that [motion] names: frames, notes, spreads, digest, advice on signs."""
-    motion = settings.motion
+def _read_motion(path: Path, toml: Path, settings: Settings) -> tuple[Source, Frames, list[str]]:
+    """Read the file that [motion] names: what is read from it, the frames, and notes."""
+    motion, spreads = settings.motion, settings.uncertainties
     assert motion is not None  # else there is nothing to read
     name = motion.file.name
     if os.path.realpath(motion.file) == os.path.realpath(path):
@@ -192,34 +167,28 @@ def _read_motion(
     text = read_text(motion.file, f"in [motion] file of {toml.name} the CSV file of the motion")
     try:
         with naming(motion.file):
-            table, columns = _table(text, motion.columns)
-            needed = named.motion_columns(table, columns)
-            numbers, _, dropped, notes = _channels(table, needed, motion.columns, settings)
+            source = Source.of(text, motion.columns).of_motion()
+            numbers, _, dropped, notes = _channels(source, settings)
     except InputError as error:
         raise InputError(_of_motion(str(error))) from None
     notes += [f"Not used: {item}." for item in dropped]
     top = _one_of(numbers, "displacement", "strain", 1 / settings.specimen.height, "height", notes)
-    assert top is not None  # see motion_columns
+    assert top is not None  # see `Source.of_motion`
     inside = {interior_channel(k): w for k, w in _inside(numbers, top, notes).items()}
-    spread, moved = settings.uncertainties.get("delay"), {"displacement": top} | inside
-    return (
-        Frames(name, numbers["time"], moved, motion.delay, spread),
-        [f"{name}: {note}" for note in notes],
-        named.scale_spreads(needed, motion.columns),
-        text.sha256,
-        lambda channel: _of_motion(named.sign_advice(table, needed, motion.columns, channel)),
-    )
+    moved = {"displacement": top} | inside
+    frames = Frames(name, numbers["time"], moved, motion.delay, spreads.get("delay"))
+    return source, frames, [f"{name}: {note}" for note in notes]
 
 
 def _of_motion(text: str) -> str:
     return text.replace("[columns]", "[motion.columns]")
 
 
-def _record(table: Table, columns: dict[str, int], settings: Settings) -> tuple[Record, list[str]]:
+def _record(source: Source, settings: Settings) -> Record:
     """Read the channels that are needed, in SI, and say what was read from where."""
-    needed = named.needed_columns(table, columns, settings)
-    numbers, rows, dropped, notes = _channels(table, needed, settings.columns, settings)
-    notes += _compare(table, needed, numbers, settings)
+    source = source.needed(settings)
+    numbers, rows, dropped, notes = _channels(source, settings)
+    notes += _compare(source, numbers, settings)
     specimen, striker = settings.specimen, settings.striker or Striker()
     if settings.striker is not None and "time" not in numbers:
         notes.append(
@@ -232,7 +201,7 @@ def _record(table: Table, columns: dict[str, int], settings: Settings) -> tuple[
     acceleration = numbers.get("acceleration")
     derived, braked = tuple[str, ...](), stress is None
     if stress is None:
-        assert striker.mass is not None  # see needed_columns
+        assert striker.mass is not None  # see `Source.needed`
         ratio = striker.mass / specimen.area
         if acceleration is not None:
             stress, acceleration = acceleration * ratio, None
@@ -245,34 +214,35 @@ def _record(table: Table, columns: dict[str, int], settings: Settings) -> tuple[
                 "The force is the striker's mass times the deceleration of its motion, read off a "
                 "smoothing spline; it is no measurement of its own."
             )
-    record = Record(
+    inside = _inside(numbers, displacement, notes)
+    return Record(
         numbers.get("time"),
         stress,
         displacement,
         numbers.get("velocity"),
         acceleration,
-        _inside(numbers, displacement, notes),
+        inside,
         cycle=numbers.get("cycle"),
         numbers=rows,
         dropped=tuple(dropped),
         derived=derived,
         braked=braked,
+        notes=tuple(notes),
     )
-    return record, notes
 
 
 def _channels(
-    table: Table, needed: dict[str, int], given: dict[str, Column], settings: Settings
-) -> tuple[dict[str, Array], NDArray[np.int64], list[Dropped], list[str]]:
+    source: Source, settings: Settings
+) -> tuple[dict[str, Array], Integers, list[Dropped], list[str]]:
     """Channels of a table in SI, the numbers of their rows, the rows left out, and notes."""
-    table, dropped = without_cut_row(table)
-    factors = {c: named.si_factor(table, c, k, given.get(c)) for c, k in needed.items()}
-    numbers, rows, empty = read_numbers(table, needed)
+    table, dropped = without_cut_row(source.table)
+    factors = {channel: source.factor(channel) for channel in source.columns}
+    numbers, rows, empty = read_numbers(table, source.columns)
     if rows.size < MIN_ROWS:
         raise InputError(f"has fewer than {MIN_ROWS} rows; a test needs more.")
-    notes = [named.read_note(table, needed, given)]
+    notes = [source.note()]
     for channel, values in numbers.items():
-        header = table.headers[needed[channel]]
+        header = table.headers[source.columns[channel]]
         column, measure = f"column {header.text!r}", header.measure(channel)
         if np.ptp(values) == 0:
             raise InputError(f"{column} is constant; a {channel} must vary.")
@@ -296,7 +266,7 @@ def _channels(
     if "time" in numbers:
         if settings.duplicates == "average":
             numbers, rows = _averaged(numbers, rows, dropped, notes)
-        _check_time(numbers["time"], table.headers[needed["time"]].text, rows)
+        _check_time(numbers["time"], table.headers[source.columns["time"]].text, rows)
     return numbers, rows, dropped, notes
 
 
@@ -312,23 +282,22 @@ def _nominal(measure: str, strain: Array) -> Array:
     return 1.0 - np.sqrt(1.0 - 2.0 * strain) if measure else strain
 
 
-def _compare(
-    table: Table, needed: dict[str, int], numbers: dict[str, Array], settings: Settings
-) -> list[str]:
+def _compare(source: Source, numbers: dict[str, Array], settings: Settings) -> list[str]:
     """Compare what is read with the columns that could have been read instead.
 
     InputError if an impact has two clocks that do not agree.
     """
+    table = source.table
     notes = list[str]()
     as_used = {"force": 1 / settings.specimen.area, "strain": settings.specimen.height}
-    for channel, k in named.left_out(table, needed).items():
+    for channel, k in source.left_out().items():
         try:
             values = read_numbers(table, {channel: k})[0][channel]
-            values = values * named.si_factor(table, channel, k, None)
+            values = values * si_factor(table, channel, k, None)
             values = _nominal(table.headers[k].measure(channel), values)
-        except InputError:  # it could not have been read
+        except InputError:  # no alternative
             continue
-        used = named.TWINS.get(channel, channel)
+        used = TWINS.get(channel, channel)
         one, name = numbers[used] * as_used.get(used, 1.0), table.name(k)
         if len(values) != len(one) or (channel == "time" and "time" in settings.columns):
             continue
@@ -340,7 +309,7 @@ def _compare(
                 f"The {channel} {name} is left out; it differs by up to {by} of the range."
             )
         elif np.diff(values).min() > 0 and np.ptp(values - one) > np.median(np.diff(one)):
-            both = f"columns {table.name(needed['time'])} and {name} are times that differ"
+            both = f"columns {table.name(source.columns['time'])} and {name} are times that differ"
             by = engineering(float(np.ptp(values - one)), "s")
             if settings.striker is not None:
                 raise InputError(
@@ -364,11 +333,11 @@ def _inside(numbers: dict[str, Array], top: Array | None, notes: list[str]) -> d
 
 
 def _averaged(
-    numbers: dict[str, Array], rows: NDArray[np.int64], dropped: list[Dropped], notes: list[str]
-) -> tuple[dict[str, Array], NDArray[np.int64]]:
+    numbers: dict[str, Array], rows: Integers, dropped: list[Dropped], notes: list[str]
+) -> tuple[dict[str, Array], Integers]:
     """Average neighbouring rows with the same time stamp; each is counted with its reason."""
     time = numbers["time"]
-    starts, counts = fresh_samples(time)
+    starts, _ = fresh_samples(time)
     again = np.delete(rows, starts)
     if not again.size:
         return numbers, rows
@@ -378,11 +347,11 @@ def _averaged(
         f"in row {again[0]}; rows with the same stamp are averaged (or refused by [data] "
         'duplicates = "refuse").'
     )
-    means = {c: np.add.reduceat(values, starts) / counts for c, values in numbers.items()}
-    return means | {"time": time[starts]}, rows[starts]
+    averages = {channel: means(values, starts) for channel, values in numbers.items()}
+    return averages | {"time": time[starts]}, rows[starts]
 
 
-def _check_time(time: Array, name: str, rows: NDArray[np.int64]) -> None:
+def _check_time(time: Array, name: str, rows: Integers) -> None:
     """Refuse a time that does not increase."""
     back = np.flatnonzero(np.diff(time) <= 0)
     if back.size:

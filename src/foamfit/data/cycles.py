@@ -1,27 +1,27 @@
-"""The cycles of a slow test: where its motion turns round, and which loading is looked at."""
+"""The cycles of a slow test: where its motion turns round, and which of them are used."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Integers
 from foamfit.data.measurement import Measurement, Record
 from foamfit.data.noise import noise_level, smooth
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
-# Shares of the largest displacement: what a reversal goes back at least, what is left of it at
-# rest, what counts as unloading, and a cycle that is named for being small.
+# Shares of the largest displacement: the least way back of a reversal, the most that is left at
+# rest, the least that counts as unloading, and the peak below which a cycle is called small.
 _TURN, _REST, _UNLOADED, _SMALLER = 0.05, 0.35, 0.1, 0.9
-# Share of the range of the displacement that is lowest between cycles; shares of the peak stress
-# that are a load at all, and from which it is said that a later cycle never was without load.
+# Lowest share of the displacement between cycles; shares of the peak stress that count as a load,
+# and from which a later cycle is said to start under load.
 _LOWEST, _LOADED, _STILL_LOADED = 0.02, 0.01, 0.05
-# Share of its peak stress up to which the rise of a later cycle is taken for straight, the fewest
-# samples of it, and the places that are tried for its foot.
+# Share of its peak stress up to which the rise of a later cycle is straight, the fewest samples of
+# it, and the number of places that are tried for its foot.
 _EARLY, _FEWEST, _PLACES = 0.1, 5, 400
+_SURE = 4.0  # standard errors by which a stress is below zero
 _BEGUN = 3.0  # times the least load: above it the first rise has certainly begun
 
 
@@ -30,7 +30,7 @@ class Cycle:
     """One loading and unloading among the samples of a slow test: `first` up to `end`.
 
     `number` is that of the record's own column of cycles, or counts from 1; `place` counts from 0.
-    Several as one history are one with a `last` number, whose last peak is at `turn`.
+    Several cycles as one history have a `last` number and their last peak at `turn`.
     """
 
     number: int
@@ -56,9 +56,9 @@ class Cycle:
 def find_cycles(record: Record) -> list[Cycle]:
     """List the cycles of a slow test; none if it has no displacement.
 
-    A cycle ends where the motion has gone back most of the way of the smaller of the peaks on
-    either side; a reversal that goes back less is part of its cycle, and so is motion without load,
-    as an approach. It runs from the last rest before its rise to its first return to rest.
+    A cycle ends where the motion has gone back most of the way from the smaller of the peaks on
+    either side; a reversal that goes back less is part of its cycle, as is motion without load,
+    such as an approach. It runs from the last rest before its rise to its first return to rest.
     """
     w, stress = record.displacement, record.stress
     if w is None:
@@ -125,8 +125,8 @@ def _choose(cycles: list[Cycle], number: int | None) -> Cycle | None:
     raise InputError(f"cycle {number} cannot be taken: the file {wrong}; give one that it has.")
 
 
-def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> tuple[Record, list[str]]:
-    """Keep one loading and unloading of a slow test, and say what is cut."""
+def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
+    """Keep one loading and unloading of a slow test, or several cycles."""
     w, n, number = record.displacement, len(cycles), cycle.number
     assert w is not None  # it has cycles
     size, start, top, end = float(np.ptp(w)), cycle.first, cycle.top, cycle.end
@@ -150,25 +150,21 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> tuple[Rec
     if end == len(record) and w[last] - w[last:].min() <= _UNLOADED * size:
         notes.append("The record has no unloading, so nothing in it determines unloading.")
     after = f"after cycle {number if cycle.last is None else cycle.last}"
-    return record.between(start, end, f"before cycle {number}", after), notes
+    return record.noted(*notes).between(start, end, f"before cycle {number}", after)
 
 
-def cut_to_reload(
-    record: Record, cycles: list[Cycle], cycle: Cycle, height: float, origins: dict[str, float]
-) -> tuple[Record, list[str]]:
+def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: float) -> Record:
     """Cut a later cycle to its contact, with time, displacement and stress zero where it starts.
 
-    The specimen is free or least loaded at the lowest displacements between the cycles. Contact is
-    where a straight line through the early rise meets the level there; it ends where the stress is
-    back at that level. A level below zero is the sensor's: a foam does not pull its platen long.
-    What is taken off joins the `origins`, the strain that has not recovered as "start_strain".
+    The specimen is free or least loaded at the lowest displacements between the cycles. Contact
+    starts where a straight line through the early rise meets the level of the stress there, and
+    ends where the stress is back at that level. A level below zero is an offset of the sensor: a
+    foam does not pull its platen for long. The strain not recovered is `origins["start_strain"]`.
     """
     w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
     turn, end_of = cycle.last_top, number if cycle.last is None else cycle.last
     assert w is not None  # it has cycles
-    before = slice(cycles[cycle.place - 1].top, top)
-    lowest = w[before] <= w[before].min() + _LOWEST * np.ptp(w)
-    free = float(np.median(stress[before][lowest]))
+    free = float(np.median(_stress_between(record, cycles, cycle.place - 1)))
     mean = smooth(stress, max(1, (top - cycle.first) // 100))
     rise = float(mean[top]) - free
     early = cycle.first + int(np.argmax(mean[cycle.first : top + 1] >= free + _EARLY * rise))
@@ -187,7 +183,6 @@ def cut_to_reload(
     time = passed(record.instants)
     moment = "" if record.time is None else f" {engineering(time, 's')} in the file,"
     notes = [
-        *cut_to_cycle(record, cycles, cycle)[1],
         f"Contact of cycle {number} starts{moment} where the stress rises from its level between "
         f"the cycles, at a strain of {percent(contact / height)} from the first contact (start "
         f"strain, not recovered), which is taken off; {first - cycle.first} samples before and "
@@ -204,21 +199,51 @@ def cut_to_reload(
             "Check: the specimen stays under load between the cycles, by "
             f"{percent(loaded)} of the peak stress."
         )
+    origins = record.origins | {"start_strain": contact / height}
+    origins["stress_zero"] += offset
+    origins["displacement_zero"] += contact
+    origins |= {} if record.time is None else {"contact_time": time}
     moved = replace(
         record,
         time=None if record.time is None else record.time - time,
         stress=stress - offset,
         displacement=w - contact,
         interior={node: values - passed(values) for node, values in record.interior.items()},
+        origins=origins,
+        notes=(*cut_to_cycle(record, cycles, cycle).notes, *notes),
     )
     cut = moved.without(slice(cycle.end, None), f"after cycle {end_of}")
     cut = cut.without(slice(end, None), "after contact ends")
     cut = cut.without(slice(cycle.first, first), "before contact starts")
-    origins["start_strain"] = contact / height
-    origins["stress_zero"] += offset
-    origins["displacement_zero"] += contact
-    origins |= {} if record.time is None else {"contact_time": time}
-    return cut.without(slice(0, cycle.first), f"before cycle {number}"), notes
+    return cut.without(slice(0, cycle.first), f"before cycle {number}")
+
+
+def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
+    """Take a stress below zero after the first cycle of a history for the zero of the stress.
+
+    A specimen that is pressed a little before its first contact and is free after it shows its zero
+    there.
+    """
+    if cycle.last is None:
+        return record
+    rest = _stress_between(record, cycles, cycle.place)
+    zero, error = float(np.median(rest)), float(np.std(rest)) / float(np.sqrt(rest.size))
+    if zero > -_SURE * error:
+        return record
+    origins = record.origins | {"stress_zero": record.origins.get("stress_zero", 0.0) + zero}
+    errors, stress = record.zeros | {"stress": error}, record.stress - zero
+    return replace(record, stress=stress, origins=origins, zeros=errors).noted(
+        f"The stress between the first two cycles, {engineering(zero, 'Pa')}, is taken off as the "
+        "sensor's offset: without contact the specimen bears none."
+    )
+
+
+def _stress_between(record: Record, cycles: list[Cycle], place: int) -> Array:
+    """Stresses at the lowest displacements between the peaks of a cycle and of the next one."""
+    w, between = record.displacement, slice(cycles[place].top, cycles[place + 1].top)
+    assert w is not None  # it has cycles
+    lowest = w[between] <= w[between].min() + _LOWEST * np.ptp(w)
+    return np.asarray(record.stress[between][lowest])
 
 
 def _hinge(w: Array, stress: Array) -> float:
@@ -232,7 +257,7 @@ def _hinge(w: Array, stress: Array) -> float:
     return float(places[int(np.argmin(left))])
 
 
-def find_turns(values: Array, back: float | None = None) -> NDArray[np.int64]:
+def find_turns(values: Array, back: float | None = None) -> Integers:
     """Samples at which a motion turns round: peaks and valleys by turns, the first a peak.
 
     Only what goes back by more than `back`, by default a twentieth of the range and more than the
@@ -240,22 +265,14 @@ def find_turns(values: Array, back: float | None = None) -> NDArray[np.int64]:
     """
     if back is None:
         back = max(_TURN * float(np.ptp(values)), 8.0 * noise_level(values))
-    # The extremes of short blocks are all that counts.
-    block = max(1, len(values) // 20_000)
-    parts = values[: len(values) // block * block].reshape(-1, block)
-    first, rest = np.arange(len(parts)) * block, np.arange(parts.size, len(values))
-    at = np.unique(
-        np.concatenate([first + parts.argmin(axis=1), first + parts.argmax(axis=1), rest])
-    )
-    turns: list[int] = []
-    up, best = True, int(at[0])
-    for i, value in zip(at.tolist(), values[at].tolist(), strict=True):
-        ahead = value - values[best] if up else values[best] - value
+    turns, up, best, most = list[int](), True, 0, float(values[0])
+    for i, value in enumerate(values.tolist()):
+        ahead = value - most if up else most - value
         if ahead > 0.0:
-            best = i
+            best, most = i, value
         elif ahead < -back:
             turns.append(best)
-            up, best = not up, i
+            up, best, most = not up, i, value
     if up or not turns:  # the record ends on its way up
         turns.append(best)
     return np.array(turns, dtype=np.int64)

@@ -75,8 +75,7 @@ def _given(test: Measurement) -> list[tuple[str, list[str]]]:
         sigma = scale * spread.get(name, 0.0)
         return engineering(scale * value, unit) + (f" ± {engineering(sigma, unit)}" * bool(sigma))
 
-    area = f"{s.area * 1e6:.4g}"
-    area += f" ± {spread['area'] * 1e6:.2g}" if "area" in spread else ""
+    area = f"{s.area * 1e6:.4g}" + (f" ± {spread['area'] * 1e6:.2g}" if "area" in spread else "")
     specimen = f"height {given(s.height, 'm', 'height')}, area {area} mm²"
     if s.mass:
         density = s.mass / (s.area * s.height)
@@ -86,12 +85,10 @@ def _given(test: Measurement) -> list[tuple[str, list[str]]]:
         specimen += f", springs from the base {' + '.join(springs)}"
     if striker is None:
         return [("specimen", [specimen]), ("striker", ["none given"])]
-    mass, velocity = "mass unknown", "velocity unknown"
-    if striker.mass:
-        mass = given(striker.mass, "g", "striker_mass", 1e3)
-    if striker.velocity:
-        own = f" ± {spread['velocity']:.2g}" if "velocity" in spread else ""
-        velocity = f"{striker.velocity:.4g}{own} m/s" + ", falling" * bool(striker.gravity)
+    own = f" ± {spread['velocity']:.2g}" if "velocity" in spread else ""
+    own += " m/s" + ", falling" * bool(striker.gravity)
+    velocity = f"{striker.velocity:.4g}{own}" if striker.velocity else "velocity unknown"
+    mass = given(striker.mass, "g", "striker_mass", 1e3) if striker.mass else "mass unknown"
     return [("specimen", [specimen]), ("striker", [f"{mass}, {velocity}"])]
 
 

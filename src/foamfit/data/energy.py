@@ -22,20 +22,18 @@ class EnergyAudit:
 
     Attributes
     ----------
-    striker_energy : float or None
+    striker_energy
         Kinetic energy of the striker at contact per volume of foam, J/m³.
-    absorbed_energy, dissipated_energy : float or None
+    absorbed_energy, dissipated_energy
         ∫σ dε up to the largest strain, and over the whole history, J/m³.
-    dissipated_fraction, absorbed_over_striker : float or None
+    dissipated_fraction, absorbed_over_striker
         Dissipated over absorbed energy, and absorbed over the striker's energy.
-    rebound_velocity : float or None
+    rebound_velocity
         Velocity with which the top leaves, m/s, positive away from the specimen.
-    impulse, momentum_change, impulse_ratio : float or None
+    impulse, momentum_change, impulse_ratio
         ∫F dt over contact and m (v_in + v_out), N·s, and the first over the second.
-    motion : str or None
-        Where the displacement came from.
-    missing : tuple of str
-        What could not be computed and what it would need, one sentence each.
+    motion, missing
+        Where the displacement came from; a sentence for each thing that could not be computed.
     """
 
     striker_energy: float | None = None
@@ -52,8 +50,8 @@ class EnergyAudit:
 
     def as_dict(self) -> dict[str, float | str | None]:
         """Return the audit as plain values; `missing` and `warnings` are joined to one text."""
-        values: dict[str, float | str | None] = asdict(self)
-        return values | {"missing": " ".join(self.missing), "warnings": " ".join(self.warnings())}
+        told = {"missing": " ".join(self.missing), "warnings": " ".join(self.warnings())}
+        return asdict(self) | told
 
     def warnings(self) -> list[str]:
         """Return one sentence for each balance that does not close."""
@@ -91,16 +89,15 @@ class EnergyAudit:
 
     def sentences(self) -> list[str]:
         """Return what was found, what does not close, and what is missing."""
-        brought, taken, lost = (
-            None if value is None else engineering(value, "J/m³")
-            for value in (self.striker_energy, self.absorbed_energy, self.dissipated_energy)
-        )
         ratio, share, told = self.absorbed_over_striker, self.dissipated_fraction, list[str]()
-        told += [f"The striker brings {brought}."] * (brought is not None)
-        if taken is not None:
+        if self.striker_energy is not None:
+            told.append(f"The striker brings {engineering(self.striker_energy, 'J/m³')}.")
+        if self.absorbed_energy is not None:
             more = "" if ratio is None else f", {ratio:.2f} of what the striker brings"
+            taken = engineering(self.absorbed_energy, "J/m³")
             told.append(f"The foam absorbs {taken} up to the largest strain{more}.")
-        if share is not None:
+        if self.dissipated_energy is not None and share is not None:
+            lost = engineering(self.dissipated_energy, "J/m³")
             told.append(f"It dissipates {lost}, {percent(share)} of that.")
         if self.rebound_velocity is not None:
             told.append(f"The striker leaves at {self.rebound_velocity:.3g} m/s.")
@@ -112,15 +109,11 @@ class EnergyAudit:
         return [*told, *self.warnings(), *self.missing]
 
 
-def audit(measurement: Measurement) -> EnergyAudit:
-    """Compare what the striker brings with what the specimen takes.
-
-    Whatever a test lacks is left None and named in `missing`.
-    """
-    test, missing = measurement, list[str]()
-    striker, specimen = test.striker or Striker(), test.specimen
+def audit(test: Measurement) -> EnergyAudit:
+    """Compare what the striker brings with what the specimen takes; name what a test lacks."""
+    striker, specimen, missing = test.striker or Striker(), test.specimen, list[str]()
     stress, w, time = test.stress, test.displacement, test.time
-    brought = absorbed = dissipated = rebound = impulse = change = None
+    brought = absorbed = dissipated = None
     if striker.mass and striker.velocity:
         brought = striker.mass * striker.velocity**2 / (2 * specimen.area * specimen.height)
     else:
@@ -134,25 +127,15 @@ def audit(measurement: Measurement) -> EnergyAudit:
         absorbed = before + float(np.trapezoid(stress[: top + 1], strain[: top + 1]))
         # The sum ends at a noisy strain, where the stress is highest; the true end is the turn.
         absorbed += float(stress[top]) * (largest / specimen.height - float(strain[top]))
-        if brought is not None and striker.mass and striker.gravity:
-            weight = striker.mass * striker.gravity
+        if brought is not None and striker.mass:
+            weight = striker.mass * (striker.gravity or 0.0)
             brought += weight * largest / (specimen.area * specimen.height)
         dissipated = before + float(np.trapezoid(stress, strain)) if unloaded else None
     if absorbed is None:
         missing.append("The absorbed energy needs stress and displacement.")
     elif dissipated is None:
         missing.append("The dissipated energy needs the unloading.")
-    if test.striker is not None and time is not None and stress is not None:
-        lead = 0.5 * stress[0] * max(time[0], 0.0)
-        impulse = specimen.area * float(np.trapezoid(stress, time) + lead)
-        if w is not None and unloaded:
-            # A gauge that rests again after contact does not show the striker any more.
-            shown = np.flatnonzero(test.sampled.get("displacement", np.ones(len(w), dtype=bool)))
-            last = shown[-max(5, len(shown) // 20) :]
-            rebound = -line_at(time[last], w[last], time[last[-1]])[1]
-            if striker.mass and striker.velocity and test.motion != INTEGRATED:
-                fall = (striker.gravity or 0.0) * float(time[-1])
-                change = striker.mass * (striker.velocity + rebound + fall)
+    impulse, rebound, change = _momentum(test, unloaded)
     if test.motion == INTEGRATED:
         missing.append("The motion comes from the force, so the balances check nothing here.")
     elif change is None:
@@ -170,6 +153,28 @@ def audit(measurement: Measurement) -> EnergyAudit:
         motion=test.motion,
         missing=tuple(missing),
     )
+
+
+def _momentum(test: Measurement, unloaded: bool) -> tuple[float | None, float | None, float | None]:
+    """Impulse of the force, N·s, velocity of the rebound, m/s, and the change of momentum, N·s.
+
+    The change is what force and motion must agree in; the weight of a falling striker adds to it.
+    """
+    striker, stress, w, time = test.striker, test.stress, test.displacement, test.time
+    if striker is None or time is None or stress is None:
+        return None, None, None
+    lead = 0.5 * stress[0] * max(time[0], 0.0)
+    impulse = test.specimen.area * float(np.trapezoid(stress, time) + lead)
+    if w is None or not unloaded:
+        return impulse, None, None
+    # A gauge that rests again after contact does not show the striker any more.
+    shown = np.flatnonzero(test.sampled.get("displacement", np.ones(len(w), dtype=bool)))
+    last = shown[-max(5, len(shown) // 20) :]
+    rebound = -line_at(time[last], w[last], time[last[-1]])[1]
+    if not (striker.mass and striker.velocity) or test.motion == INTEGRATED:
+        return impulse, rebound, None
+    fall = (striker.gravity or 0.0) * float(time[-1])
+    return impulse, rebound, striker.mass * (striker.velocity + rebound + fall)
 
 
 def largest_motion(displacement: Array, time: Array | None = None) -> tuple[int, float]:

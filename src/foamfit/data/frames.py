@@ -1,7 +1,7 @@
 """A motion that was recorded with a clock of its own, put on the clock of the force.
 
-Where it is the slower one, as that of a camera, the channel is interpolated, and only the samples
-that have a frame count as measured: `Record.sampled`.
+If it has fewer samples, like that of a camera, it is interpolated, and only the samples of the
+force that have a frame count as measured: `Record.sampled`.
 """
 
 from __future__ import annotations
@@ -11,24 +11,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Integers, Mask, means
 from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Record
 from foamfit.data.noise import averaged
 from foamfit.data.outliers import find_outliers
 from foamfit.errors import InputError
 from foamfit.text import counted, engineering
 
-_FEW = 8  # frames through which straight lines are drawn, not a spline
-_SEVERAL = 2.0  # frames of a block, usually, that are averaged
-_PAUSE = 6.0  # usual steps of time that are a pause, across which the line is straight, too
+_FEW = 8  # with fewer frames, straight lines are drawn and no spline
+_SEVERAL = 2.0  # usual number of frames in a block from which on they are averaged
+_PAUSE = 6.0  # usual steps of time that make a pause, across which the line is straight too
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
     """Motion of a file of its own: time, s, by its own clock, and displacements, m, by channel.
 
-    A frame was taken at its time + `delay` (s) by the clock of the force; the delay is known up to
-    a standard deviation `spread`, or exactly where that is None.
+    A frame was taken at its time + `delay` (s) by the clock of the force; `spread` is the standard
+    deviation of the delay, None if it is exact.
     """
 
     name: str
@@ -49,13 +49,13 @@ class Frames:
         )
 
 
-def join(record: Record, frames: Frames) -> tuple[Record, list[str]]:
+def join(record: Record, frames: Frames) -> Record:
     """Give a record of a force the motion of frames that have a clock of their own.
 
-    Where frames are the rarer ones, a cubic spline through them gives the motion at every sample;
-    only the sample nearest to a frame counts as measured. Else they are averaged or interpolated
-    for each sample, and all count. Spikes and samples outside of the frames' time are left out.
-    InputError if the two do not overlap in time, or the delay is longer than both.
+    If there are fewer frames than samples, a cubic spline through them gives the motion at every
+    sample; only the sample nearest to a frame counts as measured. Otherwise they are averaged or
+    interpolated for each sample, and all count. Spikes and samples outside the time of the frames
+    are left out. InputError if the two do not overlap in time, or the delay is longer than both.
     """
     time = record.time
     assert time is not None  # a force without it is refused
@@ -67,7 +67,7 @@ def join(record: Record, frames: Frames) -> tuple[Record, list[str]]:
                 f"{engineering(float(longest), 's')}; it must be shorter."
             )
     at = frames.time + frames.delay
-    slack = 1e-9 * longest  # of rounding
+    slack = 1e-9 * longest  # for rounding
     outside = (time < at[0] - slack) | (time > at[-1] + slack)
     there = (at >= time[0] - slack) & (at <= time[-1] + slack)
     count = int(np.count_nonzero(~outside))
@@ -79,31 +79,29 @@ def join(record: Record, frames: Frames) -> tuple[Record, list[str]]:
             f"[motion] {frames.name} {shared}: that is from {spans[0]}, the motion with its delay "
             f"from {spans[1]}."
         )
-    record = record.without(outside, f"outside the time of {frames.name}")
+    record = record.without(outside, f"outside the time of {frames.name}").noted(str(frames))
     time = record.instants
-    notes = [str(frames)]
-    if frames.time.size > there.sum():
-        lost = counted(int(frames.time.size - there.sum()), "frame")
-        notes.append(f"{lost} of {frames.name} outside the time of the force.")
+    if lost := int(np.count_nonzero(~there)):
+        told = f"{counted(lost, 'frame')} of {frames.name} outside the time of the force."
+        record = record.noted(told)
     slower = np.median(np.diff(at)) > 1.001 * np.median(np.diff(time))
     for channel, values in frames.motion.items():
         good = ~find_outliers(values, at)
         if not good.all():
             which = ", ".join(engineering(float(t), "s") for t in frames.time[~good][:4])
             out = f"{counted(int(np.sum(~good)), 'frame')} of the {channel} stood out and"
-            notes.append(f"Check: {out} are not used, the first by its clock: {which}.")
-        if slower:
-            record = record.changed(channel, _through(at[good], values[good], time))
-            taken = np.zeros(time.size, dtype=bool)
-            taken[_nearest(time, at[good & there])] = True
-            record = replace(record, sampled=record.sampled | {channel: taken})
-            notes.append(
-                f"{int(taken.sum())} of {time.size} samples have a frame of the {channel}; between "
-                "them it is interpolated and does not count as measured."
-            )
-        else:
+            record = record.noted(f"Check: {out} are not used, the first by its clock: {which}.")
+        if not slower:
             record = record.changed(channel, _averaged(at[good], values[good], time))
-    return record, notes
+            continue
+        record = record.changed(channel, _through(at[good], values[good], time))
+        taken = np.zeros(time.size, dtype=bool)
+        taken[_nearest(time, at[good & there])] = True
+        record = replace(record, sampled=record.sampled | {channel: taken}).noted(
+            f"{int(taken.sum())} of {time.size} samples have a frame of the {channel}; between "
+            "them it is interpolated and does not count as measured."
+        )
+    return record
 
 
 def _nearest(time: Array, at: Array) -> NDArray[np.intp]:
@@ -130,18 +128,17 @@ def _averaged(at: Array, values: Array, time: Array) -> Array:
         near = (at >= time[0] - step[0]) & (at <= time[-1] + step[1])
         place = _nearest(time, at[near])
         starts = np.append(0, np.flatnonzero(np.diff(place)) + 1)
-        counts = np.diff(np.append(starts, place.size))
-        at, values = (np.add.reduceat(x[near], starts) / counts for x in (at, values))
+        at, values = (means(x[near], starts) for x in (at, values))
     return _through(at, values, time)
 
 
-def frames_of_blocks(record: Record, thinned: Record, edges: NDArray[np.int64]) -> Record:
+def frames_of_blocks(record: Record, thinned: Record, edges: Integers) -> Record:
     """Put channels that were not taken at every sample into the blocks that begin at `edges`.
 
-    The value of a block is interpolated at its time, so that no average bends it, or, where each
-    block has several frames, averaged.
+    The value of a block is interpolated at its time, as averages over a curve are biased, or
+    averaged where each block has several frames.
     """
-    middle = np.add.reduceat(record.instants, edges) / np.diff(np.append(edges, len(record)))
+    middle = means(record.instants, edges)
     for name, taken in record.sampled.items():
         values = record.channel(name)
         if values is None:
@@ -156,11 +153,9 @@ def frames_of_blocks(record: Record, thinned: Record, edges: NDArray[np.int64]) 
     return thinned
 
 
-def noise_of_blocks(level: NoiseLevel, block: int, taken: NDArray[np.bool_] | None) -> NoiseLevel:
+def noise_of_blocks(level: NoiseLevel, block: int, taken: Mask | None) -> NoiseLevel:
     """Noise of blocks of samples, some of which were `taken`; see `frames_of_blocks`."""
-    if taken is None:
-        return averaged(level, block)
-    many = np.add.reduceat(taken.astype(np.int64), np.arange(0, taken.size, block))
-    if float(np.median(many)) >= _SEVERAL:
+    edges = np.arange(0, 0 if taken is None else taken.size, block)
+    if taken is None or np.median(np.add.reduceat(taken.astype(np.int64), edges)) >= _SEVERAL:
         return averaged(level, block)
     return replace(level, time=max(level.time * float(taken.mean()), 1.0))

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Integers, Mask
 from foamfit.text import engineering
 
 MIN_ROWS = 10  # samples of a test
@@ -79,12 +78,10 @@ class Noise:
     estimated: dict[str, NoiseLevel] = field(default_factory=dict)
 
     def of(self, channel: str) -> NoiseLevel | None:
-        """Return the noise of a channel, stated or else estimated; None where neither is known."""
-        given = self.displacement if channel.startswith("displacement") else self.stress
-        given = None if channel == "acceleration" else given
-        if given is not None:
-            return NoiseLevel(given, True, "given")
-        return self.estimated.get(channel)
+        """Return the noise of a channel, stated or else estimated; None if neither is known."""
+        stated = {"stress": self.stress, "acceleration": None}
+        given = stated.get(channel, self.displacement)
+        return self.estimated.get(channel) if given is None else NoiseLevel(given, True, "given")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,27 +92,10 @@ class Outliers:
     times (k,), s, or samples. The force is clipped at `clipped_at`, Pa.
     """
 
-    left_out: NDArray[np.bool_]
+    left_out: Mask
     at: Array
     values: Array
     clipped_at: float | None = None
-
-
-@dataclass(frozen=True)
-class Standstill:
-    """Rows of the file, `first` to `last`, in which the gauge stood still before it jumped.
-
-    Meanwhile the stress changed by the share `change`; the jump is in m.
-    """
-
-    first: int
-    last: int
-    change: float
-    jump: float
-
-    def among(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of the rows with these numbers are in the stretch."""
-        return (rows >= self.first) & (rows <= self.last)
 
 
 @dataclass(frozen=True)
@@ -128,7 +108,7 @@ class Dropped:
     why: str
 
     @classmethod
-    def of(cls, rows: NDArray[np.int64], why: str) -> Dropped:
+    def of(cls, rows: Integers, why: str) -> Dropped:
         """Count the rows with these numbers."""
         return cls(rows.size, int(rows[0]), int(rows[-1]), why)
 
@@ -173,9 +153,10 @@ class Record:
 
     Time, s, stress, Pa, displacement, m, velocity, m/s, and deceleration of the top, m/s² (positive
     in compression), and displacements of masses inside, m, by their number. `excess` is what the
-    file has beyond the straight line that bridges outliers, 0 elsewhere. `clipped` marks samples of
-    a clipped force. `cycle` is what a column of cycle numbers says; `numbers` are the rows in the
-    file (None: from 1). `sampled`, `derived` and `braked` are those of `Measurement`.
+    file has beyond the straight line that bridges outliers, 0 elsewhere; `clipped` marks samples of
+    a clipped force; `standstills` those in which the gauge stood still, each with the sentence on
+    it. `cycle` is what a column of cycle numbers says, `numbers` are the rows in the file (None:
+    from 1). The others are those of `Measurement`.
     """
 
     time: Array | None
@@ -185,21 +166,25 @@ class Record:
     acceleration: Array | None = None
     interior: dict[int, Array] = field(default_factory=dict)
     excess: dict[str, Array] = field(default_factory=dict)
-    clipped: NDArray[np.bool_] | None = None
+    clipped: Mask | None = None
     cycle: Array | None = None
-    numbers: NDArray[np.int64] | None = None
+    numbers: Integers | None = None
     dropped: tuple[Dropped, ...] = ()
-    sampled: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
-    standstills: tuple[Standstill, ...] = ()
+    sampled: dict[str, Mask] = field(default_factory=dict)
+    standstills: dict[str, Mask] = field(default_factory=dict)
     derived: tuple[str, ...] = ()
     braked: bool = False
+    motion: str = MEASURED
+    notes: tuple[str, ...] = ()
+    zeros: dict[str, float] = field(default_factory=dict)
+    origins: dict[str, float] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Count the samples."""
         return len(self.stress)
 
     @property
-    def row_numbers(self) -> NDArray[np.int64]:
+    def row_numbers(self) -> Integers:
         """Row number in the file of each sample, shape (n,)."""
         return np.arange(1, len(self) + 1) if self.numbers is None else self.numbers
 
@@ -209,18 +194,17 @@ class Record:
         return np.arange(len(self), dtype=np.float64) if self.time is None else self.time
 
     @property
-    def stood_still(self) -> NDArray[np.bool_]:
+    def stood_still(self) -> Mask:
         """Samples at which the gauge stood still, shape (n,)."""
-        still = np.zeros(len(self), dtype=bool)
-        for one in self.standstills:
-            still |= one.among(self.row_numbers)
+        none = np.zeros(len(self), dtype=bool)
+        still: Mask = np.logical_or.reduce([none, *self.standstills.values()])
         return still
 
     def curves(self, *more: str) -> dict[str, Array]:
         """Stress, displacement, `more` and displacements inside, as far as they are there."""
-        names = ("stress", "displacement", *more, *map(interior_channel, self.interior))
-        found = {name: self.channel(name) for name in names}
-        return {name: values for name, values in found.items() if values is not None}
+        names = ("stress", "displacement", *more)
+        found = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return found | {interior_channel(node): values for node, values in self.interior.items()}
 
     def channel(self, name: str) -> Array | None:
         """Return a channel by its name; "displacement_1" is the mass inside above spring 1."""
@@ -235,26 +219,27 @@ class Record:
             return replace(self, **{name: values})  # type: ignore[arg-type]
         return replace(self, interior=self.interior | {node: values})
 
-    def rows(self, which: slice | NDArray[np.bool_]) -> Record:
-        """Keep some rows of every channel; those that `without` leaves out are counted, too."""
-        kept: dict[str, Any] = {}
-        for item in fields(self):
-            values = getattr(self, item.name)
-            if isinstance(values, dict):
-                kept[item.name] = {key: v[which] for key, v in values.items()}
-            elif isinstance(values, np.ndarray):
-                kept[item.name] = values[which]
-        return replace(self, **kept)
+    def noted(self, *notes: str) -> Record:
+        """Add sentences to what was done."""
+        return replace(self, notes=(*self.notes, *notes))
 
-    def without(self, gone: slice | NDArray[np.bool_], why: str) -> Record:
+    def rows(self, which: slice | Mask) -> Record:
+        """Keep some rows of every channel; those that `without` leaves out are counted, too."""
+
+        def part(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {key: part(one) for key, one in value.items()}
+            return value[which] if isinstance(value, np.ndarray) else value
+
+        return replace(self, **{item.name: part(getattr(self, item.name)) for item in fields(self)})
+
+    def without(self, gone: slice | Mask, why: str) -> Record:
         """Leave out some rows of every channel, and count them with the reason."""
-        numbers = self.row_numbers
-        lost = numbers[gone]
-        if not lost.size:
-            return self
-        kept = np.ones(len(self), dtype=bool)
+        numbers, kept = self.row_numbers, np.ones(len(self), dtype=bool)
         kept[gone] = False
-        dropped = (*self.dropped, Dropped.of(lost, why))
+        if kept.all():
+            return self
+        dropped = (*self.dropped, Dropped.of(numbers[~kept], why))
         return replace(self, numbers=numbers, dropped=dropped).rows(kept)
 
     def between(self, first: int, end: int, before: str, after: str) -> Record:
@@ -270,49 +255,46 @@ class Measurement:
     ----------
     name, path, data_sha256
         Its name, its file (None if from none) and the digest of that.
-    time, stress, displacement : (n,) array or None
-        s, increasing; nominal base stress, Pa; displacement of the top, m.
+    time, stress, displacement, acceleration : (n,) array or None
+        s, increasing; nominal base stress, Pa; displacement of the top, m; deceleration of the
+        striker, m/s², where an impact has it and no displacement.
     specimen, striker, noise
         What the TOML says, and the noise that was estimated.
-    motion : str or None
+    motion
         Where the displacement came from: "measured", "integrated from force", …
-    notes : tuple of str
+    notes
         A sentence for each thing that was done or could not be done.
-    interior : dict of int to (n,) array
+    interior
         Displacements of the masses inside, m: 1 is the one above spring 1.
-    outliers : dict of str to Outliers
-        By channel.
-    contact : str
+    outliers, sampled
+        By channel: samples left out, and those that count as measured, where not all do; others
+        are interpolated.
+    contact
         What set time zero: "stress" (then the displacement is zero there too), "motion" or "file".
-    count : RowCount or None
-        Rows of the file.
-    cycle, cycles
-        Number of the cycle that is used, and of all in the record.
-    last_cycle : int or None
-        Number of the last one of several that are used as one history.
-    start_strain : float
+    count
+        Rows of the file, None without one.
+    cycle, cycles, last_cycle
+        Number of the cycle that is used, of all in the record, and of the last one of several that
+        are used as one history.
+    start_strain
         Strain at which the contact of a later cycle starts, from the first contact; taken off.
-    sampled : dict of str to (n,) bool array
-        Samples of a channel that count as measured, where not all do; others are interpolated.
-    zeros, origins : dict of str to float
+    zeros, origins
         Standard error of the zero of a channel where samples show it; and what was taken off:
         "contact_time", s, "stress_zero", Pa, "acceleration_zero", m/s², "displacement_zero", m.
-    acceleration : (n,) array or None
-        Deceleration of the striker, m/s², where an impact has it and no displacement.
-    derived : tuple of str
+    derived
         Channels that were computed from others and are no measurement of their own.
-    braked : bool
+    braked
         Whether the stress is the striker's mass over the area times its deceleration.
-    block : int
+    block
         Rows of the file that are averaged in each sample.
-    uncertainties : dict of str to float
+    uncertainties
         Standard deviations that the TOML states: "height", "height_1", … (m), "area" (m²),
         "specimen_mass", "striker_mass" (kg), "velocity" (m/s), "delay" (s) of a motion with its own
         clock, and of scales, as a share: "stress_scale", "displacement_scale", ….
-    priors : dict of str to str
-        What the TOML says of parameters before the fit, like "5.5 ± 0.1 MPa".
     standstills
         First and last time, s (or sample), of each stretch in which the gauge stood still.
+    priors
+        What the TOML says of parameters before the fit, like "5.5 ± 0.1 MPa".
     """
 
     name: str
@@ -334,7 +316,7 @@ class Measurement:
     cycles: tuple[int, ...] = (1,)
     last_cycle: int | None = None
     start_strain: float = 0.0
-    sampled: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    sampled: dict[str, Mask] = field(default_factory=dict)
     zeros: dict[str, float] = field(default_factory=dict)
     origins: dict[str, float] = field(default_factory=dict)
     acceleration: Array | None = None
@@ -359,7 +341,6 @@ class Measurement:
 
     def channels(self) -> dict[str, Array]:
         """Stress, displacement, acceleration and displacements inside, as far as they are there."""
-        found = {"stress": self.stress, "displacement": self.displacement}
-        found["acceleration"] = self.acceleration
-        found |= {interior_channel(node): values for node, values in self.interior.items()}
-        return {name: values for name, values in found.items() if values is not None}
+        names = ("stress", "displacement", "acceleration")
+        found = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return found | {interior_channel(node): values for node, values in self.interior.items()}

@@ -1,11 +1,10 @@
 """The motion behind a noisy displacement, smooth between its turns, and how sure it is.
 
-A penalised spline with kinks goes through the samples; the likelihood says how many and where. The
-spline is of the fifth degree, and the square of its third derivative is penalised: what is free is
-a parabola. A kink a (x − s)+ is a jump of the velocity; neither its height nor its instant is
-penalised. Penalty and number of kinks are those of the largest marginal likelihood, in which the
-spline is a random function and each kink has a price; the final penalty is that of the restricted
-likelihood (REML).
+A penalised spline of the fifth degree with kinks goes through the samples; the square of its third
+derivative is penalised. A kink a (x − s)+ is a jump of the velocity; neither its height nor its
+instant is penalised. Penalty and number of kinks are those of the largest marginal likelihood, in
+which the spline is a random function and each kink has a price; the final penalty is that of the
+restricted likelihood (REML).
 """
 
 from __future__ import annotations
@@ -15,12 +14,11 @@ from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 from scipy.interpolate import BSpline, PPoly
 from scipy.special import ndtr
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Integers, Mask
 from foamfit.data.cycles import find_turns
 from foamfit.data.measurement import NoiseLevel
 from foamfit.data.noise import quantum, residual_noise
@@ -48,7 +46,7 @@ class _Samples:
     """Samples (n,) in units of record and noise, and a basis (n, b) in which all is diagonal.
 
     A rotation takes the spline's coefficients to coordinates b, of which the fit has the normal
-    equations `data` and the penalty `rough`.
+    equations `data`, the penalty `rough` and the right side `y_onto`.
     """
 
     x: Array
@@ -58,6 +56,7 @@ class _Samples:
     basis: Array
     data: Array
     rough: Array
+    y_onto: Array
 
     @classmethod
     def of(cls, x: Array, y: Array, pieces: int) -> _Samples:
@@ -74,13 +73,10 @@ class _Samples:
         little = 1e-9 * np.trace(gram) / np.trace(penalty)  # for pieces without samples
         rough, rotation = linalg.eigh(penalty, gram + little * penalty)
         rough[:_ORDER] = 0.0
-        return cls(x, y, knots, rotation, basis @ rotation, 1.0 - little * rough, rough)
+        basis, data = basis @ rotation, 1.0 - little * rough
+        return cls(x, y, knots, rotation, basis, data, rough, basis.T @ y)
 
     @cached_property
-    def y_onto(self) -> Array:
-        return np.asarray(self.basis.T @ self.y)
-
-    @property
     def price(self) -> float:
         """What a kink, two unknowns, has to add to twice the log-likelihood (BIC)."""
         return 2.0 * float(np.log(self.x.size))
@@ -97,26 +93,13 @@ def _kinks(x: Array, instants: Array) -> Array:
     return np.maximum(x[:, None] - instants, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
 class _Fit:
     """Normal equations of a spline and columns (n, k) beside it, by default those of kinks."""
 
-    samples: _Samples
-    instants: Array
-    beside: Array | None = None
-
-    @cached_property
-    def columns(self) -> Array:
-        kinks = _kinks(self.samples.x, self.instants)
-        return kinks if self.beside is None else self.beside
-
-    @cached_property
-    def onto(self) -> Array:
-        return np.asarray(self.samples.basis.T @ self.columns)
-
-    @cached_property
-    def gram(self) -> Array:
-        return np.asarray(self.columns.T @ self.columns)
+    def __init__(self, samples: _Samples, instants: Array, columns: Array | None = None) -> None:
+        self.samples, self.instants = samples, instants
+        self.columns = _kinks(samples.x, instants) if columns is None else columns
+        self.onto, self.gram = samples.basis.T @ self.columns, self.columns.T @ self.columns
 
     def reduced(self, penalties: Array) -> tuple[Array, Array, Array]:
         """Weights (p, b) of the spline's coordinates, and equations of the columns without it.
@@ -151,11 +134,10 @@ class _Fit:
         dof = float((s.data / (s.data + penalty * s.rough)).sum()) + 2.0 * self.instants.size
         return float(np.sqrt(residual @ residual / max(s.x.size - dof, 1.0)))
 
-    @cached_property
+    @property
     def apart(self) -> bool:
         """Whether there are samples between any two kinks: without, there is no telling them."""
-        cells = np.searchsorted(self.samples.x, self.instants)
-        return bool(np.all(np.diff(cells) > 0))
+        return bool(np.all(np.diff(np.searchsorted(self.samples.x, self.instants)) > 0))
 
     @cached_property
     def best(self) -> tuple[float, float]:
@@ -195,15 +177,15 @@ class _Fit:
         return fit
 
     def settled(self, penalty: float) -> _Fit:
+        """Move the kinks at a stiff spline first, then at the best penalty."""
         fit = self.refined(_STIFF * penalty, 4)
         return fit.refined(fit.best[1], 6)
 
     def covariance(self, penalty: float, share: float) -> tuple[Array, Array, float]:
-        """What stays uncertain of the spline's coordinates, of the kinks' jumps and instants.
+        """Uncertainty of the spline's coordinates and of the kinks' jumps and instants.
 
-        Returns changes by one standard deviation each (unknowns, m), the largest first, so many
-        that they hold a share of the variance at the samples; the standard errors of the instants;
-        the effective number of parameters.
+        Returns changes by one standard deviation each (unknowns, m), the largest first, which hold
+        a share of the variance at the samples; standard errors of the instants; parameters in use.
         """
         s, k, size = self.samples, self.instants.size, self.samples.rough.size
         jumps, late = self.solve(penalty)[1], s.x[:, None] - self.instants
@@ -297,9 +279,8 @@ def _fitted(x: Array, y: Array, pieces: int) -> tuple[_Fit, float]:
 class _Modes:
     """Changes of the motion by one standard deviation each, by parts x of the record's duration.
 
-    They are those of the `spline`, of the `jumps` (k, m) of the velocity at the kinks, and of the
-    `instants` (k, m) of these. `kinks` (4, k) holds instants, their standard errors, jumps, and the
-    velocities before them.
+    They are those of the `spline`, and of the `jumps` (k, m) and `instants` (k, m) of its kinks.
+    `kinks` (4, k) holds instants, their standard errors, jumps, and the velocities before them.
     """
 
     spline: BSpline
@@ -339,8 +320,9 @@ class SmoothMotion:
 
     def at(self, times: Array) -> Array:
         """Displacement (m) at times inside the record; monotone between two turns."""
-        inside = self._part(times)
-        past = (np.asarray(times, float) - self._start) / self._duration - inside
+        part = (times - self._start) / self._duration
+        inside = np.clip(part, 0.0, 1.0)
+        past = part - inside
         ends = self._curve(np.array([0.0, 1.0]), 1)  # it goes straight on past what was measured
         return np.asarray(self._curve(inside) + past * np.where(past < 0.0, ends[0], ends[1]))
 
@@ -350,17 +332,11 @@ class SmoothMotion:
         The covariance of the motion at these times is `modes @ modes.T`. At a turn itself they are
         the changes of its height, wherever its instant moves to.
         """
-        return self._modes(self._part(times))
-
-    def _part(self, times: Array) -> Array:
-        return np.clip((np.asarray(times, float) - self._start) / self._duration, 0.0, 1.0)
+        return self._modes(np.clip((times - self._start) / self._duration, 0.0, 1.0))
 
 
 def follow(
-    time: Array | None,
-    displacement: Array,
-    noise: NoiseLevel,
-    counts: NDArray[np.bool_] | None = None,
+    time: Array | None, displacement: Array, noise: NoiseLevel, counts: Mask | None = None
 ) -> SmoothMotion:
     """Find the motion behind a displacement (n,), m, at times (n,), s, or samples.
 
@@ -368,23 +344,17 @@ def follow(
     data contradict, is estimated again from what the motion leaves. Motions found are kept: every
     model of a record, and every resampling of its other curves, goes by the same one.
     """
-    raw = (None if given is None else given.tobytes() for given in (time, displacement, counts))
-    return _found(*raw, noise)
+    times = np.arange(displacement.size, dtype=float) if time is None else time
+    taken = slice(None) if counts is None else counts
+    return _found(times[taken].tobytes(), displacement[taken].tobytes(), noise)
 
 
 @lru_cache(maxsize=32)
-def _found(
-    raw_time: bytes | None, raw_displacement: bytes, raw_counts: bytes | None, noise: NoiseLevel
-) -> SmoothMotion:
+def _found(raw_times: bytes, raw_motion: bytes, noise: NoiseLevel) -> SmoothMotion:
     """Find the motion from the bytes of the arrays of `follow`."""
-    displacement = np.frombuffer(raw_displacement)
-    time = None if raw_time is None else np.frombuffer(raw_time)
-    counts = None if raw_counts is None else np.frombuffer(raw_counts, bool)
-    taken = np.ones(displacement.size, bool) if counts is None else counts
-    times = np.arange(displacement.size, dtype=float) if time is None else time
-    own, w = times[taken], displacement[taken]
-    start, duration = float(own[0]), float(np.ptp(own))
-    x = (own - start) / duration
+    times, w = np.frombuffer(raw_times), np.frombuffer(raw_motion)
+    start, duration = float(times[0]), float(np.ptp(times))
+    x = (times - start) / duration
     middle, size = float(np.mean(w)), max(float(np.ptp(w)), 1e-300)
     pieces, finest = max(4, min(x.size // _PIECE, _PIECES)), min(_MANY, x.size // 2)
     slow, shown, digital = np.sqrt(max(noise.time, 1.0)), residual_noise(w)[0], quantum(w) / 12**0.5
@@ -394,7 +364,7 @@ def _found(
         sigma = noise.sigma
     for _ in range(8):
         if sigma <= _LITTLE * size:
-            return _exact(times[taken], w, max(sigma, _ROUNDING * size))
+            return _exact(times, w, max(sigma, _ROUNDING * size))
         unit = sigma * slow
         fit, penalty = _fitted(x, (w - middle) / unit, pieces)
         left = fit.left(penalty) * unit
@@ -451,8 +421,8 @@ def _exact(times: Array, values: Array, sigma: float) -> SmoothMotion:
     corners = [corner for i in turns if (corner := _corner(x, values, int(i), 4.0 * sigma))]
     if corners:
         more, heights = np.array(corners).T
-        order = np.argsort(np.append(x, more), kind="stable")
-        x, values = np.append(x, more)[order], np.append(values, heights)[order]
+        places = np.searchsorted(x, more)
+        x, values = np.insert(x, places, more), np.insert(values, places, heights)
     turns, slopes = _turns(x, values, modes, bounds), np.gradient(values, x)
     curve, at = _monotone(x, values, (slopes, slopes), turns), start + duration * x[turns[1:-1]]
     return SmoothMotion(at, sigma, float(x.size), curve, modes, start, duration)
@@ -476,9 +446,7 @@ def _corner(x: Array, y: Array, i: int, off: float) -> tuple[float, float] | Non
     return None
 
 
-def _turns(
-    x: Array, values: Array, modes: _Modes, bounds: tuple[float, float]
-) -> NDArray[np.int64]:
+def _turns(x: Array, values: Array, modes: _Modes, bounds: tuple[float, float]) -> Integers:
     """Return the places between which the motion goes back significantly, with both ends.
 
     Standard errors of differences are taken within `bounds`.
@@ -504,9 +472,7 @@ def _turns(
     return at
 
 
-def _monotone(
-    x: Array, values: Array, velocities: tuple[Array, Array], turns: NDArray[np.int64]
-) -> PPoly:
+def _monotone(x: Array, values: Array, velocities: tuple[Array, Array], turns: Integers) -> PPoly:
     """Return the curve through the values, in cubic pieces that go nowhere back between turns."""
     y = values.copy()
     for first, last in pairwise(turns):

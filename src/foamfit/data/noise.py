@@ -60,15 +60,13 @@ def quantum(values: Array) -> float:
 
 
 def residual_noise(values: Array) -> tuple[float, float]:
-    """Noise of a sampled signal from what local cubics leave of it.
+    """Noise of a sampled signal from the residuals of local cubic fits.
 
     Cubics over 5, 7, 11, … samples take off the signal; each leaves a known share of the variance
     of noise with the autocorrelation φ^k: c_0 + 2 Σ c_k φ^k, with c the autocorrelation of the
     filter. If the three narrowest agree with white noise, their variance is the answer, else σ and
-    φ explain all widths best. Switches and spikes are cut from the residuals at three deviations.
-
-    Returns σ, at least that of the digitiser's step q, q/√12, and φ, 0 for white noise and where a
-    vibration or a noise slower than the signal hides it.
+    φ explain all widths best. Returns σ, at least that of the digitiser's step q, q/√12, and φ, 0
+    for white noise and where a vibration or a noise slower than the signal hides it.
     """
     n = values.size
     digital = quantum(values) / np.sqrt(12.0)
@@ -144,9 +142,9 @@ def noise_before_contact(
 
 def _noise_about(values: Array, degree: int) -> tuple[float, float]:
     """Noise of samples about a polynomial: standard deviation and correlation time in samples."""
-    n, x = values.size, np.linspace(-1.0, 1.0, values.size)
+    x = np.linspace(-1.0, 1.0, values.size)
     off = values - np.polyval(np.polyfit(x, values, degree), x)
-    return float(np.sqrt(off @ off / (n - degree - 1))), _time_shown(off)
+    return float(np.sqrt(off @ off / (off.size - degree - 1))), _time_shown(off)
 
 
 def _time_shown(residual: Array) -> float:
@@ -217,13 +215,9 @@ def averaged(level: NoiseLevel, block: int) -> NoiseLevel:
 
 def with_noise(measurement: Measurement) -> Measurement:
     """Estimate the noise of the channels that have none; a test that has all stays as it is."""
-    noise, curves = measurement.noise, measurement.channels()
-    taken = measurement.sampled
-    missing = {
-        c: estimated_noise(v[taken.get(c, slice(None))])
-        for c, v in curves.items()
-        if noise.of(c) is None
-    }
-    if not missing:
+    noise, taken = measurement.noise, measurement.sampled
+    unknown = {c: v for c, v in measurement.channels().items() if noise.of(c) is None}
+    found = {c: estimated_noise(v[taken.get(c, slice(None))]) for c, v in unknown.items()}
+    if not found:
         return measurement
-    return replace(measurement, noise=replace(noise, estimated=noise.estimated | missing))
+    return replace(measurement, noise=replace(noise, estimated=noise.estimated | found))

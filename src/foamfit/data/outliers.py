@@ -1,63 +1,61 @@
 """Samples to leave out: spikes, short gaps, a clipped force, a gauge that stands still.
 
 A sample is judged by its neighbours, not by a model. A gauge that stands still while the stress
-goes on, and then jumps, shows its play where a motion turns round, or a display that is not
-renewed there. A true hold has another end: the motion goes on smoothly from where it stood, and the
-stress follows.
+changes, and then jumps, has play where the motion turns round, or a display that is not renewed
+there. A true hold ends otherwise: the motion goes on smoothly from where it stood, and the stress
+follows.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from foamfit.arrays import Array
-from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Outliers, Record, Standstill
+from foamfit.arrays import Array, Integers, Mask
+from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Outliers, Record
 from foamfit.data.noise import estimated_noise, noise_level, quantum, robust_variance
 from foamfit.text import counted, engineering, percent
 
-# An outlier is off by this many standard deviations of its leave-one-out residual, and by this
-# many of what its neighbours are off when it is gone (at a kink they are off too).
+# An outlier is off by so many standard deviations of its leave-one-out residual, and by so many of
+# the residuals of its neighbours without it (at a kink they are off too).
 _OFF, _ALONE = 4.0, 2.5
 _LEAST = 5e-3  # of the range: what is less far off is no outlier
-_MOST = 0.02  # of the samples: if more stand out, they are no exceptions
-# A gap is entered and left by a jump so many times the median one of the samples nearby.
+_MOST = 0.02  # of the samples: if more stand out, none is an outlier
+# A gap begins and ends with a jump of so many times the median jump nearby; its longest, samples.
 _JUMP, _NEARBY, _MAX_RUN = 10.0, 31, 5
 _WIDTH, _HALF = 9, 4  # samples of a cubic, and on either side of its middle
-_SIDES = [1, 2, 3], [5, 6, 7]  # samples of the lines that lead to its middle
-# Samples count as even if their steps differ by this share at most; a pause is so many times the
-# usual step; a middle sample is judged if its neighbours hold so much of the cubic.
+# Share by which the steps of even samples differ at most; usual steps that make a pause; least
+# leverage that the neighbours of a sample must have for it to be judged.
 _EVEN, _PAUSE, _OPEN = 0.02, 6.0, 0.1
 _CHUNK = 50_000
 # A force may be clipped where so many samples are equal at its top; a parabola falls by so many
 # steps of its digits within half that length on either side.
 _FLAT, _PARABOLA = 5, 3
-# A gauge stands still for at least so many of the steps in which it is read, and so many samples.
-_STEPS, _SAMPLES = 4, 8
+_STEPS, _SAMPLES = 4, 8  # a gauge stands still for at least so many of its readings, and samples
 # A jump is at least this share of the range, so many deviations of the noise and so many steps of
-# the digitiser; it takes so many samples at most; after it the motion goes on by less than a share.
+# the digitiser; it takes so many samples at most; then the motion goes on by less than a share.
 _LEAP, _ABOVE_NOISE, _DIGITS, _LONGEST, _GOES_ON = 0.003, 12.0, 2.5, 3, 0.75
-# While it stands the gauge moves by less than this share of its jump, and so many deviations; it
-# stands as soon as it is so near its level.
+# A gauge that stands moves by less than this share of its jump, and so many deviations of the
+# noise; it stands as soon as it is so near its level.
 _STANDS, _SCATTER, _NEAR = 0.1, 5.0, 0.02
-# Of the range of the stress: what a specimen in contact bears, by how much the stress changes while
-# the gauge stands, and what a motion as large as the jump would change.
+# Shares of the range of the stress: least stress of a specimen in contact, least change while the
+# gauge stands, and least change that a motion as large as the jump would cause.
 _CONTACT, _CHANGE, _FELT = 0.1, 0.005, 0.004
-# Of what such a motion would change, the stress changes by less than this share, and what is
-# missing is so many standard errors. The stiffness is taken over so many jumps on either side.
+# The stress follows by less than this share of that change, and what is missing is so many standard
+# errors. The stiffness is taken over so many jumps on either side.
 _FOLLOWS, _SURE, _AROUND = 0.5, 3.0, 3.0
 
 
-def find_outliers(values: Array, time: Array | None = None) -> NDArray[np.bool_]:
-    """Isolated samples that no smooth signal with this noise can hold: spikes and gaps.
+def find_outliers(values: Array, time: Array | None = None) -> Mask:
+    """Isolated samples that cannot belong to a smooth signal with this noise: spikes and gaps.
 
     Gaps are up to five samples between two opposite jumps of ten times the median jump nearby. A
     spike is off the cubic through its eight neighbours by four standard deviations, while these
-    agree among themselves and the lines from either side do not lead to it. Nothing is judged
-    across a pause, and of a held channel only gaps. If more than 2 % stand out, none is an outlier.
+    agree among themselves and the lines from either side do not lead to it. Samples across a pause
+    are not judged, and of a held channel only gaps are found. If more than 2 % stand out, none is
+    an outlier.
     """
     n = values.size
     if n < 30:
@@ -70,25 +68,25 @@ def find_outliers(values: Array, time: Array | None = None) -> NDArray[np.bool_]
         differ = off * float(np.quantile(np.abs(np.diff(values)), 0.99))
         even = off <= _EVEN or differ < 0.1 * least
         at = at if even else time
-    cubics = _cubics(at, even)
+    weights = _weights(at, even)
     wrong = _gaps(values, at)
     for _ in range(4):  # beside a large spike a small one is found later
         smooth = _bridged(values, wrong, at)
         if is_staircase(smooth):
             break
-        found = _spikes(smooth, least, at, *cubics) & ~wrong
+        found = _spikes(smooth, least, at, weights) & ~wrong
         if not found.any():
             break
         wrong |= found
     return wrong if wrong.sum() <= max(_MOST * n, 2) else np.zeros(n, dtype=bool)
 
 
-def _bridged(values: Array, wrong: NDArray[np.bool_], time: Array) -> Array:
+def _bridged(values: Array, wrong: Mask, time: Array) -> Array:
     """Replace samples by the straight line between those around them."""
     return np.where(wrong, np.interp(time, time[~wrong], values[~wrong]), values)
 
 
-def _gaps(values: Array, time: Array) -> NDArray[np.bool_]:
+def _gaps(values: Array, time: Array) -> Mask:
     """Short runs into which the signal jumps and out of which it jumps back."""
     from scipy.ndimage import median_filter
 
@@ -106,69 +104,48 @@ def _gaps(values: Array, time: Array) -> NDArray[np.bool_]:
     return out
 
 
-def _spikes(
-    values: Array, least: float, time: Array, weights: Array, own: Array
-) -> NDArray[np.bool_]:
-    """Samples that the cubic through their eight neighbours does not expect; see `_cubics`."""
-    out = np.zeros(values.size, dtype=bool)
-    residual = np.einsum("sw,ws->w", weights, _windows(values))
-    off = np.abs(residual) / own
-    usual = np.sqrt(robust_variance(residual / np.sqrt(own)) / own)
-    far = np.flatnonzero(off > np.maximum(_OFF * usual, least))
-    near, times = _windows(values)[far], _windows(time)[far]
-    basis = _orthonormal(times.T)
-    left = near - np.einsum("kw,ksw->ws", np.einsum("ksw,ws->kw", basis, near), basis)
-    rest = np.sum(left**2, axis=1) - residual[far] ** 2 / own[far]
-    alone = np.sqrt(np.maximum(rest, 0.0) / (_WIDTH - 5) / own[far])
+def _spikes(values: Array, least: float, time: Array, weights: Array) -> Mask:
+    """Samples that the cubic through their eight neighbours does not expect; see `_weights`."""
+    from scipy.ndimage import maximum_filter1d
+
+    out, own = np.zeros(values.size, dtype=bool), weights[:, _HALF]
+    residual = np.einsum("ws,ws->w", weights, _windows(values)) / np.where(own, own, 1.0)
+    usual = np.sqrt(robust_variance(residual * np.sqrt(own)) / np.where(own, own, 1.0))
+    off, own = np.abs(residual), np.broadcast_to(own, residual.shape)
     # Beside a spike the cubic is off too: only the farthest of five is one.
-    nearby = _windows(np.pad(off, 2), 5).max(axis=1)
-    leads = []  # the tip of a kink is where the line from one of its sides leads
-    for side in _SIDES:
-        x = times[:, side] - times[:, [_HALF]]
-        centre = x.mean(axis=1, keepdims=True)
-        x = x - centre
-        line = 1.0 / 3.0 - centre * x / np.sum(x**2, axis=1, keepdims=True)
-        leads.append(np.sum(near[:, side] * line, axis=1))
-    beside = np.min((near[:, _HALF] - np.array(leads)) * np.sign(residual[far]), axis=0)
-    out[far + _HALF] = (
-        (off[far] > _ALONE * alone) & (off[far] >= nearby[far]) & (beside > 0.5 * off[far])
-    )
+    farthest = off >= maximum_filter1d(off, 5, mode="constant")
+    for i in np.flatnonzero((off > np.maximum(_OFF * usual, least)) & farthest):
+        y, t = values[i : i + _WIDTH], time[i : i + _WIDTH] - time[i + _HALF]
+        rest = np.polyfit(np.delete(t, _HALF), np.delete(y, _HALF), 3, full=True)[1][0]
+        alone = np.sqrt(rest / (_WIDTH - 5) / own[i])
+        # The tip of a kink is where the line from one of its sides leads.
+        lines = (np.polyfit(t[side], y[side], 1)[1] for side in (slice(1, 4), slice(5, 8)))
+        beside = min((y[_HALF] - line) * np.sign(residual[i]) for line in lines)
+        out[i + _HALF] = off[i] > _ALONE * alone and beside > 0.5 * off[i]
     return out
 
 
-def _cubics(time: Array, even: bool) -> tuple[Array, Array]:
-    """Weights (samples, windows) of "sample minus local cubic", and those of the middle samples.
+def _weights(time: Array, even: bool) -> Array:
+    """Weights (windows, samples) of "sample minus local cubic", one window if all are the same.
 
-    They are zero and one across a pause, and where the middle sample alone holds the cubic.
+    They are zero across a pause, and where the middle sample alone holds the cubic.
     """
-    windows = _windows(time)[: 1 if even else None]  # even ones are all the same
-    weights = np.empty((_WIDTH, len(windows)))
+    windows = _windows(time)[: 1 if even else None]
+    weights = np.empty(windows.shape)
     for first in range(0, len(windows), _CHUNK):  # all at once would take much memory
-        basis = _orthonormal(windows[first : first + _CHUNK].T)
-        weights[:, first : first + _CHUNK] = -np.einsum("kw,ksw->sw", basis[:, _HALF], basis)
-    weights[_HALF] += 1.0
+        x = windows[first : first + _CHUNK] - windows[first : first + _CHUNK, [_HALF]]
+        powers = (x / np.abs(x).max(axis=1, keepdims=True))[:, :, None] ** np.arange(4)
+        at_middle = np.linalg.solve(powers.swapaxes(1, 2) @ powers, np.eye(4)[:, :1])
+        weights[first : first + _CHUNK] = -(powers @ at_middle)[:, :, 0]
+    weights[:, _HALF] += 1.0
     step = np.diff(time)
     pause = _windows(step, _WIDTH - 1).max(axis=1) > _PAUSE * float(np.median(step))
-    unjudged = pause | (weights[_HALF] < _OPEN)
-    own = np.where(unjudged, 1.0, weights[_HALF])
-    return np.where(unjudged, 0.0, weights) if unjudged.any() else weights, own
+    unjudged = pause | (weights[:, _HALF] < _OPEN)
+    return np.where(unjudged[:, None], 0.0, weights) if unjudged.any() else weights
 
 
 def _windows(values: Array, width: int = _WIDTH) -> Array:
     return np.lib.stride_tricks.sliding_window_view(values, width)
-
-
-def _orthonormal(times: Array) -> Array:
-    """Orthonormal cubics over times (samples, windows), shape (4, samples, windows)."""
-    x = times - times[_HALF]
-    x = x / np.abs(x).max(axis=0)
-    basis = np.empty((4, *x.shape))
-    for k in range(4):
-        new = x**k
-        for lower in basis[:k]:
-            new = new - np.einsum("sw,sw->w", new, lower) * lower
-        basis[k] = new / np.sqrt(np.einsum("sw,sw->w", new, new))
-    return basis
 
 
 def bridge_outliers(record: Record) -> Record:
@@ -184,11 +161,11 @@ def bridge_outliers(record: Record) -> Record:
     return record
 
 
-def mark_clipped(record: Record) -> tuple[Record, list[str]]:
+def mark_clipped(record: Record) -> Record:
     """Find the samples at which the force is clipped: a flat top at one value, with steep flanks.
 
-    A top whose values are rounded shows equal samples, too, but it is about a parabola, which falls
-    by three more steps of the digits within half the length of the flat; a clipped force by more.
+    A rounded top of a smooth curve has equal samples too, but is nearly a parabola, which falls by
+    three more steps of the digits within half the length of the flat; a clipped force by more.
     """
     stress = record.stress
     top = float(stress.max())
@@ -197,67 +174,65 @@ def mark_clipped(record: Record) -> tuple[Record, list[str]]:
     longest = int(np.argmax(np.where(at_top[starts], lengths, 0)))
     first, length = int(starts[longest]), int(lengths[longest])
     if length < max(_FLAT, 3 * float(np.median(fresh_samples(stress)[1]))):
-        return record, []
+        return record
     reach = -(-length // 2)
     last = min(first + length - 1 + reach, len(stress) - 1)
     around = stress[max(first - reach, 0)], stress[last]
     levels = np.diff(np.unique(stress))
     step = float(levels[levels > 1e-9 * np.ptp(stress)].min())
     if top - max(around) < 4 * _PARABOLA * step:
-        return record, []
+        return record
     lines = record.row_numbers[at_top]
-    note = (
+    return replace(record, clipped=at_top).noted(
         f"Check: the force is clipped: {lines.size} samples have one and the same value at its "
         f"top, a stress of {engineering(top, 'Pa')} (rows {lines[0]} to {lines[-1]}); they are not "
         "fitted, the true peak is not known, and energy and impulse come out too small."
     )
-    return replace(record, clipped=at_top), [note]
 
 
 def outliers_of_blocks(record: Record, block: int) -> dict[str, Outliers]:
     """Outliers of blocks of samples: a block of them is left out, one in a block is not."""
-    found, none = dict[str, Outliers](), np.zeros(0)
+    found, none = dict[str, Outliers](), np.zeros(len(record))
     edges = np.arange(0, len(record), block)
 
-    def share(wrong: NDArray[np.bool_]) -> Array:
+    def share(wrong: Mask) -> Array:
         return np.asarray(np.add.reduceat(wrong.astype(float), edges) / block)
 
-    for name, excess in record.excess.items():
-        values, at = record.channel(name), np.flatnonzero(excess)
-        if values is not None and at.size:
-            file = values[at] + excess[at]
-            found[name] = Outliers(share(excess != 0.0) > 0.5, record.instants[at], file)
-    left_out, clipped_at = dict[str, NDArray[np.bool_]](), None
-    if record.stood_still.any():
-        left_out["displacement"] = share(record.stood_still) > 0.5
-    if record.clipped is not None and record.clipped.any():
-        left_out["stress"], clipped_at = share(record.clipped) > 0.0, float(record.stress.max())
-    for name, wrong in left_out.items():
-        spikes = found.get(name) or Outliers(np.zeros_like(wrong), none, none)
-        top = clipped_at if name == "stress" else None
-        found[name] = replace(spikes, left_out=spikes.left_out | wrong, clipped_at=top)
+    for name, values in record.curves("velocity", "acceleration").items():
+        excess, top, clipped = record.excess.get(name, none), None, record.clipped
+        at, left_out = np.flatnonzero(excess), share(excess != 0.0) > 0.5
+        if name == "displacement":
+            left_out |= share(record.stood_still) > 0.5
+        if name == "stress" and clipped is not None and clipped.any():
+            left_out, top = left_out | (share(clipped) > 0.0), float(values.max())
+        if at.size or left_out.any():
+            found[name] = Outliers(left_out, record.instants[at], (values + excess)[at], top)
     return found
 
 
-def outlier_note(name: str, count: int, found: Outliers | None, timed: bool) -> str:
-    """Name a channel's outliers: how many, and where those of the part that is used are."""
-    note = f"Check: {counted(count, 'sample')} of the {name} stood out as spikes or gaps and"
-    if found is None or not found.at.size:
-        return f"{note} were bridged, none of them in the part that is used."
-    unit = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}.get(name, "m")
-    told = [
-        f"{engineering(value, unit)} at {engineering(at, 's') if timed else f'sample {at:.0f}'}"
-        for at, value in zip(found.at[:4], found.values[:4], strict=True)
-    ]
-    used = found.at.size
-    more = f" and {used - 4} more" if used > 4 else ""
-    part = "" if used == count else f", {used} of them in the part that is used"
-    return f"{note} are not fitted{part}: {', '.join(told)}{more}."
+def notes_on(record: Record, spikes: dict[str, int], found: dict[str, Outliers]) -> list[str]:
+    """Count the `spikes` and gaps of each channel; name those of the used part and standstills."""
+    notes = []
+    for name, count in spikes.items():
+        note = f"Check: {counted(count, 'sample')} of the {name} stood out as spikes or gaps and"
+        one = found.get(name)
+        if one is None or not one.at.size:
+            notes.append(f"{note} were bridged, none of them in the part that is used.")
+            continue
+        unit = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}.get(name, "m")
+        told, used = list[str](), one.at.size
+        for at, value in zip(one.at[:4], one.values[:4], strict=True):
+            where = f"sample {at:.0f}" if record.time is None else engineering(at, "s")
+            told.append(f"{engineering(value, unit)} at {where}")
+        more = f" and {used - 4} more" if used > 4 else ""
+        part = "" if used == count else f", {used} of them in the part that is used"
+        notes.append(f"{note} are not fitted{part}: {', '.join(told)}{more}.")
+    return notes + [note for note, rows in record.standstills.items() if rows.any()]
 
 
 def fresh_samples(
-    values: Array | NDArray[np.bool_],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    values: Array | Mask,
+) -> tuple[Integers, Integers]:
     """Samples at which a value is new, and for how many samples each is held."""
     fresh = np.append(0, np.flatnonzero(np.diff(values) != 0) + 1)
     return fresh, np.diff(np.append(fresh, len(values)))
@@ -279,19 +254,18 @@ def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
         elif name != "stress" and is_staircase(values):
             fresh = values[fresh_samples(values)[0]]
             if len(fresh) >= MIN_ROWS:
-                levels[name] = replace(
-                    estimated_noise(fresh, "fresh samples"), time=len(values) / len(fresh)
-                )
+                level = estimated_noise(fresh, "fresh samples")
+                levels[name] = replace(level, time=len(values) / len(fresh))
     return levels
 
 
-def fill_staircase(record: Record) -> tuple[Record, list[str]]:
-    """Interpolate displacements that are held while the stress goes on.
+def fill_staircase(record: Record) -> Record:
+    """Interpolate displacements that are held while the stress changes.
 
-    The instants where a value is fresh are kept, and only these count as measured. A hold of more
-    than three usual steps is a real one: it lasts until one usual step before the next fresh value.
+    The instants at which a value is new are kept, and only these count as measured. A hold of more
+    than three usual steps is real: it lasts until one usual step before the next new value.
     """
-    notes, time = [], record.instants
+    time = record.instants
     for name, values in record.curves().items():
         fresh, lengths = fresh_samples(values)
         step = int(np.median(lengths))
@@ -303,81 +277,67 @@ def fill_staircase(record: Record) -> tuple[Record, list[str]]:
         taken[knots] = True
         record = replace(record, sampled=record.sampled | {name: taken})
         shown = "The displacement" if name == "displacement" else name
-        notes.append(
+        record = record.noted(
             f"{shown} is held for about {step} samples at a time; it is interpolated between the "
             f"{len(fresh)} instants where it is fresh."
         )
-    return record, notes
-
-
-@dataclass(frozen=True)
-class _Gauge:
-    """Displacement and stress that are looked at, the noise of the first, and its reading step."""
-
-    w: Array
-    stress: Array
-    noise: float
-    step: int  # samples
+    return record
 
 
 def find_standstills(record: Record) -> list[tuple[int, int]]:
     """Find where the gauge of a slow test stands still and then jumps.
 
-    Returns the last sample before each stretch and the first after its jump: the specimen is in
-    contact and its stress changes, but does not follow the jump, with which the motion does not go
-    on. A displacement that is held at each reading is not yet interpolated.
+    Returns the last sample before each stretch and the first after its jump. Meanwhile the specimen
+    is in contact and its stress changes, but the stress does not follow the jump, and the motion
+    does not go on with it. A displacement held at each reading must not be interpolated yet.
     """
-    w = record.displacement
+    w, stress, found = record.displacement, record.stress, list[tuple[int, int]]()
     if w is None or len(w) < 4 * _SAMPLES:
-        return []
+        return found
     fresh, lengths = fresh_samples(w)
-    at = _Gauge(w, record.stress, noise_level(w[fresh]), int(np.median(lengths)))
-    shortest = max(_STEPS * at.step, _SAMPLES)
-    found = list[tuple[int, int]]()
-    for after, length in sorted(_jumps(at, shortest).items()):
+    noise, step = noise_level(w[fresh]), int(np.median(lengths))
+    shortest = max(_STEPS * step, _SAMPLES)
+    size, low = float(np.ptp(stress)), float(np.quantile(stress, 0.01))
+    for after, length in sorted(_jumps(w, noise, step, shortest).items()):
         last = after - length
         if found and last < found[-1][1]:
             continue
         level = float(np.median(w[last - _SAMPLES + 1 : last + 1]))
-        near = _NEAR * abs(float(w[after]) - level) + _SCATTER * at.noise
+        near = _NEAR * abs(float(w[after]) - level) + _SCATTER * noise
         moving = np.flatnonzero(np.abs(w[: last + 1] - level) > near)
         before = int(moving[-1]) + 1 if moving.size else 0  # there the gauge is still right
-        long = last + 1 - before >= shortest
-        if long and _stress_goes_on(at, before, last) and not _follows(at, before, last, after):
+        if last + 1 - before < shortest:
+            continue
+        meanwhile = stress[before : last + 1]
+        change, part = _change(meanwhile)
+        error = noise_level(meanwhile) * np.sqrt(2.0 / part)
+        changed = abs(change) >= max(_CHANGE * size, _SURE * error)
+        loaded = np.median(meanwhile) - low >= _CONTACT * size
+        if changed and loaded and not _follows(w, stress, noise, step, before, last, after):
             found.append((before, after))
     return found
 
 
-def _jumps(at: _Gauge, width: int) -> dict[int, int]:
+def _jumps(w: Array, noise: float, step: int, width: int) -> dict[int, int]:
     """First samples after jumps out of a stretch, and how many samples each jump takes."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-    w, n = at.w, len(at.w)
+    n = len(w)
     # The window of sample i ends with it.
     shift: Any = {"size": width, "origin": (width - 1) // 2, "mode": "nearest"}
     range_before = maximum_filter1d(w, **shift) - minimum_filter1d(w, **shift)
-    least = max(_LEAP * float(np.ptp(w)), _ABOVE_NOISE * at.noise, _DIGITS * quantum(w))
+    least = max(_LEAP * float(np.ptp(w)), _ABOVE_NOISE * noise, _DIGITS * quantum(w))
     found = dict[int, int]()
     for length in range(_LONGEST, 0, -1):  # the shortest counts
         last = np.arange(width - 1, n - length)
         jump = w[last + length] - w[last]
         far = np.abs(jump)
-        later = np.minimum(last + length + 2 * max(at.step, length), n - 1)
+        later = np.minimum(last + length + 2 * max(step, length), n - 1)
         goes_on = (w[later] - w[last + length]) * np.sign(jump) > _GOES_ON * far
-        stands = range_before[last] <= _STANDS * far + _SCATTER * at.noise
+        stands = range_before[last] <= _STANDS * far + _SCATTER * noise
         good = (far >= least) & stands & ~goes_on
         found |= dict.fromkeys((last[good] + length).tolist(), length)
     return found
-
-
-def _stress_goes_on(at: _Gauge, before: int, last: int) -> bool:
-    """Whether the specimen is loaded while the gauge stands, by a stress that changes."""
-    stress = at.stress[before : last + 1]
-    size, low = float(np.ptp(at.stress)), float(np.quantile(at.stress, 0.01))
-    change, part = _change(stress)
-    error = noise_level(stress) * np.sqrt(2.0 / part)
-    changed = abs(change) >= max(_CHANGE * size, _SURE * error)
-    return bool(changed and np.median(stress) - low >= _CONTACT * size)
 
 
 def _change(stress: Array) -> tuple[float, int]:
@@ -387,18 +347,19 @@ def _change(stress: Array) -> tuple[float, int]:
     return max(float(mean[-1] - mean.min()), float(mean[-1] - mean.max()), key=abs), part
 
 
-def _follows(at: _Gauge, before: int, last: int, after: int) -> bool:
-    """Whether the stress leaves its trend as by a motion as large as the jump, or this is unknown.
+def _follows(
+    w: Array, stress: Array, noise: float, step: int, before: int, last: int, after: int
+) -> bool:
+    """Whether the stress leaves its trend as if the jump were a motion, or this is unknown.
 
     A gauge that is read at steps may show a motion a step late.
     """
-    w, stress = at.w, at.stress
     # As long as the displacement stays where it jumped to.
-    rest = w[after : after + 3 * max(at.step, 2)]
+    rest = w[after : after + 3 * max(step, 2)]
     jump = float(rest[0] - np.median(w[before : last + 1]))
-    away = np.abs(rest - rest[0]) > 0.25 * abs(jump) + _SCATTER * at.noise
+    away = np.abs(rest - rest[0]) > 0.25 * abs(jump) + _SCATTER * noise
     window = after + np.arange(int(np.argmax(away)) if away.any() else rest.size)
-    end = last + 1 - (at.step if at.step > 1 else 0)
+    end = last + 1 - (step if step > 1 else 0)
     fitted = np.arange(min((before + end) // 2, end - 5), end)
     middle = float(fitted.mean())
     slope, level = np.polyfit(fitted - middle, stress[fitted], 1)
@@ -422,36 +383,23 @@ def _follows(at: _Gauge, before: int, last: int, after: int) -> bool:
     )
 
 
-def bridge_standstills(record: Record, found: list[tuple[int, int]]) -> Record:
+def bridge_standstills(record: Record, found: list[tuple[int, int]], height: float) -> Record:
     """Draw straight lines from the last sample before each stretch to the first after its jump."""
     if record.displacement is None or not found:
         return record
     w, time, numbers = record.displacement.copy(), record.instants, record.row_numbers
-    standstills = []
+    standstills = dict[str, Mask]()
     for before, after in found:
         stress = record.stress[before:after]
         change = _change(stress)[0] / float(np.abs(stress).max())
-        first, last = int(numbers[before + 1]), int(numbers[after - 1])
-        standstills.append(Standstill(first, last, change, float(w[after] - w[before])))
-        inside, ends = slice(before + 1, after), [before, after]
+        jump, inside, ends = w[after] - w[before], slice(before + 1, after), [before, after]
         w[inside] = np.interp(time[inside], time[ends], w[ends])
-    return replace(record, displacement=w, standstills=tuple(standstills))
-
-
-def standstill_notes(record: Record, height: float) -> list[str]:
-    """Name the stretches in what is left of a record, by the rows of the file."""
-    return [
-        f"Check: the displacement stands still in rows {one.first} to {one.last} while the stress "
-        f"{'rises' if one.change > 0.0 else 'falls'} by {percent(abs(one.change))}, then jumps by "
-        f"{percent(abs(one.jump) / height)} strain, which the stress does not follow: play of the "
-        "gauge; it is bridged by a straight line."
-        for one in record.standstills
-        if one.among(record.row_numbers).any()
-    ]
-
-
-def standstill_spans(record: Record, block: int) -> tuple[tuple[float, float], ...]:
-    """First and last instant of each stretch in what is left, s or blocks of samples."""
-    instants = record.instants if record.time is not None else record.instants // block
-    there = [instants[one.among(record.row_numbers)] for one in record.standstills]
-    return tuple((float(at[0]), float(at[-1])) for at in there if at.size)
+        told = (
+            f"Check: the displacement stands still in rows {numbers[before + 1]} to "
+            f"{numbers[after - 1]} while the stress {'rises' if change > 0.0 else 'falls'} by "
+            f"{percent(abs(change))}, then jumps by {percent(abs(jump) / height)} strain, which "
+            "the stress does not follow: play of the gauge; it is bridged by a straight line."
+        )
+        standstills[told] = np.zeros(len(w), dtype=bool)
+        standstills[told][inside] = True
+    return replace(record, displacement=w, standstills=standstills)

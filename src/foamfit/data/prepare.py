@@ -1,7 +1,7 @@
 """From the samples of a file to one loading and unloading, with time zero where contact starts.
 
-`condition` holds the steps in their order. Each returns a new `Record` and a sentence for each
-thing that it changed or left out.
+`condition` holds the steps in their order. Each returns a new `Record`, with a note on each thing
+that was changed or left out.
 """
 
 from __future__ import annotations
@@ -11,25 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, means
+from foamfit.data import contact, cycles, frames, zeros
 from foamfit.data import outliers as spoilt
-from foamfit.data import zeros
-from foamfit.data.contact import (
-    STILL_MOTION,
-    Start,
-    leave_rest,
-    start_of_impact,
-    start_of_slow_test,
-)
-from foamfit.data.cycles import (
-    Cycle,
-    choose_cycles,
-    cut_to_cycle,
-    cut_to_reload,
-    find_cycles,
-    inner_reversals,
-)
-from foamfit.data.frames import frames_of_blocks, noise_of_blocks
 from foamfit.data.measurement import (
     INTEGRATED,
     MEASURED,
@@ -49,7 +33,7 @@ from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, 
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
-# What tests of specimens have, in SI; beyond it a unit is wrong, seldom the specimen.
+# Usual range of each quantity, SI; beyond it a unit is probably wrong.
 _USUAL = {
     "height": (1e-5, 1.0, "m"),
     "area": (1e-10, 1.0, "m²"),
@@ -58,7 +42,7 @@ _USUAL = {
     "modulus (peak stress over peak strain)": (10.0, 1e11, "Pa"),
     "duration": (1e-6, 1e7, "s"),
 }
-_MAX_ROWS, _BLOCKS = 1500, 1000  # above so many samples they are averaged in so many blocks
+_MAX_ROWS, _BLOCKS = 1500, 1000  # more samples than this are averaged in so many blocks
 
 
 def condition(
@@ -76,108 +60,98 @@ def condition(
     `advice` see `check_signs`. At most 1500 samples are left; time and displacement are zero where
     contact starts. The noise is estimated where samples before contact, or held ones, show it.
     """
-    window, notes, known = window or Window(), list[str](), striker or Striker()
+    window, known = window or Window(), striker or Striker()
     impact = striker is not None and record.time is not None
     if impact and window.cycle not in (None, 1):
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
-
-    def done(result: tuple[Record, list[str]]) -> Record:
-        notes.extend(result[1])
-        return result[0]
-
-    record = done(cut_to_window(record, window))
-    record = done(spoilt.mark_clipped(spoilt.bridge_outliers(record)))
+    record = spoilt.mark_clipped(spoilt.bridge_outliers(cut_to_window(record, window)))
     spikes = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
     check_signs(record, advice)
     held = spoilt.noise_of_held(record)
     still = [] if impact else spoilt.find_standstills(record)
-    record = spoilt.bridge_standstills(done(spoilt.fill_staircase(record)), still)
-    cycles = [] if impact else find_cycles(record)
-    chosen = choose_cycles(cycles, window.cycle, window.last)
-    first = cut_to_cycle(record, cycles, cycles[0])[0] if cycles else record
+    record = spoilt.bridge_standstills(spoilt.fill_staircase(record), still, specimen.height)
+    found = [] if impact else cycles.find_cycles(record)
+    chosen = cycles.choose_cycles(found, window.cycle, window.last)
+    first = cycles.cut_to_cycle(record, found, found[0]) if found else record
     curves = first.curves("acceleration")
     levels = {c: estimated_noise(v) for c, v in curves.items()} | held
-    used = chosen or Cycle(number=1, place=0, first=0, top=0, end=len(record))
+    used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record))
     if impact:
-        start = start_of_impact(first, levels)
+        start = contact.start_of_impact(first, levels)
         start = replace(start, gauge=zeros.gauge_before(first, start, levels, known))
-        span = zeros.Span.of_impact(first, start, levels)
-        known, told = zeros.flight_of(first, start, span, levels, known, spread)
-        notes += told
+        span = zeros.span_of_impact(first, start, levels)
+        striker, told = zeros.flight_of(first, start, span, levels, known, spread)
+        record = record.noted(*told)
     else:  # its first cycle shows the start
-        start = start_of_slow_test(first, levels)
+        start = contact.start_of_slow_test(first, levels)
         end = len(first) if used.place else used.end - used.first
         span = zeros.Span(start.first, end, start.resting, end)
-    record, found = zeros.take_zeros(record, first, start, span, levels, impact=impact)
-    notes += found.notes
+    record = zeros.take_zeros(record, first, start, span, levels, impact=impact)
     if used.place:  # with a contact of its own
-        record = done(cut_to_reload(record, cycles, used, specimen.height, found.origins))
+        record = cycles.cut_to_reload(record, found, used, specimen.height)
     else:
-        record = done(cut_to_cycle(record, cycles, chosen)) if chosen else record
-        record = done(cut_to_contact(record, start, span, found.origins))
+        record = cycles.zero_between(record, found, used)
+        record = cycles.cut_to_cycle(record, found, chosen) if chosen else record
+        record = cut_to_contact(record, start, span)
     if impact:
         record = zeros.mark_flight(record, start, span)
-    record, motion = integrate_motion(record, specimen, known)
+    known = striker or known
+    record = integrate_motion(record, specimen, known)
     if impact:
-        record = done(start_within_height(record, specimen, known, motion, found.origins))
-    notes += checks(record, specimen, known, motion, several=used.last is not None)
-    whole, record = record, done(thin(record))
+        record = start_within_height(record, specimen, known)
+    whole = checks(record, specimen, known, several=used.last is not None)
+    record = thin(whole)
     block = -(-len(whole) // len(record))
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
-    noise |= {c: noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
+    noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
     outliers = spoilt.outliers_of_blocks(whole, block)
-    timed = record.time is not None
-    notes += [spoilt.outlier_note(c, n, outliers.get(c), timed) for c, n in spikes.items()]
-    notes += spoilt.standstill_notes(whole, specimen.height)
+    instants = whole.instants if whole.time is not None else whole.instants // block
+    stood = [instants[rows] for rows in whole.standstills.values() if rows.any()]
     channels = record.time, record.stress, record.displacement
     return Measurement(
-        *("", None, "", *channels, specimen, known if striker else None),  # no name and no file
+        *("", None, "", *channels, specimen, striker),  # no name and no file
         noise=Noise(estimated=noise),
-        motion=motion,
-        notes=tuple(notes),
+        motion=whole.motion,
+        notes=(*record.notes, *spoilt.notes_on(whole, spikes, outliers)),
         interior=record.interior,
         outliers=outliers,
         contact="stress" if used.place else start.by,
         count=count_rows(whole, outliers, block),
         cycle=used.number,
-        cycles=tuple(cycle.number for cycle in cycles) or (1,),
+        cycles=tuple(cycle.number for cycle in found) or (1,),
         last_cycle=used.last,
-        start_strain=found.origins.pop("start_strain", 0.0),
+        start_strain=whole.origins.pop("start_strain", 0.0),
         sampled=record.sampled,
-        zeros=found.errors,
-        origins=found.origins,
+        zeros=whole.zeros,
+        origins=whole.origins,
         acceleration=record.acceleration if impact else None,
-        derived=record.derived,
-        braked=record.braked,
+        derived=whole.derived,
+        braked=whole.braked,
         block=block,
-        standstills=spoilt.standstill_spans(whole, block),
+        standstills=tuple((float(at[0]), float(at[-1])) for at in stood),
     )
 
 
-def cut_to_contact(
-    record: Record, start: Start, span: zeros.Span, origins: dict[str, float]
-) -> tuple[Record, list[str]]:
+def cut_to_contact(record: Record, start: contact.Start, span: zeros.Span) -> Record:
     """Keep the rows of contact and those just before it; time is zero where it starts."""
     n, lead = len(record), start.first - span.first
-    notes = (
-        [] if span.returned else ["Check: the record ends before the stress has returned to zero."]
-    )
     cut = f"; {span.first} samples before and {n - span.end} after are cut, "
     cut += f"{span.end - span.first} kept" + (f", {lead} of them before contact" if lead else "")
     at = "" if record.time is None else f", {engineering(start.time, 's')} in the file"
     cut = cut if span.end - start.first < n else ""
-    notes.insert(0, f"Contact starts {start.how}{at}{cut}.")
+    record = record.noted(f"Contact starts {start.how}{at}{cut}.")
+    if not span.returned:
+        record = record.noted("Check: the record ends before the stress has returned to zero.")
     if record.time is not None:
-        origins["contact_time"] = start.time
-        record = replace(record, time=record.time - start.time)
-    why = "before contact starts", "after contact ends"
-    return record.between(span.first, span.end, *why), notes
+        origins = record.origins | {"contact_time": start.time}
+        record = replace(record, time=record.time - start.time, origins=origins)
+    return record.between(span.first, span.end, "before contact starts", "after contact ends")
 
 
-def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
+def cut_to_window(record: Record, window: Window) -> Record:
     """Keep what lies between the window's start and end, as the file counts time."""
     if (window.start, window.end) == (-np.inf, np.inf):
-        return record, []
+        return record
     if record.time is None:
         raise InputError("[window] start and end need a time column; the file has none.")
     inside = (record.time >= window.start) & (record.time <= window.end)
@@ -189,11 +163,11 @@ def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
             f"{last} are needed."
         )
     note = f"[window] cut {len(record) - kept} of {len(record)} samples."
-    record = record.without(~inside, "outside [window] start and end")
+    record = record.without(~inside, "outside [window] start and end").noted(note)
     for name, values in record.curves().items():
         if np.ptp(values) == 0:
             raise InputError(f"the {name} is constant within [window]; it must vary.")
-    return record, [note]
+    return record
 
 
 def check_signs(record: Record, advice: Callable[[str], str] | None) -> None:
@@ -222,20 +196,18 @@ def check_signs(record: Record, advice: Callable[[str], str] | None) -> None:
         raise InputError(f"the {advice(wrong[0]) if advice else plain}.")
 
 
-def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tuple[Record, str]:
+def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> Record:
     """Integrate a motion that was not measured: w(0) = 0, w'(0) = v, and w'' = g − a or g − σA/m.
 
     A channel is linear between samples.
     """
     if record.displacement is not None:
-        return replace(record, acceleration=None), MEASURED
+        return replace(record, acceleration=None)
     time = record.time
     assert time is not None  # without a time the file has been refused
     if record.clipped is not None and record.acceleration is None and record.velocity is None:
-        raise InputError(
-            "the force is clipped, so the motion cannot be integrated from it; give a "
-            "displacement, an acceleration or a velocity."
-        )
+        wrong = "the force is clipped, so the motion cannot be integrated from it"
+        raise InputError(f"{wrong}; give a displacement, an acceleration or a velocity.")
     if record.acceleration is not None and striker.velocity:
         rate, source = -record.acceleration, "acceleration"
     elif record.velocity is not None:
@@ -259,7 +231,7 @@ def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tu
         w = np.append(0.0, np.cumsum(v[:-1] * dt + dt**2 * (2 * r[:-1] + r[1:]) / 6))
         record = replace(record, derived=(*record.derived, "displacement"))
     w = np.delete(w - w[at], at)
-    return record.changed("displacement", w), f"integrated from {source}"
+    return replace(record, displacement=w, motion=f"integrated from {source}")
 
 
 def stress_of_motion(
@@ -273,21 +245,21 @@ def stress_of_motion(
     from scipy.interpolate import make_smoothing_spline
 
     values = displacement if velocity is None else velocity
-    assert values is not None  # see needed_columns
+    assert values is not None  # see `Source.needed`
     noise, first, end = estimated_noise(values), 0, len(time)
     if velocity is None:
         top = int(np.argmax(values))
-        found = leave_rest(time[: top + 1], values[: top + 1], noise, STILL_MOTION)
-        first = int(np.searchsorted(time, found.time)) if found else 0
-        found = leave_rest(-time[top:][::-1], values[top:][::-1], noise, STILL_MOTION)
-        end = int(np.searchsorted(time, -found.time)) if found else end
+        there, back = (time[: top + 1], values[: top + 1]), (-time[top:][::-1], values[top:][::-1])
+        if found := contact.leave_rest(*there, noise, contact.STILL_MOTION):
+            first = int(np.searchsorted(time, found[0]))
+        if found := contact.leave_rest(*back, noise, contact.STILL_MOTION):
+            end = int(np.searchsorted(time, -found[0]))
     n = end - first
     block = max(1, min(round(noise.time), n // 50), n // 1000)
     edges = np.arange(first, end, block)
-    counts = np.diff(np.append(edges, end))
-    t, y = (np.add.reduceat(x[:end], edges) / counts for x in (time, values))
+    t, y = (means(x[:end], edges) for x in (time, values))
     t, step = t - t[0], (t[-1] - t[0]) / len(t)
-    # An estimate that is a little too small would have the curve follow the noise.
+    # With an estimate that is a little too small the curve would follow the noise.
     sigma, low, high = 1.1 * averaged(noise, block).sigma, -6.0, 14.0
     for _ in range(24):
         middle = 0.5 * (low + high)
@@ -301,49 +273,57 @@ def stress_of_motion(
     return stress
 
 
-def start_within_height(
-    record: Record, specimen: Specimen, striker: Striker, motion: str, origins: dict[str, float]
-) -> tuple[Record, list[str]]:
+def start_within_height(record: Record, specimen: Specimen, striker: Striker) -> Record:
     """Move the start of an impact that was too early: its motion goes farther than the height."""
     w, most = record.displacement, 0.97 * specimen.height
     assert w is not None  # measured or integrated by now
     assert record.time is not None  # it is an impact
     over, rough = float(w.max()) - most, 0.5 if "stress" in record.derived else 0.2
     if not striker.velocity or not 0.03 * specimen.height <= over < rough * specimen.height:
-        return record, []
-    late = over / striker.velocity
+        return record
+    late, origins = over / striker.velocity, dict(record.origins)
     origins["contact_time"] += late
-    if motion == MEASURED:
+    if record.motion == MEASURED:
         origins["displacement_zero"] += over
     told = f"Contact is taken to be {engineering(late, 's')} later, where the motion does not go "
-    record = replace(record, time=record.time - late, displacement=w - over)
-    return record, [told + "farther than the height."]
+    record = replace(record, time=record.time - late, displacement=w - over, origins=origins)
+    return record.noted(told + "farther than the height.")
 
 
 def checks(
-    record: Record, specimen: Specimen, striker: Striker, motion: str, *, several: bool = False
-) -> list[str]:
+    record: Record, specimen: Specimen, striker: Striker, *, several: bool = False
+) -> Record:
     """Refuse strains beyond one; say what is not plausible, of `several` cycles less."""
     displacement, height = record.displacement, specimen.height
     assert displacement is not None  # measured or integrated by now
-    notes = [] if motion == MEASURED else [f"The file has no displacement: the motion is {motion}."]
-    notes += [] if several else inner_reversals(displacement)
+    notes, motion = list[str](), record.motion
+    if motion != MEASURED:
+        notes.append(f"The file has no displacement: the motion is {motion}.")
+    notes += [] if several else cycles.inner_reversals(displacement)
     if len(record) < MIN_ROWS:
         raise InputError(f"only {len(record)} samples are in contact; at least {MIN_ROWS} needed.")
     strain = float(displacement.max()) / height
     if strain >= 1:
         cause = "the unit of displacement or strain" if motion == MEASURED else "the striker"
         raise InputError(f"strain reaches {strain:.3g}, beyond one; check height and {cause}.")
-    notes += _unusual(record, specimen, strain)
+    peak = float(record.stress.max())
+    duration = 1.0 if record.time is None else float(np.ptp(record.time))
+    sizes = height, specimen.area, strain, peak, peak / strain if strain > 0 else 1e3, duration
+    for value, (name, (low, high, unit)) in zip(sizes, _USUAL.items(), strict=True):
+        if not low <= value <= high:
+            shown, least, most = (f"{v:.4g} {unit}".strip() for v in (value, low, high))
+            notes.append(
+                f"Check: the {name} is {shown}, but tests of specimens have {least} to {most}; "
+                "check the units (mm or Mm, mN or MN)."
+            )
     for node, values in record.interior.items():
-        name, most = interior_channel(node), float(values.max())
-        if most >= height:
-            reached = f"{engineering(most, 'm')}, the height {engineering(height, 'm')}"
+        name, far = interior_channel(node), float(values.max())
+        if far >= height:
+            reached = f"{engineering(far, 'm')}, the height {engineering(height, 'm')}"
             raise InputError(f"{name} reaches {reached}; check its unit.")
-        if most > 1.05 * displacement.max():
+        if far > 1.05 * displacement.max():
             notes.append(f"Check: {name} goes farther than the top; check its unit and its node.")
-    stress = record.stress
-    peak, width, first = float(stress.max()), max(1, len(stress) // 100), stress[:3].mean()
+    stress, width, first = record.stress, max(1, len(record) // 100), record.stress[:3].mean()
     if first > 0.05 * peak:
         load = percent(first / peak)
         notes.append(f"Check: the record starts under load, at {load} of the peak stress.")
@@ -365,41 +345,22 @@ def checks(
     density = (specimen.mass or 0.0) / (specimen.area * height)
     if specimen.mass and not 1 < density < 3000:
         notes.append(f"Check: mass and volume give a density of {density:.3g} kg/m³.")
-    return notes
+    return record.noted(*notes)
 
 
-def _unusual(record: Record, specimen: Specimen, strain: float) -> list[str]:
-    """Question what is outside of `_USUAL`."""
-    stress = float(record.stress.max())
-    duration = 1.0 if record.time is None else float(np.ptp(record.time))
-    moduli = stress / strain if strain > 0 else 1e3
-    values = specimen.height, specimen.area, strain, stress, moduli, duration
-    notes = []
-    for value, (name, (low, high, unit)) in zip(values, _USUAL.items(), strict=True):
-        if not low <= value <= high:
-            shown, least, most = (f"{v:.4g} {unit}".strip() for v in (value, low, high))
-            notes.append(
-                f"Check: the {name} is {shown}, but tests of specimens have {least} to {most}; "
-                "check the units (mm or Mm, mN or MN)."
-            )
-    return notes
-
-
-def thin(record: Record) -> tuple[Record, list[str]]:
+def thin(record: Record) -> Record:
     """Average blocks of samples where there are many more than a fit needs; noise falls with it."""
     n = len(record)
     if n <= _MAX_ROWS:
-        return record, []
+        return record
     size = -(-n // _BLOCKS)
     edges = np.arange(0, n, size)
-    counts = np.diff(np.append(edges, n))
-    time = None if record.time is None else np.add.reduceat(record.time, edges) / counts
-    thinned = Record(time, record.stress, None)
+    time = None if record.time is None else means(record.time, edges)
+    note = f"{n} samples are averaged in {len(edges)} blocks of {size}."
+    thinned = Record(time, record.stress, None, notes=(*record.notes, note))
     for name, values in record.curves("acceleration").items():
-        thinned = thinned.changed(name, np.add.reduceat(values, edges) / counts)
-    thinned = frames_of_blocks(record, thinned, edges)
-    thinned = replace(thinned, derived=record.derived, braked=record.braked)
-    return thinned, [f"{n} samples are averaged in {len(edges)} blocks of {size}."]
+        thinned = thinned.changed(name, means(values, edges))
+    return frames.frames_of_blocks(record, thinned, edges)
 
 
 def count_rows(record: Record, outliers: dict[str, Outliers], block: int) -> RowCount:
@@ -410,8 +371,7 @@ def count_rows(record: Record, outliers: dict[str, Outliers], block: int) -> Row
         f"a spike or gap of the {name}, bridged by a straight line": excess != 0.0
         for name, excess in record.excess.items()
     }
-    if record.standstills:
-        wrong["the displacement stands still, bridged by a straight line"] = record.stood_still
+    wrong["the displacement stands still, bridged by a straight line"] = record.stood_still
     if record.clipped is not None:
         wrong["the force is clipped"] = of_blocks["stress"] & record.clipped
     for name, left_out in of_blocks.items():

@@ -11,12 +11,8 @@ from foamfit.data.measurement import Measurement
 
 # Samples within so many standard deviations of the noise below the largest may be the peak.
 _SURE = 3.0
-# The motion has come close to its peak at this share of it; one that takes longer from there than
-# it took to get there is held.
-_CLOSE = 0.95
-# Copies of a record with other noise that show the error of its rate; median of the size of a
-# normal deviate.
-_COPIES, _NORMAL = 30, 0.6745
+_CLOSE = 0.95  # of its peak: a motion that takes longer from there than to there is held
+_COPIES, _NORMAL = 30, 0.6745  # copies with other noise; median of the size of a normal deviate
 
 
 def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None:
@@ -49,13 +45,11 @@ def rate_error(test: Measurement) -> float:
     From the rates of copies of the record to which as much noise is added again. Noise that is
     estimated is no larger than the samples differ from a parabola through their neighbours.
     """
-    w, scatter = test.displacement, _sigma(test)
-    if test.time is None or w is None or w.size < 5 or scatter <= 0.0:
+    w, sigma = test.displacement, _sigma(test)
+    if test.time is None or w is None or w.size < 5 or sigma <= 0.0:
         return 0.0
-    sigma = scatter
-    if test.noise.displacement is None:
-        third = float(np.median(np.abs(np.diff(w, 3))))
-        scatter = min(sigma, third / (_NORMAL * math.sqrt(20.0)))
+    third = float(np.median(np.abs(np.diff(w, 3)))) / (_NORMAL * math.sqrt(20.0))
+    scatter = min(sigma, third) if test.noise.displacement is None else sigma
     noise = scatter * np.random.default_rng(0).standard_normal((_COPIES, w.size))
     rates = [_velocity(test.time - test.time[0], w + one, sigma) for one in noise]
     known = [rate for rate in rates if rate is not None]
@@ -64,7 +58,7 @@ def rate_error(test: Measurement) -> float:
 
 def _sigma(test: Measurement) -> float:
     noise = test.noise.of("displacement")
-    return 0.0 if noise is None else noise.sigma
+    return noise.sigma if noise else 0.0
 
 
 def _velocity(time: Array, motion: Array, sigma: float) -> float | None:

@@ -1,14 +1,13 @@
 """The TOML beside a test: specimen, striker, columns, noise, window and data, checked and in SI.
 
 [columns] names the column of a channel where its header does not: ``column`` (its header or its
-number), ``unit``, ``scale`` (a number, or a quantity such as "4444.4 N/V"; negative turns a sign
-round) and, for displacements, ``counts_down = true`` (a gap or a position that gets smaller in
+number), ``unit``, ``scale`` (a number, or a quantity such as "4444.4 N/V"; a negative one changes
+the sign) and, for displacements, ``counts_down = true`` (a gap or a position that gets smaller in
 compression). [data] ``duplicates`` is "average" (neighbouring rows with one time stamp make one
 sample) or "refuse", ``sheet`` that of a workbook. A quantity may have a standard deviation, "1.75 ±
-0.01 m/s"; `Measurement.uncertainties` says of which it is used.
-[motion] names a ``file`` that has the motion by a clock of its own, relative to the TOML, the
-``delay`` of that clock, and in [motion.columns] its columns. [priors] names parameters of the model
-and what is known of them before the fit, "5.5 ± 0.1 MPa".
+0.01 m/s"; `Measurement.uncertainties` lists those that are used. [motion] names a ``file`` with a
+clock of its own, relative to the TOML, the ``delay`` of that clock, and in [motion.columns] its
+columns. [priors] gives what is known of parameters before the fit, "5.5 ± 0.1 MPa".
 """
 
 from __future__ import annotations
@@ -47,7 +46,20 @@ class _Quantity(NamedTuple):
     spread: str = ""
 
 
-_SECTIONS = {
+class _Other(NamedTuple):
+    """What a key that is no quantity may be, and how that is told."""
+
+    valid: Callable[[Any], bool]
+    right: str
+
+
+def is_range(cycles: Any) -> bool:
+    """Whether a value has the numbers of a first and a last cycle."""
+    pair = isinstance(cycles, tuple | list) and len(cycles) == 2
+    return pair and all(type(one) is int and one > 0 for one in cycles)
+
+
+_SECTIONS: dict[str, dict[str, _Quantity | _Other]] = {
     "specimen": {
         "height": _Quantity("m", "1.19 mm", "height"),
         "diameter": _Quantity("m", "5 mm", "diameter"),
@@ -58,30 +70,18 @@ _SECTIONS = {
     "striker": {
         "mass": _Quantity("kg", "7 g", "striker_mass"),
         "velocity": _Quantity("m/s", "1.75 m/s", "velocity"),
+        "gravity": _Other(lambda v: type(v) is bool, "true or false"),
     },
     "noise": {"stress": _Quantity("Pa", "20 kPa"), "displacement": _Quantity("m", "2 um")},
-    "window": {"start": _Quantity("s", "0.5 ms"), "end": _Quantity("s", "2 ms")},
-    "data": {},
-}
-
-
-def is_range(cycles: Any) -> bool:
-    """Whether a value has the numbers of a first and a last cycle."""
-    if not isinstance(cycles, tuple | list) or len(cycles) != 2:
-        return False
-    return all(type(one) is int and one > 0 for one in cycles)
-
-
-# Keys that are no quantities: what they may be, and how that is told.
-_OTHERS: dict[str, dict[str, tuple[Callable[[Any], bool], str]]] = {
-    "striker": {"gravity": (lambda v: type(v) is bool, "true or false")},
     "window": {
-        "cycle": (lambda v: type(v) is int and v > 0, "a whole number from 1 up"),
-        "cycles": (is_range, "the numbers of the first and the last one, like [1, 3]"),
+        "start": _Quantity("s", "0.5 ms"),
+        "end": _Quantity("s", "2 ms"),
+        "cycle": _Other(lambda v: type(v) is int and v > 0, "a whole number from 1 up"),
+        "cycles": _Other(is_range, "the numbers of the first and the last one, like [1, 3]"),
     },
     "data": {
-        "duplicates": (lambda v: v in ("average", "refuse"), "one of average, refuse"),
-        "sheet": (lambda v: isinstance(v, str), 'a name, like "Sheet1"'),
+        "duplicates": _Other(lambda v: v in ("average", "refuse"), "one of average, refuse"),
+        "sheet": _Other(lambda v: isinstance(v, str), 'a name, like "Sheet1"'),
     },
 }
 _SCALE = "4444.4 N/V"
@@ -93,8 +93,8 @@ MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
 class Column:
     """What [columns] says of one channel: its header, or number from 1, its unit and its scale.
 
-    `spread` is the relative standard deviation of the scale; one that `counts_down` gets smaller in
-    compression.
+    `spread` is the relative standard deviation of the scale; a column that `counts_down` gets
+    smaller in compression.
     """
 
     column: str | int
@@ -184,8 +184,8 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         spreads: dict[str, float] = {}
         values: dict[str, dict[str, Any]] = {}
         for section, keys in _SECTIONS.items():
-            table, others = _table(document, section), _OTHERS.get(section, {})
-            check_keys(f"[{section}]", table, [*keys, *others])
+            table = _table(document, section)
+            check_keys(f"[{section}]", table, keys)
             values[section] = {k: _value(section, k, v, spreads) for k, v in table.items()}
         name = document.get("name", printable(toml_beside(test).stem))
         if not (isinstance(name, str) and name.strip() and name.isprintable()):
@@ -193,7 +193,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         if len(name) > LONGEST:
             raise InputError(f"name has {len(name)} characters; it must have {LONGEST} at most.")
         priors, window = _table(document, "priors"), values["window"]
-        for key, value in priors.items():  # the model, which is not known here, says which
+        for key, value in priors.items():  # which keys there are depends on the model
             if not isinstance(value, str):
                 raise InputError(f'[priors] {key} = {value!r} must be like "5.5 ± 0.1 MPa".')
         if {"cycle", "cycles"} <= window.keys():
@@ -223,15 +223,14 @@ def _table(document: dict[str, Any], name: str, within: str = "") -> dict[str, A
 
 def _value(section: str, key: str, value: Any, spreads: dict[str, float]) -> Any:
     """Check and return what a key says, in SI, and put its ± into `spreads`."""
-    where, several = f"[{section}] {key}", key == "heights"
-    if (other := _OTHERS.get(section, {}).get(key)) is not None:
-        if not other[0](value):
-            raise InputError(f"{where} = {value!r} must be {other[1]}.")
+    where, several, kind = f"[{section}] {key}", key == "heights", _SECTIONS[section][key]
+    if isinstance(kind, _Other):
+        if not kind.valid(value):
+            raise InputError(f"{where} = {value!r} must be {kind.right}.")
         return value
     if several and (not isinstance(value, list) or not value):
         raise InputError(f'{where} must be a list like ["0.700 mm", "0.490 mm"], base first.')
-    si, example, spread = _SECTIONS[section][key]
-    numbers = []
+    (si, example, spread), numbers = kind, []
     for i, v in enumerate(value if several else [value], 1):
         if spread:
             number, sigma = parse_uncertain(v, si, where, example)
@@ -273,16 +272,15 @@ def motion_file(toml: Path) -> Path | None:
     """Return the file that [motion] of a TOML names; None if it names none or cannot be read."""
     try:
         return _file(toml, load_toml(toml, "").get("motion"))
-    except InputError:  # who reads the test says it
+    except InputError:  # `read_settings` says what is wrong
         return None
 
 
 def _file(toml: Path, table: Any) -> Path | None:
     """Path of the file that a table [motion] names, which is relative to its TOML."""
     name = table.get("file") if isinstance(table, dict) else None
-    if not isinstance(name, str) or not name.strip() or "\0" in name:
-        return None
-    return toml.parent / name
+    named = isinstance(name, str) and name.strip() and "\0" not in name
+    return toml.parent / str(name) if named else None
 
 
 def _motion(path: Path, document: dict[str, Any], spreads: dict[str, float]) -> Motion | None:
@@ -322,11 +320,10 @@ def _columns(
         parts = split_quantity(split_uncertain(text)[0])
         if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not is_unit(parts[1]):
             raise InputError(f'{where}: scale = {scale!r} must be like -1 or "{_SCALE}".')
-        if inside or channel in ("time", "cycle"):  # a ± has no meaning there
+        sigma, exact = 0.0, inside or channel in ("time", "cycle")  # a ± has no meaning there
+        if exact:
             parse_quantity(text, parts[1], f"{where}: scale", _SCALE)
-            spread = 0.0
         else:
-            sigma = parse_uncertain(text, parts[1], f"{where}: scale", _SCALE)[1]
-            spread = (sigma or 0.0) / abs(parts[0])
-        columns[channel] = Column(column, unit, *parts, bool(down), spread)
+            sigma = parse_uncertain(text, parts[1], f"{where}: scale", _SCALE)[1] or 0.0
+        columns[channel] = Column(column, unit, *parts, bool(down), sigma / abs(parts[0]))
     return columns

@@ -8,11 +8,11 @@ from typing import Any
 
 from foamfit.errors import InputError
 
-# Usual units, for headers in capitals: "MM" is millimetre as a displacement, "MPA" megapascal.
+# For headers in capitals: "MM" is a millimetre as a displacement, "MPA" a megapascal.
 _USUAL = ["s", "ms", "us", "m", "cm", "mm", "um", "N", "kN", "mN", "Pa", "kPa", "MPa", "GPa"]
 _USUAL += ["m/s", "mm/s", "m/s^2", "V", "mV"]
 _QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
-# No quantity of a test is larger in SI, or smaller than its inverse; its square is still a number.
+# No quantity of a test is larger in SI, or smaller than the inverse; the square is still finite.
 LARGEST = 1e30
 _PLUS_MINUS = re.compile(r"±|\+/[-−]")
 
@@ -21,11 +21,11 @@ _PLUS_MINUS = re.compile(r"±|\+/[-−]")
 def _registry() -> Any:
     import pint
 
-    make = functools.partial(pint.UnitRegistry, autoconvert_offset_to_baseunit=True)
+    registry: Any
     try:  # parsing pint's definitions takes longer than most fits: it keeps them in a cache
-        registry: Any = make(cache_folder=":auto:")
+        registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True, cache_folder=":auto:")
     except OSError:
-        registry = make()
+        registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
     registry.define("microstrain = 1e-6 = ustrain")
     return registry
 
@@ -39,7 +39,7 @@ def _unit(text: str) -> Any:
         text = ""
     try:
         return _registry().Quantity(1.0, _registry().parse_units(text))
-    except Exception:  # pint and the tokenizer beneath it have a dozen ways of saying no
+    except Exception:  # pint and its tokenizer raise a dozen kinds of errors
         return None
 
 
@@ -84,11 +84,10 @@ def parse_quantity(value: object, si: str, where: str, example: str) -> float:
 def parse_uncertain(
     value: object, si: str, where: str, example: str, *, zero: bool = False
 ) -> tuple[float, float | None]:
-    """Read a quantity and its standard deviation, None where it has none, in the unit `si`.
+    """Read a quantity in the unit `si` and its standard deviation, None where it has none.
 
     It is written like "1.75 ± 0.01 m/s", "1.19 mm +/- 5 um" or "5 mm ± 1 %" (of the value). The
-    standard deviation must be less than the value, unless that may be `zero`. The InputError names
-    the place by `where`, and gives the `example`.
+    standard deviation must be less than the value, unless that may be `zero`.
     """
     text, spread = split_uncertain(value)
     number = _in_si(text, si)
@@ -97,9 +96,9 @@ def parse_uncertain(
         raise InputError(f'{where} = {shown} {number}; give it like "{example}".')
     if not spread:
         return number, None
-    parts = split_quantity(spread)
-    share = parts is not None and parts[1] == "%"
-    sigma = abs(number) * parts[0] / 100.0 if parts and share else _in_si(spread, si)
+    amount, unit = split_quantity(spread) or (0.0, "")
+    share = unit == "%"
+    sigma = abs(number) * amount / 100.0 if share else _in_si(spread, si)
     if isinstance(sigma, str):
         wrong = sigma
     elif sigma < 0.0:

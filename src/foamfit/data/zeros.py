@@ -1,8 +1,8 @@
-"""What the rows around contact show: zeros of the channels, and the flight of a striker."""
+"""What the rows around contact show: zeros of the channels, and the flight of the striker."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.constants import g as gravity
@@ -14,10 +14,10 @@ from foamfit.data.noise import MIN_REST, NOTHING, Level, level_on_line, line_at,
 from foamfit.text import engineering, percent
 
 _LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
-_FEW = 20  # rows before contact below which the end of a record that is flat shows the zero better
+_FEW = 20  # with fewer rows before contact, a flat end of the record shows the zero better
 _TAIL, _HIGHEST = 0.04, 0.1  # share of a record that is its end; of the range, its highest level
 _MATTERS = 0.01  # share of a striker's velocity from which on its gain by gravity is asked for
-# How a note begins to say which velocity a motion contradicts.
+# Part of a note on a velocity that the motion contradicts.
 CONTRADICTED = "but the striker's velocity is given as"
 
 
@@ -25,8 +25,7 @@ CONTRADICTED = "but the striker's velocity is given as"
 class Span:
     """Rows around contact: `first` up to `end` are kept, those before `rest` show zeros.
 
-    From the row `leaves` on there is no contact any more. `returned` says whether the stress has
-    returned to zero at the end.
+    Contact ends at the row `leaves`; `returned` says whether the stress is back at zero there.
     """
 
     first: int
@@ -35,43 +34,34 @@ class Span:
     leaves: int
     returned: bool = True
 
-    @classmethod
-    def of_impact(cls, record: Record, start: Start, levels: Levels) -> Span:
-        """Keep a tenth of the rows of contact before it, a fiftieth after it.
 
-        The rows kept from before contact show no zeros: the estimate of contact may be late. A
-        derived stress shows its end less well: a quarter is kept after it.
-        """
-        first, stress = start.first, record.stress
-        before = stress[: max(0, first - 2)]
-        zero = float(before.mean()) if before.size >= _FEWEST else 0.0
-        if before.size < _FEW and (tail := tail_level(stress, levels["stress"])):
-            zero = tail.value
-        found, returned = contact_end(stress[first:] - zero, levels["stress"])
-        after = found // (4 if "stress" in record.derived else 50)
-        end = min(len(record), first + found + max(3, after)) if returned else len(record)
-        # Of few rows before contact half are kept and half show the zeros.
-        lead = min(max(_LEAST_LEAD, found // 10), first // 2 if first >= 2 * _FEWEST else first)
-        late = int(3 * start.error / float(np.median(np.diff(record.instants))))
-        rest = first - max(lead, min(late, 2 * first // 3))
-        return cls(first - lead, end, rest, first + found, returned)
+def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
+    """Keep a tenth of the rows of contact before it, a fiftieth after it.
 
-
-@dataclass
-class Zeros:
-    """What was taken off the channels, and the standard errors of the zeros that were measured."""
-
-    origins: dict[str, float] = field(default_factory=dict)
-    errors: dict[str, float] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    The rows kept from before contact show no zeros: the estimate of contact may be late. A derived
+    stress shows its end less well: a quarter is kept after it.
+    """
+    first, stress = start.first, record.stress
+    before = stress[: max(0, first - 2)]
+    zero = float(before.mean()) if before.size >= _FEWEST else 0.0
+    if before.size < _FEW and (tail := tail_level(stress, levels["stress"])):
+        zero = tail.value
+    found, returned = contact_end(stress[first:] - zero, levels["stress"])
+    after = found // (4 if "stress" in record.derived else 50)
+    end = min(len(record), first + found + max(3, after)) if returned else len(record)
+    # Of few rows before contact half are kept and half show the zeros.
+    lead = min(max(_LEAST_LEAD, found // 10), first // 2 if first >= 2 * _FEWEST else first)
+    late = int(3 * start.error / float(np.median(np.diff(record.instants))))
+    rest = first - max(lead, min(late, 2 * first // 3))
+    return Span(first - lead, end, rest, first + found, returned)
 
 
 def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
-    """Level of a force at the end of an impact's record, if it is flat there and the striker left.
+    """Level of a force at the end of an impact's record, if it is flat there: the striker has left.
 
     The end grows backwards as long as the rows before it lie at its level within a standard error:
-    a contact that ends softly presses for long by less than its noise. Of few rows the correlation
-    is not known: their mean counts as one row.
+    a soft end of contact stays below the noise for long. The correlation of few rows is unknown:
+    their mean counts as one row.
     """
     size = max(8, int(_TAIL * len(values)))
     step, n = max(4, size // 2), size
@@ -87,7 +77,7 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
             break
         n += step
         level = mean_level(values[-n:], noise)
-    # The rows next to the end of contact may still press.
+    # The rows next to the end of contact may still be loaded.
     level = mean_level(values[step - n :], noise) if n > 2 * step else level
     if level.samples < MIN_REST:
         level = level._replace(error=max(level.error, noise.sigma))
@@ -96,13 +86,13 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
 
 def take_zeros(
     record: Record, first: Record, start: Start, span: Span, levels: Levels, *, impact: bool
-) -> tuple[Record, Zeros]:
+) -> Record:
     """Take off what the channels of `first` show before contact, or a motion at contact.
 
-    Where hardly a row lies before the contact of an impact, the end of the record shows the zero of
-    a force that has left; where neither does, the file's own zero of the channel stands.
+    With too few rows before the contact of an impact, the end of the record shows the zero of the
+    force; without those, the file's own zero of the channel stands.
     """
-    done, n = Zeros(), span.rest
+    origins, errors, n = dict[str, float](), dict[str, float](), span.rest
     for name, values in first.curves("acceleration").items():
         if name in record.derived:
             continue
@@ -120,32 +110,29 @@ def take_zeros(
             elif n >= _FEWEST:
                 zero, note = _zero_at_rest(name, values[:n], unit, np.ptp(values), noise)
             elif start.first:
-                note = (
-                    f"Only {n} rows certainly lie before contact: the file's own zero of the "
-                    f"{name} stands."
-                )
+                note = f"Only {n} rows certainly lie before contact: the file's own zero of the "
+                note += f"{name} stands."
             if zero.samples:
-                done.errors[name] = zero.error
+                errors[name] = zero.error
         else:
             zero, source = _zero_of_motion(name, first, start, n, noise, impact=impact)
             top = name == "displacement"
             if top and start.gauge == "rest" and n >= _FEWEST:
-                done.errors[name] = zero.error
+                errors[name] = zero.error
             if abs(zero.value) > (0.0 if top else 1e-3 * np.ptp(values)):
                 label, size = "The displacement" if top else name, engineering(zero.value, "m")
                 note = f"{label} at contact, {size}, is taken off ({source})."
-        done.notes += [note] * bool(note)
         whole = record.channel(name)
         assert whole is not None  # the record has the channels of its first cycle
-        record = record.changed(name, whole - zero.value)
-        done.origins[f"{name}_zero"] = zero.value
-    return record, done
+        record = record.changed(name, whole - zero.value).noted(*[note] * bool(note))
+        origins[f"{name}_zero"] = zero.value
+    return replace(record, origins=origins, zeros=errors)
 
 
 def _zero_at_rest(
     name: str, rest: Array, unit: str, size: float, noise: NoiseLevel
 ) -> tuple[Level, str]:
-    """Zero of a stress or acceleration at rest; one that drifts more than it is off is kept."""
+    """Zero of a stress or acceleration at rest; none is taken off if it drifts by more."""
     n, zero, scatter, told = len(rest), mean_level(rest, noise), float(rest.std()), ""
     slope = level_on_line(np.arange(n, dtype=np.float64), rest, 0.0, noise)[1]
     rise = slope.value * n
@@ -170,8 +157,8 @@ def _zero_of_motion(
 ) -> tuple[Level, str]:
     """Value of a motion at contact: the mean of its rest, or else that of a line there.
 
-    Where nothing was recorded before contact, the file's zero stands unless it lies elsewhere; a
-    slow test whose record starts under load has its own zero, too.
+    Where nothing was recorded before contact, the file's zero stands unless it is clearly wrong;
+    it also stands in a slow test whose record starts under load.
     """
     time, values, first = record.instants, record.channel(name), start.first
     assert values is not None  # asked for by its name
@@ -210,14 +197,14 @@ def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker)
 
 
 def mark_flight(record: Record, start: Start, span: Span) -> Record:
-    """Mark rows in which the motion is not the striker's, or may not be yet, as not measured."""
+    """Mark rows in which the motion is not, or perhaps not yet, the striker's as not measured."""
     if record.displacement is None or start.gauge in ("flight", ""):
         return record
     step = float(np.median(np.diff(record.instants)))
     moves = record.instants > max(2.5 * step, 2 * start.error)
     if start.gauge == "rest":
         moves[span.leaves - span.first :] = False
-    kept = record.sampled.get("displacement", np.ones(len(record), dtype=np.bool_))
+    kept = record.sampled.get("displacement", np.ones(len(record), dtype=bool))
     return replace(record, sampled=record.sampled | {"displacement": kept & moves})
 
 
@@ -272,15 +259,14 @@ def contact_end(stress: Array, noise: NoiseLevel) -> tuple[int, bool]:
     """Index after the last sample of the contact with the highest stress, and if it was reached.
 
     The end is the last return to zero of a moving mean, whose noise is half a percent of the peak
-    if the pulse is long enough. A stress that soon rises again has not ended, nor one whose mean
-    over the next quarter of the time since the peak is not zero within its error.
+    if the pulse is long enough. Contact goes on if the stress soon rises again, or if its mean over
+    the next quarter of the time since the peak is not zero within its error.
     """
     top = int(np.argmax(stress))
     peak = float(stress[top])
-    below = np.flatnonzero(stress[top:] < 0.5 * peak)
     loaded = int(np.count_nonzero(stress > 0.1 * peak))
     needed = noise.time * (2 * noise.sigma / (0.005 * peak)) ** 2
-    steep = int(below[0]) if below.size else 0
+    steep = int(np.argmax(stress[top:] < 0.5 * peak))  # 0 if it never falls so far
     width = max(1, steep // 12, int(min(needed, loaded // 24)))
     mean = smooth(stress, width)
 

@@ -69,29 +69,23 @@ class Scales:
         """Time under load, s; 1 where time is unknown."""
         return 2.0 * self.strain / self.rate if self.rate > 0.0 else 1.0
 
-    @property
-    def _hundredth(self) -> dict[str, float]:
-        """A hundredth of the time under load, and of the largest value of each channel."""
-        times = dict.fromkeys((nuisance.CONTACT_TIME, nuisance.TIME_SHIFT), 0.01 * self.duration)
-        moved, acceleration = self.strain * self.height, self.height / self.duration**2
-        return times | {
-            "stress_zero": 0.01 * self.stress,
-            "displacement_zero": 0.01 * moved,
-            "acceleration_zero": 0.01 * acceleration,
+    def _hundredth(self, name: str) -> float:
+        """A hundredth of the time under load, or of the largest value of a channel."""
+        largest = {
+            "stress_zero": self.stress,
+            "displacement_zero": self.strain * self.height,
+            "acceleration_zero": self.height / self.duration**2,
         }
+        return 0.01 * largest.get(name, self.duration)
 
     def unit(self, scale: str) -> float:
         """A scale of a parameter by its name, see `springs.laws.record.Param`."""
-        return {
-            "one": 1.0, "strain": self.strain, "stress": self.stress, "slope": self.slope,
-            "damping": self.eta, "duration": self.duration, "height": self.height,
-        }[scale]  # fmt: skip
+        return 1.0 if scale == "one" else float(getattr(self, scale.replace("damping", "eta")))
 
     def of_parameter(self, model: Model, name: str, values: dict[str, float]) -> float:
         """Scale of a parameter, in its unit: the unit of its relative change."""
-        short = split_name(name)[1]
         if name in NUISANCE:
-            return abs(values[name]) if name in nuisance.STRIKER else self._hundredth[short]
+            return abs(values[name]) if name in nuisance.STRIKER else self._hundredth(name)
         param = model.param(name)
         if not param.least_size:
             return abs(values[name]) or 1.0
@@ -109,7 +103,6 @@ def others(name: str, param: Param, values: dict[str, float]) -> list[float]:
 
 
 SCALES_IN_WORDS = {
-    "one": "1",
     "stress": "the largest stress",
     "slope": "the largest stress over strain",
     "damping": "the damping that would carry the whole stress",
@@ -209,30 +202,24 @@ class Space:
     @cached_property
     def box(self) -> tuple[Array, Array]:
         """Lowest and highest coordinates, (n_free,) each."""
-        low, high = np.empty((2, len(self.coordinates)))
-        for j, one in enumerate(self.coordinates):
-            if one.param is not None:
-                low[j], high[j] = one.param.limits
-            elif one.unit:
-                low[j], high[j] = self.low[one.place], self.high[one.place]
-            else:
-                low[j], high[j] = NUISANCE_BOX
+        limits = [
+            one.param.limits
+            if one.param is not None
+            else (self.low[one.place], self.high[one.place])
+            if one.unit
+            else NUISANCE_BOX
+            for one in self.coordinates
+        ]
+        low, high = np.reshape(np.array(limits, dtype=float), (-1, 2)).T.copy()
         return low, high
-
-    def _middle(self, i: int) -> tuple[float, float]:
-        """Middle between the limits of a nuisance parameter, and half of their distance."""
-        return 0.5 * (self.low[i] + self.high[i]), 0.5 * (self.high[i] - self.low[i])
 
     def _ends(self, one: Coordinate, values: Array) -> tuple[float, float]:
         """Values of a parameter at the coordinates 0 and 1, unless its logarithm is one."""
-        if one.param is None and one.unit:
-            return 0.0, one.unit
-        if one.param is None:
-            middle, half = self._middle(one.place)
-            return middle, middle + half
-        if isinstance(one.param.coordinate, Between):
+        if one.param is not None and isinstance(one.param.coordinate, Between):
             return one.param.coordinate.ends(*(float(values[place]) for place in one.of))
-        return 0.0, one.unit
+        if one.unit:
+            return 0.0, one.unit
+        return 0.5 * (self.low[one.place] + self.high[one.place]), self.high[one.place]
 
     def encode(self, values: Array) -> Array:
         """Coordinates of a vector of parameters, moved into the box."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -66,30 +65,15 @@ def _states(problem: Problem, simulated: Simulated) -> list[tuple[int, dict[int,
     return out
 
 
-@dataclass(frozen=True)
-class Section:
-    """Samples `start` to `stop` (excluded) in which no spring changes its branch.
-
-    `branches` names those of the hysteretic springs from the base up, joined by a dot: "d", "a·c".
-    """
-
-    branches: str
-    start: int
-    stop: int
-
-
-def sections(problem: Problem, simulated: Simulated) -> tuple[Section, ...]:
-    """Cut the samples of a run at its switches and at the end of contact, in the order of time."""
+def sections(problem: Problem, simulated: Simulated) -> list[str]:
+    """Branches of the hysteretic springs at each sample, base first: "d", "a·c"; or free flight."""
     clock, contact_end = problem.objective.time, simulated.motion.contact_end
-    cuts = [(at, "·".join(on.values()) or "line") for at, on in _states(problem, simulated)]
+    words = np.empty(clock.size, dtype=object)
+    for at, on in _states(problem, simulated):
+        words[at:] = "·".join(on.values()) or "line"
     if np.isfinite(contact_end):
-        cuts.append((int(np.searchsorted(clock, contact_end, side="right")), FLIGHT))
-    ends = [start for start, _ in cuts[1:]] + [clock.size]
-    return tuple(
-        Section(name, start, min(stop, clock.size))
-        for (start, name), stop in zip(cuts, ends, strict=True)
-        if stop > start
-    )
+        words[int(np.searchsorted(clock, contact_end, side="right")) :] = FLIGHT
+    return words.tolist()
 
 
 def branch_of_samples(problem: Problem, simulated: Simulated) -> NDArray[np.str_]:

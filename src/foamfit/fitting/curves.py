@@ -13,6 +13,7 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel
 from foamfit.data.motion import SmoothMotion, follow
 from foamfit.errors import InputError
+from foamfit.solve.scene import Motion
 from foamfit.springs.model import Model
 
 # Those of every objective, besides displacement_1_time … where masses inside were followed.
@@ -199,6 +200,20 @@ def driven_instants(measurement: Measurement, clock: Array, motion: SmoothMotion
         late = first / (second - first) if second > first else -1.0
         more += [at - late * (then - at)] if 0.0 < late < LATEST else []
     return np.union1d(clock, more) if more else clock
+
+
+def without_tension(motion: Motion) -> Motion:
+    """The run of a specimen that is not fixed to the platen: where it would pull, it bears none.
+
+    It has lost contact there; what it remembers follows the platen on.
+    """
+    lost = motion.base_stress < 0.0
+    if not lost.any():
+        return motion
+    slopes = motion.slopes
+    if slopes is not None:
+        slopes = slopes._replace(base_stress=np.where(lost, 0.0, slopes.base_stress))
+    return motion._replace(base_stress=np.where(lost, 0.0, motion.base_stress), slopes=slopes)
 
 
 def later(time: Array, curves: Array, late: float) -> Array:

@@ -102,7 +102,7 @@ def descend(
     residual: Callable[[Array], Array],
     jacobian: Callable[[Array], Array | Blocks],
     start: Array,
-    box: tuple[Array, Array],
+    box: tuple[Array, Array] | Array,
     iterations: int,
     *,
     enough: float = 0.0,

@@ -12,6 +12,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from foamfit.data.measurement import Measurement
 from foamfit.springs.parameters import NUISANCE
 
@@ -98,9 +100,9 @@ def open_in(measurement: Measurement, drive: str, counted: Mapping[str, bool]) -
 
 
 def limits_of(
-    name: str, measurement: Measurement, drive: str, duration: float, ranges: Mapping[str, float]
+    name: str, measurement: Measurement, drive: str, duration: float
 ) -> tuple[float, float]:
-    """Limits of a nuisance parameter, SI; `ranges` are those of the channels."""
+    """Limits of a nuisance parameter, SI."""
     prior, middle = priors_of(measurement, drive).get(name), values_of(measurement)[name]
     if prior is not None:
         reach = REACH * prior.sigma
@@ -108,7 +110,8 @@ def limits_of(
     elif name in STRIKER:
         return 0.1 * middle, 10.0 * middle
     elif name in ZEROS:
-        reach = LARGEST_ZERO * ranges.get(ZEROS[name], 0.0)
+        values = measurement.channels().get(ZEROS[name])
+        reach = 0.0 if values is None else LARGEST_ZERO * float(np.ptp(values))
     else:
         reach = (LARGEST_CONTACT if name == CONTACT_TIME else LARGEST_SHIFT) * duration
     return middle - reach, middle + reach

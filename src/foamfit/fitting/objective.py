@@ -1,16 +1,14 @@
 """The objective: how far a model's curves are from the measured ones, sample by sample.
 
 Curves are compared in time (or sample by sample along a history), never by interpolating across
-the loop. Two channels were measured, stress and displacement, and perhaps displacements of masses
-inside; what is counted of them, and how much, is in `weights`, so that nothing is counted twice
-silently.
+the loop. `weights` say which curves are counted, so that nothing is counted twice silently.
 """
 
 from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +33,9 @@ from foamfit.fitting.curves import (
     interior_curves,
     later,
     moved_at,
+    without_tension,
 )
-from foamfit.fitting.losses import LOSSES, Weighing, soften, softness
+from foamfit.fitting.weighing import Weighing
 from foamfit.solve.plan import AnyPlan, Motion
 from foamfit.solve.plan import plan as make_plan
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
@@ -53,10 +52,8 @@ OF_DRIVE = ("those of the drive",)  # nuisance parameters, where none are named
 MODEL_ERROR = 0.005
 MAX_STEPS = 20_000  # a trial that needs more is too stiff to be worth waiting for
 RTOL_OF_ANY_LAW = 1e-5  # of a registered law, whose halved steps cost more
-# Standard deviation of normal residuals over the median of their sizes.
-NORMAL = 1.4826
-# Most instants that are simulated for each sample that averages rows of the file.
-FINEST = 8
+NORMAL = 1.4826  # standard deviation of normal residuals over the median of their sizes
+FINEST = 8  # most instants that are simulated for each sample that averages rows of the file
 # Steps of differences: of the velocity and the mass, relative, of times over the instants' gap, and
 # of the zero of a motion over its range.
 RELATIVE_STEP, STEP_OF_TIME, STEP_OF_ZERO = 1e-3, 0.02, 1e-4
@@ -64,16 +61,13 @@ RELATIVE_STEP, STEP_OF_TIME, STEP_OF_ZERO = 1e-3, 0.02, 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """The curves of one set of parameters and the run itself.
+    """The curves of one set of parameters, the run itself, and derivatives if they were wanted."""
 
-    `curves` are by their names in `Objective.curves`, absent where the drive prescribes or the test
-    lacks them; stress_strain is the stress (Pa) along the measured displacement. `slopes` are the
-    derivatives (p, n) of the curves by the parameters that were asked for; None where none were.
-    """
-
+    # By their names in `Objective.curves`, absent where the drive prescribes or the test lacks
+    # them; stress_strain is the stress (Pa) along the measured displacement.
     curves: dict[str, Array]
     motion: Motion
-    slopes: dict[str, Array] | None = None
+    slopes: dict[str, Array] | None = None  # (p, n) each
 
 
 @dataclass(eq=False)
@@ -97,7 +91,6 @@ class Objective:
     nuisance: tuple[str, ...] = OF_DRIVE
     # The covariance that a driving motion's own uncertainty gives the residual; see `weigh_motion`.
     weighing: Weighing | None = None
-    loss: str = "linear"  # One of `LOSSES`
     given: tuple[nuisances.Prior, ...] = ()  # Priors of parameters of the springs
     followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is known already
     evaluations: int = field(default=0, init=False)  # Sets of parameters that were simulated
@@ -108,10 +101,6 @@ class Objective:
         check_drive(self.measurement, self.drive)
         if self.time_shift:
             check_time_shift(self.measurement, self.drive)
-        if self.loss not in LOSSES:
-            raise InputError(
-                f"loss '{self.loss}' is unknown; it must be one of {', '.join(LOSSES)}"
-            )
         if self.nuisance == OF_DRIVE:
             self.nuisance = nuisances.names_of(self.drive, time_shift=self.time_shift)
         self.rtol = max(self.rtol, RTOL_OF_ANY_LAW * self.model.is_registered)
@@ -123,7 +112,7 @@ class Objective:
         self._dashpots = np.array([name.endswith("eta") for name in self.model.names])
         self._dashpots[-1] = False  # the onsite damper is none of a spring
         time = self.measurement.time
-        self.time = np.arange(self._stress.size, dtype=float) if time is None else time
+        self.time = np.arange(self.stress.size, dtype=float) if time is None else time
         self._fine = min(self.measurement.block, FINEST) if self.drive != "stress" else 1
         self._clock, self._own = instants(self.time, self._fine), None
         if self._driven:
@@ -132,8 +121,10 @@ class Objective:
             self._own = np.searchsorted(self._clock, own) if self._clock.size > own.size else None
         driving = {"stress": ["stress_time"], "displacement": ["displacement_time"]}
         self._absent = driving.get(self.drive, []) + ["stress_time"] * (time is None)
-        loading = self._loading()
-        self._plans = {damped: self._scene(loading, damped=damped) for damped in (False, True)}
+        self.usual = nuisances.values_of(self.measurement)
+        striker = self.measurement.striker
+        self._gravity = (striker.gravity if striker else None) or 0.0
+        self._plans = self._scenes(self._loading())
         self.measured = self._measured()
         self.counted = tuple(name for name in self.measured if self.weights[name] > 0)
         self._inside = any(name in self.interior for name in self.counted)
@@ -142,7 +133,11 @@ class Objective:
                 f"{self.measurement.name}: no curve is left to fit; give one that the "
                 f"{self.drive} drive has a weight above zero"
             )
-        self.scale = {name: self._scale(name) for name in self.measured}
+        least = {name: MODEL_ERROR * float(np.ptp(curve)) for name, curve in self.measured.items()}
+        self.scale = {  # one standard deviation of the noise; an estimated one not below `least`
+            name: level.sigma if (level := self.noise(name)).given else max(level.sigma, floor)
+            for name, floor in least.items()
+        }
         self._kept = {name: self._fitted(name) for name in self.measured}
         self.sizes = tuple(self.kept(name).size for name in self.counted)
         self.n_data = sum(self.sizes)
@@ -163,10 +158,8 @@ class Objective:
     @cached_property
     def _along(self) -> dict[bool, AnyPlan]:
         """Scenes of the springs along the measured motion; none where there is no motion."""
-        if self.measurement.displacement is None:
-            return {}
-        along = DisplacementDrive(self._moved)
-        return {damped: self._scene(along, damped=damped) for damped in (False, True)}
+        there = self.measurement.displacement is not None
+        return self._scenes(DisplacementDrive(self._moved)) if there else {}
 
     def weigh_motion(self, values: Array) -> bool:
         """Weigh residuals by the motion's own uncertainty at a point; False where it has none.
@@ -176,7 +169,7 @@ class Objective:
         uncertain = self.by_motion(values)
         if uncertain is None:
             return False
-        plain = np.abs(self._moved_by(0.0).differences(values)[: self.n_data])
+        plain = np.abs(self._moved_by(0.0).residual(values)[: self.n_data])
         parts = np.split(plain, np.cumsum(self.sizes)[:-1])
         levels = [
             max(NORMAL * float(np.median(part)), self.noise(name).sigma * self.factor(name), 1e-9)
@@ -192,7 +185,7 @@ class Objective:
         modes = self.motion.modes(self._clock)
         out = np.empty((self.n_data, modes.shape[1]))
         for column, mode in zip(out.T, modes.T, strict=True):
-            sides = [self._moved_by(side * mode).differences(values) for side in (-0.5, 0.5)]
+            sides = [self._moved_by(side * mode).residual(values) for side in (-0.5, 0.5)]
             column[:] = (sides[1] - sides[0])[: self.n_data]
         self.evaluations += 2 * modes.shape[1]
         return out
@@ -216,7 +209,6 @@ class Objective:
             if (zero := channels.get(self.channel(curve))) in self.nuisance
         }
         gap = float(np.median(np.diff(self._clock)))
-        self.usual = nuisances.values_of(self.measurement)
         self._steps = dict.fromkeys(self.nuisance, STEP_OF_TIME * gap)
         self._steps |= {name: RELATIVE_STEP * self.usual[name] for name in nuisances.STRIKER}
         if self.measurement.displacement is not None:
@@ -228,31 +220,26 @@ class Objective:
         self._prior_places = np.array([names.index(one.name) for one in self.priors], np.int64)
 
     @property
-    def _stress(self) -> Array:
+    def stress(self) -> Array:
+        """Measured stress, Pa."""
         assert self.measurement.stress is not None  # checked by check_drive
         return self.measurement.stress
 
     def _loading(self) -> Drive:
         if self.drive == "impact":
-            striker = self.measurement.striker
-            assert striker is not None
-            assert striker.mass is not None
-            assert striker.velocity is not None
-            return Impact(striker.mass, striker.velocity, striker.gravity or 0.0)
+            usual = self.usual
+            return Impact(usual[nuisances.STRIKER_MASS], usual[nuisances.VELOCITY], self._gravity)
         if self.drive == "stress":
-            return StressDrive(driving_stress(self._stress, self.model))
+            return StressDrive(driving_stress(self.stress, self.model))
         return DisplacementDrive(self._moved)
 
-    def _scene(self, loading: Drive, *, damped: bool) -> AnyPlan:
-        """Make a scene ready; only which springs have a dashpot matters here, not their values.
+    def _scenes(self, loading: Drive) -> dict[bool, AnyPlan]:
+        """Make scenes without and with dashpots ready; the values of the springs do not matter.
 
         Interior masses move in an impact only; along a given motion the springs are in equilibrium.
         """
-        specimen = self.measurement.specimen
-        count = len(self.model.kinds)
-        springs = [law.any_spring() for law in self.model.laws]
-        heights = [specimen.height / count] * count
-        masses = [0.0] * count
+        specimen, count = self.measurement.specimen, len(self.model.kinds)
+        heights, masses = [specimen.height / count] * count, [0.0] * count
         if self.interior_mass and count > 1 and isinstance(loading, Impact):
             if specimen.mass is None:
                 raise InputError(
@@ -260,18 +247,18 @@ class Objective:
                     'like mass = "5.56 mg"'
                 )
             masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
+        springs = [law.any_spring() for law in self.model.laws]
         chain = Chain(springs, heights, specimen.area, masses)
-        return make_plan(
-            chain, loading, self._clock, dashpots=damped, relaxing=self.model.relaxation > 0,
-            max_steps=MAX_STEPS,
-        )  # fmt: skip
+        make = partial(make_plan, chain, loading, self._clock, max_steps=MAX_STEPS)
+        relaxing = self.model.relaxation > 0
+        return {damped: make(dashpots=damped, relaxing=relaxing) for damped in (False, True)}
 
     def _measured(self) -> dict[str, Array]:
         """Measured curves that the drive leaves free."""
-        measured = {"stress_time": self._stress}
+        measured = {"stress_time": self.stress}
         if self.measurement.displacement is not None:
             measured["displacement_time"] = self.measurement.displacement
-            measured["stress_strain"] = self._stress
+            measured["stress_strain"] = self.stress
         inside = self.measurement.interior
         measured |= {name: inside[node] for name, node in self.interior.items()}
         if self.accelerated:
@@ -290,19 +277,13 @@ class Objective:
         assert level is not None  # completed by with_noise
         return level
 
-    def _scale(self, name: str) -> float:
-        """One standard deviation of a curve's noise; an estimated one not below MODEL_ERROR."""
-        level = self.noise(name)
-        least = MODEL_ERROR * float(np.ptp(self.measured[name]))
-        return level.sigma if level.given else max(level.sigma, least)
-
     def _fitted(self, name: str) -> slice | NDArray[np.bool_]:
         """Samples of a curve that count: those that its channel measured, but no outliers."""
         outliers = self.measurement.outliers.get(self.channel(name))
-        taken = self.measurement.sampled.get(self.channel(name))
+        taken = self.measurement.sampled.get(self.channel(name), slice(None))
         if outliers is None:
-            return slice(None) if taken is None else taken
-        return ~outliers.left_out if taken is None else taken & ~outliers.left_out
+            return taken
+        return ~outliers.left_out if isinstance(taken, slice) else taken & ~outliers.left_out
 
     # ------------------------------------------------------------------ simulation and residual
 
@@ -311,9 +292,8 @@ class Objective:
     ) -> Simulated:
         """Simulate a flat vector of parameters; what is not counted only if `everything`.
 
-        `places` are those of the parameters by which derivatives are wanted.
-
-        Raises SimulationError if they are not admissible or the scene has no finite answer.
+        `places` are those of the parameters by which derivatives are wanted. Raises SimulationError
+        if the parameters are not admissible or the scene has no finite answer.
         """
         count = len(self.model.names)
         self.evaluations += 1
@@ -334,48 +314,47 @@ class Objective:
     ) -> Simulated:
         """Curves of springs as the channels show them, and their derivatives; see `simulate`."""
         own = places < values.size
-        zero = [p for p in places[~own] if self.nuisance[p - values.size] == "displacement_zero"]
-        damped = values[: self._dashpots.size][self._dashpots].any()
-        still = not (damped or self._dashpots[places[own]].any())
-        moved = bool(zero) and still and self._plans[False].moves_one
-        curves = self._curves(values, nuisance, everything, places[own], moved=moved)
         if own.all():
-            return curves
-        slopes = {}
-        by_zero = {}
-        if moved and curves.slopes is not None:  # the motion goes back by as much
-            by_zero = {int(zero[0]): {name: -one[-1] for name, one in curves.slopes.items()}}
-            own_slopes = {name: one[:-1] for name, one in curves.slopes.items()}
-            curves = replace(curves, slopes=own_slopes)
-        given = curves.slopes or {name: np.empty((0, self.time.size)) for name in curves.curves}
-        by_nuisance = by_zero | {
-            int(place): self._nuisance_slope(values, nuisance, int(place) - values.size)
-            for place in places[~own]
-            if int(place) not in by_zero
+            return self._curves(values, nuisance, everything, places)
+        named = {int(p): self.nuisance[p - values.size] for p in places[~own]}
+        zero = next((p for p, name in named.items() if name == "displacement_zero"), None)
+        still = not self._is_damped(values, places[own])
+        moved = zero is not None and still and self._plans[False].moves_one
+        curves = self._curves(values, nuisance, everything, places[own], moved=moved)
+        carried = curves.slopes or {}
+        by = {
+            int(place): {name: rows[i] for name, rows in carried.items()}
+            for i, place in enumerate(places[own])
         }
-        for name, carried in given.items():
-            slopes[name] = out = np.empty((places.size, self.time.size))
-            out[own] = carried
-            out[~own] = np.reshape(
-                [by_nuisance[int(place)][name] for place in places[~own]], (-1, self.time.size)
-            )
+        for place, name in named.items():
+            if moved and place == zero:  # the motion goes back by as much
+                by[place] = {curve: -rows[-1] for curve, rows in carried.items()}
+            else:
+                by[place] = self._nuisance_slope(values, nuisance, name)
+        slopes = {
+            name: np.array([by[place][name] for place in places.tolist()]) for name in curves.curves
+        }
         return replace(curves, slopes=slopes)
 
-    def _nuisance_slope(self, values: Array, nuisance: Array, at: int) -> dict[str, Array]:
+    def _is_damped(self, values: Array, places: NDArray[np.int64]) -> bool:
+        """Whether a spring has a dashpot, or a derivative by one is wanted."""
+        eta = self._dashpots
+        return bool(values[: eta.size][eta].any() or eta[places].any())
+
+    def _nuisance_slope(self, values: Array, nuisance: Array, name: str) -> dict[str, Array]:
         """Derivative of the curves by one nuisance parameter.
 
         The zero of a channel adds to it; the others by a central difference of two simulations,
         whose error is far below that of their steps. So is the zero of a motion along which the
         stress of an impact is counted.
         """
-        name, n = self.nuisance[at], self.time.size
+        n, at, step = self.time.size, self.nuisance.index(name), self._steps[name]
         followed = self._driven or "stress_strain" in self.counted
         if name in nuisances.ZEROS and not (followed and name == "displacement_zero"):
             own = {curve: self._zero_of.get(curve) == name for curve in self.curves}
             return {curve: np.full(n, float(shifted)) for curve, shifted in own.items()}
         if self.drive != "impact" and name not in (nuisances.TIME_SHIFT, "displacement_zero"):
             return {curve: np.zeros(n) for curve in self.curves}
-        step = self._steps[name]
         sides = []
         for side in (-0.5, 0.5):
             there = nuisance.copy()
@@ -385,89 +364,73 @@ class Objective:
         if name == nuisances.CONTACT_TIME:  # with a dashpot the stress jumps there
             jumped = np.abs(self._clock - nuisance[at]) <= step
             for slope in slopes.values():
-                slope[np.any(jumped.reshape(self.time.size, -1), axis=1)] = 0.0
+                slope[np.any(jumped.reshape(n, -1), axis=1)] = 0.0
         return slopes
 
     def _curves(
-        self, values: Array, nuisance: Array, everything: bool, places: NDArray[np.int64],
-        *, moved: bool = False,
-    ) -> Simulated:  # fmt: skip
+        self,
+        values: Array,
+        nuisance: Array,
+        everything: bool,
+        places: NDArray[np.int64],
+        moved: bool = False,
+    ) -> Simulated:
         """Curves of springs with derivatives by their own parameters alone; see `simulate`.
 
         The last derivative is by the displacement if the driving motion is to be `moved`.
         """
-        height = self.measurement.specimen.height
-        rows = self.model.rows(values)
+        height, rows = self.measurement.specimen.height, self.model.rows(values)
         heights = np.ascontiguousarray(self.model.heights(values, height))
         if rows is None or not (np.all(heights > 0.0) and values[-1] >= 0.0):
             raise SimulationError("the parameters are not admissible")
-        # A dashpot at zero is left out, unless a derivative by it is wanted.
-        damped = bool(values[: self._dashpots.size][self._dashpots].any()) or bool(
-            self._dashpots[places].any()
-        )
-        drag = float(values[-1]) / height
-        everywhere = everything or self._inside
+        damped = self._is_damped(values, places)  # a dashpot at zero is left out
+        drag, everywhere = float(values[-1]) / height, everything or self._inside
         wanted = self.model.directions[places]
         wanted = np.append(wanted, [(0, MOVED)], axis=0) if moved else wanted
         at = dict(zip(self.nuisance, nuisance.tolist(), strict=True))
-        plan = self._placed(self._plans[damped], at)
 
         def run(plan: AnyPlan, everything: bool) -> Motion:
             return plan.run(
                 rows, heights, self.rtol, drag=drag, everything=everything, directions=wanted
             )
 
+        plan, late = self._placed(self._plans[damped], at), at.get(nuisances.TIME_SHIFT, 0.0)
         motion = run(plan, everywhere)
-        late = at.get(nuisances.TIME_SHIFT, 0.0)
+        if self._driven and self.measurement.last_cycle is not None:
+            motion = without_tension(motion)
         shown = motion
         if late != 0.0 and self.drive == "impact":
             shown = run(plan._replace(time=plan.time - late), everywhere)
         along = motion if self._driven else None
-        wanted_along = everything or "stress_strain" in self.counted
-        if along is None and wanted_along and self._along:
+        if along is None and (everything or "stress_strain" in self.counted) and self._along:
             along = run(self._followed(self._along[damped], at), False)
-        parts = self._parts(motion, shown, along, everywhere, (values, at))
-        curves = {name: self._sampled(curve) for name, (curve, _) in parts.items()}
-        seen = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
-        for name in curves:
-            zero = self._zero_of.get(name)
-            if zero is not None:
-                curves[name] = curves[name] + at[zero]
-            curves[name] = self._late(name, curves[name], late)
-        if not len(wanted):
-            return Simulated(curves, seen)
-        slopes = {}
-        for name, (_, slope) in parts.items():
-            if slope is None:
-                continue
-            by_site = np.flatnonzero(places == values.size - 1)
-            slopes[name] = self._sampled(slope)
-            slopes[name][by_site] /= height  # site_eta acts through η_site/H
-            if name == "acceleration_time":
-                slopes[name][by_site] += self._sampled(self._push_of_site(shown, at)) / height
-            slopes[name] = self._late(name, slopes[name], late)
-        return Simulated(curves, seen, slopes)
-
-    def _parts(
-        self, motion: Motion, moved: Motion, along: Motion | None, everywhere: bool,
-        point: tuple[Array, dict[str, float]],
-    ) -> dict[str, tuple[Array, Array | None]]:  # fmt: skip
-        """Each curve and its derivatives at the instants that are simulated."""
 
         def of(run: Motion, node: int) -> tuple[Array, Array | None]:
             return run.displacement[node], run.slopes and run.slopes.displacement[:, node]
 
-        parts: dict[str, tuple[Array, Array | None]] = {
+        parts = {
             "stress_time": (motion.base_stress, motion.slopes and motion.slopes.base_stress),
-            "displacement_time": of(moved, -1),
+            "displacement_time": of(shown, -1),
         }
         if everywhere:
-            parts |= {name: of(moved, node - 1) for name, node in self.interior.items()}
+            parts |= {name: of(shown, node - 1) for name, node in self.interior.items()}
         if along is not None:
             parts["stress_strain"] = along.base_stress, along.slopes and along.slopes.base_stress
+        by_site = np.flatnonzero(places == values.size - 1)
         if self.accelerated:
-            parts["acceleration_time"] = self._acceleration(moved, *point)
-        return {name: part for name, part in parts.items() if name not in self._absent}
+            parts[ACCELERATION] = self._acceleration(shown, drag, at, by_site)
+        curves, slopes = dict[str, Array](), dict[str, Array]()
+        for name, (curve, slope) in parts.items():
+            if name in self._absent:
+                continue
+            curve, zero = self._sampled(curve), self._zero_of.get(name)
+            curves[name] = self._late(name, curve + at[zero] if zero else curve, late)
+            if slope is not None:
+                sampled = self._sampled(slope)
+                sampled[by_site] /= height  # site_eta acts through η_site/H
+                slopes[name] = self._late(name, sampled, late)
+        seen = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
+        return Simulated(curves, seen, slopes if len(wanted) else None)
 
     # ------------------------------------------------------------------ where and when
 
@@ -531,54 +494,42 @@ class Objective:
         rows = [np.interp(when, self.time, row) for row in np.atleast_2d(curves)]
         return np.reshape(rows, curves.shape)
 
-    def _push_of_site(self, motion: Motion, at: dict[str, float]) -> Array:
-        """Deceleration of the striker by an onsite damper of η_site/H = 1 Pa·s/m, m/s²."""
-        per_mass = self.measurement.specimen.area / at[nuisances.STRIKER_MASS]
-        clock = self._clock - at[nuisances.CONTACT_TIME]
-        speed = np.gradient(motion.displacement[-1], self._clock)
-        return np.where(clock < 0.0, 0.0, per_mass * speed)
-
     def _acceleration(
-        self, motion: Motion, values: Array, at: dict[str, float]
+        self, motion: Motion, drag: float, at: dict[str, float], by_site: NDArray[np.intp]
     ) -> tuple[Array, Array | None]:
         """Deceleration of the striker, m/s², and its derivatives: eq. of motion of the top mass.
 
         A (Σ_N + η_site/H dw/dt)/m; with masses inside the second derivative of the motion itself.
         A sensor on the striker does not feel gravity, nor does its zero before contact show it.
         """
-        drag = float(values[-1]) / self.measurement.specimen.height
         per_mass = self.measurement.specimen.area / at[nuisances.STRIKER_MASS]
-        striker = self.measurement.striker
-        gravity = (striker.gravity if striker else None) or 0.0
+        flying = self._clock < at[nuisances.CONTACT_TIME]
 
-        def of(stress: Array, top: Array) -> Array:
+        def of(stress: Array, top: Array) -> tuple[Array, Array]:
             speed = np.gradient(top, self._clock, axis=-1)
             if self.interior_mass:
-                felt = 0.0 if top.ndim > 1 else gravity
-                return felt - np.gradient(speed, self._clock, axis=-1)
-            flying = self._clock < at[nuisances.CONTACT_TIME]
-            return np.asarray(per_mass * (stress + np.where(flying, 0.0, drag * speed)))
+                felt = 0.0 if top.ndim > 1 else self._gravity
+                return felt - np.gradient(speed, self._clock, axis=-1), np.zeros_like(speed)
+            braked = np.where(flying, 0.0, speed)
+            return per_mass * (stress + drag * braked), per_mass * braked
 
-        push = of(motion.base_stress, motion.displacement[-1])
+        push, by_drag = of(motion.base_stress, motion.displacement[-1])
         if motion.slopes is None:
             return push, None
-        return push, of(motion.slopes.base_stress, motion.slopes.displacement[:, -1])
+        slopes = of(motion.slopes.base_stress, motion.slopes.displacement[:, -1])[0]
+        slopes[by_site] += by_drag
+        return push, slopes
 
     # ------------------------------------------------------------------ residual
 
-    def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
+    def residual(self, values: Array) -> Array:
         """Weighted residuals of all counted curves and of the priors, dimensionless.
 
         The first `n_data` are those of the curves: simulated minus measured over the curve's scale,
-        times the root of its weight, softened by the loss; outliers are left out. Behind them
-        stands a residual for each of the `priors`, over its standard deviation. Parameters that
-        cannot be simulated cost a finite penalty and are counted in `failures`. `shift` is taken
-        off before the loss, as if the data differed from the measured ones by that amount.
+        times the root of its weight; outliers are left out. Behind them stands a residual for each
+        of the `priors`, over its standard deviation. Parameters that cannot be simulated cost a
+        finite penalty and are counted in `failures`.
         """
-        return soften(self.differences(values) - shift, self.loss, self.n_data)
-
-    def differences(self, values: Array) -> Array:
-        """Residuals before the loss gives way to large ones; see `residual`."""
         try:
             curves = self.simulate(values)
         except SimulationError:
@@ -587,11 +538,11 @@ class Objective:
 
     def off_priors(self, values: Array) -> Array:
         """How far parameters are off their priors, in standard deviations."""
-        pairs = zip(values[self._prior_places], self.priors, strict=True)
-        return np.array([(value - one.mean) / one.sigma for value, one in pairs])
+        known = zip(values[self._prior_places], self.priors, strict=True)
+        return np.array([(value - one.mean) / one.sigma for value, one in known])
 
     def compare(self, curves: Simulated, values: Array) -> Array:
-        """Residuals of simulated curves before the loss gives way to large ones; see `residual`."""
+        """Residuals of simulated curves; see `residual`."""
         parts = [
             (curves.curves[name] - self.measured[name])[self._kept[name]] * self.factor(name)
             for name in self.counted
@@ -604,10 +555,8 @@ class Objective:
     @property
     def floor(self) -> float:
         """Sum of squares that leaves no more of the curves than noise, with a margin of half."""
-        levels = zip(self.counted, self.sizes, strict=True)
-        return 1.5 * sum(
-            n * (self.noise(name).sigma * self.factor(name)) ** 2 for name, n in levels
-        )
+        sizes = zip(self.counted, self.sizes, strict=True)
+        return 1.5 * sum(n * (self.noise(one).sigma * self.factor(one)) ** 2 for one, n in sizes)
 
     def factor(self, name: str) -> float:
         """Residual of a curve that is off by one SI unit."""
@@ -629,17 +578,13 @@ class Objective:
             curves = self.simulate(values, places=places)
         except SimulationError:
             return np.concatenate([np.zeros((self.n_data, places.size)), by_priors])
-        if curves.slopes is None:  # none were asked for
+        if (by := curves.slopes) is None:  # none were asked for
             return np.zeros((self.n_data + len(self.priors), 0))
-        parts = [
-            curves.slopes[name][:, self._kept[name]] * self.factor(name) for name in self.counted
-        ]
+        parts = [by[name][:, self._kept[name]] * self.factor(name) for name in self.counted]
         slopes = np.concatenate(parts, axis=1).T
         residual = self.compare(curves, values)[: self.n_data]
         slopes[np.abs(residual) >= self.penalty] = 0.0
         slopes = slopes if self.weighing is None else self.weighing(slopes)
-        if self.loss != "linear":
-            slopes *= softness(residual, self.loss)[:, None]
         return np.concatenate([slopes, by_priors]) if self.priors else slopes
 
     def jacobian_along(self, values: Array, moves: Array) -> Array:
@@ -657,7 +602,7 @@ class Objective:
         return self.time.size if taken is None else int(np.count_nonzero(taken))
 
     def rms(self, residual: Array) -> dict[str, float]:
-        """RMS of each counted curve in its unit, from residuals before the loss."""
+        """RMS of each counted curve in its unit, from residuals."""
         parts = np.split(residual[: self.n_data], np.cumsum(self.sizes)[:-1])
         return {
             name: float(np.sqrt(np.mean(part**2))) / self.factor(name)
@@ -676,22 +621,19 @@ class Objective:
 
     def shifted(self, curves: Simulated, late: float) -> dict[str, Array]:
         """Curves as channels show them of which the motion is late by so many seconds."""
-        impact, there = self.drive == "impact", curves.curves
+        moved = "displacement" if self.drive == "impact" else " "
         return {
             name: later(self.time, curve, late)
-            if impact and name.startswith("displacement")
+            if name.startswith(moved)
             else self._late(name, curve, late)
-            for name, curve in there.items()
+            for name, curve in curves.curves.items()
         }
 
-    def look(self, values: Array, *, everything: bool = False) -> dict[str, float | None] | None:
-        """Misfits of a point, see `misfit`, which is counted as no step of a fit.
-
-        None if it cannot be simulated.
-        """
+    def look(self, values: Array) -> dict[str, float | None] | None:
+        """Misfits of all curves of a point, which counts as no step; None if not simulated."""
         counts = self.evaluations, self.failures
         try:
-            return self.misfit(self.simulate(values, everything=everything))
+            return self.misfit(self.simulate(values, everything=True))
         except SimulationError:
             return None
         finally:

@@ -18,7 +18,7 @@ from foamfit.fitting import nuisance
 from foamfit.fitting.box import Scales, Space, others
 from foamfit.fitting.curves import check_interior, choose_drive, default_weights
 from foamfit.fitting.objective import Objective
-from foamfit.springs.laws.record import ADMISSIBLE, Between, Param
+from foamfit.springs.laws.record import ADMISSIBLE, Between
 from foamfit.springs.model import Model, with_options
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 
@@ -60,8 +60,7 @@ def make_params(
         Values in SI, named s1_k0 … site_eta.
     """
     if isinstance(model, str):
-        model = with_options(model, **options)
-        model = Model.parse(model, relaxation)
+        model = Model.parse(with_options(model, **options), relaxation)
     drive = choose_drive(measurement) if drive is None else drive
     scales = Scales.of(measurement)
     if model.relaxation and measurement.time is None:
@@ -85,19 +84,13 @@ def make_params(
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)
     late = nuisance.is_late(measurement, time_shift=time_shift)
-    _add_nuisance(params, measurement, scales, drive, time_shift=late)
-    for name in params:
-        if name in model.index and name != "site_eta":
-            _start_between(params, name, model.param(name))
+    _add_nuisance(params, measurement, scales, drive, late)
+    for name in params:  # a fifth of the way between ends that depend on others, one of them zero
+        if name in model.index and isinstance((param := model.param(name)).coordinate, Between):
+            first, last = param.coordinate.ends(*others(name, param, params.valuesdict()))
+            if first == 0.0:
+                params[name].value = 0.2 * last
     return params
-
-
-def _start_between(params: lmfit.Parameters, name: str, param: Param) -> None:
-    """Start a parameter whose ends depend on others at a fifth of the way, if one end is zero."""
-    if isinstance(param.coordinate, Between):
-        first, last = param.coordinate.ends(*others(name, param, params.valuesdict()))
-        if first == 0.0:
-            params[name].value = 0.2 * last
 
 
 def fix_and_vary(
@@ -105,14 +98,8 @@ def fix_and_vary(
 ) -> lmfit.Parameters:
     """Hold some parameters of a model at values in SI, and vary others that are held by default."""
     vary = tuple(vary)
+    check_fixed_and_varied(params, model, fix, vary)
     for name in (*fix, *vary):
-        if name not in params:
-            raise InputError(
-                f"parameter '{name}' is not one of the model {model}; "
-                f"its parameters are {', '.join(params)}"
-            )
-        if name in fix and name in vary:
-            raise InputError(f"parameter '{name}' cannot be both fixed and varied; choose one")
         if params[name].expr is not None:
             others = ", ".join(other for other in params if other in params[name].expr)
             raise InputError(f"parameter '{name}' follows from {others}; fix or vary that instead")
@@ -127,57 +114,67 @@ def fix_and_vary(
     return params
 
 
+def check_fixed_and_varied(
+    names: Iterable[str], model: str, fix: Mapping[str, float], vary: Iterable[str]
+) -> None:
+    """Refuse what is none of these parameters, or both fixed and varied (InputError)."""
+    for name in (*fix, *vary):
+        if name not in names:
+            raise InputError(
+                f"parameter '{name}' is not one of the model {model}; "
+                f"its parameters are {', '.join(names)}"
+            )
+        if name in fix and name in vary:
+            raise InputError(f"parameter '{name}' cannot be both fixed and varied; choose one")
+
+
 def _add_heights(params: lmfit.Parameters, measurement: Measurement, model: Model) -> None:
     """Heights of a chain: the specimen's, or varied with their sum fixed."""
-    count = len(model.kinds)
-    if count == 1:
-        return
-    specimen = measurement.specimen
-    if specimen.heights is None:
-        low, value = 0.02 * specimen.height, specimen.height / count
-        for i in range(1, count):
-            params.add(f"s{i}_height", value=value, min=low, max=specimen.height - low)
-        params.add(f"s{count}_height", expr=_rest_of_height(measurement, model))
-        return
-    if len(specimen.heights) != count:
+    count, specimen = len(model.kinds), measurement.specimen
+    if specimen.heights is not None and len(specimen.heights) != count > 1:
         raise InputError(
             f"{measurement.name}: [specimen] heights has {len(specimen.heights)} values for "
             f"a model of {count} springs; give one per spring, base first"
         )
-    for i, height in enumerate(specimen.heights, start=1):
-        params.add(f"s{i}_height", value=height, vary=False)
+    low, value = 0.02 * specimen.height, specimen.height / count
+    for i in range(1, count + 1) if count > 1 else ():
+        if specimen.heights is not None:
+            params.add(f"s{i}_height", value=specimen.heights[i - 1], vary=False)
+        elif i < count:
+            params.add(f"s{i}_height", value=value, min=low, max=specimen.height - low)
+        else:
+            params.add(f"s{count}_height", expr=_rest_of_height(measurement, model))
 
 
 def _add_nuisance(
-    params: lmfit.Parameters, measurement: Measurement, scales: Scales, drive: str, *,
-    time_shift: bool,
-) -> None:  # fmt: skip
+    params: lmfit.Parameters, measurement: Measurement, scales: Scales, drive: str, late: bool
+) -> None:
     """What the record does not say exactly, in the numbers of its file."""
-    names = nuisance.names_of(drive, time_shift=time_shift)
     weights = default_weights(measurement, drive)
     counted = {
         "displacement": weights["displacement_time"] > 0.0 or drive == "displacement",
         "stress": weights["stress_time"] + weights["stress_strain"] > 0.0,
         "acceleration": measurement.acceleration is not None,
     }
-    ranges = {name: float(np.ptp(values)) for name, values in measurement.channels().items()}
     free = nuisance.open_in(measurement, drive, counted) | {nuisance.TIME_SHIFT}
     usual = nuisance.values_of(measurement)
-    for name in names:
-        low, high = nuisance.limits_of(name, measurement, drive, scales.duration, ranges)
+    for name in nuisance.names_of(drive, time_shift=late):
+        low, high = nuisance.limits_of(name, measurement, drive, scales.duration)
         origin = measurement.origins.get(name, 0.0)
-        vary = name in free and low < high
         limits = {"min": low + origin, "max": high + origin} if low < high else {}
+        vary = name in free and low < high
         params.add(name, value=usual[name] + origin, vary=vary, **limits)
 
 
-def _counted_from(params: lmfit.Parameters, origins: Mapping[str, float], sign: float) -> None:
+def _counted_from(
+    params: lmfit.Parameters, origins: Mapping[str, float], sign: float
+) -> lmfit.Parameters:
     """Count nuisance parameters from what was taken off the record, or in its own numbers."""
-    for name, origin in origins.items():
-        if name in params and origin != 0.0:
+    for name in origins.keys() & params.keys():
+        if by := sign * origins[name]:
             one = params[name]
-            by = sign * origin
             one.set(value=one.value + by, min=one.min + by, max=one.max + by)
+    return params
 
 
 def _rest_of_height(measurement: Measurement, model: Model) -> str:
@@ -212,13 +209,6 @@ class Problem:
         """What was taken off the record, by parameter, SI: values + origins are the file's own."""
         return np.array([self.measurement.origins.get(name, 0.0) for name in self.names])
 
-    @cached_property
-    def linear(self) -> Problem:
-        """The same problem without a soft loss, for derivatives of the plain residuals."""
-        if self.objective.loss == "linear":
-            return self
-        return replace(self, objective=replace(self.objective, loss="linear"))
-
     def vector(self, params: lmfit.Parameters | None = None) -> Array:
         """Flat vector of these parameters, or of the problem's own."""
         values = (self.params if params is None else params).valuesdict()
@@ -226,9 +216,7 @@ class Problem:
 
     def told(self) -> lmfit.Parameters:
         """Parameters for the user: nuisance parameters in the numbers of the file."""
-        params = self.params.copy()
-        _counted_from(params, self.measurement.origins, 1.0)
-        return params
+        return _counted_from(self.params.copy(), self.measurement.origins, 1.0)
 
     def is_exact(self, name: str) -> bool:
         """Whether the record leaves a nuisance parameter no freedom, and nobody has held it."""
@@ -266,11 +254,10 @@ class Problem:
         tied = [name for name in self.names if self.params[name].expr is not None]
         if not tied:
             return None
-        places = [self.index[name] for name in tied]
         rest = _rest_of_height(self.measurement, self.model)
         if [self.params[name].expr for name in tied] == [rest]:
             return self._last_height
-        scratch = self.params.copy()
+        places, scratch = [self.index[name] for name in tied], self.params.copy()
 
         def complete(values: Array) -> Array:
             for name in self.free():
@@ -309,12 +296,12 @@ class Problem:
         Exact; see `Objective.jacobian`. Parameters that hang on these by expressions move with
         them.
         """
-        places = np.array([self.index[name] for name in names])
-        steps = 1e-5 * self.sizes(names, values)
-        moves = np.zeros((values.size, places.size))
-        moves[places, np.arange(places.size)] = 1.0
-        moves = self.space().follow(values, moves, steps)
-        return self.objective.jacobian_along(values, moves)
+        return self.objective.jacobian_along(values, self.moves(values, names))
+
+    def moves(self, values: Array, names: tuple[str, ...]) -> Array:
+        """Moves (n_values, n_names) of all parameters with each of these, those that hang on it."""
+        moves = np.eye(values.size)[:, [self.index[name] for name in names]]
+        return self.space().follow(values, moves, 1e-5 * self.sizes(names, values))
 
 
 def _check_held(params: lmfit.Parameters) -> None:
@@ -322,15 +309,11 @@ def _check_held(params: lmfit.Parameters) -> None:
     for name, parameter in params.items():
         if parameter.vary or parameter.expr is not None:
             continue
-        value = parameter.value
-        if name in NUISANCE:
-            wanted = "positive" if name in nuisance.STRIKER else "finite"
-        else:
+        wanted = "positive" if name in nuisance.STRIKER else "finite"
+        if name not in NUISANCE:
             wanted = any_param(split_name(name)[1]).admissible
-        fine = ADMISSIBLE[wanted](value)
-        if abs(value) > LARGEST:
-            wanted, fine = f"less than {LARGEST:g} (SI)", False
-        if not fine:
+        if abs(value := parameter.value) > LARGEST or not ADMISSIBLE[wanted](value):
+            wanted = f"less than {LARGEST:g} (SI)" if abs(value) > LARGEST else wanted
             raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
 
 
@@ -371,7 +354,6 @@ def make_problem(
     interior_mass: bool,
     *,
     time_shift: bool = False,
-    loss: str = "linear",
     relaxation: int = 0,
     priors: Mapping[str, object] | None = None,
 ) -> Problem:
@@ -392,7 +374,7 @@ def make_problem(
     time_shift = nuisance.is_late(measurement, time_shift=time_shift)
     objective = Objective(
         measurement, model, drive, chosen,
-        interior_mass=interior_mass, time_shift=time_shift, loss=loss,
+        interior_mass=interior_mass, time_shift=time_shift,
         given=tuple(_prior(name, value, model) for name, value in (priors or {}).items()),
     )  # fmt: skip
     measurement = objective.measurement  # with the noise of each channel

@@ -9,15 +9,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foamfit.arrays import Array
+from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import CURVE_STARTS, box_starts, curve_starts, smooth_loop
-from foamfit.fitting.together import Squares
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 
@@ -96,7 +98,7 @@ class Tracker:
     ends: list[Array] = field(default_factory=list)
 
     def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
-        """Residual of the objective; raises SearchStoppedError once the time is up."""
+        """Residual less a shift; raises SearchStoppedError once the time is up."""
         residual = self.consider(values, shift)
         if self.pulse is not None and self.objective.evaluations % PULSE == 0:
             self.pulse()
@@ -118,10 +120,10 @@ class Tracker:
     def consider(self, values: Array, shift: Array | float = 0.0) -> Array:
         """Residual of the objective, whatever the time; with a shift, that of other data."""
         failures = self.objective.failures
-        residual = self.objective.residual(values, shift)
-        cost = float(residual @ residual)
+        residual = self.objective.residual(values)
         if np.any(shift):
-            return residual
+            return residual - shift
+        cost = float(residual @ residual)
         if cost < self.best_cost and self.objective.failures == failures:
             self.best_cost, self.best_values = cost, values.copy()
             if self.better is not None:
@@ -129,23 +131,35 @@ class Tracker:
         return residual
 
 
-def _cost(item: tuple[float, Array]) -> float:
-    return item[0]
-
-
 def descend(
     tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
 ) -> tuple[float, Array]:
     """Levenberg-Marquardt descent inside the box; returns (cost, coordinates) of its end."""
-    squares = Squares.of_one(tracker.residual, tracker.objective, space)
-    end = squares.descend(start, iterations, enough)
+    end = levenberg.descend(*squares(tracker, space), start, space.box, iterations, enough=enough)
     return end.cost, end.point
+
+
+def squares(
+    tracker: Tracker, space: Space, rows: slice | NDArray[np.bool_] = slice(None)
+) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """Residual of some rows by the coordinates of a box, and its derivative."""
+
+    def residual(point: Array) -> Array:
+        return tracker.residual(space.decode(point))[rows]
+
+    def jacobian(point: Array) -> Array:
+        values = space.decode(point)
+        return tracker.objective.jacobian_along(values, space.slopes(point, values))[rows]
+
+    return residual, jacobian
 
 
 def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:
     """Points of the box with their costs, cheapest first."""
     residuals = [tracker.residual(space.decode(point)) for point in points]
-    return sorted(((float(r @ r), p) for r, p in zip(residuals, points, strict=True)), key=_cost)
+    return sorted(
+        ((float(r @ r), p) for r, p in zip(residuals, points, strict=True)), key=itemgetter(0)
+    )
 
 
 def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
@@ -169,15 +183,13 @@ def distinct(ends: list[tuple[float, Array]], apart: float = 1e-3) -> list[tuple
 
     Ends whose costs differ by less than the share `apart` are of one minimum.
     """
-    chosen: list[tuple[int, Array]] = []
-    last = 0.0
-    for cost, point in sorted(ends, key=_cost):
-        if chosen and cost <= (1.0 + apart) * last:
-            chosen[-1] = (chosen[-1][0] + 1, chosen[-1][1])
+    groups: list[list[tuple[float, Array]]] = []
+    for end in sorted(ends, key=itemgetter(0)):
+        if groups and end[0] <= (1.0 + apart) * groups[-1][0][0]:
+            groups[-1].append(end)
         else:
-            chosen.append((1, point))
-            last = cost
-    return chosen
+            groups.append([end])
+    return [(len(group), group[0][1]) for group in groups]
 
 
 def search(
@@ -206,7 +218,7 @@ def search(
             tracker.look()
         if tracker.objective.interior_mass:
             progress(ON_CURVES, "vibration")
-            ranked = sorted(ranked + _scan_vibration(tracker, space, points[0]), key=_cost)
+            ranked = sorted(ranked + _scan_vibration(tracker, space, points[0]), key=itemgetter(0))
         promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
         points = [point for _, point in distinct(promising)][: max(3, starts // 4)]
         for i, point in enumerate(points):
@@ -346,7 +358,7 @@ def _search_loop(
     loop = smooth_loop(objective.measurement, followed)
     along = Objective(
         loop, objective.model, "displacement", {"stress_strain": 1.0},
-        time_shift=objective.time_shift, nuisance=objective.nuisance, loss=objective.loss,
+        time_shift=objective.time_shift, nuisance=objective.nuisance,
     )  # fmt: skip
     inner = Tracker(along, tracker.deadline, tracker.better)
     own = space

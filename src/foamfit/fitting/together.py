@@ -1,14 +1,14 @@
-"""The sum of squares of one test or several, and the fit of several tests with linked parameters.
+"""The fit of several tests with linked parameters.
 
 All residuals are minimised as one sum of squares, each test in units of its own noise. A parameter
 has one value for all tests, one for each, scatters about a common value or follows a law of rate
-(`fitting.links`). The fit of a single test is the case of one test whose coordinates are its own.
+(`fitting.links`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -68,12 +68,16 @@ class Term:
     of all coordinates; the slope b of a law of rate stands behind the value at rate0.
     """
 
-    residual: Callable[[Array], Array]  # By the parameters, SI; infinite where not simulated
     objective: Objective
     space: Space
     places: NDArray[np.intp]
-    rates: tuple[Rate, ...] = ()
-    pulls: tuple[Pull, ...] = ()
+    rates: tuple[Rate, ...]
+    pulls: tuple[Pull, ...]
+
+    @property
+    def size(self) -> int:
+        """Residuals of the test, those of what is drawn among them."""
+        return self.objective.n_data + len(self.objective.priors) + len(self.pulls)
 
     @cached_property
     def all_places(self) -> NDArray[np.intp]:
@@ -93,78 +97,32 @@ class Term:
 
     def values(self, point: Array) -> Array:
         """Parameters at all coordinates, SI."""
-        return self.space.decode(self._at(point)[0] if self.rates else point[self.places])
+        return self.space.decode(self._at(point)[0])
 
     def residual_at(self, point: Array) -> Array:
-        """Residual at all coordinates, followed by those of what is drawn to a common value."""
-        values = self.values(point)
-        found = self.residual(values)
-        if not self.pulls:
-            return found
+        """Residual, then that of what is drawn to a common value; infinite if not simulated."""
+        values, failures = self.values(point), self.objective.failures
+        found = self.objective.residual(values)
+        if self.objective.failures > failures:
+            found = np.full(found.size, np.inf)
         off = [
             pull.weight * (_logarithm(values[pull.place]) - point[pull.common])
             for pull in self.pulls
         ]
-        return np.append(found, off)
+        return np.append(found, off) if off else found
 
     def jacobian_at(self, point: Array) -> Array:
         """Derivative of `residual_at` by the coordinates in `all_places`, (n, c)."""
         own, through = self._at(point)
         values = self.space.decode(own)
         moves = self.space.slopes(own, values) @ through
-        slopes = self.objective.jacobian_along(values, moves)
-        rows = []
+        rows = np.zeros((len(self.pulls), moves.shape[1]))
         first = self.places.size + len(self.rates)
         for j, pull in enumerate(self.pulls):
-            value = values[pull.place]
-            row = np.zeros(moves.shape[1])
-            if abs(value) > _TINY:
-                row = pull.weight * moves[pull.place] / value
-                row[first + j] -= pull.weight
-            rows.append(row)
-        return np.vstack([slopes, *rows]) if rows else slopes
-
-
-@dataclass(frozen=True, eq=False)
-class Squares:
-    """The sum of squares of one test or several, by the coordinates (k,) of a box."""
-
-    terms: tuple[Term, ...]
-    box: tuple[Array, Array]
-
-    @classmethod
-    def of_one(
-        cls, residual: Callable[[Array], Array], objective: Objective, space: Space
-    ) -> Squares:
-        """Sum of squares of one test, whose coordinates are those of its own box."""
-        places = np.arange(len(space.coordinates), dtype=np.intp)
-        return cls((Term(residual, objective, space, places),), space.box)
-
-    @cached_property
-    def _is_plain(self) -> bool:
-        """Whether the coordinates are those of the box of one test."""
-        return len(self.terms) == 1 and bool(
-            np.array_equal(self.terms[0].all_places, np.arange(self.box[0].size))
-        )
-
-    def residual(self, point: Array) -> Array:
-        """Residuals of the tests, one after the other; infinite where one is not simulated."""
-        if len(self.terms) == 1:
-            return self.terms[0].residual_at(point)
-        return np.concatenate([term.residual_at(point) for term in self.terms])
-
-    def jacobian(self, point: Array) -> Array | levenberg.Blocks:
-        """Derivative of the residual by the coordinates."""
-        if self._is_plain:
-            return self.terms[0].jacobian_at(point)
-        found = [(term.jacobian_at(point), term.all_places) for term in self.terms]
-        return levenberg.Blocks(found, point.size)
-
-    def descend(self, start: Array, iterations: int, enough: float = ENOUGH) -> levenberg.Iterate:
-        """Levenberg-Marquardt descent in the box; see `levenberg.descend`."""
-        return levenberg.descend(
-            self.residual, self.jacobian, start, self.box, iterations, enough=enough
-        )
+            if abs(value := values[pull.place]) > _TINY:
+                rows[j] = pull.weight * moves[pull.place] / value
+                rows[j, first + j] -= pull.weight
+        return np.vstack([self.objective.jacobian_along(values, moves), rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,8 +166,9 @@ class Together:
         return sum(map(effective_samples, self.problems, self.values))
 
     def bic(self, n_eff: int) -> float:
-        """Bayesian information criterion by so many effective samples, those of the own fits."""
-        return bic(self.cost, self.n_data, self.n_vary, n_eff)
+        """Bayesian information criterion n_eff ln(χ²/n) + k ln(n_eff)."""
+        n, n_eff = self.n_data, max(n_eff, 2)
+        return n_eff * math.log(max(self.cost, 1e-12 * n) / n) + self.n_vary * math.log(n_eff)
 
     @property
     def cost(self) -> float:
@@ -251,61 +210,38 @@ def fit_linked(
     *,
     iterations: int = ITERATIONS,
 ) -> Together:
-    """Fit several tests at once, their parameters linked as `links` say.
+    """Fit several tests of one model at once, their parameters linked as `links` say.
 
-    Parameters
-    ----------
-    problems : sequence of Problem
-        Of one model. Drives and noise may differ, and with them the nuisance parameters; a
-        parameter that does not vary in one of them keeps its value there.
-    links : Links
-        What each parameter is to all tests.
-    starts : sequence of sequences of (n_values,) arrays
-        Each holds a vector of parameters for each test, as its own fit has found; the shared
-        parameters start at the median over the tests, laws of rate at their least squares. The
-        best end of all starts is returned.
-    iterations : int
-        Steps of a descent at most.
-
-    Returns
-    -------
-    Together
-
-    Raises
-    ------
-    InputError
-        If the problems are not of one model.
-    SimulationError
-        If no start can be simulated.
+    Drives and noise may differ, and with them the nuisance parameters; what does not vary in a test
+    keeps its value there. Each of the `starts` holds a vector of parameters for each test: shared
+    ones start at the median over the tests, laws of rate at their least squares. The best end of
+    all starts is returned. Raises InputError if the problems are not of one model, SimulationError
+    if no start can be simulated.
     """
     layout = _Layout.of(tuple(problems), links)
     ends = list[levenberg.Iterate]()
     for vectors in starts:
         start = layout.start(vectors)
-        if np.all(np.isfinite(layout.squares.residual(start))):
-            ends.append(layout.squares.descend(start, iterations))
+        if np.all(np.isfinite(layout.residual(start))):
+            ends.append(
+                levenberg.descend(
+                    layout.residual, layout.jacobian, start, layout.box, iterations, enough=ENOUGH
+                )
+            )
     if not ends:
         raise SimulationError(
             f"{problems[0].measurement.name}: no start of the fit of {len(problems)} tests can be "
             "simulated; give values that each test can be simulated with"
         )
     best = min(ends, key=lambda end: end.cost)
-    parts = np.split(best.residual, np.cumsum(layout.counts)[:-1])
-    terms = layout.squares.terms
-    values = tuple(term.values(best.point) for term in terms)
+    parts = np.split(best.residual, np.cumsum([term.size for term in layout.terms])[:-1])
+    values = tuple(term.values(best.point) for term in layout.terms)
     costs = tuple(
         float(np.sum(part[: part.size - len(term.pulls)] ** 2))
-        for part, term in zip(parts, terms, strict=True)
+        for part, term in zip(parts, layout.terms, strict=True)
     )
-    return Together(
-        layout.problems,
-        links,
-        layout.linked,
-        layout.own,
-        values,
-        costs,
-        layout.common(best.point, values),
-    )
+    shared, common = layout.shared, layout.common(best.point, values)
+    return Together(layout.problems, links, shared, layout.own, values, costs, common)
 
 
 def effective_samples(problem: Problem, values: Array) -> int:
@@ -320,12 +256,6 @@ def effective_samples(problem: Problem, values: Array) -> int:
         signs = np.sign([float(np.mean(block)) for block in blocks])
         count += 1 + int(np.count_nonzero(np.diff(signs)))
     return count
-
-
-def bic(cost: float, n_data: int, n_vary: int, n_eff: int) -> float:
-    """Bayesian information criterion n_eff ln(χ²/n) + k ln(n_eff)."""
-    n_eff = max(n_eff, 2)
-    return n_eff * math.log(max(cost, 1e-12 * n_data) / n_data) + n_vary * math.log(n_eff)
 
 
 def _varying(problems: Sequence[Problem]) -> tuple[str, ...]:
@@ -367,13 +297,14 @@ def _spaces(problems: Sequence[Problem], absolute: Sequence[str]) -> list[Space]
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """The sum of squares of tests that are linked, and the places of what they have in common."""
+    """The sum of squares of tests that are linked, by the coordinates (k,) of a box."""
 
     problems: tuple[Problem, ...]
     links: Links
     own: tuple[str, ...]
     common_places: Mapping[str, int]  # Of what is shared, follows a law of rate, or scatters
-    squares: Squares
+    terms: tuple[Term, ...]
+    box: tuple[Array, Array]
 
     @classmethod
     def of(cls, problems: tuple[Problem, ...], links: Links) -> _Layout:
@@ -413,16 +344,8 @@ class _Layout:
                 for name, pull in links.pulls.items()
                 if name in places and name in problem.free() and pull[t]
             )
-            terms.append(
-                Term(
-                    _finite(problem),
-                    problem.objective,
-                    space,
-                    np.array(at, np.intp),
-                    tuple(rates),
-                    pulls,
-                )
-            )
+            at_all = np.array(at, np.intp)
+            terms.append(Term(problem.objective, space, at_all, tuple(rates), pulls))
         box = np.full(count, -_FAR), np.full(count, _FAR)
         for term in terms:
             for side, ends, steepest in zip(
@@ -430,27 +353,27 @@ class _Layout:
             ):
                 side[term.places] = ends
                 side[[term.places[rate.at] + 1 for rate in term.rates]] = steepest
-        return cls(problems, links, own, places, Squares(tuple(terms), box))
+        return cls(problems, links, own, places, tuple(terms), box)
 
     @property
-    def linked(self) -> tuple[str, ...]:
+    def shared(self) -> tuple[str, ...]:
         """Names of the parameters that follow from what all tests have in common."""
         return tuple(name for name in self.common_places if name not in self.own)
 
-    @property
-    def counts(self) -> list[int]:
-        """Residuals of each test, those of what is drawn among them."""
-        return [
-            term.objective.n_data + len(term.objective.priors) + len(term.pulls)
-            for term in self.squares.terms
-        ]
+    def residual(self, point: Array) -> Array:
+        """Residuals of the tests, one after the other; infinite where one is not simulated."""
+        return np.concatenate([term.residual_at(point) for term in self.terms])
+
+    def jacobian(self, point: Array) -> levenberg.Blocks:
+        """Derivative of the residual by the coordinates."""
+        found = [(term.jacobian_at(point), term.all_places) for term in self.terms]
+        return levenberg.Blocks(found, point.size)
 
     def start(self, vectors: Sequence[Array]) -> Array:
         """The point that has the own parameters of these vectors, and what is nearest in common."""
-        terms, (low, high) = self.squares.terms, self.squares.box
-        point = np.zeros(low.size)
+        point = np.zeros(self.box[0].size)
         there = dict[int, list[tuple[float, Rate | None]]]()
-        for term, vector in zip(terms, vectors, strict=True):
+        for term, vector in zip(self.terms, vectors, strict=True):
             found = term.space.encode(vector)
             point[term.places] = found
             rates = {rate.at: rate for rate in term.rates}
@@ -473,7 +396,7 @@ class _Layout:
             values = np.exp(own) if rate.logarithmic else np.array(own)
             v, b = start_of(rate.kind, values, np.array([one.x for one in rates_]))
             point[place : place + 2] = np.log(v) if rate.logarithmic else v, b
-        return np.clip(point, low, high)
+        return np.clip(point, *self.box)
 
     def common(self, point: Array, values: Sequence[Array]) -> dict[str, tuple[float, ...]]:
         """What all tests have in common at a point, SI; see `Together.common`."""
@@ -490,17 +413,6 @@ class _Layout:
             b = float(point[place + 1])
             out[name] = value / factor(kind, b, self.links.x(t))[0], b
         return out
-
-
-def _finite(problem: Problem) -> Callable[[Array], Array]:
-    """Give the residual of one test, infinite where it cannot be simulated."""
-
-    def residual(values: Array) -> Array:
-        failures = problem.objective.failures
-        found = problem.objective.residual(values)
-        return found if problem.objective.failures == failures else np.full(found.size, np.inf)
-
-    return residual
 
 
 def _logarithm(value: float) -> float:

@@ -17,11 +17,12 @@ from typing import Any
 
 import panel as pn
 
+from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.page.curves import Curves, grid, misfits_text
-from foamfit.page.desk import BUSY, FIRST, LARGEST, QUANTITIES, Checked, Desk
+from foamfit.page.desk import BUSY, FIRST, LARGEST, QUANTITIES, Desk, wrong_quantity
 from foamfit.page.turning import Turning
-from foamfit.page.widgets import RELAXATIONS, TEMPLATES, Field, Upload, message, piece, style
+from foamfit.page.widgets import RELAXATIONS, TEMPLATES, WIDE, Field, Upload, message, piece, style
 from foamfit.page.worker import FirstUse, News, parsed
 from foamfit.report.folder import load_result
 from foamfit.results import law_in_words
@@ -31,10 +32,11 @@ from foamfit.springs.model import Model
 # Where a checkout of the repository may be: the working directory, or around an editable install.
 CHECKOUTS = (Path(), Path(__file__).parents[3])
 # Options that are shown, and those that are folded away; --fix and --vary have ticks.
-SHOWN = ("model", "drive", "relaxation", "cycle")
+CYCLES = ("cycle", "cycles")  # shown where a record has several
+SHOWN = ("model", "drive", "relaxation", *CYCLES)
 FOLDED = (
     *laws.OPTIONS,
-    *("cycles", "starts", "max_time", "seed", "loss", "interior_mass", "time_shift"),
+    *("starts", "max_time", "seed", "interior_mass", "time_shift"),
     *("profile", "bootstrap", "mcmc"),
 )
 # Options on which the curves of a model depend.
@@ -49,8 +51,7 @@ COMPILING = (
     "machine is busy, a whole one. Meanwhile a test can be dropped and its specimen filled in."
 )
 TEXT, FIELD = style("text"), style("field")
-WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: #fdeeed; }"
-WIDE: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
+WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: var(--bad); }"
 STYLE: dict[str, Any] = {
     "stylesheets": [FIELD],
     "sizing_mode": "stretch_width",
@@ -76,23 +77,19 @@ class Window:
         self._outputs()
         self._inputs(address)
         self.template = pn.Template((TEMPLATES / "page.html").read_text(encoding="utf-8"))
-        first, others = (
-            [field for name, field in self.quantities.items() if (name in FIRST) == shown]
-            for shown in (True, False)
-        )
-        asked = grid(first, 8.0)
-        asked.visible = True
-        result_parts = [self.saves, self.ending, self.report_of]
+        fields = [*self.quantities.values()]
+        first = grid(fields[:FIRST], 8.0)
+        first.visible = True
         parts = {
-            "test": [self.upload, self.chosen, asked],
-            "specimen": [*others, self.rest],
+            "test": [self.upload, self.chosen, first],
+            "specimen": [*fields[FIRST:], self.rest],
             "check": [self.check, self.problem],
             "model": [self.options[name].widget for name in SHOWN],
             "more": [self.options[name].widget for name in FOLDED],
             "run": [self.run, self.stop, self.progress],
             "curves": [self.compiling, self.misfit, self.curves.view, self.back],
             "understood": [self.understood],
-            "result": [*result_parts, self.report],
+            "result": [self.saves, self.ending, self.report_of, self.report],
         }
         for name, widgets in parts.items():
             self.template.add_panel(name, pn.Column(*widgets, **WIDE))
@@ -142,29 +139,28 @@ class Window:
         self.check = button("Check the test", self._check)
         lists = {"model": models(), "relaxation": [*range(RELAXATIONS)]}
         self.options = {name: Field(name, lists.get(name), **STYLE) for name in (*SHOWN, *FOLDED)}
-        self.model, _, self.relaxation, self.cycle = (self.options[n].widget for n in SHOWN)
-        self.cycle.visible = False
+        self.model, _, self.relaxation, *self.cycles = (self.options[n].widget for n in SHOWN)
+        for field in self.cycles:
+            field.visible = False
         self.run = button("Fit", self._run, "primary", disabled=True)
         self.stop = button("Stop, and keep the best", self._stop, "danger", visible=False)
         self.back = button("Back to the fit", self._back, visible=False)
         self.report_of = select(name="Report and curves of cycle", options=[0], visible=False)
         self.report_of.param.watch(self._back, "value")
-        self.fields = (*self.quantities.values(), self.rest, self.cycle)
+        self.fields = (*self.quantities.values(), self.rest, *self.cycles)
         for field in self.fields:
             field.param.watch(self._edited, "value")
         for name in ("model", *OF_CURVES):
             self.options[name].widget.param.watch(self._model_chosen, "value")
         save = partial(pn.widgets.FileDownload, embed=False, auto=True, **STYLE)
-        saves = {
-            "the result folder": ("result.zip", lambda: BytesIO(self.desk.zipped())),
-            "the report": ("report.html", lambda: BytesIO(self._report().encode())),
-            "the TOML": ("test.toml", lambda: BytesIO(self.desk.toml)),
-        }
-        parts = [
-            save(label=f"Save {what}", filename=name, callback=content)
-            for what, (name, content) in saves.items()
-        ]
-        self.saves = grid(parts, 11.0)
+        saves = (
+            ("the result folder", "result.zip", lambda: BytesIO(self.desk.zipped())),
+            ("the report", "report.html", lambda: BytesIO(self._report().encode())),
+            ("the TOML", "test.toml", lambda: BytesIO(self.desk.toml)),
+        )
+        self.saves = grid(
+            [save(label=f"Save {s}", filename=n, callback=c) for s, n, c in saves], 11.0
+        )
 
     def _report(self) -> str:
         """Return the report of the fit, or of the chosen cycle."""
@@ -198,18 +194,17 @@ class Window:
         self._asked[pool] += 1
         asked, document = self._asked[pool], pn.state.curdoc
 
-        def done(found: Any) -> None:
-            if asked == self._asked[pool]:
-                then(found)
+        def last() -> bool:
+            return asked == self._asked[pool]
 
         def run() -> None:
-            if asked != self._asked[pool]:
+            if not last():
                 return
             try:
                 found = work()
             except Exception as error:  # shown, not lost in a thread
                 found = error
-            document.add_next_tick_callback(partial(done, found))
+            document.add_next_tick_callback(lambda: then(found) if last() else None)
 
         pool.submit(run)
 
@@ -245,7 +240,9 @@ class Window:
         self._filling = True  # one check after all of them
         if self.desk.worker is None:  # what is shown of a fit is of another test
             self._hide_result("There is no fit yet.")
-            self.curves.held, self.curves.found, self.cycle.value = {}, {}, ""
+            self.curves.held, self.curves.found = {}, {}
+            for field in self.cycles:
+                field.value = ""
         if found is not None or self.desk.replaced:
             quantities, self.rest.value = found or ({}, "")
             for name, field in self.quantities.items():
@@ -254,40 +251,33 @@ class Window:
         self._filling = False
         self._check()
 
-    def _given(self) -> tuple[dict[str, str], str]:
-        """The quantities and the further TOML as they are filled in."""
-        given = {name: field.value or "" for name, field in self.quantities.items()}
-        return given, self.rest.value or ""
-
     def _edited(self, event: Any) -> None:
         if not self._filling and self.desk.csv is not None:
             self._check()
 
     def _check(self, event: Any = None) -> None:
         """Check the test as it is filled in, and show what is understood or wrong."""
-        (given, rest), cycle = self._given(), self.cycle.value or ""
-        self.run.disabled = True
+        given = {name: field.value or "" for name, field in self.quantities.items()}
+        which = [argument for name in CYCLES for argument in self.options[name].arguments()]
+        rest, self.run.disabled = self.rest.value or "", True
         self._asked[PREPARING] += 1  # curves in preparation are of the old test
-        self._beside(READING, lambda: self.desk.check(given, rest, cycle), self._show_checked)
+        self._beside(READING, lambda: self.desk.check(given, rest, which), self._show_checked)
 
-    def _show_checked(self, checked: Checked | Exception) -> None:
-        if isinstance(checked, Exception):
-            checked = Checked(error=defect(checked))
-        self.problem.object = wrong(checked.error)
+    def _show_checked(self, found: str | Exception) -> None:
+        error = found if isinstance(found, Exception) else ""
+        self.problem.object = wrong(error)
         for name, field in self.quantities.items():
-            field.stylesheets = [WRONG if name == checked.quantity else FIELD]
-        if checked.error == BUSY:
+            field.stylesheets = [WRONG if name == wrong_quantity(str(error)) else FIELD]
+        if str(error) == BUSY:
             return
-        if checked.error:
-            told = "The test cannot be read yet: see what is wrong with it."
-            self.understood.object = soft(told)
-        else:
-            self.understood.object = piece("verbatim", checked.text)
+        told = "The test cannot be read yet: see what is wrong with it."
+        self.understood.object = soft(told) if error else piece("verbatim", found)
         self._allow()
         if self.desk.measurement is not None:
             there = len(self.desk.measurement.cycles)
-            self.cycle.visible = there > 1
-            self.cycle.name = f"{self.options['cycle'].label} This record has {there}."
+            for field in self.cycles:
+                field.visible = there > 1
+            self.cycles[0].name = f"{self.options['cycle'].label} This record has {there}."
         self._model_chosen()
 
     # ------------------------------------------------------------------------------- the curves
@@ -305,20 +295,28 @@ class Window:
         except InputError:  # said when it is fitted
             asked = parsed([])
         model = models()[1] if auto else self.model.value
-        self._turn_model(model, self.desk.measurement.cycle, **keywords(asked))
+        self._turn_model(model, self.desk.measurement, **keywords(asked))
 
-    def _hide_curves(self, why: str = "") -> None:
+    def _hide_curves(self, why: object = "") -> None:
         self.curves.hide()
         self.misfit.object = wrong(why)
 
     def _turn_model(
-        self, model: str, cycle: int, values: Mapping[str, float] | None = None, **options: Any
+        self,
+        model: str,
+        of: Measurement | News,
+        values: Mapping[str, float] | None = None,
+        **options: Any,
     ) -> None:
-        """Show other sliders under the curves, at these values or at values read off the loop."""
+        """Show other sliders under the curves, at these values or at values read off the loop.
+
+        The cycles are those of a test or of a report.
+        """
 
         def make() -> Turning:
             self.first_use.needed(model, options["relaxation"]).result()
-            made = Turning(self.desk.measured(cycle), model, values, **options)
+            test = self.desk.measured(of.cycle, of.last_cycle)
+            made = Turning(test, model, values, **options)
             made.turn({})  # loads the compiled code
             return made
 
@@ -331,8 +329,7 @@ class Window:
 
     def _show_turning(self, made: Turning | Exception) -> None:
         if isinstance(made, Exception):
-            known = isinstance(made, InputError | SimulationError)
-            self._hide_curves(str(made) if known else defect(made))
+            self._hide_curves(made)
             return
         self.misfit.object = ""
         self.curves.show(made)
@@ -342,7 +339,7 @@ class Window:
     def _arguments(self, ticked: bool = True) -> list[str]:
         """Return the arguments of `foamfit fit` for what is filled in."""
         auto = self.model.value == "auto"
-        hidden = {"relaxation": auto, "cycle": not self.cycle.visible}
+        hidden = {"relaxation": auto} | dict.fromkeys(CYCLES, not self.cycles[0].visible)
         shown = (field for name, field in self.options.items() if not hidden.get(name))
         given = [argument for field in shown for argument in field.arguments()]
         if auto or not ticked:
@@ -402,8 +399,10 @@ class Window:
         if not news.values or self.desk.measurement is None:
             return
         now = self.curves.turning
-        there = None if now is None else (now.law, now.drive, now.problem.measurement.cycle)
-        if there != (law_in_words(news.model, news.relaxation), news.drive, news.cycle):
+        test = None if now is None else now.problem.measurement
+        there = now and test and (now.law, now.drive, test.cycle, test.last_cycle)
+        law = law_in_words(news.model, news.relaxation)
+        if there != (law, news.drive, news.cycle, news.last_cycle):
             self._turn_fitted(news)
         else:
             self.curves.put(news.values)
@@ -411,11 +410,9 @@ class Window:
     def _turn_fitted(self, news: News) -> None:
         """Show the curves of the last fit at the values of a report."""
         assert self.desk.worker is not None
-        assert self.desk.measurement is not None
         options = keywords(parsed(self.desk.worker.job.arguments))
         options |= {"relaxation": news.relaxation, "drive": news.drive}
-        cycle = news.cycle or self.desk.measurement.cycle
-        self._turn_model(news.model, cycle, news.values, **options)
+        self._turn_model(news.model, news, news.values, **options)
 
     def _ended(self) -> None:
         """Show the result of the fit, or why it failed."""
@@ -427,7 +424,8 @@ class Window:
         if self.desk.result is None:
             self.ending.object = wrong(self.desk.ending())
             return
-        told, picture = self.desk.told, self.desk.result / "cycles.png"
+        assert self.desk.worker is not None
+        told, picture = self.desk.worker.told, self.desk.result / "cycles.png"
         self.ending.object = soft(f"In a terminal: {self.desk.command}")
         if told:
             self.ending.object += piece("verbatim", told)
@@ -452,8 +450,8 @@ class Window:
         self.curves.found = fit["parameters"]
         values = {name: one["value"] for name, one in fit["parameters"].items()}
         place = {name: fit[name] for name in ("relaxation", "drive")}
-        model = Model.of_result(fit).name
-        self._turn_fitted(News(cycle=cycle, values=values, model=model, **place))
+        place |= {name: fit["data"][name] for name in ("cycle", "last_cycle")}
+        self._turn_fitted(News(values=values, model=Model.of_result(fit).name, **place))
 
 
 def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -483,10 +481,10 @@ def soft(text: str) -> str:
 
 
 def wrong(error: object) -> str:
-    """Write an error as a paragraph, nothing for none."""
-    return piece("paragraph", str(error), "error") if str(error) else ""
-
-
-def defect(error: Exception) -> str:
-    """Say that an error is a defect."""
-    return f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."
+    """Write an error as a paragraph, nothing for none; one of no input is a defect."""
+    told = str(error)
+    if isinstance(error, Exception) and not isinstance(
+        error, InputError | SimulationError | OSError
+    ):
+        told = f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."
+    return piece("paragraph", told, "error") if told else ""

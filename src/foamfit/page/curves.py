@@ -15,8 +15,9 @@ from bokeh.core.properties import value
 from bokeh.models import Band, ColumnDataSource, LabelSet, Range1d
 from bokeh.plotting import figure
 
+from foamfit.arrays import Array
 from foamfit.page.turning import PANELS, Drawn, Row, Turning
-from foamfit.page.widgets import Sliders, message, piece
+from foamfit.page.widgets import WIDE, Chain, Sliders, message, piece
 from foamfit.report.figures import GREY, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
@@ -38,10 +39,10 @@ def grid(parts: list[Any], width: float) -> pn.Column:
     """
     style = (
         ":host { display: grid; gap: .4rem; "
-        f"grid-template-columns: repeat(auto-fit, minmax(min(100%, {width}rem), 1fr)); }}"
+        f"grid-template-columns: repeat(auto-fit, minmax(min(100%, {width}rem), 1fr)); }} "
+        ".scroll-button { display: none; }"  # would take the place of a part
     )
-    wide: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
-    return pn.Column(pn.Column(*parts, stylesheets=[style], **wide), visible=False, **wide)
+    return pn.Column(pn.Column(*parts, stylesheets=[style], **WIDE), visible=False, **WIDE)
 
 
 class Curves:
@@ -61,13 +62,13 @@ class Curves:
         self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
         # With the lock of the document, which not every message holds.
         self.sliders.on_msg(lambda event: pn.state.execute(partial(self._moved, event), True))
-        wide: dict[str, Any] = {"sizing_mode": "stretch_width"}
-        legend = pn.pane.HTML(piece("legend", GREY, VERMILION), margin=0, **wide)
+        legend = pn.pane.HTML(piece("legend", GREY, VERMILION), **WIDE)
         loop_first = sorted(PANELS, key=lambda name: name != "stress_strain")
-        self._panes = {n: pn.pane.Bokeh(self._figures[n], **wide) for n in loop_first}
+        self._panes = {n: pn.pane.Bokeh(self._figures[n], **WIDE) for n in loop_first}
         self._panels = grid([*self._panes.values()], 14.5)
         self._panels.insert(0, legend)  # a figure's own would be redrawn each time
-        self.view = pn.Column(self._panels, self.sliders, margin=0, **wide)
+        self.chain = Chain(visible=False, **WIDE)
+        self.view = pn.Column(self._panels, self.sliders, self.chain, **WIDE)
         if turning is not None:
             self.show(turning)
 
@@ -98,7 +99,7 @@ class Curves:
         """Hide everything."""
         self.sliders.tell("")
         self.turning, self._rows, self.sliders.rows = None, {}, []
-        self._panels.visible = False
+        self._panels.visible = self.chain.visible = False
 
     def chosen(self) -> tuple[dict[str, float], list[str]]:
         """Return what a fit is to hold, with values (SI), and what it is to vary.
@@ -122,6 +123,7 @@ class Curves:
             height=270,
             sizing_mode="stretch_width",
             output_backend="canvas",
+            stylesheets=[":host { filter: var(--figure, none); }"],  # on dark screens
             tools="pan,box_zoom,reset",
             toolbar_location="right",
             x_range=Range1d(0.0, 1.0),
@@ -159,7 +161,7 @@ class Curves:
             self._scales[name] = fx, fy
             made.xaxis.axis_label = f"{x_name} ({x_unit})" if x_unit else x_name
             made.yaxis.axis_label = f"{y_name} ({y_unit})"
-            some = slice(None, None, -(-len(there[0]) // MOST_MARKERS))
+            some = self._some(there[0], MOST_MARKERS)
             x, y = there[0] / fx, there[1] / fy
             self._measured[name].data = {"x": x[some], "y": y[some]}
             # The axes keep their ranges while parameters change.
@@ -167,7 +169,12 @@ class Curves:
                 more = beyond * float(np.ptp(values))
                 low, high = float(values.min()) - more, float(values.max()) + more
                 limits.update(start=low, end=high, reset_start=low, reset_end=high)
-        self._panels.visible = True
+        self._panels.visible = self.chain.visible = True
+
+    def _some(self, samples: Array, most: int) -> slice:
+        """Return every sample, or so many that at most some are drawn of each cycle."""
+        assert self.turning is not None
+        return slice(None, None, -(-len(samples) // (most * self.turning.cycles)) or 1)
 
     def _moved(self, event: Any) -> None:
         """Draw the curves for sliders that were moved; note ticks."""
@@ -194,7 +201,7 @@ class Curves:
         for name in PANELS:
             x, y = drawn.curves.get(name, NOTHING)
             fx, fy = self._scales.get(name, (1.0, 1.0))
-            some = slice(None, None, -(-len(x) // MOST_DRAWN) or 1)
+            some = self._some(x, MOST_DRAWN)
             data |= {f"{name}_x": x[some] / fx, f"{name}_y": y[some] / fy}
         # A source needs arrays of one length; single precision resolves a pixel.
         sent = {name: np.full(max(map(len, data.values())), np.nan, np.float32) for name in data}
@@ -202,9 +209,13 @@ class Curves:
             sent[name][: len(values)] = values
         self._turned.data = sent
         self._draw_points(drawn)
+        self._draw_chain(drawn.chain)
         test = self.turning.problem.measurement
         told = f"{self.turning.law}, {self.turning.drive} drive"
-        told += f", cycle {test.cycle}" if len(test.cycles) > 1 else ""
+        if test.last_cycle is not None:
+            told += f", cycles {test.cycle} to {test.last_cycle}"
+        elif len(test.cycles) > 1:
+            told += f", cycle {test.cycle}"
         told += f": misfit {misfits_text(drawn.misfit)}"
         self.sliders.tell(drawn.error or told, wrong=bool(drawn.error))
 
@@ -217,6 +228,12 @@ class Curves:
             beside = [(-8 - 7 * len(name), 2) if name[-1] == "1" else (6, -15) for name in names]
             aside, up = np.array(beside).reshape(-1, 2).T
             self._points.data = {"x": x / fx, "y": y / fy, "name": names, "aside": aside, "up": up}
+
+    def _draw_chain(self, chain: Mapping[str, Array]) -> None:
+        factor, unit = readable_unit(float(np.ptp(chain.get("stress", 0.0))), "Pa")
+        scaled = {name: one / factor if name == "stress" else one for name, one in chain.items()}
+        frames: dict[str, Any] = {name: np.round(one, 4).tolist() for name, one in scaled.items()}
+        self.chain.frames = frames | {"unit": unit} if frames else {}
 
 
 def misfits_text(misfit: Mapping[str, float | None]) -> str:

@@ -12,9 +12,10 @@ import shutil
 import tomllib
 import unicodedata
 import zipfile
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import tomli_w
 
@@ -33,26 +34,16 @@ LARGEST = 64 * 1024 * 1024  # bytes of a file that is dropped
 LONGEST = 80  # characters of the name of a file
 BUSY = "A fit is running; stop it before anything of the test is changed."
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
-# Quantities to fill in, by their names in messages: label and example.
+# Quantities to fill in, by their names in messages: label and example. The first are shown at once.
+FIRST = 4
 QUANTITIES = {
     "[specimen] height": ("Specimen height", "1.19 mm"),
     "[specimen] diameter": ("Specimen diameter", "5 mm"),
-    "[specimen] area": ("or its area", "19.6 mm^2"),
-    "[specimen] mass": ("Specimen mass (optional)", "5.56 mg"),
     "[striker] mass": ("Striker mass (optional)", "7 g"),
     "[striker] velocity": ("Striker velocity (optional)", "1.75 m/s"),
+    "[specimen] area": ("or its area", "19.6 mm^2"),
+    "[specimen] mass": ("Specimen mass (optional)", "5.56 mg"),
 }
-# Those that are shown; the others are folded.
-FIRST = ("[specimen] height", "[specimen] diameter", "[striker] mass", "[striker] velocity")
-
-
-@dataclass(frozen=True)
-class Checked:
-    """What was understood of a test, or why it cannot be read, and which quantity is wrong."""
-
-    text: str = ""
-    error: str = ""
-    quantity: str = ""
 
 
 class Desk:
@@ -131,39 +122,39 @@ class Desk:
 
     # ------------------------------------------------------------------------------- the test
 
-    def check(self, quantities: Mapping[str, str], rest: str, cycle: str = "") -> Checked:
-        """Read the test as `foamfit check` does, and say what was understood or what is wrong.
+    def check(self, quantities: Mapping[str, str], rest: str, arguments: Sequence[str] = ()) -> str:
+        """Read the test as `foamfit check` does, and say what was understood.
 
-        `cycle` is as the command takes it; of several the first is read.
+        `arguments` are those of `foamfit fit` on cycles; of several apart the first is read.
+        InputError if it cannot be read.
         """
         if self.running:
-            return Checked(error=BUSY)
+            raise InputError(BUSY)
         self.measurement = None
         if self.csv is None:
-            return Checked(error="There is no test yet; drop a CSV or choose a reconstruction.")
+            raise InputError("There is no test yet; drop a CSV or choose a reconstruction.")
         toml = self.csv.with_suffix(".toml")
         try:
             toml.write_text(join_toml(quantities, rest), encoding="utf-8")
-            alone, several = cycles_of(cycle.strip() or None)
-            measurement = read_test(self.csv, toml, several[0] if several else alone)
+            asked = parsed([*arguments])
+            wanted = cycles_of(asked)
+            first = next(iter(wanted), None) if isinstance(wanted, tuple) else wanted
+            measurement = read_test(self.csv, toml, first, cycles=asked["cycles"])
             # By its own name: the folder of the window means nothing to a user.
             text = describe(replace(measurement, path=Path(self.csv.name)), audit(measurement))
         except InputError as error:
-            told = self._plain(str(error))
-            quantity = next((name for name in QUANTITIES if f"{name} " in told), "")
-            if "[specimen] needs a diameter" in told:
-                quantity = "[specimen] diameter"
-            return Checked(error=told, quantity=quantity)
+            raise InputError(self._plain(str(error))) from None
         self.measurement = measurement
-        return Checked(text)
+        return text
 
-    def measured(self, cycle: int) -> Measurement:
-        """Return a cycle of the test that was checked last."""
+    def measured(self, cycle: int, last: int | None) -> Measurement:
+        """Return a cycle of the test that was checked last, or with a `last` one a history."""
         assert self.csv is not None
-        assert self.measurement is not None
-        if cycle == self.measurement.cycle:
-            return self.measurement
-        return read_test(self.csv, self.csv.with_suffix(".toml"), cycle)
+        there = self.measurement
+        if there is not None and (cycle, last) == (there.cycle, there.last_cycle):
+            return there
+        which: Any = {"cycles": (cycle, last)} if last else {"cycle": cycle}
+        return read_test(self.csv, self.csv.with_suffix(".toml"), **which)
 
     @property
     def toml(self) -> bytes:
@@ -225,11 +216,6 @@ class Desk:
         assert self.worker is not None
         return shlex.join(["foamfit", "fit", self.csv.name, *self.worker.job.arguments])
 
-    @property
-    def told(self) -> str:
-        """The text that the command prints on several cycles, "" for one fit."""
-        return "" if self.worker is None else self.worker.told
-
     def zipped(self) -> bytes:
         """Return the result folder as a ZIP, with the TOML of the test."""
         assert self.result is not None
@@ -239,6 +225,13 @@ class Desk:
                 archive.write(path, path.relative_to(self.result))
             archive.write(self.result.with_suffix(".toml"), "test.toml")
         return content.getvalue()
+
+
+def wrong_quantity(told: str) -> str:
+    """Return the name of the quantity that a sentence refuses, "" for none."""
+    if "[specimen] needs a diameter" in told:
+        return "[specimen] diameter"
+    return next((name for name in QUANTITIES if f"{name} " in told), "")
 
 
 def safe_name(name: str) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Unpack
@@ -11,8 +12,9 @@ from typing import Unpack
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
-from foamfit.errors import SimulationError
+from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import Tracker, rank
 from foamfit.fitting.starts import curve_starts, smooth_loop
@@ -20,9 +22,12 @@ from foamfit.one_model import Keywords, Options
 from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
 from foamfit.results import law_in_words
+from foamfit.solve.plan import Motion
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
+from foamfit.springs.spring import Spring
 
 WIDE = 4.0  # a slider reaches to so many times the value
+INSTANTS = 60  # at which a chain is drawn along one cycle
 PANELS = tuple(CURVES)
 
 
@@ -46,12 +51,18 @@ class Row:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Curves (x, y) by the name of their panel at some parameters, or why there are none."""
+    """Curves (x, y) by the name of their panel at some parameters, or why there are none.
+
+    `chain` is the chain at instants along its loop: "strain" and "stress" (Pa) of the loop, "top"
+    and "heights" (n_springs, m) of the springs over the specimen's height at rest, and "snapped",
+    the fraction of each spring that has snapped, NaN where its law does not say.
+    """
 
     curves: dict[str, tuple[Array, Array]]
     misfit: dict[str, float | None]
     values: dict[str, float]
     points: dict[str, tuple[float, float]] = field(default_factory=dict)  # strain, stress
+    chain: dict[str, Array] = field(default_factory=dict)
     error: str = ""
 
 
@@ -81,6 +92,11 @@ class Turning:
         return law_in_words(self.problem.model.name, self.problem.model.relaxation)
 
     @property
+    def cycles(self) -> int:
+        """How many cycles of the record are one history."""
+        return len(cycles_of(self.problem.measurement)) or 1
+
+    @property
     def named(self) -> dict[str, float]:
         """The values (SI) by name; times and zeros are those of the file."""
         told = self.values + self.problem.origins
@@ -91,12 +107,9 @@ class Turning:
 
         The contact time, for example, is of the record.
         """
-        if name in NUISANCE and name != "time_shift":
-            return False
-        given = self.problem.measurement.specimen.heights is not None
-        if given and split_name(name)[1] == "height":
-            return False
-        return self.problem.params[name].expr is None
+        heights, short = self.problem.measurement.specimen.heights, split_name(name)[1]
+        of_record = name in NUISANCE or (short == "height" and heights is not None)
+        return name == "time_shift" or not (of_record or self.problem.params[name].expr)
 
     def _at(self, values: Array, moves: Mapping[str, float]) -> Array:
         """Put some values into a vector; parameters that depend on them by expressions follow."""
@@ -112,24 +125,40 @@ class Turning:
         """Change some parameters (SI) and return the curves."""
         problem = self.problem
         self.values = values = self._at(self.values, moves)
-        named = self.named
         try:
+            springs = problem.model.springs(values[: len(problem.model.names)])
             simulated = problem.objective.simulate(values, everything=True)
-        except SimulationError as error:
-            return Drawn({}, {}, named, error=self._why(error))
+        except (InputError, SimulationError) as error:
+            return Drawn({}, {}, self.named, error=str(error))
         m, drive, found = problem.measurement, self.drive, simulated.curves
         without_time = found.get("stress_strain")  # along the measured motion
         stress = m.stress if drive == "stress" else found.get("stress_time", without_time)
         moved = m.displacement if drive == "displacement" else found.get("displacement_time")
-        curves = {n: xy for n, xy in self._panels(stress, moved).items() if n in self.measured}
-        return Drawn(curves, problem.objective.misfit(simulated), named, self._points())
+        panels = self._panels(stress, moved)
+        chain = self._chained(springs, simulated.motion, *panels["stress_strain"])
+        curves = {n: xy for n, xy in panels.items() if n in self.measured}
+        alone = len(springs) == 1 and not problem.model.relaxation
+        points = springs[0].corners if alone else {}
+        return Drawn(curves, problem.objective.misfit(simulated), self.named, points, chain)
 
-    def _points(self) -> dict[str, tuple[float, float]]:
-        """Return where the branches of a single spring meet, by the names of the paper."""
-        model = self.problem.model
-        if len(model.kinds) > 1 or model.relaxation:
-            return {}
-        return model.springs(self.values[: len(model.names)])[0].corners
+    def _chained(
+        self, springs: Sequence[Spring], motion: Motion, strain: Array, stress: Array
+    ) -> dict[str, Array]:
+        """Return the chain along its loop; before contact and after it the springs are at rest."""
+        problem, total = self.problem, self.problem.measurement.specimen.height
+        heights = problem.model.heights(self.values[: len(problem.model.names)], total)[:, None]
+        strains = np.maximum(np.diff(motion.displacement, axis=0, prepend=0.0) / heights, 0.0)
+        along = np.cumsum(np.abs(np.diff(strain, prepend=strain[0])))
+        steps = np.linspace(0.0, along[-1], INSTANTS * self.cycles)
+        at = np.unique(np.searchsorted(along, steps))
+        snapped = np.full(strains.shape, np.nan)
+        for row, spring, own in zip(snapped, springs, strains, strict=True):
+            with suppress(SimulationError):  # at the end of a branch
+                shares = spring.snapped_along(own)
+                row[:] = np.nan if shares is None else shares
+        parts = {"strain": strain, "stress": stress, "top": 1.0 - motion.displacement[-1] / total}
+        parts |= {"heights": heights / total * (1.0 - strains), "snapped": snapped}
+        return {name: part[..., at] for name, part in parts.items()}
 
     @cached_property
     def measured(self) -> dict[str, tuple[Array, Array]]:
@@ -142,15 +171,6 @@ class Turning:
         strain = None if moved is None else moved / m.specimen.height
         pairs = zip(PANELS, (m.time, m.time, strain), (stress, moved, stress), strict=True)
         return {n: (x, y) for n, x, y in pairs if x is not None and y is not None}
-
-    def _why(self, error: SimulationError) -> str:
-        """Say which parameter is inadmissible, if one is."""
-        model = self.problem.model
-        try:
-            model.springs(self.values[: len(model.names)])
-        except ValueError as reason:
-            return str(reason)
-        return str(error)
 
     def _guess(self) -> Array:
         """Return the best of the starts that a fit reads off the measured loop."""

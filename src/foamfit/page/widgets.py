@@ -19,6 +19,7 @@ from panel.custom import JSComponent
 from foamfit.cli.fit import fit as fit_command
 
 TEMPLATES = Path(__file__).with_name("templates")
+WIDE: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
 RELAXATIONS = 4  # numbers of terms that are listed
 OPTIONS = {
     one.name: one for one in fit_command.params if isinstance(one, click.Option) and one.name
@@ -72,6 +73,15 @@ class Sliders(JSComponent):
     def drawn(self) -> None:
         """Say that the last move is drawn; the next may come."""
         self._send_msg({"drawn": True})
+
+
+class Chain(JSComponent):
+    """The chain as it deforms along its loop, at an instant that is chosen or played."""
+
+    frames = param.Dict({})
+
+    _esm = TEMPLATES / "chain.js"
+    _stylesheets: ClassVar[list[str]] = [style("inputs"), style("chain")]
 
 
 def message(event: Any) -> dict[str, Any]:

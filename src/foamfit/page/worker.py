@@ -62,6 +62,7 @@ class News:
     relaxation: int = 0
     drive: str = ""
     cycle: int = 1
+    last_cycle: int | None = None
     values: dict[str, float] = field(default_factory=dict)
     misfit: dict[str, float | None] = field(default_factory=dict)
 
@@ -202,6 +203,7 @@ class _Teller(Watcher):
             "relaxation": problem.model.relaxation,
             "drive": problem.objective.drive,
             "cycle": problem.measurement.cycle,
+            "last_cycle": problem.measurement.last_cycle,
             "values": dict(named),
             "misfit": misfit,
         }

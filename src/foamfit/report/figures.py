@@ -1,4 +1,4 @@
-"""What all figures share: colours, style, one layout for all images, saving."""
+"""Colours, style, layout and saving of all figures."""
 
 from __future__ import annotations
 
@@ -9,18 +9,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from foamfit.errors import InputError
 from foamfit.files import write_file
-from foamfit.report.readable import readable_unit
 from foamfit.text import wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-    from foamfit.arrays import Array
 
 GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # by Okabe and Ito
 INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of interior masses, from the base up
@@ -46,8 +42,7 @@ STYLE: Any = {  # matplotlib types its keys one by one
 }
 NO_LAYOUT = {"figure.autolayout": False, "figure.constrained_layout.use": False}
 DPI = 250  # of a PNG
-# Widths of a figure in inches by what they are called: one column of the Journal of Applied
-# Mechanics, and both.
+# Width of one and of two columns of the Journal of Applied Mechanics, in.
 TWO = "two"
 COLUMNS = {"one": 3.25, TWO: 7.0}
 NARROWEST, WIDEST = 2.5, 20.0
@@ -58,12 +53,12 @@ def inches(width: str) -> float:
     """Return the width of a figure that "one" or "two" columns or a length ("85 mm") name."""
     from foamfit.data.units import parse_quantity
 
-    length, words = _parted(width)
+    length, *words = _parts(width)
     wide = COLUMNS.get(length)
     if wide is None:
         metres = parse_quantity(length, "m", "the width of figures", "85 mm")
         wide = round(metres / 0.0254, 6)
-    if not NARROWEST <= wide <= WIDEST or words - {UNTITLED, PDF}:
+    if not NARROWEST <= wide <= WIDEST or {*words} - {UNTITLED, PDF}:
         low, high = (f"{25.4 * end:.0f}" for end in (NARROWEST, WIDEST))
         raise InputError(
             f"the width of figures = {width!r} is not admissible; it must be one, two (columns) or "
@@ -72,20 +67,19 @@ def inches(width: str) -> float:
     return wide
 
 
-def _parted(width: str) -> tuple[str, set[str]]:
+def _parts(width: str) -> list[str]:
     """Split "two, untitled" into the width and the words behind it."""
-    length, *words = (part.strip().lower() for part in width.split(","))
-    return length, set(words)
+    return [part.strip().lower() for part in width.split(",")]
 
 
 def is_titled(width: str) -> bool:
     """Whether a figure of such a width has a title: all but "two, untitled" and its like."""
-    return UNTITLED not in _parted(width)[1]
+    return UNTITLED not in _parts(width)
 
 
 def all_as_pdf(width: str) -> bool:
     """Whether all figures of a report are written as PDF too, as by "two, pdf"."""
-    return PDF in _parted(width)[1]
+    return PDF in _parts(width)
 
 
 def abreast(width: float, panels: int, least: float = 2.1) -> int:
@@ -99,22 +93,14 @@ def title_lines(wide: float, *parts: str, titled: bool = True) -> list[str]:
 
 
 def tail(name: str, most: int) -> str:
-    """Return a name, or the end of one that has more letters than there is room for."""
+    """Return a name, or its end if it is too long."""
     return name if len(name) <= most else f"…{name[1 - most :]}"
-
-
-def over_time(time: Array | None, size: int) -> tuple[Array, str]:
-    """Return what a curve is drawn over, and the label of that: its time, or its samples."""
-    if time is None:
-        return np.arange(size, dtype=float), "sample"
-    factor, unit = readable_unit(float(np.nanmax(np.abs(time))), "s")
-    return time / factor, f"time ({unit})"
 
 
 def grid_of(
     part: Figure | SubFigure, rows: int, columns: int, count: int, **more: Any
 ) -> list[Axes]:
-    """Return so many panels, row by row; the other places of the grid stay empty."""
+    """Return `count` panels, row by row; the rest of the grid stays empty."""
     every: list[Axes] = part.subplots(rows, columns, squeeze=False, **more).ravel().tolist()
     for ax in every[count:]:
         ax.set_axis_off()
@@ -140,7 +126,7 @@ def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[
 
 @contextmanager
 def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
-    """Give axes of the user's, or those of a new pyplot figure in the style of all figures."""
+    """Give the axes of the caller, or those of a new pyplot figure in the style of all figures."""
     if ax is not None:
         yield ax
         return
@@ -151,19 +137,8 @@ def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
         yield pyplot.subplots(figsize=(4.5, 3.2), layout="constrained")[1]
 
 
-def key_of(axes: Iterable[Axes]) -> dict[str, Any]:
-    """Return what is drawn by its label, less the "_" that keeps it off other legends."""
-    found: dict[str, Any] = {}
-    for artist in (one for ax in axes for one in (*ax.lines, *ax.collections, *ax.patches)):
-        label = str(artist.get_label())
-        empty = hasattr(artist, "get_xdata") and not len(artist.get_xdata())
-        if label.startswith("_") and not label.startswith("_child") and not empty:
-            found.setdefault(label[1:], artist)
-    return found
-
-
 def named_in(axes: Iterable[Axes]) -> dict[str, Any]:
-    """Return what is drawn by its label, as a legend of all axes has it."""
+    """Return labelled artists by their label, as for a legend of all axes."""
     each = (zip(*reversed(ax.get_legend_handles_labels()), strict=True) for ax in axes)
     return {name: artist for pairs in each for name, artist in pairs}
 
@@ -229,45 +204,8 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
     return buffer.getvalue()
 
 
-def write_haloed(ax: Axes, name: str, at: Array, offset: tuple[float, float], **style: Any) -> None:
-    """Write a text at an offset (points) from a place, with a white rim."""
-    from matplotlib.patheffects import Stroke
-    from matplotlib.text import Annotation
-
-    class Haloed(Annotation):
-        """A text with a rim; matplotlib's own rim would turn its letters into outlines."""
-
-        def draw(self, renderer: Any) -> None:
-            self.set_path_effects([Stroke(linewidth=1.5, foreground="white")])
-            super().draw(renderer)
-            self.set_path_effects([])
-            super().draw(renderer)
-
-    text = Haloed(name, tuple(at), offset, textcoords="offset points", clip_on=False, **style)
-    ax.add_artist(text)
-
-
-def draw_estimates(
-    ax: Axes, points: Sequence[tuple[float, Any]], factor: float, size: float = 3.5
-) -> tuple[list[float], list[float]]:
-    """Draw values of a parameter, hollow if not determined, and their 95 % intervals.
-
-    `points` are (x, estimate), `factor` is the unit; with a size of 0 there are intervals alone.
-    Returns the values and the ends as drawn.
-    """
-    bars = [(x, *p.ci95) for x, p in points if p.ci95 is not None and np.all(np.isfinite(p.ci95))]
-    ends = np.array(bars, dtype=float).reshape(-1, 3) / (1.0, factor, factor)
-    ax.vlines(*ends.T, color=GREY, linewidth=0.8, zorder=1, label="_95 % interval")
-    for sure, face in ((True, BLUE), (False, "white")) if size else ():
-        chosen = [(x, p.value / factor) for x, p in points if (p.state == "determined") == sure]
-        style: Any = {"color": BLUE, "markerfacecolor": face, "markersize": size}
-        style["label"] = "_determined" if sure else "_not well determined"
-        ax.plot(*np.array(chosen).reshape(-1, 2).T, "o", **style)
-    return [p.value / factor for _, p in points], ends[:, 1:].ravel().tolist()
-
-
 def limits(values: Sequence[float], ends: Sequence[float]) -> tuple[float, float]:
-    """Return limits of an axis out of which wide intervals run rather than flatten the values."""
+    """Return limits of an axis; wide intervals run out of it, so that values stay apart."""
     low, high = min(values), max(values)
     room = max(1.5 * (high - low), 0.1 * max(abs(low), abs(high)), 1e-12)
     bottom, top = max(min([low, *ends]), low - room), min(max([high, *ends]), high + room)

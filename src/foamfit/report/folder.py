@@ -1,4 +1,4 @@
-"""The folder of a result: written whole, replaced whole, and read again."""
+"""Result folders: written and replaced as a whole, and read again."""
 
 from __future__ import annotations
 
@@ -22,22 +22,20 @@ from foamfit.report.samples import write_samples
 from foamfit.report.tables import parameters_tex
 from foamfit.results import SCHEMA, Fit, ParameterEstimate, plain
 
-# All that `save_result` may write, and what `studies` write beside the folders of cycles and tests.
-# Older versions wrote tables of what was plotted: their folders are replaced as well.
-RESULT_FILES = {
-    *("fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png"),
-    *("fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "budget.csv", "report.html"),
-    *("table.tex", SAMPLES, "residuals.pdf", "information.pdf", "snapping.pdf", "profiles.pdf"),
+# Files of each kind of result, by the file that marks it. Folders of older versions, which wrote
+# other files too, are replaced as well.
+_OLDER = {"fit.csv", "residuals.csv", "sensitivities.csv", "residuals.pdf", "information.pdf"}
+_TABLES = {"fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "budget.csv"}
+_DRAWN = {"fit.png", "fit.pdf", "report.html", "snapping.pdf", "profiles.pdf"}
+_KINDS = ("json", "csv", "html", "tex", "png", "pdf")
+FILES = {
+    "fit.json": {*_TABLES, *_DRAWN, *_OLDER, "table.tex", SAMPLES},
+    "cycles.json": {*(f"cycles.{kind}" for kind in _KINDS), "cycles-plotted.csv", "table.tex"},
+    "joint.json": {f"{name}.{kind}" for name in ("joint", "parameters") for kind in _KINDS}
+    | {"table.tex"},
+    "batch.json": {*(f"summary.{kind}" for kind in _KINDS), "batch.json"},
+    "prediction.json": {f"prediction.{kind}" for kind in _KINDS},
 }
-CYCLES_FILES = {f"cycles.{kind}" for kind in ("json", "csv", "png", "pdf")}
-CYCLES_FILES |= {"cycles-plotted.csv", "table.tex"}
-JOINT_FILES = {f"joint.{kind}" for kind in ("json", "html", "png", "pdf", "csv")}
-JOINT_FILES |= {"table.tex", "parameters.png", "parameters.pdf"}
-BATCH_FILES = {f"summary.{kind}" for kind in ("csv", "html", "tex", "png", "pdf")} | {"batch.json"}
-PREDICTION_FILES = {f"prediction.{kind}" for kind in ("json", "csv", "png", "pdf")}
-# One of these is in every result.
-MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json", "prediction.json")
-_FILES = RESULT_FILES | CYCLES_FILES | JOINT_FILES | PREDICTION_FILES | {"batch.json"}
 
 
 class _TriedError(Exception):
@@ -150,7 +148,7 @@ def _check_replaceable(folder: Path, place: Path) -> None:
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
     there = sorted(place.iterdir())
-    if there and not any(_content(place / name) for name in MARKS):
+    if there and not any(_content(place / name) for name in FILES):
         raise InputError(
             f"{folder} is not empty and holds no foamfit result (no fit.json of foamfit), so it is "
             "not replaced; choose a new or an empty folder"
@@ -173,8 +171,8 @@ def is_written(path: Path, tests: Collection[str] = ()) -> bool:
         return False
     if path.is_dir() and (re.fullmatch(r"cycle-\d+", path.name) or path.name in tests):
         within = list(path.iterdir())
-        return all(inner.name in RESULT_FILES and is_written(inner) for inner in within)
-    return path.name in _FILES and path.is_file()
+        return all(inner.name in FILES["fit.json"] and is_written(inner) for inner in within)
+    return any(path.name in names for names in FILES.values()) and path.is_file()
 
 
 def _content(path: Path) -> dict[str, Any]:
@@ -238,12 +236,11 @@ def write_result(
         write_table(folder / "budget.csv", result.budget.rows())
     if result.ladder is not None:
         write_table(folder / "ladder.csv", result.ladder.rows())
-    drawn = dict(figures)
-    for name, images in drawn.items():
+    for name, images in (drawn := dict(figures)).items():
         if images is not None and images.pdf is not None:
             (folder / f"{name}.pdf").write_bytes(images.pdf)
-    if (fit := drawn.get("fit")) is not None:
-        (folder / "fit.png").write_bytes(fit.png)
+        if images is not None and name == "fit":
+            (folder / "fit.png").write_bytes(images.png)
     if pages:
         write_text(folder / "report.html", render_report(result, drawn))
 

@@ -1,13 +1,13 @@
-"""What was fitted, to look at: the three panels of the paper's Figs. 3 and 4, and the residuals."""
+"""Figures of a fit and of a forward run: the three panels of the paper's Figs. 3 and 4."""
 
 from __future__ import annotations
 
-import math
 import re
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -30,40 +30,38 @@ if TYPE_CHECKING:
 
 # Points at which a spring changes between two branches, in either order.
 POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"}
-# Where the name of a point stands, in points from it: beside its curve, off the others.
+# Preferred offset of the name of a switching point, in typographic points.
 IN_LOOP = {"A1": (-4, 5), "C1": (-5, 3), "C2": (5, -3), "A2": (4, -7), "σ₊": (-4, 5), "σ₋": (5, -5)}
 IN_TIME = {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4), "σ₊": (5, -4), "σ₋": (5, 4)}
-# The same of a branch, if not to the upper left; of an elastic one that is drawn lightly, behind
-# the share of its length at which the name stands.
+# The same for a branch, if not to the upper left; for an elastic branch, after the share of its
+# length at which its name stands.
 BESIDE = {"c": (7.0, -3.0), "e": (4.0, -7.0), "snap-back": (7.0, -6.0)}
 LIGHT = {"a": (0.9, (-4.0, 3.0)), "c": (0.5, (5.0, -4.0))}
 MARKERS = 60  # markers on a measured curve; more would blot
 PALE = "#A6CEE3"
 MOST_NAMED = 12  # loops that a legend names
 STOOD = "#F2DC6B"  # where the gauge stood still
-# Dashes and marks of interior masses, from the base up, for readers without colour.
+# Dashes and marks of interior masses, from the base up, to be told apart without colour.
 DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)))
 MARKS = ("^", "v", "D", "p")
-# Typographic points: height of a panel beside others and above others, what its labels take beside
-# and below it, and what title and legend take.
-HEIGHT, STACKED, BESIDE_IT, BELOW_IT, AROUND = 133.0, 112.0, 31.0, 26.0, 39.0
+# Typographic points: height of panels side by side, of stacked ones and of a residual; room for the
+# labels beside and below a panel, and for title and legend.
+HEIGHT, STACKED, STRIP, BESIDE_IT, BELOW_IT, AROUND = 133.0, 112.0, 40.0, 31.0, 26.0, 39.0
 MOST_WIDE = {0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}  # in, by the number of panels
-# Of a known motion: height of the loop, how many times as wide it is as others, and the height of a
-# residual below, points.
-LOOP, WIDER, STRIP = 165.0, 1.45, 40.0
+LOOP, WIDER = 165.0, 1.45  # of a known motion: height of the loop, its width over that of others
 
 
 def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -> Figure:
-    """Draw stress-time, displacement-time and stress-strain, measured and fitted.
+    """Draw stress-time, displacement-time and stress-strain, measured and fitted, and residuals.
 
     A panel of which the fit has no curve is left out. Where the motion is prescribed, the loop is
-    large, the input is not drawn, and below each curve is its residual. `width` is "one" or "two"
-    columns, or a length such as "85 mm", and with ", untitled" behind it there is no title; panels
-    for which it has no room side by side stand one above the other, and a figure of fewer panels is
-    no wider than these need. Saved at `path`, if one is given, in the format of its suffix.
+    large and the input is not drawn. `width` is "one" or "two" columns, or a length such as
+    "85 mm", and with ", untitled" behind it there is no title; panels for which it has no room side
+    by side stand one above the other, and a figure of fewer panels is no wider than these need.
+    Saved at `path`, if one is given, in the format of its suffix.
     """
     panels = _panels(result)
-    with _panelled(panels, width, known=is_known(result)) as (figure, axes, sizes):
+    with _panelled(panels, width, residuals=True, known=is_known(result)) as (figure, axes, sizes):
         for ax, panel, size in zip(axes, panels, sizes, strict=False):
             _annotate(ax, panel, result, size)
         _head(figure, result, titled=figures.is_titled(width))
@@ -112,27 +110,6 @@ def draw_loops(loops: Iterable[Loop], ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
-    """Draw fitted minus measured along each curve, in percent of the measured range.
-
-    One strip above the other, 7 in wide, over time, or over the sample where there is no time; a
-    curve that has nothing to compare is left out. Saved at `path`, if one is given.
-    """
-    strips = dict(_residuals(result))
-    with figures.drawing(7.0, 0.45 + 0.85 * max(len(strips), 1)) as figure:
-        column = figures.grid_of(figure, max(len(strips), 1), 1, max(len(strips), 1), sharex=True)
-        for ax, (name, residual) in zip(column, strips.items(), strict=False):
-            x, label = figures.over_time(result.curves.time, residual.size)
-            ax.axhline(0.0, color=GREY, lw=0.6)
-            ax.plot(x, 100.0 * residual, color=VERMILION, lw=0.9, label="fitted − measured")
-            ax.set_ylabel("% of range")
-            ax.set_title(f"{name}: fitted − measured", loc="left", fontsize=7.5, pad=3)
-            column[-1].set_xlabel(label)
-        if not strips:
-            figures.say_nothing_there(column[0])
-    return figures.save(figure, path)
-
-
 def plot_response(
     response: Response, path: str | Path | None = None, *, width: str = TWO
 ) -> Figure:
@@ -161,12 +138,8 @@ def plot_response(
         if end is not None:
             at = end / panels[0].scale()[0]
             for ax in axes[:2]:
-                ax.axvline(at, color=GREY, lw=0.6, ls=(0, (2, 2)), label="_end of contact")
-            style: Any = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
-            style |= {"ha": "right", "va": "top", "rotation": 90, "color": GREY, "fontsize": 6.5}
-            axes[0].annotate("end of contact", (at, 1.0), (-3, -3), **style)
-        if len(nodes) > 1:
-            axes[1].legend(loc="best", handlelength=1.4)
+                ax.axvline(at, color=GREY, lw=0.6, ls=(0, (2, 2)), label="end of contact")
+        figures.legend_below(figure, figures.named_in(axes))
     return figures.save(figure, path)
 
 
@@ -177,16 +150,9 @@ def origin_word(result: Fit) -> str | None:
     return match and {"reconstruct": "reconstruction"}.get(match[1], match[1])
 
 
-def _annotate(ax: Axes, panel: _Panel, result: Fit, size: tuple[float, float]) -> None:
-    """Write into a panel of about a size (points) all but its curves."""
-    _mark_outliers(ax, panel, result)
-    _shade_standstills(ax, panel, result)
-    labels = _Labels(ax, panel, size)
-    if panel.is_loop:
-        _draw_law(labels, result)
-    _mark_switches(labels, panel, result)
-    if panel.is_loop:
-        _name_branches(labels, panel, result)
+def is_known(result: Fit) -> bool:
+    """Whether the motion is prescribed, and no motion of interior masses is compared."""
+    return result.drive == "displacement" and not result.curves.interior
 
 
 # ------------------------------------------------------------------------------- the panels
@@ -194,7 +160,7 @@ def _annotate(ax: Axes, panel: _Panel, result: Fit, size: tuple[float, float]) -
 
 @dataclass(frozen=True)
 class _Line:
-    """A curve of a panel, SI; `marked` draws it as marks through which all samples run thinly."""
+    """A curve of a panel, SI; of a measured curve, `off` is the residual in % of its range."""
 
     x: Array
     y: Array
@@ -202,6 +168,7 @@ class _Line:
     style: dict[str, Any]
     kind: Literal["measured", "fitted", "other"] = "other"
     node: int = 0  # the mass inside that it belongs to, 0 = the top
+    off: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -216,6 +183,11 @@ class _Panel:
     @property
     def is_loop(self) -> bool:
         return self.key == "stress_strain"
+
+    @property
+    def fitted(self) -> _Line | None:
+        """The fitted curve of the top."""
+        return next((one for one in self.lines if one.kind == "fitted" and not one.node), None)
 
     def scale(self) -> tuple[float, str, float, str]:
         """Return factor and axis label of x, then of y."""
@@ -233,42 +205,38 @@ def _panels(result: Fit) -> list[_Panel]:
         moved = c.measured_displacement
     strain = None if c.measured_displacement is None else c.measured_displacement / height
     motion = result.measurement.motion or "measured"
-    moving = [_measured(c.time, c.measured_displacement, motion), _fitted(c.time, c.displacement)]
+
+    def compared(curve: str, fitted: Array | None) -> Array | None:
+        return None if result.misfit.get(curve) is None else fitted
+
+    off = compared("stress_time", c.stress)
+    pushing = _measured(c.time, c.measured_stress, off) + _fitted(c.time, c.stress)
+    off = compared("displacement_time", c.displacement)
+    moving = _measured(c.time, c.measured_displacement, off, motion)
+    moving += _fitted(c.time, c.displacement)
     for node, (measured, fitted) in c.interior.items():
-        moving += [_measured(c.time, measured, node=node), _fitted(c.time, fitted, node)]
-    loop = [
-        _measured(strain, c.measured_stress, motion),
-        _fitted(None if moved is None else moved / height, pushed),
-    ]
+        moving += _measured(c.time, measured, fitted, node=node) + _fitted(c.time, fitted, node)
+    loop = _measured(strain, c.measured_stress, compared("stress_strain", c.stress_along), motion)
+    loop += _fitted(None if moved is None else moved / height, pushed)
     if strain is not None and c.stress_along is not None and not is_known(result):
-        # Wide and pale below the others, with which it coincides where the fit is good.
+        # Wide and pale below the others, because it coincides with them where the fit is good.
         pale = {"color": PALE, "lw": 3.2, "zorder": 2}
         loop.append(_Line(strain, c.stress_along, "springs along measured strain", pale))
-    pushing = [_measured(c.time, c.measured_stress), _fitted(c.time, c.stress)]
     panels = [
-        ("stress_time", "time", "s", "stress", "Pa", pushing),
-        ("displacement_time", "time", "s", "displacement", "m", moving),
-        ("stress_strain", "strain", "–", "stress", "Pa", loop),
+        _Panel("stress_time", "time", "s", "stress", "Pa", pushing),
+        _Panel("displacement_time", "time", "s", "displacement", "m", moving),
+        _Panel("stress_strain", "strain", "–", "stress", "Pa", loop),
     ]
     if is_known(result):
         panels = [panels[2], panels[0]]
-    made = (
-        _Panel(key, x, x_unit, y, y_unit, [line for line in lines if line])
-        for key, x, x_unit, y, y_unit, lines in panels
-    )
-    return [panel for panel in made if panel.lines]
-
-
-def is_known(result: Fit) -> bool:
-    """Whether the motion is the input and nothing else of it is compared."""
-    return result.drive == "displacement" and not result.curves.interior
+    return [panel for panel in panels if panel.lines]
 
 
 def _measured(
-    x: Array | None, y: Array | None, motion: str = "measured", node: int = 0
-) -> _Line | None:
+    x: Array | None, y: Array | None, fitted: Array | None, motion: str = "measured", node: int = 0
+) -> list[_Line]:
     if x is None or y is None:
-        return None
+        return []
     label, mark, edge = "measured", "o", "0.6"
     if node:
         mark, edge = MARKS[(node - 1) % len(MARKS)], INSIDE[(node - 1) % len(INSIDE)]
@@ -276,31 +244,34 @@ def _measured(
     elif motion != "measured":
         label, mark = f"measured, motion {motion}", "s"
     style = {"marker": mark, "mfc": "white", "mec": edge, "mew": 0.6, "ms": 3.4, "zorder": 3}
-    return _Line(x, y, label, style, "measured", node)
+    off = None if fitted is None else 100.0 * (fitted - y) / (float(np.ptp(y)) or 1.0)
+    return [_Line(x, y, label, style, "measured", node, off)]
 
 
-def _fitted(x: Array | None, y: Array | None, node: int = 0) -> _Line | None:
+def _fitted(x: Array | None, y: Array | None, node: int = 0) -> list[_Line]:
     if x is None or y is None:
-        return None
-    style = {"color": VERMILION, "ls": "-", "lw": 0.9, "zorder": 4}
-    if node:
-        at = node - 1
-        style |= {"color": INSIDE[at % len(INSIDE)], "ls": DASHES[at % len(DASHES)]}
-    return _Line(x, y, f"mass {node}" if node else "fitted", style, "fitted", node)
+        return []
+    style = {"ls": DASHES[(node - 1) % len(DASHES)] if node else "-", "lw": 0.9, "zorder": 4}
+    label = f"mass {node}" if node else "fitted"
+    return [_Line(x, y, label, style | {"color": _colour(node)}, "fitted", node)]
+
+
+def _colour(node: int) -> str:
+    return INSIDE[(node - 1) % len(INSIDE)] if node else VERMILION
 
 
 @contextmanager
 def _panelled(
-    panels: list[_Panel], width: str, *, known: bool = False
+    panels: list[_Panel], width: str, *, residuals: bool = False, known: bool = False
 ) -> Iterator[tuple[Figure, list[Axes], list[tuple[float, float]]]]:
     """Give a figure with its panels drawn, their axes, and about how large each is, in points.
 
-    With `known` the first is the largest, and below each is its residual.
+    With `residuals` these are below the panels; of a `known` motion the first panel is the largest.
     """
     count = max(len(panels), 1)
     wide = min(figures.inches(width), MOST_WIDE[3 if known and count > 1 else len(panels)])
     across = figures.abreast(wide, count)
-    rows, every = -(-count // across), 2 if known else 1
+    rows, every = -(-count // across), 2 if residuals else 1
     parts = [WIDER if known else 1.0, *[1.0] * (across - 1)]
     spans = [72.0 * wide * part / sum(parts) - BESIDE_IT for part in parts]
     tall = LOOP if known and across > 1 else HEIGHT if rows == 1 else STACKED
@@ -314,12 +285,18 @@ def _panelled(
             ax.set_axis_off()
         if not panels:
             figures.say_nothing_there(axes[0])
-        for ax, panel in zip(axes, panels, strict=False):
+        sizes = [(span, tall) for span in spans * rows]
+        for i, (ax, panel) in enumerate(zip(axes, panels, strict=False)):
             ax.set_label(panel.key.replace("_", "-"))
             _draw(ax, panel)
-        for ax, strip, panel in zip(axes, below, panels, strict=False) if known else ():
-            _draw_residual(ax, strip, panel)
-        yield figure, axes, [(spans[i % across], tall) for i in range(count)]
+            if any(line.off is not None for line in panel.lines) and residuals:
+                _draw_residuals(ax, below[i], panel)
+            elif residuals:  # the panel takes their place
+                below[i].remove()
+                at = ax.get_subplotspec().rowspan.start
+                ax.set_subplotspec(ax.get_gridspec()[at : at + 2, i % across])
+                sizes[i] = (sizes[i][0], tall + STRIP)
+        yield figure, axes, sizes
         figure.align_ylabels()
 
 
@@ -337,17 +314,13 @@ def _draw(ax: Axes, panel: _Panel) -> None:
     ax.margins(0.05, 0.11)
 
 
-def _draw_residual(ax: Axes, strip: Axes, panel: _Panel) -> None:
+def _draw_residuals(ax: Axes, strip: Axes, panel: _Panel) -> None:
     """Draw fitted minus measured below a panel, in percent of the measured range."""
-    ends = {line.kind: line for line in panel.lines}
-    if len(ends) < 2:
-        strip.set_axis_off()
-        return
-    measured, fitted = ends["measured"].y, ends["fitted"].y
-    strip.axhline(0.0, color=GREY, lw=0.6)
-    off = 100.0 * (fitted - measured) / (float(np.ptp(measured)) or 1.0)
-    style: Any = {"color": VERMILION, "lw": 0.7, "label": "_fitted − measured"}
-    strip.plot(ends["measured"].x / panel.scale()[0], off, **style)
+    for line in panel.lines:
+        if line.off is not None:
+            style: Any = {"color": _colour(line.node), "lw": 0.7, "label": "_fitted − measured"}
+            strip.plot(line.x / panel.scale()[0], line.off, **style)
+    strip.axhline(0.0, color=GREY, lw=0.6, zorder=1)
     strip.set(xlabel=ax.get_xlabel(), label=f"{ax.get_label()}, residual")
     strip.set_ylabel("residual\n(% of range)", fontsize=7)
     strip.sharex(ax)
@@ -356,7 +329,7 @@ def _draw_residual(ax: Axes, strip: Axes, panel: _Panel) -> None:
 
 
 def _evenly(x: Array, y: Array, n: int) -> NDArray[np.intp]:
-    """Return up to `n` samples even along the curve; even in time they would crowd at its turns."""
+    """Return up to `n` samples, evenly spaced along the curve, not in time."""
     there = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if there.size <= n:
         return there
@@ -365,8 +338,20 @@ def _evenly(x: Array, y: Array, n: int) -> NDArray[np.intp]:
     return there[np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], n)))]
 
 
+def _annotate(ax: Axes, panel: _Panel, result: Fit, size: tuple[float, float]) -> None:
+    """Add to a panel of about this size (points) all but its curves."""
+    _mark_outliers(ax, panel, result)
+    _shade_standstills(ax, panel, result)
+    labels = _Labels(ax, panel, size)
+    if panel.is_loop:
+        _draw_law(labels, result)
+    _mark_switches(labels, panel, result)
+    if panel.is_loop:
+        _name_branches(labels, panel, result)
+
+
 def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
-    """Cross what the file has at samples that are not fitted, at the edge if it is beyond."""
+    """Mark outliers, which are not fitted, by crosses; those beyond the panel at its edge."""
     test = result.measurement
     fx, _, fy, _ = panel.scale()
     own = "displacement" if panel.key == "displacement_time" else "stress"
@@ -387,7 +372,7 @@ def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
 
 
 def _shade_standstills(ax: Axes, panel: _Panel, result: Fit) -> None:
-    """Shade where the displacement is bridged: a span of time, a stretch of the measured loop."""
+    """Shade where the gauge stood still: a span of time, a part of the measured loop."""
     test = result.measurement
     fx, _, fy, _ = panel.scale()
     style: Any = {"color": STOOD, "zorder": 0.5, "label": "gauge stands still, bridged"}
@@ -406,15 +391,13 @@ def _shade_standstills(ax: Axes, panel: _Panel, result: Fit) -> None:
 
 
 class _Labels:
-    """Places names in a panel: on no other name, and on little of the fitted curves and marks."""
+    """Places names in a panel so that they cover no other name and little of curves and marks."""
 
     def __init__(self, ax: Axes, panel: _Panel, size: tuple[float, float]) -> None:
         """Take a panel and about how large it will be, typographic points."""
         self.ax, (self.fx, _, self.fy, _) = ax, panel.scale()
-        low = np.array([ax.get_xlim()[0], ax.get_ylim()[0]])
-        self.corner, self.size = low, size
-        limits = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())])
-        self.span = np.array(size) / limits  # points per unit
+        self.corner, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
+        self.size, self.scale = size, np.array(size) / (high - self.corner)  # points per unit
         self.drawn = [np.empty((0, 2))]  # places that names are to leave free
         for line in panel.lines:
             if line.kind == "fitted":
@@ -427,73 +410,71 @@ class _Labels:
         self.ax.plot(*places.T, "o", ms=3.2, color="black", zorder=5, label=f"_{name}")
         self.drawn += [places, places]
 
-    def has_room(self, name: str, at: Array, wanted: tuple[float, float]) -> bool:
-        """Whether a name beside a place stays in the width of the panel."""
-        anchor, width = (at[0] - self.corner[0]) * self.span[0], 5.5 * len(name) + abs(wanted[0])
-        return bool(anchor > width if wanted[0] < 0 else anchor + width < self.size[0])
-
     def write(
-        self, name: str, at: Array, wanted: tuple[float, float], *, stay: bool = False, **style: Any
+        self,
+        name: str,
+        places: Sequence[Array],
+        wanted: tuple[float, float],
+        *,
+        stay: bool = False,
+        **style: Any,
     ) -> None:
-        """Write a name beside a place, `wanted` points from it or where it covers least.
+        """Write a name beside one of some places, `wanted` points from it or where it covers least.
 
-        With `stay` it stands on the side that is wanted.
+        Earlier places are better. With `stay` it stands on the side that is wanted.
         """
-        anchor = (at - self.corner) * self.span
-        avoid = (np.concatenate(self.drawn) - self.corner) * self.span
-        (x, y), size = wanted, np.array([4.2 * len(name), 9.0])
-        best, offset, box = math.inf, wanted, np.zeros(4)  # left, low, right, high
-        for factor in (1.0, 2.5, 4.0):
-            sides = ((x, factor * y), (-x, -factor * y), (x, -factor * y), (-x, factor * y))
-            for dx, dy in sides[:1] if stay else sides:
-                low = np.add(anchor, (dx - (size[0] if dx < 0 else 0.0), dy - 0.5 * size[1]))
-                high = low + size
-                names = sum(bool(np.all((low < b[2:]) & (b[:2] < high))) for b in self.taken)
-                beyond = bool(np.any((low < 0.0) | (high > self.size)))
-                inside = int(np.all((avoid > low) & (avoid < high), axis=1).sum())
-                cost = 1000 * names + 50 * beyond + inside + 2.0 * factor
-                if cost < best:
-                    best, offset, box = cost, (dx, dy), np.concatenate((low, high))
+        avoid = (np.concatenate(self.drawn) - self.corner) * self.scale
+        x, y = wanted
+        sides = [(x, y)] if stay else [(x, y), (-x, -y), (x, -y), (-x, y)]
+        found = []
+        for place, far, (dx, dy) in product(range(len(places)), (1.0, 2.5, 4.0), sides):
+            size = np.array([4.2 * len(name), 9.0])
+            left = dx - (size[0] if dx < 0 else 0.0)
+            low = (places[place] - self.corner) * self.scale + (left, far * dy - 0.5 * size[1])
+            high = low + size
+            names = sum(bool(np.all((low < b[2:]) & (b[:2] < high))) for b in self.taken)
+            beyond = bool(np.any((low < 0.0) | (high > self.size)))
+            inside = int(np.all((avoid > low) & (avoid < high), axis=1).sum())
+            cost = 1000 * names + 50 * beyond + inside + 2.0 * far + 3.0 * place
+            found.append((cost, places[place], (dx, far * dy), np.concatenate((low, high))))
+        _, at, offset, box = min(found, key=lambda one: one[0])
         self.taken.append(box)
         side = "left" if offset[0] > 0 else "right"
-        figures.write_haloed(self.ax, name, at, offset, zorder=6, ha=side, va="center", **style)
+        style |= {"ha": side, "va": "center", "zorder": 6, "annotation_clip": False}
+        back = {"fc": "white", "alpha": 0.75, "lw": 0.0, "pad": 0.5}
+        self.ax.annotate(
+            name, (at[0], at[1]), offset, textcoords="offset points", bbox=back, **style
+        )
 
 
 def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
-    """Mark what happens to the springs, and name each mark where it first stands."""
+    """Mark where springs switch, and name each kind of mark once."""
     at: dict[str, list[tuple[float, float]]] = {}
-    for spring, point, x, y in (*_switches(panel, result), *_halves(panel, result)):
+    for spring, point, x, y in _points(panel, result):
         name = f"{spring} {point}" if len(result.chain.springs) > 1 else point
         at.setdefault(name, []).append((x / labels.fx, y / labels.fy))
     wanted = IN_LOOP if panel.is_loop else IN_TIME
     for name, places in at.items():
         labels.mark(name, np.array(places))
     for name, places in at.items():
-        labels.write(name, np.array(places[0]), wanted.get(name[-2:], (5, 5)), fontsize=7)
+        labels.write(name, [np.array(places[0])], wanted.get(name[-2:], (5, 5)), fontsize=7)
 
 
-def _switches(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
-    """Give the points at which a spring changes its branch: spring, name and place, SI."""
+def _points(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
+    """Give where springs change branches, and where half of the micro-springs have snapped."""
     for switch in result.switches:
-        ends = switch.source, switch.target
+        ends, x = (switch.source, switch.target), switch.time
         name = POINTS.get("".join(ends))
-        if name is None and result.chain.springs[switch.spring - 1].law.remembers:
-            continue
-        x = switch.time
         if panel.is_loop:
             x = switch.displacement / result.measurement.specimen.height
-        if x is not None:
+        remembers = result.chain.springs[switch.spring - 1].law.remembers
+        if x is not None and not (name is None and remembers):
             y = switch.displacement if panel.key == "displacement_time" else switch.stress
             yield f"s{switch.spring}", name or "→".join(ends), x, y
-
-
-def _halves(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
-    """Give where half of the micro-springs have snapped, and snapped back."""
-    fitted = next((line for line in panel.lines if line.kind == "fitted" and not line.node), None)
     for spring, snapped in result.snapping.items():
         for symbol, sample in zip(("σ₊", "σ₋"), snapped.halves, strict=True):
-            if sample is not None and fitted is not None and sample < fitted.x.size:
-                yield spring, symbol, float(fitted.x[sample]), float(fitted.y[sample])
+            if sample is not None and (on := panel.fitted) is not None and sample < on.x.size:
+                yield spring, symbol, float(on.x[sample]), float(on.y[sample])
 
 
 def _draw_law(labels: _Labels, result: Fit) -> None:
@@ -510,7 +491,7 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
             ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5, label=f"_branch {name}")
             along, wanted = LIGHT[name[0]]
             at = line[int(along * (len(line) - 1))]
-            labels.write(name, at, wanted, color=GREY, fontsize=7)
+            labels.write(name, [at], wanted, color=GREY, fontsize=7)
     if spring.relaxation and "s1" in result.snapping and result.strain is not None:
         style: Any = {"color": "0.35", "lw": 0.7, "ls": (0, (4, 2)), "zorder": 3.5}
         held = result.snapping["s1"].stress / labels.fy
@@ -518,41 +499,33 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
 
 
 def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
-    """Write beside the curve of the only spring on which branch it is."""
-    fitted = next((line for line in panel.lines if line.kind == "fitted"), None)
-    springs = result.chain.springs
+    """Write the names of the branches beside the curve of a single spring."""
+    springs, fitted = result.chain.springs, panel.fitted
     if len(springs) > 1 or not springs[0].law.hysteretic or fitted is None:
         return
-    for branch, start, end in _first_visits(result, fitted):
-        x, y = fitted.x[start : end + 1] / labels.fx, fitted.y[start : end + 1] / labels.fy
-        inner = np.column_stack((x, y))[_evenly(x, y, 9)]
+    for branch, stretch in _longest_visits(result, fitted).items():
+        x, y = fitted.x[stretch] / labels.fx, fitted.y[stretch] / labels.fy
         middle = x[_evenly(x, y, 3)[1]]
+        inner = np.column_stack((x, y))[_evenly(x, y, 9)]
         around = sorted(inner, key=lambda at: float(abs(at[0] - middle)))
+        style: Any = {"fontsize": 7.5 if len(branch) == 1 else 7.0, "label": "_on branch"}
         wanted = BESIDE.get(branch, (-6.0, 5.0))
-        at = next((at for at in around if labels.has_room(branch, at, wanted)), around[0])
-        size = 7.5 if len(branch) == 1 else 7.0
-        labels.write(branch, at, wanted, stay=True, fontsize=size, color=BLUE, label="_on branch")
+        labels.write(branch, around, wanted, stay=True, color=BLUE, **style)
 
 
-def _first_visits(result: Fit, fitted: _Line) -> Iterator[tuple[str, int, int]]:
-    """Give each branch of the only spring, and the samples of its first stretch on it."""
-    starts = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
+def _longest_visits(result: Fit, fitted: _Line) -> dict[str, slice]:
+    """Return the samples of the longest visit, in strain, of a single spring to each branch."""
+    ends = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
     at_rest = next(iter(result.chain.springs[0].law.branches))
     branches = [switch.source for switch in result.switches[:1]] or [at_rest]
     branches += [switch.target for switch in result.switches]
-    stretches: list[tuple[str, int, int]] = []
-    for branch, start, end in zip(branches, starts, starts[1:], strict=False):
-        if end <= start:
-            continue
+    found, longest = dict[str, slice](), dict[str, float]()
+    for branch, start, end in zip(branches, ends, ends[1:], strict=False):
+        span = float(np.ptp(fitted.x[start : end + 1])) if end > start else 0.0
         # A shaking motion leaves a branch for less than a fiftieth of the largest strain.
-        shakes = np.ptp(fitted.x[start : end + 1]) < 0.02 * np.ptp(fitted.x)
-        if stretches and (shakes or branch == stretches[-1][0]):
-            stretches[-1] = (stretches[-1][0], stretches[-1][1], end)
-        elif not shakes:
-            stretches.append((branch, start, end))
-    for i, (branch, start, end) in enumerate(stretches):
-        if branch not in [one for one, *_ in stretches[:i]]:
-            yield branch, start, end
+        if span > longest.get(branch, 0.02 * float(np.ptp(fitted.x))):
+            found[branch], longest[branch] = slice(start, end + 1), span
+    return found
 
 
 def _switch_samples(result: Fit, loop: _Line) -> list[int]:
@@ -579,27 +552,12 @@ def _head(figure: Figure, result: Fit, *, titled: bool) -> None:
     # No line begins with a dot.
     title = "\u00a0· ".join([name, result.law, f"{result.drive} drive", *more])
     title = textwrap.fill(title, int(12 * figure.get_figwidth()))
-    # A name may hold a dollar sign: it is no formula.
+    # A dollar sign in a name begins no formula.
     if titled:
         figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, parse_math=False)
     lines = figures.legend_below(figure, figures.named_in(figure.axes))
     extra = 11.0 * max(lines - 1, 0) + (11.0 * title.count("\n") if titled else -13.0)
     figure.set_figheight(figure.get_figheight() + extra / 72.0)
-
-
-def _residuals(result: Fit) -> Iterator[tuple[str, Array]]:
-    """Give fitted − measured over the measured range, of each curve that is compared."""
-    c = result.curves
-    pairs: dict[str, tuple[Array | None, Array | None]] = {
-        "stress-time": (c.measured_stress, c.stress),
-        "displacement-time": (c.measured_displacement, c.displacement),
-        "stress-strain": (c.measured_stress, c.stress_along),
-    }
-    pairs = {n: p for n, p in pairs.items() if result.misfit.get(n.replace("-", "_")) is not None}
-    pairs |= {f"displacement-time of mass {node}": pair for node, pair in c.interior.items()}
-    for name, (measured, fitted) in pairs.items():
-        if measured is not None and fitted is not None:
-            yield name, (fitted - measured) / (float(np.ptp(measured)) or 1.0)
 
 
 def _size(values: Array) -> float:

@@ -1,4 +1,4 @@
-"""Parameters and numbers as they are to be read: unit, digits, symbol."""
+"""How parameters and numbers are written for readers: unit, digits, symbol."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from foamfit import text
 from foamfit.results import ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
 
-# Parameters that belong to no spring: symbol and index, and the name in reports, if it is another.
-# Those of springs are in the records of laws.
+# Parameters that belong to no spring: symbol, index, and their name in reports if it differs. Those
+# of springs are in the records of laws.
 _OTHERS = {
     "site_eta": ("η", "site", ""),
     "contact_time": ("t", "0", "contact time t₀"),
@@ -58,7 +58,7 @@ class Readable:
 
     @property
     def label(self) -> str:
-        """Its name in reports; for a parameter of a spring its own name."""
+        """The name in reports: for a parameter of a spring, its name in fit.json."""
         return _OTHERS.get(self.name, ("", "", ""))[2] or self.name
 
     @property
@@ -67,7 +67,7 @@ class Readable:
         return f"{self.value} ± {self.stderr}" if self.stderr else self.value
 
     def with_unit(self, told: str) -> str:
-        """Numbers of this parameter with its unit, where there are any."""
+        """Append the unit to a number of this parameter, unless there is none."""
         return f"{told} {self.unit}".removesuffix(" –") if told else ""
 
     @property
@@ -100,12 +100,6 @@ def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = 
     return Readable(name, symbol(name), shown, stderr, interval, unit, *told)
 
 
-def quantity(value: float, unit: str) -> tuple[str, str]:
-    """Return a number in the unit in which it reads well, and that unit; "–" for none."""
-    factor, name = readable_unit(value, unit)
-    return number(value / factor), name or "–"
-
-
 def own_name(name: str, model: str) -> str:
     """Name of a parameter, without the spring where there is only one."""
     return name if "+" in model else name.removeprefix("s1_")
@@ -120,7 +114,7 @@ def in_unit(values: Sequence[float], unit: str) -> str:
 
 
 def number(value: float | None) -> str:
-    """Return a number with four digits, an integer with all of its own, None as a dash."""
+    """Return a number with four digits, an integer with all its digits, None as a dash."""
     if value is None:
         return "–"
     return text.number(value) if isinstance(value, float) else str(value)

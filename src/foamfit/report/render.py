@@ -1,4 +1,4 @@
-"""The templates: pages in HTML, and what the terminal prints."""
+"""Templates of HTML pages and of what the terminal prints."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def sentences(name: str, **values: Any) -> tuple[str, ...]:
 
 
 def table(name: str, **values: Any) -> list[list[str]]:
-    """Return the cells of a table whose rows are the lines of a text, parted by "¦"."""
+    """Return the cells of a table whose rows are the lines of a text, separated by "¦"."""
     return [line.split("¦") for line in words(name, **values).splitlines()]
 
 

@@ -1,4 +1,4 @@
-"""The figures of a result: each is drawn once for all files of it, in whatever process."""
+"""The figures of a result, each drawn once for all its files, in any process."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from foamfit.report.figures import DPI, TWO, UNTITLED, all_as_pdf, image, laid_out
-from foamfit.report.plots import is_known, plot_fit, plot_residuals
-from foamfit.report.report_plots import plot_insight, plot_profiles, plot_snapping
+from foamfit.report.plots import plot_fit
+from foamfit.report.report_plots import plot_profiles, plot_snapping
 from foamfit.results import Fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Mapped = Callable[..., Iterable[Any]]  # as the built-in `map`
-SHOWN, COARSE = 200, 160  # dots per inch of figures that are only on the page, to save time
-# In the order in which they are begun: what takes longest first. Those on the screen are the fit on
-# the page, which has its title in the text, also on a phone.
+SHOWN = 200  # dots per inch of figures that are only on the page, to save time
+# In the order in which they are begun. Those on the screen show the fit on the page, which has its
+# own title, and on a phone.
 _ON_SCREEN = ("shown", "narrow")
-_NAMES = ("fit", *_ON_SCREEN, "information", "residuals", "snapping", "profiles")
+_NAMES = ("fit", *_ON_SCREEN, "snapping", "profiles")
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def _draw(result: Fit, width: str, name: str) -> Images | None:
     figure = _figure(result, width, name)
     if figure is None:
         return None
-    dpi = DPI if name == "fit" else COARSE if name == "information" else SHOWN
+    dpi = DPI if name == "fit" else SHOWN
     with laid_out(figure, dpi):
         printed = name == "fit" or (all_as_pdf(width) and name not in _ON_SCREEN)
         pdf = image(figure, "pdf") if printed else None
@@ -67,11 +67,6 @@ def _draw(result: Fit, width: str, name: str) -> Images | None:
 
 def _figure(result: Fit, width: str, name: str) -> Figure | None:
     """Draw one of the figures, if the result has it."""
-    if name == "residuals":  # those of a known motion are below its curves
-        return None if is_known(result) else plot_residuals(result)
-    if name == "information":
-        matrix = None if result.correlation is None else result.correlation.matrix
-        return None if result.insight is None else plot_insight(result.insight, matrix)
     if name == "profiles":
         return plot_profiles(result) if result.intervals and result.intervals.profiles else None
     if name == "snapping":

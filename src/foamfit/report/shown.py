@@ -1,4 +1,4 @@
-"""Results as Python and notebooks show them: a few lines of text, or one line and a table."""
+"""How Python and notebooks show results: a few lines of text, or one line and a table."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page
-from foamfit.report.summary import misfits
-from foamfit.report.tables import by_test, frame, stacked
+from foamfit.report.summary import compared
+from foamfit.report.tables import frame, stacked
 from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent, wrapped
@@ -18,38 +18,19 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-    from foamfit.study.cycle_fits import FittedCycles
-
-Joint = Any  # `foamfit.study.joint_result.JointData`, or `foamfit.saved.SavedJoint`, read back
+Joint = Any  # `foamfit.study.joint_result.JointResult`, or `foamfit.saved.SavedJoint`, read back
 
 
 def fit_shown(result: Fit, *, html: bool = False) -> str:
     """Return status, model, misfit and parameters of a fit."""
-    off = ((name, one) for name, one in misfits(result).items() if one is not None)
-    told = ", ".join(f"{name} {percent(one)}" for name, one in off)
+    told = ", ".join(f"{name} {percent(off)}" for name, off in compared(result).items())
     line = f"{result.law}, {result.drive} drive · status {result.status} · misfit: {told or '–'}"
-    rows = [readable(name, p) for name, p in result.parameters.items()]
-    return _shown(
-        result.measurement.name, line, [one for one in rows if one.state != "fixed"], html
-    )
+    rows = [readable(name, p) for name, p in result.parameters.items() if p.state != "fixed"]
+    return brief(result.measurement.name, line, rows, html)
 
 
-def cycles_shown(found: FittedCycles, *, html: bool = False) -> str:
-    """Return how many cycles were fitted and their misfits; as HTML the parameters by cycle too."""
-    line = f"{found.model} · {len(found.results)} of {counted(len(found.recorded), 'cycle')} fitted"
-    each = (one.misfit.get("stress_strain") for one in found.results.values())
-    if known := [off for off in each if off is not None]:
-        line += f" · misfit {percent(min(known))} to {percent(max(known))}"
-    table = {"first": "cycle", **cycles_by_test(found)} if html else None
-    return _shown(found.test, line, [], html, table)
-
-
-def cycles_by_test(found: FittedCycles) -> dict[str, Any]:
-    """Return head and rows of a table with a row for each cycle."""
-    return by_test(list(map(str, sorted(found.results))), found.varied)
-
-
-def _shown(title: str, line: str, rows: Sequence[Readable], html: bool, table: Any = None) -> str:
+def brief(title: str, line: str, rows: Sequence[Readable], html: bool, table: Any = None) -> str:
+    """Return a result in a few lines, or as HTML with a table of tests."""
     if html:
         return page("shown", title=title, line=line, rows=rows, by_test=table)
     marks = {"weak": " (weak)", "not determined": " (not determined)"}
@@ -93,4 +74,4 @@ def _joint_shown(found: Joint, *, html: bool = False) -> str:
     line = f"{found.model} · {counted(len(found.tests), 'test')} together · status {found.status}"
     common = {n: p for n, p in found.parameters.items() if p.kind != "fixed" and n not in NUISANCE}
     rows = [readable(name, p.estimate()) for name, p in common.items()]
-    return _shown(found.name, line, rows, html)
+    return brief(found.name, line, rows, html)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -19,7 +20,7 @@ CURVES = {
     "stress_strain": "stress-strain",
 }
 ANSWERS = {True: "yes", False: "no", None: "–"}
-# The screen of a fit, of which two lines say where the result is; lines kept for its warnings.
+# Lines of the screen of a fit (two more say where the result is), and lines kept for warnings.
 LINES, COLUMNS, WARNING_LINES = 22, 80, 3
 LONGEST = 180  # characters of the reasons for a state; longer ones are left to the report
 
@@ -28,7 +29,8 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     """Return what the command prints after a fit: one screen of 80 columns and 24 lines.
 
     Parameters that are not determined, and those of the record, stand in a line where the table has
-    no room for them; warnings are cut. `verbose` prints all of that, and what else is only in the
+    no room for them; if it still has none, several parameters stand side by side without their
+    intervals. Warnings are cut. `verbose` prints all of that, and what else is only in the
     report: the ladder, the reasons of each state, the checklist and the notes.
     """
     ladder, measured = result.ladder, result.measurement
@@ -37,7 +39,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
         "result": result,
         "m": measured,
         "ladder": ladder,
-        "shown": [(name, percent(off)) for name, off in _compared(result).items()],
+        "shown": [(name, percent(off)) for name, off in compared(result).items()],
         "fixed": [f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed"],
         "determined": determined(result),
         "unknown": _unknown({n: p for n, p in result.parameters.items() if n not in NUISANCE}),
@@ -57,7 +59,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
 def _screen(
     result: Fit, rows: list[Readable], given: dict[str, Any], *, verbose: bool
 ) -> Iterator[str]:
-    """Give the lines of one screen: as much as it has room for, all with `verbose`."""
+    """Give the lines that have room on one screen, with `verbose` all."""
     head = words("short", part="head", **given).split("\n")
     head = [line for one in head for line in wrapped(one, 2, COLUMNS)[:2]]
     states = [w for check in result.checklist if check.key == "determined" for w in check.warnings]
@@ -66,30 +68,43 @@ def _screen(
     sure = [row for row in varied if row.state != "not determined"]
     springs = [row for row in sure if row.name not in NUISANCE]
     lines, kept = 10**6 if verbose else LINES, min(len(warnings), WARNING_LINES)
-    stages = [(varied, True), (varied, False), (sure, False), (springs, False)]
-    for shown, whole in stages:
+    stages = [(varied, True, 1), (varied, False, 1), (sure, False, 1)]
+    for shown, whole, across in [*stages, *((springs, False, i) for i in (1, 2, 3))]:
         left = [row for row in varied if row not in shown and row.name in NUISANCE]
         record = [f"{row.label} {row.with_unit(row.with_error)}" for row in left]
-        foot = words("short", part="foot", whole=whole, of_record=record, **given).split("\n")
-        room = lines - len(head) - len(foot) - (len(shown) + 2 if shown else 0)
+        more = {"whole": whole, "stated": across == 1, "of_record": record}
+        foot = words("short", part="foot", **more, **given).split("\n")
+        table = aligned(_table(shown, short=not verbose, across=across)) if shown else []
+        room = lines - len(head) - len(foot) - len(table) - 1
         if room >= kept:
             break
     yield from head
-    if shown:
-        yield from ("", *aligned(_table(shown, short=not verbose)))
+    yield from ("", *table) if table else ()
     for line in foot[:-1]:
         yield from wrapped(line) if verbose else [_cut(line)]
     yield from _fitting(warnings, max(room, min(kept, 1)))
     yield foot[-1]
 
 
-def _table(rows: list[Readable], *, short: bool) -> list[list[str]]:
-    """Table of parameters, its head first; in `short` the range takes the place of the error."""
+def _table(rows: list[Readable], *, short: bool, across: int) -> list[list[str]]:
+    """Table of parameters, its head first; in `short` the range takes the place of the error.
+
+    Several parameters `across` have their values alone, with errors where two have room.
+    """
     ranged = any(row.range for row in rows)
     value = {"value": "value"} if short and ranged else {"value ± stderr": "with_error"}
     columns = {"parameter": "label"} | value | {"unit": "unit", "95 % interval": "interval"}
     columns |= ({"range": "range"} if ranged else {}) | {"state": "state"}
-    return [[*columns], *([getattr(row, one) for one in columns.values()] for row in rows)]
+    if across == 1:
+        return [[*columns], *([getattr(row, one) for one in columns.values()] for row in rows)]
+    value = {"value ± stderr": "with_error"} if across == 2 else {"value": "value"}
+    columns = {"parameter": "label"} | value | {"unit": "unit"}
+    tall = -(-len(rows) // across)
+    blocks = [[*columns] * across]
+    for row in range(tall):
+        cells = ([getattr(one, c) for c in columns.values()] for one in rows[row::tall])
+        blocks.append([*itertools.chain(*cells)])
+    return [[*block, *[""] * (len(blocks[0]) - len(block))] for block in blocks]
 
 
 def _cut(line: str) -> str:
@@ -97,7 +112,7 @@ def _cut(line: str) -> str:
 
 
 def _fitting(warnings: list[str], room: int) -> list[str]:
-    """Return the lines of warnings for which there is room: the last are cut, then left out."""
+    """Return the warnings in `room` lines: the last ones are cut, then left out."""
     told = [wrapped(f"warning: {warning}", 2, COLUMNS) for warning in warnings]
     for i in reversed(range(len(told))):
         if sum(map(len, told)) > room:
@@ -117,7 +132,8 @@ def misfits(result: Fit) -> dict[str, float | None]:
     return {name: result.misfit.get(key) for key, name in names.items()}
 
 
-def _compared(result: Fit) -> dict[str, float]:
+def compared(result: Fit) -> dict[str, float]:
+    """Return the misfits of the curves that are compared."""
     return {name: off for name, off in misfits(result).items() if off is not None}
 
 
@@ -127,7 +143,7 @@ def conclusions(result: Fit) -> tuple[str, ...]:
     Further sentences say what the ± of the TOML add and, for microscale springs and relaxation,
     what the identified law does.
     """
-    shown = _compared(result)
+    shown = compared(result)
     timed = {name: off for name, off in shown.items() if name != CURVES["stress_strain"]} or shown
     springs = {name: p for name, p in result.parameters.items() if name not in NUISANCE}
     found = {name: p for name, p in springs.items() if p.state == "determined"}
@@ -179,7 +195,7 @@ def _unknown(parameters: dict[str, ParameterEstimate]) -> dict[str, dict[str, li
 
 
 def _moved(result: Fit) -> tuple[str, float] | None:
-    """Parameter that the unfitted ± of the TOML move farthest, and by which share of its scale."""
+    """Return the parameter that the unfitted ± of the TOML move most, and by which share."""
     if (budget := result.budget) is None or not budget.contributions:
         return None
     shares = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import re
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -18,15 +19,12 @@ from foamfit.springs.parameters import springs_first
 if TYPE_CHECKING:
     import pandas as pd
 
-_NAMES = (
-    r"\alpha \beta \gamma \delta \varepsilon \zeta \eta \theta \kappa \lambda \mu \nu \xi \pi "
-    r"\rho \sigma \tau \phi \chi \psi \omega \Gamma \Delta \Theta \Lambda \Xi \Pi \Sigma \Phi "
-    r"\Psi \Omega \mu "
-)
-_GREEK = zip("αβγδεζηθκλμνξπρστφχψωΓΔΘΛΞΠΣΦΨΩµ", re.findall(r"\S+ ", _NAMES), strict=True)
-_MATH = dict(_GREEK) | {
-    "−": "-", "·": r"\cdot ", "±": r"\pm ", "²": "^2", "³": "^3", "₀": "_0", "₊": "_+", "₋": "_-",
-}  # fmt: skip
+_MATH = {"−": "-", "·": r"\cdot ", "±": r"\pm ", "²": "^2", "³": "^3", "µ": r"\mu "}
+_MATH |= {"₀": "_0", "₊": "_+", "₋": "_-"}
+for _letter in "αβγδεζηθκλμνξπρστφχψωΓΔΘΛΞΠΣΦΨΩ":
+    _, _size, _, _name = unicodedata.name(_letter).replace("LAMDA", "LAMBDA").split()
+    _MATH[_letter] = f"\\{_name.lower() if _size == 'SMALL' else _name.capitalize()} "
+_MATH["ε"] = r"\varepsilon "
 _TEXT = {letter: f"${name.strip()}$" for letter, name in _MATH.items()}
 _TEXT |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
 _TEXT |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
@@ -37,10 +35,11 @@ _LAST_LETTER = "ſ"  # that pdfLaTeX sets without further packages
 MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
 PARTS = ("", "_stderr", "_lo", "_hi", "_state")  # of a parameter, in a row for each test
 Parameters = Mapping[str, ParameterEstimate]
+ByTest = Mapping[str, Sequence[ParameterEstimate | None]]
 
 
 def escaped(told: object) -> str:
-    """Return a text as LaTeX sets it; "?" stands for a letter that its fonts lack."""
+    """Escape a text for LaTeX; "?" stands for a letter that its fonts lack."""
     letters = (c if c.isprintable() else " " for c in str(told))
     return "".join(_TEXT.get(c, c if c <= _LAST_LETTER else "?") for c in letters)
 
@@ -50,21 +49,14 @@ def formula(pair: tuple[str, str]) -> str:
     stem, index = pair
     if len(stem) > 2:  # the name of a parameter that has no symbol
         return rf"$\mathrm{{{escaped(stem)}}}$"
-    stem = "".join(_MATH.get(c, c) for c in stem).strip()
-    index = "".join(_MATH.get(c, c) for c in index).strip()
-    return f"${stem}_{{{re.sub(r'[a-z]{2,}', roman, index)}}}$" if index else f"${stem}$"
-
-
-def roman(word: re.Match[str]) -> str:
-    """Return a word in a formula, upright."""
-    return rf"\mathrm{{{word[0]}}}"
+    stem, index = ("".join(_MATH.get(c, c) for c in part).strip() for part in pair)
+    index = re.sub(r"[a-z]{2,}", lambda word: rf"\mathrm{{{word[0]}}}", index)  # upright
+    return f"${stem}_{{{index}}}$" if index else f"${stem}$"
 
 
 def numbers(told: str) -> str:
     """Return "5.50 ± 0.01" or "1 to 2" as LaTeX."""
-    told = re.sub(r"e([-+]?)0*(\d+)", r"\\times 10^{\1\2}", told.replace("−", "-")).replace(
-        "{+", "{"
-    )
+    told = re.sub(r"e\+?(-?)0*(\d+)", r"\\times 10^{\1\2}", told.replace("−", "-"))
     told = re.sub(r"(\S+) ± (\S+times \S+)", r"\1 \\pm (\2)", told)
     return " to ".join(f"${one.replace('±', chr(92) + 'pm')}$" for one in told.split(" to ") if one)
 
@@ -75,7 +67,7 @@ def parameters_tex(parameters: Parameters, **more: Any) -> str:
     `more` may hold `kinds` and `between` of a joint fit, by the name of the parameter.
     """
     shown = {n: p for n, p in parameters.items() if p.state != "fixed" or p.value}
-    rows = list(zip(_symbols(shown), itertools.starmap(readable, shown.items()), strict=True))
+    rows = list(zip(symbols(shown), itertools.starmap(readable, shown.items()), strict=True))
     return _tex("parameters", rows=rows, **({"kinds": {}, "between": {}} | more))
 
 
@@ -109,24 +101,22 @@ def wide_cells(names: Iterable[str], parameters: Parameters) -> list[Any]:
     return list(plain(cells))
 
 
-def by_test(
-    tests: Sequence[str], parameters: Mapping[str, Sequence[ParameterEstimate | None]]
-) -> dict[str, Any]:
+def by_test(tests: Sequence[str], parameters: ByTest) -> dict[str, Any]:
     """Return heads and rows of a table: a row for each test, for each parameter a column."""
     heads, cells = [], []
-    for own, (name, each) in zip(_symbols(parameters), parameters.items(), strict=True):
+    for own, (name, each) in zip(symbols(parameters), parameters.items(), strict=True):
         factor, unit = unit_of_all(each)
         heads.append((own, unit))
         cells.append([one and readable(name, one, (factor, unit)) for one in each])
     return {"heads": heads, "rows": list(zip(tests, *cells, strict=True))}
 
 
-def by_test_tex(first: str, table: Mapping[str, Any]) -> str:
+def by_test_tex(first: str, tests: Sequence[str], parameters: ByTest) -> str:
     """Return a table of `by_test` as LaTeX; `first` is the head of its first column."""
-    return _tex("by_test", first=first, **table)
+    return _tex("by_test", first=first, **by_test(tests, parameters))
 
 
-def _symbols(names: Iterable[str]) -> list[tuple[str, str]]:
+def symbols(names: Iterable[str]) -> list[tuple[str, str]]:
     """Return the symbols of parameters, without the spring where there is only one."""
     names = list(names)
     springs = 1 + any(name.startswith("s2_") for name in names)
@@ -153,18 +143,14 @@ def frame(parameters: Mapping[str, Any], **more: Mapping[str, Any]) -> pd.DataFr
 
 
 def _rows(parameters: Mapping[str, Any], more: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    for own, (name, p) in zip(_symbols(parameters), parameters.items(), strict=True):
+    for own, (name, p) in zip(symbols(parameters), parameters.items(), strict=True):
         ends = (*(p.ci95 or (None, None)), *(getattr(p, "range", None) or (None, None)))
         spans = zip(("ci95_low", "ci95_high", "range_low", "range_high"), ends, strict=True)
         row = {"parameter": name, "symbol": formula(own), "value": p.value}
         row |= {"stderr": p.stderr, **dict(spans), "systematic": getattr(p, "systematic", None)}
-        numbers = {key: _number(one) for key, one in row.items()}
-        others = {key: _number(values.get(name)) for key, values in more.items()}
-        yield numbers | others | {"unit": getattr(p, "unit", ""), "state": p.state}
-
-
-def _number(value: object) -> object:
-    return np.nan if value is None else value
+        row |= {key: values.get(name) for key, values in more.items()}
+        known = {key: np.nan if one is None else one for key, one in row.items()}
+        yield known | {"unit": getattr(p, "unit", ""), "state": p.state}
 
 
 def stacked(frames: Mapping[Any, pd.DataFrame], name: str) -> pd.DataFrame:

@@ -7,7 +7,6 @@ step. A striker of areal mass M follows M dv/dt = -(Σ + η_site v/H) by the vel
 Every part is of second order in the step: where time counts, steps are halved until two runs agree.
 """
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 import math
@@ -25,7 +24,7 @@ from foamfit.springs import kernels
 from foamfit.springs import laws as known
 from foamfit.springs.chain import Chain
 from foamfit.springs.laws import followed
-from foamfit.springs.laws.followed import MEMORY, STRENGTH, TIME, compiled
+from foamfit.springs.laws.followed import MEMORY, STRENGTH, TIME, Springs, compiled
 from foamfit.springs.laws.record import BRANCH, EPS, Law
 from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
@@ -35,21 +34,11 @@ FIRST_STEPS, MOST_STEPS = 400, 4_000_000
 RELATIVE, ABSOLUTE = 1e-5, 1e-6
 
 
-class Springs(NamedTuple):
-    """Springs in series: rows, states (springs, columns), terms (springs, n, 3), and the rest."""
-
-    rows: Array
-    states: Array
-    terms: Array
-    heights: Array  # m
-    eta: Array  # Pa·s
-
-
 @cache
 def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
     """Loops that begin with springs of these laws, stretch and elongate them, and note a sample."""
-    loops = followed.loops_of(laws)
-    start, step, to_stress, count = loops.start, loops.step, loops.to_stress, len(laws)
+    loops, count = followed.loops_of(laws), len(laws)
+    start, step, to_stress = loops.start, loops.step, loops.to_stress
 
     @compiled
     def begin(springs: Springs) -> None:
@@ -61,20 +50,13 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
         """Take all springs to a stress; returns the elongation, m."""
         out = 0.0
         for i in range(count):
-            eps = to_stress(
-                i, springs.rows[i], springs.states[i], springs.terms[i], springs.eta[i], sigma, h
-            )
-            out += springs.heights[i] * eps
+            out += springs.heights[i] * to_stress(i, springs, sigma, h)
         return out
 
     @compiled
     def beside(given: tuple[Springs, float], sigma: float) -> float:
         """Elongation under a stress; the springs stay where they are."""
-        springs, h = given
-        trial = Springs(
-            springs.rows, springs.states.copy(), springs.terms.copy(), springs.heights, springs.eta
-        )
-        return stretch(trial, sigma, h)
+        return stretch(followed.trial_of(given[0]), sigma, given[1])
 
     find = followed.inverse(beside)
 
@@ -82,10 +64,7 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
     def elongate(springs: Springs, sigma: float, moved: float, h: float) -> float:
         """Take springs to an elongation, m; returns their stress, sought about `sigma`."""
         if count == 1:
-            eps = moved / springs.heights[0]
-            return step(
-                0, springs.rows[0], springs.states[0], springs.terms[0], springs.eta[0], eps, h
-            )
+            return step(0, springs, moved / springs.heights[0], h)
         common = find((springs, h), sigma, 1e-3 * max(abs(sigma), 1.0), 0.0, moved)
         if math.isfinite(common):
             stretch(springs, common, h)
@@ -206,8 +185,7 @@ class Followed(NamedTuple):
 class AnyLawPlan(NamedTuple):
     """A scene made ready for springs of any laws; it runs as a `solve.plan.Plan` does.
 
-    `laws` are those of the springs; `top`, `values`, `time` and `speed` are those of a `Plan`,
-    `mass` (1,) is the areal mass of the striker, kg/m², `drag` is η_site/H, Pa·s/m.
+    The fields are those of a `Plan`; mass (1,) is that of the striker.
     """
 
     laws: tuple[Law, ...]
@@ -252,13 +230,7 @@ class AnyLawPlan(NamedTuple):
         return Springs(own, states, np.ascontiguousarray(used), np.array(heights), eta)
 
     def follow(self, rows: Array, heights: Array, drag: float, parts: int) -> Followed:
-        """Run once, with so many steps from sample to sample.
-
-        Raises
-        ------
-        SimulationError
-            If a stress or strain is no longer finite.
-        """
+        """Run once, with so many steps between samples; refuses what is not finite."""
         springs, shape = self.springs(rows, heights), (len(rows), self.time.size)
         rate, eta = None, springs.eta
         if self.top == MOTION and len(rows) == 1 and eta[0] > 0.0:  # the rate is that of the motion
@@ -333,12 +305,7 @@ class AnyLawPlan(NamedTuple):
     ) -> tuple[Array, Array]:
         """Difference of displacements and base stress over a step of one direction.
 
-        It is one-sided at a limit of what the law admits, and at zero.
-
-        Raises
-        ------
-        SimulationError
-            If neither side can be followed.
+        It is one-sided at zero and at a limit of the law; without either side it is refused.
         """
         spring, what = way
         count = len(self.laws[spring].names)
@@ -377,11 +344,7 @@ def plan_of(
 ) -> AnyLawPlan:
     """Make a scene ready; `above` is the mass on top, kg, the others are those of a `Plan`.
 
-    Raises
-    ------
-    InputError
-        If it has masses between the springs, or a damper under a prescribed stress, which only
-        chains of the paper's laws have.
+    Refused (InputError) are masses between the springs, and a damper under a prescribed stress.
     """
     if chain.arrays.heavy:
         raise InputError(

@@ -38,7 +38,12 @@ def announce(function: Any, what: str) -> None:
     """Log, once in a process, that `function` is about to be compiled, unless it has been."""
     made = getattr(function, "signatures", True)  # where numba is switched off there are none
     if not made and not compiled(function.__name__):
-        _LOG.warning("foamfit: %s", compiling(what))
+        warn(what)
+
+
+def warn(what: str) -> None:
+    """Log that something is compiled."""
+    _LOG.warning("foamfit: %s", compiling(what))
 
 
 @functools.cache

@@ -16,7 +16,6 @@ In time a step is a Taylor series again, with powers of the series of S put into
 It goes regularly through the turning point of the motion and through any damping of the top.
 """
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 import math
@@ -24,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from foamfit.solve import scene as scenes
 from foamfit.solve.polynomial import (
     LEAST_TRUNCATION,
     fill_values,
@@ -31,18 +31,7 @@ from foamfit.solve.polynomial import (
     order_for,
     value_at,
 )
-from foamfit.solve.scene import (
-    DONE,
-    NOT_FINITE,
-    STEP_UNDERFLOW,
-    TOO_MANY_STEPS,
-    Scene,
-    SceneTuple,
-    before_contact,
-    first_past,
-    fly,
-    log_switch,
-)
+from foamfit.solve.scene import Scene, SceneTuple, before_contact, first_past, fly, log_switch
 from foamfit.springs.kernels import (
     ETA,
     K0,
@@ -78,11 +67,10 @@ ANCHOR, UNIT, LEAST, N_PLACE = range(4)
 class Group(NamedTuple):
     """Springs in series under one stress, on the branches that they are on.
 
-    `rows` (springs, columns), `heights` (springs,) in m, `branches` (springs,). `upper` and `lower`
-    hold in their second halves the stresses at which each spring leaves its branch upwards and,
-    negative, downwards; every entry before is the lesser of its two children, so that the first is
-    the next to be reached. `sum` (DEGREE + 1,) is the elongation as a polynomial of
-    (S - anchor)/unit, with both, Pa, in `place`, and the least first slope of a branch.
+    The second halves of `upper` and `lower` hold the stresses at which each spring leaves its
+    branch upwards and, negative, downwards; every entry before is the lesser of its two children:
+    the first is the next. `sum` (DEGREE + 1,) is the elongation as a polynomial of (S -
+    anchor)/unit, with both, Pa, in `place`, and the least first slope of a branch.
     """
 
     rows: Array
@@ -97,8 +85,8 @@ class Group(NamedTuple):
 class Step(NamedTuple):
     """Series in time of stress s, displacement w and velocity v of the top; order 0 is the state.
 
-    `powers` (order + 1, order + 1) are those of the series of (S - S(0))/unit, from the first on,
-    `shifted` (DEGREE + 1,) is the polynomial of the elongation about S(0).
+    `powers` (order + 1, order + 1) are those of the series of (S - S(0))/unit, `shifted` (DEGREE +
+    1,) is the polynomial of the elongation about S(0).
     """
 
     s: Array
@@ -130,15 +118,6 @@ def _set(tree: Array, i: int, value: float) -> None:
     while at > 1:
         at //= 2
         tree[at] = min(tree[2 * at], tree[2 * at + 1])
-
-
-@inner
-def _least(tree: Array) -> int:
-    """Which leaf of a tree is the least."""
-    at = 1
-    while at < tree.size // 2:
-        at = 2 * at if tree[2 * at] == tree[at] else 2 * at + 1
-    return at - tree.size // 2
 
 
 @inner
@@ -219,7 +198,10 @@ def _switch(
     tree = group.upper if rising else group.lower
     met = (stress if rising else -stress) + CLOSE * abs(stress)
     while tree[1] <= met:
-        i = _least(tree)
+        i = 1  # the leaf that is the least
+        while i < tree.size // 2:
+            i = 2 * i if tree[2 * i] == tree[i] else 2 * i + 1
+        i -= tree.size // 2
         left = group.branches[i]
         entered = above(left) if rising else below(left)
         strain = _strain(group, i, stress)
@@ -237,8 +219,8 @@ def _switch(
 def _next_order(group: Group, now: Step, n: int, mass: float, drag: float) -> None:
     """Find the coefficients n > 0 of a step from the lower ones.
 
-    The displacement follows from the velocity, the velocity from the stress, and the stress from
-    w_n = Σ_m g_m [S^m]_n, in which its own coefficient stands with g_1 alone.
+    The stress follows from w_n = Σ_m g_m [S^m]_n, in which its own coefficient stands with g_1
+    alone.
     """
     g, x = now.shifted, now.powers
     now.w[n] = now.v[n - 1] / n
@@ -326,31 +308,14 @@ def _shape(group: Group, stress: float, nodes: Array) -> None:
         nodes[min(i, nodes.size - 1)] = place
 
 
-@inner
-def _scales(group: Group, mass: float, drag: float, speed: float) -> tuple[float, float]:
-    """Least ranges of stress and displacement to be expected of a first impact on the springs."""
-    compliance = group.sum[1] / group.place[UNIT]
-    w = speed * math.sqrt(mass * compliance)
-    if drag > 0.0:
-        w = min(w, speed * mass / drag)
-    stress = min(w / compliance, group.upper[1])
-    return stress, stress * compliance
-
-
 @compiled
 def integrate_aggregate(
     given: SceneTuple, tol: float, max_steps: int, curves: Array, log: Array, effort: Branches
 ) -> tuple[int, float, int, int]:
     """Integrate an impact on springs without dashpots or masses between them, over the samples.
 
-    The arguments are those of `explicit.taylor.integrate`, of springs as `holds` wants them;
-    `effort` (2,) is added to: sums over all springs, and orders of all steps.
-
-    Returns
-    -------
-    tuple
-        Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
-        taken, switches (also those past the log).
+    Arguments and results are those of `explicit.taylor.integrate`, of springs as `holds` wants
+    them; `effort` (2,) is added to: sums over all springs, and orders of all steps.
     """
     scene = Scene(*given)
     heights, mass, drag, speed, t = scene.heights, scene.mass[0], scene.drag, scene.speed, scene.t
@@ -360,14 +325,19 @@ def integrate_aggregate(
         np.zeros(order + 1), np.zeros(order + 1), np.zeros(order + 1),
         np.zeros((order + 1, order + 1)), np.zeros(DEGREE + 1),
     )  # fmt: skip
-    s_scale, w_scale = _scales(group, mass, drag, speed)
+    compliance = group.sum[1] / group.place[UNIT]
+    w_scale = speed * math.sqrt(mass * compliance)  # least ranges to be expected
+    if drag > 0.0:
+        w_scale = min(w_scale, speed * mass / drag)
+    s_scale = min(w_scale / compliance, group.upper[1])
+    w_scale = s_scale * compliance
     effort[0] += 1
     done = before_contact(curves, t, speed, 0.0)
     begin, switches, stalled, horizon = 0.0, 0, 0, t[t.size - 1]
     now.v[0] = speed
     for step in range(max_steps):
         if done == t.size:
-            return DONE, math.nan, step, switches
+            return scenes.DONE, math.nan, step, switches
         reach = REACH * group.place[UNIT]
         high = min(group.upper[1], group.place[ANCHOR] + reach)
         low = max(-group.lower[1], group.place[ANCHOR] - reach, 0.0)
@@ -376,12 +346,12 @@ def integrate_aggregate(
         )
         effort[1] += n
         if not math.isfinite(span) or not math.isfinite(now.s[n]):
-            return NOT_FINITE, begin, step, switches
+            return scenes.NOT_FINITE, begin, step, switches
         span, side = first_crossing(now.s, n, low, high, span)
         end = begin + span
         stalled = stalled + 1 if end <= begin else 0
         if stalled > 4 * count + 8:
-            return STEP_UNDERFLOW, begin, step, switches
+            return scenes.STEP_UNDERFLOW, begin, step, switches
         last = end >= horizon and side == 0
         first, done = done, first_past(t, done, horizon if last else end, last)
         _sample(group, now, n, t, first, done, begin, curves)
@@ -396,7 +366,7 @@ def integrate_aggregate(
             w_end = np.zeros(curves.shape[0] - 1)
             _shape(group, 0.0, w_end)
             fly(curves, t, done, begin, w_end, velocity, 0.0)
-            return DONE, begin, step + 1, switches
+            return scenes.DONE, begin, step + 1, switches
         s_scale = max(s_scale, stress)
         w_scale = max(w_scale, now.w[0])
         if side != 0:
@@ -404,4 +374,4 @@ def integrate_aggregate(
             if abs(stress - group.place[ANCHOR]) >= reach * (1.0 - 1e-12):
                 _anchor(group, stress, side > 0)
                 effort[0] += 1
-    return TOO_MANY_STEPS, begin, max_steps, switches
+    return scenes.TOO_MANY_STEPS, begin, max_steps, switches

@@ -83,35 +83,14 @@ _STIFF = (scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW)
 class Plan(NamedTuple):
     """A scene made ready to run many times with other springs: what does not change between runs.
 
-    Attributes
-    ----------
-    solver : str
-        The least solver.
-    height : float
-        H, m.
-    ends, mass : arrays
-        The groups of springs and the areal masses between them; see `solve.scene.Scene`.
-    drag : float
-        η_site/H, Pa·s/m.
-    top : int
-        What is known of the top; see `solve.scene`.
-    values, time : (n,) arrays
-        The drive and its samples; of an impact, values (1,) is the weight of the striker, Pa.
-    speed : float
-        Velocity of the striker, m/s; 0 = no impact.
-    margin : float
-        Truncation of an explicit step over the wanted error.
-    max_steps, max_explicit : int
-        Bounds on steps, and on explicit ones that implicit ones may take over from.
-    plain : bool
-        Whether one mass bounces once: it has neither dashpot nor damper, nor a mass inside.
-    implicit : bool or None
-        Whether to take implicit steps; None = where explicit ones are the wrong tool.
-    memory : bool
-        Whether a spring keeps more than its branch: microscale springs and relaxation.
-    unit : float
-        Time, s, in which springs with memory are strained by about 1: in it the coefficients of
-        their series stay numbers. A power of 2, which costs no digit.
+    `solver` is the least solver, `height` H, m. `ends`, `mass`, `drag`, `top`, `values`, `speed`
+    and `time` are those of a `solve.scene.Scene`. `margin` is the truncation of an explicit step
+    over the wanted error, `max_steps` bounds steps, `max_explicit` those that implicit ones may
+    take over from. `plain` says that one mass bounces once, without dashpot, damper, or mass
+    inside; `implicit` whether to take implicit steps (None: where explicit ones are the wrong
+    tool); `memory` whether a spring keeps more than its branch. `unit` is a time, s, in which
+    springs with memory are strained by about 1: in it the coefficients of their series stay
+    numbers; a power of 2 costs no digit.
     """
 
     solver: str
@@ -151,56 +130,47 @@ class Plan(NamedTuple):
 
         `drag` replaces the scene's own. With `everything` false only the base stress and the
         displacement of the top, shape (1, n_t), are sure to be there. `directions` (p, 2) are those
-        of the derivatives to carry along; see `springs.parameters`.
-
-        Raises
-        ------
-        SimulationError
-            If the scene has no finite answer; the message says why.
+        of the derivatives to carry along; see `springs.parameters`. A scene without a finite answer
+        is refused (SimulationError).
         """
         if self.solver == CLOSED_FORM:
             return self._closed_form(rows, heights, rtol, everything, directions)
-        p, time = len(directions), self.time
+        p, time, values = len(directions), self.time, self.values
+        drag = self.drag if drag is None else drag
         out = np.empty((1 + p, 1 + len(heights) if everything else 2, time.size))
         log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
         if self.memory:
             return self._remembered(self.given(rows, heights, drag), rtol, directions, out, log)
-        drag = self.drag if drag is None else drag
-        bounces = self.plain and not drag and self.implicit is None
-        stiff = not bounces and self._is_stiff(self.given(rows, heights, drag))
-        one = self.speed > 0.0 and self.top == scenes.FREE and len(self.ends) == 1
-        one = one and p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE
-        one = one and self.values[0] == 0.0  # springs that count as one know no weight
-        if one and many.holds(rows):
-            return self._aggregate(self.given(rows, heights, drag), rtol, out)
+        stiff = bool(self.implicit)
+        if self.implicit is None and (drag or not self.plain):
+            vibrates, relaxes = self.fastest_rates(rows, heights, drag)
+            stiff = vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION
+        one = self.speed > 0.0 and len(self.ends) == 1 and p == 0 and not stiff
+        one = one and values[0] == 0.0  # springs that count as one know no weight
+        if one and len(heights) >= LEAST_AGGREGATE and many.holds(rows):
+            cache.announce(many.integrate_aggregate, "the solver of many springs")
+            tol, log = AS_ONE * rtol / len(rows), np.empty((4 * len(rows) + 64, 5))
+            given = self.given(rows, heights, drag), tol, self.max_steps
+            ending = many.integrate_aggregate(*given, out[0], log, np.zeros(2, np.int64))
+            return _motion(AGGREGATE, ending, out, log)
         start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
         if not stiff:
             cache.announce(taylor.integrate, "the solver")
             most = self.max_explicit if self.implicit is None else self.max_steps
-            ending: Sequence[Any] = taylor.integrate(
-                rows,
-                heights,
-                self.ends,
-                self.mass,
-                np.array((drag, self.top, self.speed, self.margin * rtol, most)),
-                self.values,
-                time,
-                directions,
-                start,
-                out,
-                log,
+            numbers = np.array((drag, self.top, self.speed, self.margin * rtol, most))
+            ends, mass = self.ends, self.mass
+            ending = taylor.integrate(
+                rows, heights, ends, mass, numbers, values, time, directions, start, out, log
             )
             if self.implicit is False or ending[0] not in _STIFF:
                 return _motion(TAYLOR, ending, out, log)
         margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
-        scene, tol = (
-            scenes.Scene(*self.given(rows, heights, drag)),
-            max(margin * rtol, LEAST_IMPLICIT),
-        )
+        scene = scenes.Scene(*self.given(rows, heights, drag))
+        tol = max(margin * rtol, LEAST_IMPLICIT)
         most = min(self.max_steps, MOST_IMPLICIT)
         samples = scenes.Samples(time, out[0], out[1:])
-        *ending, lost = steps.integrate_implicit(scene, tol, most, directions, start, samples, log)
-        return _motion(RADAU, ending, out, log, lost)
+        *found, lost = steps.integrate_implicit(scene, tol, most, directions, start, samples, log)
+        return _motion(RADAU, found, out, log, lost)
 
     def _remembered(
         self, given: scenes.SceneTuple, rtol: float, directions: Directions, out: Array, log: Array
@@ -230,61 +200,56 @@ class Plan(NamedTuple):
 
     def _fastest(self, given: scenes.SceneTuple) -> tuple[float, str]:
         """What of springs with memory is fastest, in radians while the scene lasts; its name."""
-        rows, heights, k = given[0], given[1], kernels
+        rows, heights, drag, k = given[0], given[1], given[4], kernels
         elastic, terms = np.zeros((len(rows), k.N_COLUMNS)), rows[:, k.N_COLUMNS :]
         bistable = rows[:, k.KIND] == BISTABLE
         steep = np.where(bistable, np.maximum(rows[:, k.KH_PLUS], rows[:, k.KC]), rows[:, k.KC])
         elastic[:, k.KIND], elastic[:, k.ETA] = LINEAR, rows[:, k.ETA]
         elastic[:, k.K0] = np.maximum(rows[:, k.K0], steep) * (1.0 + terms[:, ::2].sum(axis=1))
-        swings, decays = rates.fastest_rates((elastic, heights, *given[2:]))
+        swings, decays = self.fastest_rates(elastic, heights, drag)
         found = [(swings, "a light mass"), (decays, "a light mass or a dashpot")]
-        lasts = float(given[8][-1] - (0.0 if self.speed > 0.0 else given[8][0]))
         for i, term in zip(*np.nonzero(terms[:, ::2]), strict=True):
             tau = terms[i, 2 * term + 1]
             name = f"the relaxation of spring {i + 1} (s{i + 1}_tau{term + 1} = {tau:g} s)"
-            found.append((lasts / tau, name))
+            found.append((self._lasts / tau, name))
         return max(found)
-
-    def given(self, rows: Array, heights: Array, drag: float | None = None) -> scenes.SceneTuple:
-        """The scene with these springs (and onsite damping) as the compiled integrators take it."""
-        return (
-            rows, heights, self.ends, self.mass, self.drag if drag is None else drag, self.top,
-            self.values, self.speed, self.time,
-        )  # fmt: skip
 
     def _closed_form(
         self, rows: Array, heights: Array, rtol: float, everything: bool, directions: Directions
     ) -> Motion:
         """Undamped and massless: one stress in all springs; or one spring under known motion."""
-        moved, wanted = self.top == scenes.MOTION, everything or len(directions) > 0
+        moved, wanted, n = self.top == scenes.MOTION, len(directions) > 0, self.time.size
+        alone, top, fine = moved and len(heights) == 1, np.array(self.values), True
         slopes: Slopes | None = None
-        if self.memory and moved and len(heights) == 1:
-            top, fine = np.array(self.values), True
+        if alone:
             strain = (self.values / heights)[None, :]
-            stress, seen, pressed = relaxation.stress_along(
-                rows[0], strain[0], self.time, heights[0], rtol, directions
-            )
+            if self.memory or wanted:
+                history = strain[0], self.time, heights[0], rtol, directions
+                stress, seen, pressed = relaxation.stress_along(rows[0], *history)
+                slopes = Slopes(np.zeros((len(directions), 1, n)), pressed) if wanted else None
+            else:
+                stress, seen = kernels.stress_along(rows[0], strain[0])
             branches = seen[None, :]
-            if len(directions):
-                slopes = Slopes(np.zeros((len(directions), 1, stress.size)), pressed)
-        elif moved:
-            top = np.array(self.values)
-            stress, strain, branches = self._stretched(rows, heights)
-            fine = True
         else:
-            stress, top = np.array(self.values), np.empty(self.time.size)
-            strain, branches = _new_history(len(heights) if wanted else 0, self.time.size)
-            fine = equilibrium.strains_along(rows, heights, stress, top, strain, branches)
-        if len(directions) and slopes is None:
-            slopes = Slopes(
-                *equilibrium_tangents(rows, heights, stress, strain, branches, moved, directions),
-                _on_one_plateau(rows, branches, directions) if moved else _NOTHING[:0],
-            )
+            kept = len(heights) if moved or everything or wanted else 0
+            strain, branches = np.empty((kept, n)), np.empty((kept, n), np.int64)
+            if moved:
+                stress = np.empty(n)
+                equilibrium.equilibrium_along(rows, heights, top, stress, strain, branches)
+                miss = np.abs(heights @ strain - top).max()
+                fine = miss <= 1e-9 * (self.height + np.abs(top).max())
+            else:
+                stress, top = top, np.empty(n)
+                fine = equilibrium.strains_along(rows, heights, stress, top, strain, branches)
+            if wanted and fine:
+                along = rows, heights, stress, strain, branches
+                slopes = Slopes(*equilibrium_tangents(*along, moved, directions))
+                if moved:
+                    one_sided = _on_one_plateau(rows, branches, directions)
+                    slopes = slopes._replace(one_sided=one_sided)
         eta = rows[0, kernels.ETA]
-        damped = eta > 0.0
-        if len(directions):
-            damped |= bool(np.isin(directions[:, 1], (OWN_ETA, OWN_HEIGHT)).any())
-        if moved and len(heights) == 1 and stress.size > 1 and damped:
+        felt = wanted and not {OWN_ETA, OWN_HEIGHT}.isdisjoint(directions[:, 1].tolist())
+        if alone and n > 1 and (felt or eta > 0.0):
             rate = np.gradient(strain[0], self.time)
             stress = stress + eta * rate
             for p, (_, what) in enumerate(directions):
@@ -304,31 +269,6 @@ class Plan(NamedTuple):
         switches = kernels.list_switches(self.time, strain, branches)
         return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
 
-    def _stretched(self, rows: Array, heights: Array) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Stress, strains and branches under a known motion."""
-        count, n = len(heights), self.time.size
-        if count == 1:
-            strain = self.values / heights
-            stress, history = kernels.stress_along(rows[0], strain)
-            return stress, strain[None, :], history[None, :]
-        stress = np.empty(n)
-        strain, branches = _new_history(count, n)
-        equilibrium.equilibrium_along(rows, heights, self.values, stress, strain, branches)
-        miss = np.abs(heights @ strain - self.values).max()
-        if not miss <= 1e-9 * (self.height + np.abs(self.values).max()):
-            raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
-        return stress, strain, branches
-
-    def _aggregate(self, given: scenes.SceneTuple, rtol: float, out: Array) -> Motion:
-        """Springs under one stress count as one: one step to a switch."""
-        count = len(given[0])
-        log, tolerance = np.empty((4 * count + 64, 5)), AS_ONE * rtol / count
-        cache.announce(many.integrate_aggregate, "the solver of many springs")
-        ending = many.integrate_aggregate(
-            given, tolerance, self.max_steps, out[0], log, np.zeros(2, np.int64)
-        )
-        return _motion(AGGREGATE, ending, out, log)
-
     def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
         """Strains (1 + p, springs) in equilibrium with the first sample, and their derivatives.
 
@@ -337,7 +277,8 @@ class Plan(NamedTuple):
         start = np.zeros((1 + len(directions), len(heights)))
         first = self.ends[-2] if len(self.ends) > 1 else 0
         rows, heights, moved = rows[first:], heights[first:], self.top == scenes.MOTION
-        stress, (strain, branches) = self.values[:1].copy(), _new_history(len(heights), 1)
+        stress, count = self.values[:1].copy(), len(heights)
+        strain, branches = np.empty((count, 1)), np.empty((count, 1), np.int64)
         held = (rows[:, kernels.ETA] > 0.0) & (not moved)  # a dashpot holds its spring where it is
         if moved:
             equilibrium.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
@@ -357,16 +298,21 @@ class Plan(NamedTuple):
             start[1 + own, first:] = np.where(held, 0.0, longer / heights)
         return start
 
-    def fastest_rates(self, rows: Array, heights: Array) -> tuple[float, float]:
-        """Vibration and relaxation (radians) that explicit steps would have to go through."""
-        return rates.fastest_rates(self.given(rows, heights))
+    @property
+    def _lasts(self) -> float:
+        """Duration, s."""
+        return float(self.time[-1] - (0.0 if self.speed > 0.0 else self.time[0]))
 
-    def _is_stiff(self, given: scenes.SceneTuple) -> bool:
-        """Whether explicit steps would have to follow rates that have long died out."""
-        if self.implicit is not None:
-            return self.implicit
-        vibrates, relaxes = rates.fastest_rates(given)
-        return bool(vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION)
+    def given(self, rows: Array, heights: Array, drag: float | None = None) -> scenes.SceneTuple:
+        """The scene with these springs (and onsite damping) as the compiled integrators take it."""
+        drag = self.drag if drag is None else drag
+        motion = self.top, self.values, self.speed, self.time
+        return (rows, heights, self.ends, self.mass, drag, *motion)
+
+    def fastest_rates(self, rows: Array, heights: Array, drag: float) -> tuple[float, float]:
+        """Vibration and relaxation (radians) that explicit steps would have to go through."""
+        chain = rows, heights, self.ends, self.mass, drag, self.top
+        return rates.fastest_rates(*chain, self.speed > 0.0, self._lasts)
 
 
 AnyPlan = Plan | AnyLawPlan
@@ -400,11 +346,6 @@ def _motion(
     return Motion(out[0, 1:], out[0, 0], time, seen, steps, method, slopes, lost)
 
 
-def _new_history(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:
-    """Empty arrays for the strains and branches of springs along a history."""
-    return np.empty((count, n)), np.empty((count, n), np.int64)
-
-
 def _time(t: ArrayLike) -> Array:
     time = as_samples(t, "t")  # a copy of one compiled type: writable
     if time.ndim != 1 or time.size == 0:
@@ -427,26 +368,11 @@ def plan(
 ) -> AnyPlan:
     """Find what a scene needs: the nodes that have a state, and the least solver.
 
-    Parameters
-    ----------
-    chain : Chain
-        Only its heights, area, masses, site damping and which springs have a dashpot,
-        relaxation terms or the microscale law count.
-    drive : Impact, StressDrive or DisplacementDrive
-        How it is loaded.
-    t : (n_t,) array
-        Samples, s, increasing.
-    dashpots : bool
-        Whether to reckon with a dashpot in every spring, also where it is zero.
-    relaxing : bool
-        Whether to reckon with the relaxation terms that there are, also where they are zero.
-    max_steps : int
-        Bound on steps; there are others on steps times springs.
-
-    Raises
-    ------
-    ValueError
-        If t does not increase or has not one value per sample of the drive.
+    Of the chain only its heights, area, masses, site damping and which springs have a dashpot,
+    relaxation terms or a memory count. `t` (n_t,) are samples, s. `dashpots` and `relaxing` say to
+    reckon with a dashpot in every spring, and with the relaxation terms that there are, also where
+    they are zero. `max_steps` bounds steps; there are other bounds on steps times springs. A time
+    that does not increase, or does not fit the drive, is refused (InputError).
     """
     time = _time(t)
     speed, values, top = 0.0, _NOTHING, scenes.FREE
@@ -462,7 +388,8 @@ def plan(
     above = chain.masses[-1]
     if isinstance(drive, Impact):
         above += drive.mass
-        values = np.array([above * drive.gravity / chain.area])
+        if drive.gravity:
+            values = np.array([above * drive.gravity / chain.area])
     elif isinstance(drive, DisplacementDrive):
         above, top = 0.0, scenes.MOTION
     elif above == 0.0:

@@ -1,6 +1,5 @@
 """Compiled polynomials c[0] + c[1] τ + … of a step in time: values, slopes, first crossings."""
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 import math
@@ -48,8 +47,8 @@ def fill_values(
 ) -> None:
     """Write the polynomial at the times t[first:last] - now to `out`, a block at a time.
 
-    Slices, whose index cannot be negative, and loops without dependence from sample to sample are
-    done four samples at once; six coefficients a pass save reading and writing the block.
+    Loops without dependence from sample to sample, over slices, are done four samples at once; six
+    coefficients a pass save reading and writing the block.
     """
     while first < last:
         end = min(first + 512, last)

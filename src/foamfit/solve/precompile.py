@@ -6,19 +6,21 @@ is compiled where it is first needed, and said so.
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from foamfit.solve import cache
 from foamfit.solve.cache import PACKAGE
+
+_open: list[subprocess.Popen[bytes]] = []  # processes that compile beside this one
 
 
 def _scene(drive: str, count: int = 1, eta: float = 0.0) -> Callable[[], object]:
@@ -37,14 +39,11 @@ def _scene(drive: str, count: int = 1, eta: float = 0.0) -> Callable[[], object]
     scene = plan(chain, drives[drive], np.linspace(0.0, 1e-3, 4))
     assert isinstance(scene, Plan)
     run, directions = scene._replace(implicit=False).run, np.zeros((1, 2), np.int64)
-    return partial(run, *chain.arrays[:2], 1e-2, directions=directions)
+    return functools.partial(run, *chain.arrays[:2], 1e-2, directions=directions)
 
 
 def _calls() -> dict[Any, tuple[Any, ...]]:
-    """The explicit integrator, the loops that it calls, and the types of their arguments.
-
-    Some small scenes run uncompiled, which shows them.
-    """
+    """The explicit integrator and its loops with their argument types, seen in uncompiled runs."""
     from unittest.mock import patch
 
     from numba import typeof
@@ -86,10 +85,7 @@ def _compile(calls: dict[Any, tuple[Any, ...]], cached: bool) -> None:
 
 
 def _memory(relaxed: bool) -> None:
-    """Call what a fit of springs with memory calls under a known motion or stress.
-
-    With `relaxed` the law along a motion, which takes longest; without, the rest.
-    """
+    """Call what a fit of springs with memory needs: the `relaxed` law, or all but that."""
     from foamfit.solve import relaxation
     from foamfit.springs import microscale_kernels as micro
     from foamfit.springs.model import Model
@@ -113,37 +109,51 @@ def _rest() -> None:
     Model(("linear",)).rows(np.ones(2))
     one, rows = np.ones(1), np.ones((1, kernels.N_COLUMNS))
     groups = np.ones(1, np.int64)
-    rates.fastest_rates((rows, one, groups, one, 0.0, scene.FREE, one, 1.0, one))
+    rates.fastest_rates(rows, one, groups, one, 0.0, scene.FREE, True, 1.0)
     for run in (_scene("displacement"), _scene("displacement", 2), _scene("stress")):
         run()
 
 
 @contextmanager
 def at_first_use(
-    model: str, relaxation: int, tell: Callable[[], None]
+    model: str, relaxation: int, tell: Callable[[], None] | None = None
 ) -> Iterator[Callable[[], None]]:
     """Compile beside the body what the fit of a model needs and is not in the cache.
 
     The body calls what is given before it simulates; `tell` is called if there is anything to do.
+    Left out, the log says so, and what this process has compiled is known.
     """
+    from foamfit.solve.explicit.taylor import integrate
+    from foamfit.solve.relaxation import relaxed_along
+    from foamfit.springs.laws import is_registered
+
+    def is_new(loop: Any) -> bool:
+        known = tell is None and getattr(loop, "signatures", True)  # True: numba is switched off
+        return not (known or cache.compiled(loop.__name__))
+
     memory = model == "auto" or "microscale" in model or relaxation > 0
-    integrator = (model == "auto" or not memory) and not cache.compiled()
-    memory = memory and not cache.compiled("relaxed_along")
-    if not (integrator or memory):
+    integrator = (model == "auto" or not memory) and is_new(integrate)
+    memory = memory and is_new(relaxed_along)
+    registered = any(
+        is_registered(kind.strip()) for kind in model.split("+")
+    )  # has loops of its own
+    if _open or registered or not (integrator or memory):
         yield lambda: None
         return
-    tell()
+    if tell is None:
+        cache.warn("the solver")
+    else:
+        tell()
     with side_by_side(integrator, memory) as finish:
-        yield finish
+        yield functools.cache(finish)
 
 
 @contextmanager
 def side_by_side(integrator: bool = True, memory: bool = False) -> Iterator[Callable[[], None]]:
     """Let another process compile beside the body, which calls what is given before it simulates.
 
-    At the end all that a fit needs is in the cache: with `integrator` one of springs without
-    memory, with `memory` one of others along a known motion or stress. The other process is stopped
-    if the body fails.
+    At the end all that a fit needs is in the cache: with `integrator` of springs without memory,
+    with `memory` of others. The other process is stopped if the body fails.
     """
     path = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}".rstrip(os.pathsep)
     parts = [part for part, asked in (("integrator", integrator), ("memory", memory)) if asked]
@@ -166,12 +176,15 @@ def side_by_side(integrator: bool = True, memory: bool = False) -> Iterator[Call
                 _memory(relaxed=True)
             gc.enable()
 
+        _open.append(other)
         try:
             yield finish
             other.wait()
         except BaseException:
             other.terminate()
             raise
+        finally:
+            _open.remove(other)
 
 
 def _main(parts: list[str]) -> None:

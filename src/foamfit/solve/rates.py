@@ -3,14 +3,12 @@
 Implicit steps damp out what is too fast for them.
 """
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
-
 from __future__ import annotations
 
 import math
 
-from foamfit.solve.scene import FREE, VISCOUS, Scene, SceneTuple
-from foamfit.springs.kernels import ETA, K0, KC, KH_PLUS, compiled, inner
+from foamfit.solve.scene import FREE, VISCOUS
+from foamfit.springs.kernels import ETA, K0, KC, KH_PLUS, Array, Branches, compiled, inner
 
 # (Rate of stopping)/(rate of creep) from which dashpots stop a striker long before it is thrown
 # back.
@@ -18,42 +16,49 @@ OVERDAMPED = 1e3
 
 
 @inner
-def contact_time(scene: Scene) -> float:
+def contact_time(rows: Array, heights: Array, mass: float, drag: float) -> float:
     """Time, roughly, for which the mass on top stays on the chain that it strikes."""
     soft, slow = 0.0, 0.0
-    for i in range(scene.heights.size):
-        soft += scene.heights[i] / scene.rows[i, K0]
-        slow = max(slow, scene.rows[i, ETA] / scene.rows[i, K0])
-    return math.sqrt(scene.mass[-1] * soft) + scene.drag * soft + slow
+    for i in range(heights.size):
+        soft += heights[i] / rows[i, K0]
+        slow = max(slow, rows[i, ETA] / rows[i, K0])
+    return math.sqrt(mass * soft) + drag * soft + slow
 
 
 @inner
-def is_overdamped(scene: Scene) -> bool:
-    """Whether dashpots stop a striker long before the springs throw it back.
+def is_overdamped(rows: Array, heights: Array, mass: float) -> bool:
+    """Whether dashpots stop a striker of that mass long before the springs throw it back.
 
     With the rates a = k/c of creep and b = c/m of stopping, contact ends where the base stress has
     fallen to (a/b)² of its peak: explicit steps, whose error is relative to the peak, lose it.
     """
     soft, flow = 0.0, 0.0
-    for i in range(scene.heights.size):
-        if scene.rows[i, ETA] == 0.0:
+    for i in range(heights.size):
+        if rows[i, ETA] == 0.0:
             return False
-        soft += scene.heights[i] / scene.rows[i, K0]
-        flow += scene.heights[i] / scene.rows[i, ETA]
-    return scene.speed > 0.0 and soft > OVERDAMPED * flow * flow * scene.mass[-1]
+        soft += heights[i] / rows[i, K0]
+        flow += heights[i] / rows[i, ETA]
+    return soft > OVERDAMPED * flow * flow * mass
 
 
 @compiled
-def fastest_rates(given: SceneTuple) -> tuple[float, float]:
-    """Fastest vibration and fastest relaxation of a scene, as rates times its duration (radians).
+def fastest_rates(
+    rows: Array,
+    heights: Array,
+    ends: Branches,
+    mass: Array,
+    drag: float,
+    top: int,
+    struck: bool,
+    duration: float,
+) -> tuple[float, float]:
+    """Fastest vibration and relaxation of a scene, as rates times its duration (radians).
 
-    They are estimated row by row from the masses, dashpots and slopes of the springs: what steps
-    that must follow every rate have to go through. Infinite where a scene `is_overdamped`.
+    They are estimated from the masses, dashpots and slopes of the springs. Infinite where a scene
+    `is_overdamped`.
     """
-    scene = Scene(*given)
-    if is_overdamped(scene):
+    if struck and is_overdamped(rows, heights, mass[-1]):
         return math.inf, math.inf
-    rows, heights, ends, mass, drag, top = scene[:6]
     vibration, relaxation = 0.0, 0.0
     below_stiff, below_damp = 0.0, 0.0
     i0 = 0
@@ -87,7 +92,6 @@ def fastest_rates(given: SceneTuple) -> tuple[float, float]:
         relaxation = max(relaxation, below_stiff / drag)
         if below_damp > 1e4 * drag:  # explicit steps take the velocity from what little is left
             relaxation = math.inf
-    duration = scene.t[scene.t.size - 1] - (0.0 if scene.speed > 0.0 else scene.t[0])
-    if scene.speed > 0.0:
-        duration = min(duration, contact_time(scene))
+    if struck:
+        duration = min(duration, contact_time(rows, heights, mass[-1], drag))
     return vibration * duration, relaxation * duration

@@ -13,7 +13,6 @@ those of σ at the same nodes. A step on which the cubic bends too much is halve
 bends and no derivative is wanted, the cubic is that through values and slopes at both ends.
 """
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 import math
@@ -21,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from foamfit.springs import kernels
 from foamfit.springs import microscale_kernels as micro
 from foamfit.springs.kernels import (
     HELD,
@@ -31,28 +31,16 @@ from foamfit.springs.kernels import (
     Array,
     Branches,
     Row,
-    branch_shape,
     compiled,
     inlined,
     inner,
-    slope_on,
+    maker,
 )
 from foamfit.springs.law import MICROSCALE
 from foamfit.springs.laws import followed
-from foamfit.springs.microscale_kernels import (
-    BRANCH,
-    CARRIED,
-    CURVATURE,
-    EPS,
-    FLEXIBILITY,
-    HIGH,
-    LOW,
-    OF_STRAIN,
-    SIGMA,
-    STATE,
-)
+from foamfit.springs.microscale_kernels import BRANCH, CURVATURE, EPS, FLEXIBILITY, OF_STRAIN, SIGMA
 from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
-from foamfit.springs.sensitivities import branch_derivative
+from foamfit.springs.sensitivities import branch_tangents, stress_tangents_along
 
 # The nodes on [0, 1], and the coefficients of 1, r, r², r³ in the Lagrange polynomials on them.
 _NODES = (0.0, 0.5 - math.sqrt(0.05), 0.5 + math.sqrt(0.05), 1.0)
@@ -72,17 +60,34 @@ LEAST_PACE = 1e-9
 PLAIN, EVEN, CHECKED = 1e-2, 0.1, 16
 # Columns of the table of a term: its step h, exp(-x), the weights of the four nodes, their
 # derivatives by x, what the cubic leaves out of higher polynomials, and r²(1 - r)² as these;
-# and g, or less where the term lasts longer than the motion.
+# and g, or less where the term lasts longer than the motion; and the moments J_0 … J_4.
 STEP, DECAY, WEIGHT, BY_X, OF_FOURTH, OF_FIFTH, OF_SIXTH = 0, 1, 2, 6, 10, 11, 12
-OF_BUMP, LASTING, TABLE = 13, 14, 15
+OF_BUMP, LASTING, MOMENTS, TABLE = 13, 14, 15, 20
 
 
-class Kept(NamedTuple):
-    """What terms remember: y (terms,), and its derivatives (terms, carried), by τ (terms or 0,)."""
+class Work(NamedTuple):
+    """What a run works with.
 
+    nodes (4,) and d_nodes (4, carried) are the stresses of a step and their derivatives, d_ranks
+    (2, CARRIED) those of the ranks; table (terms, TABLE). Of what terms remember, y (terms,) are
+    the values, by (terms, carried) their derivatives, and by_tau (terms or 0,) those by τ.
+    """
+
+    nodes: Array
+    d_nodes: Array
+    d_ranks: Array
+    table: Array
     y: Array
     by: Array
     by_tau: Array
+
+
+@maker
+def _make_work(terms: int, count: int, derived: int) -> Work:
+    """Make what a run works with, derivatives of `derived` terms by τ among it."""
+    table, by = np.zeros((terms, TABLE)), np.zeros((terms, count))
+    nodes, d_nodes, d_ranks = np.empty(4), np.zeros((4, count)), np.zeros((2, micro.CARRIED))
+    return Work(nodes, d_nodes, d_ranks, table, np.zeros(terms), by, np.zeros(derived))
 
 
 _, _begin, _leaves, _switch_law, _settle_law = followed.functions_of("microscale")[:5]
@@ -109,25 +114,15 @@ def _switch(row: Row, state: Array, up: bool) -> None:
 
 @inner
 def _tangents(row: Row, state: Array, seed: Array, d_ranks: Array, out: Array) -> None:
-    """Fill the derivatives of the stress at a strain; see `microscale_kernels.tangents`.
-
-    In place of that by the logarithm of the strain ε stands that by what moves ε by seed · (1, ε).
-    """
+    """Fill the derivatives of the stress; the last is by what moves ε by seed · (1, ε)."""
     branch, eps = int(state[BRANCH]), state[EPS]
     moved = seed[0] + seed[1] * eps
     if row[KIND] == MICROSCALE:
         rank = micro.rank_now(row, state)
         ever = micro.ever_now(state, rank)
         micro.tangents(row, branch, rank, ever, state[SIGMA], moved, d_ranks, out)
-        return
-    slope = slope_on(row, branch, eps)
-    curved, _, x0, _ = branch_shape(row, branch)
-    x = eps - x0
-    factor = x / (1.0 - x) if curved else x
-    for own in range(OF_STRAIN):
-        dk, dx0, ds0 = branch_derivative(row, branch, own)
-        out[own] = factor * dk - slope * dx0 + ds0
-    out[OF_STRAIN] = slope * moved
+    else:
+        branch_tangents(row, branch, eps, moved, out)
 
 
 @inner
@@ -150,9 +145,9 @@ def _moments(x: float, out: Array) -> None:
 
 
 @inner
-def _tabulate(h: float, tau: float, moments: Array, table: Array) -> None:
+def _tabulate(h: float, tau: float, table: Array) -> None:
     """Fill the table of a term for steps of the length h."""
-    x = h / tau
+    x, moments = h / tau, table[MOMENTS:]
     _moments(x, moments)
     table[STEP], table[DECAY] = h, math.exp(-x)
     for i in range(4):
@@ -176,8 +171,8 @@ def _tabulate(h: float, tau: float, moments: Array, table: Array) -> None:
 def _truncation(nodes: Array, table: Array, begins: float, ends_with: float) -> float:
     """Estimate what the cubic through four nodes does to the stress of all terms in the end.
 
-    Its Legendre coefficients are taken to fall on as they have begun; where the slopes at the ends
-    are known (not 0), the fourth is at least what they want.
+    Its Legendre coefficients are taken to fall on as they have begun; slopes at the ends, where
+    known (not 0), bound the fourth from below.
     """
     ends, inside = 0.25 * (nodes[3] - nodes[0]), _BEND * (nodes[2] - nodes[1])
     one, three = abs(ends + inside), abs(ends - inside)
@@ -208,8 +203,8 @@ def _try_slopes(
 ) -> bool:
     """Take a step to a strain by the cubic through values and slopes at its ends.
 
-    False, and not taken, if it is too long: the second derivatives tell how much of r²(1 - r)² the
-    stress has beside the cubic. `bar` is the wanted error over the `largest` stress.
+    False, and not taken, if it is too long by the second derivatives, which show what r²(1 - r)²
+    adds to the cubic. `bar` is the wanted error over the `largest` stress.
     """
     origin, flexibility, curvature = state[EPS], state[FLEXIBILITY], state[CURVATURE]
     _settle(row, state, end)
@@ -241,10 +236,7 @@ def _try_slopes(
 def _try_nodes(
     row: Row, state: Array, nodes: Array, table: Array, goal: float, rough: bool
 ) -> tuple[float, bool]:
-    """Take a step to a strain by the four nodes.
-
-    Returns its error, which is not asked for of a `rough` one, and whether the slopes are known.
-    """
+    """Step to a strain by the four nodes; its error (0 if `rough`), whether slopes are known."""
     origin, flexibility, begins, ends_with = state[EPS], state[FLEXIBILITY], 0.0, 0.0
     for i in range(1, 4):
         _settle(row, state, goal if i == 3 else origin + NODES[i] * (goal - origin))
@@ -258,17 +250,15 @@ def _try_nodes(
 
 
 @inlined
-def _derive(
-    row: Row, state: Array, seed: Array, nodes: Array, d_ranks: Array, d_nodes: Array, first: float,
-    short: bool,
-) -> None:  # fmt: skip
+def _derive(row: Row, state: Array, seed: Array, work: Work, first: float, short: bool) -> None:
     """Fill the derivatives of the stress at the nodes of a step, from a strain to where it is.
 
     On a `short` one they are those of the parabola through both ends and the middle.
     """
+    nodes, d_nodes, d_ranks = work.nodes, work.d_nodes, work.d_ranks
+    here = state[SIGMA], state[EPS]
     for c in range(d_nodes.shape[1]):
         d_nodes[0, c] = d_nodes[3, c]
-    here = state[SIGMA], state[EPS]
     if short:
         state[EPS] = 0.5 * (first + here[1])
         state[SIGMA] = 0.625 * (nodes[1] + nodes[2]) - 0.125 * (nodes[0] + nodes[3])
@@ -287,41 +277,88 @@ def _derive(
 
 
 @inlined
-def _relax(row: Row, h: float, table: Array, nodes: Array, d_nodes: Array, kept: Kept) -> None:
+def _relax(row: Row, h: float, work: Work) -> None:
     """Let all terms relax over a step."""
-    for k in range(table.shape[0]):
-        tau = row[N_COLUMNS + 2 * k + 1]
-        x, decay, total, change = h / tau, table[k, DECAY], 0.0, 0.0
+    nodes, d_nodes, y, by = work.nodes, work.d_nodes, work.y, work.by
+    for k in range(y.size):
+        table, tau = work.table[k], row[N_COLUMNS + 2 * k + 1]
+        x, decay, total, change = h / tau, table[DECAY], 0.0, 0.0
         for i in range(4):
-            total += table[k, WEIGHT + i] * nodes[i]
-            change += table[k, BY_X + i] * nodes[i]
-        if kept.by_tau.size > 0:
-            by_x = -decay * kept.y[k] - total - x * change
-            kept.by_tau[k] = decay * kept.by_tau[k] - by_x * x / tau
+            total += table[WEIGHT + i] * nodes[i]
+            change += table[BY_X + i] * nodes[i]
+        if work.by_tau.size > 0:
+            by_x = -decay * y[k] - total - x * change
+            work.by_tau[k] = decay * work.by_tau[k] - by_x * x / tau
             for c in range(d_nodes.shape[1]):
                 total_c = 0.0
                 for i in range(4):
-                    total_c += table[k, WEIGHT + i] * d_nodes[i, c]
-                kept.by[k, c] = decay * kept.by[k, c] - x * total_c
-        kept.y[k] = decay * kept.y[k] - x * total
+                    total_c += table[WEIGHT + i] * d_nodes[i, c]
+                by[k, c] = decay * by[k, c] - x * total_c
+        y[k] = decay * y[k] - x * total
 
 
 @inlined
-def _sum_up(
-    row: Row, sigma: float, d_sigma: Array, kept: Kept, by: Array, by_g: Array, by_tau: Array
-) -> float:
+def _follow(
+    row: Row, state: Array, seed: Array, work: Work, part: tuple[float, float, float, float],
+    rtol: float, largest: float, plain: int,
+) -> tuple[float, int]:  # fmt: skip
+    """Follow a branch to a strain by steps that are exact enough.
+
+    `part` is that strain, the time between the samples (s), and where between them, from 0 to 1,
+    the branch begins and ends. Returns the largest stress so far, and how many of the next steps
+    may take values and slopes at both ends.
+    """
+    (end, between, begun, until), nodes, table = part, work.nodes, work.table
+    first, done, pace = state[EPS], begun, until - begun
+    while done < until:
+        pace = min(pace, until - done)
+        last = pace == until - done
+        nodes[0], origin = state[SIGMA], state[EPS]
+        flexibility, curvature = state[FLEXIBILITY], state[CURVATURE]
+        h = pace * between
+        for k in range(table.shape[0]):
+            if not abs(h - table[k, STEP]) <= 1e-13 * h:
+                _tabulate(h, row[N_COLUMNS + 2 * k + 1], table[k])
+        goal = end
+        if not last:
+            goal = first + (done + pace - begun) / (until - begun) * (end - first)
+        tried = plain > 0 and last and pace == 1.0
+        short = tried and _try_slopes(row, state, nodes, table, end, rtol, largest)
+        plain, error, sloped = plain - tried, 0.0, False
+        if not short:
+            error, sloped = _try_nodes(row, state, nodes, table, goal, pace <= LEAST_PACE)
+        if not abs(nodes[3]) < math.inf:
+            break
+        largest = max(largest, abs(nodes[3]))
+        if error > rtol * largest:
+            state[EPS], state[SIGMA] = origin, nodes[0]
+            state[FLEXIBILITY], state[CURVATURE] = flexibility, curvature
+            pace *= 0.5
+            continue
+        if not short:
+            plain = CHECKED if sloped and error <= PLAIN * rtol * largest else 0
+        if work.by_tau.size > 0:
+            _derive(row, state, seed, work, origin, short)
+        _relax(row, h, work)
+        done = until if last else done + pace
+        pace *= 2.0
+    return largest, plain
+
+
+@inlined
+def _sum_up(row: Row, sigma: float, work: Work, by: Array, by_g: Array, by_tau: Array) -> float:
     """Fill the derivatives of the stress at a sample; returns the stress with all terms."""
-    total = sigma
+    total, d_sigma = sigma, work.d_nodes[3]
     for c in range(by.size):
         by[c] = d_sigma[c]
     for k in range(by_g.size):
         g = row[N_COLUMNS + 2 * k]
-        by_g[k] = sigma + kept.y[k]
+        by_g[k] = sigma + work.y[k]
         total += g * by_g[k]
         for c in range(by.size):
-            by[c] += g * (d_sigma[c] + kept.by[k, c])
+            by[c] += g * (d_sigma[c] + work.by[k, c])
     for k in range(by_tau.size):
-        by_tau[k] = row[N_COLUMNS + 2 * k] * kept.by_tau[k]
+        by_tau[k] = row[N_COLUMNS + 2 * k] * work.by_tau[k]
     return total
 
 
@@ -331,108 +368,58 @@ def relaxed_along(
 ) -> tuple[Array, Branches, Array, Array, Array]:
     """Stress of a spring and of its relaxation terms along a history of its strain.
 
-    Parameters
-    ----------
-    row : array
-        The spring with its terms.
-    eps, t : (n,) arrays
-        Strains and times, s.
-    rtol : float
-        Wanted error over the largest stress.
-    derive : bool
-        Whether to fill the derivatives too.
-    seeds : (n, 2) array
-        On the way to each sample the last but one of them is by what moves the strain ε by
-        seed · (1, ε): (0, 1) is the logarithm of the strain.
+    `eps` and `t` (n,) are strains and times, s, `rtol` the wanted error over the largest stress.
+    With `derive`, on the way to each sample the derivative by the strain is by what moves it by
+    seed · (1, ε), of seeds (n, 2): (0, 1) is the logarithm of the strain.
 
-    Returns
-    -------
-    tuple of arrays
-        Stress (n,), Pa, infinite from the end of a branch on; branches (n,); derivatives of the
-        stress (8, 11 or 0, n) by k0 … kh_minus or spread_minus, by the logarithm of the strain, and
-        by what a spring remembers; by the g of every term (terms, n), and by its τ (terms or 0, n).
+    Returned are the stress (n,), Pa, infinite from the end of a branch on; branches (n,);
+    derivatives of the stress (8, 11 or 0, n) by k0 … kh_minus or spread_minus, by the strain, and
+    by what a spring remembers; by the g of every term (terms, n), and by its τ (terms or 0, n).
     """
-    n, terms, wanted = eps.size, (row.size - N_COLUMNS) // 2, int(derive)
-    taus = row[N_COLUMNS + 1 :: 2]
-    count = micro.carried(row)
+    n, terms, wanted, count = eps.size, (row.size - N_COLUMNS) // 2, int(derive), micro.carried(row)
     sigma, branches, by = np.empty(n), np.empty(n, np.int64), np.empty((wanted * count, n))
     by_g, by_tau = np.empty((terms, n)), np.empty((wanted * terms, n))
-    state, nodes = np.empty(STATE), np.empty(4)
-    table, moments = np.zeros((terms, TABLE)), np.empty(5)
-    kept = Kept(np.zeros(terms), np.zeros((terms, count)), np.zeros(by_tau.shape[0]))
-    d_ranks, d_nodes = np.zeros((2, CARRIED)), np.zeros((4, count))
+    state, work = np.empty(micro.STATE), _make_work(terms, count, wanted * terms)
     _begin(row, state)
     largest, entered, plain = 0.0, True, 0
     for k in range(terms):
-        table[k, LASTING] = row[N_COLUMNS + 2 * k] * min(1.0, (t[n - 1] - t[0]) / taus[k])
+        lasts = (t[n - 1] - t[0]) / row[N_COLUMNS + 2 * k + 1]
+        work.table[k, LASTING] = row[N_COLUMNS + 2 * k] * min(1.0, lasts)
     for j in range(n):
-        before, start, done = state[EPS], j == 0, 0.0
-        while True:
+        before, done, leaving = state[EPS], 0.0, True
+        while leaving:
             up, leaving = eps[j] > state[EPS], _leaves(row, state, eps[j])
-            if leaving and row[KIND] == MICROSCALE and micro.turned(state, up):
-                _switch(row, state, up)
-                entered, plain = True, 0
-                continue
-            end, until = eps[j], 1.0
-            if leaving:
-                end = state[HIGH] if up else state[LOW]
-                until = min(max((end - before) / (eps[j] - before), done), 1.0)
-            if start:  # from rest to the first sample in no time
-                _settle(row, state, end)
-                done, entered = until, True
-            if derive and entered:
-                _tangents(row, state, seeds[j], d_ranks, d_nodes[3])
-            entered = False
-            pace = until - done
-            at, first = done, state[EPS]
-            while done < until:
-                pace = min(pace, until - done)
-                last = pace == until - done
-                nodes[0], origin = state[SIGMA], state[EPS]
-                flexibility, curvature = state[FLEXIBILITY], state[CURVATURE]
-                h = pace * (t[j] - t[j - 1])
-                for k in range(terms):
-                    if not abs(h - table[k, STEP]) <= 1e-13 * h:
-                        _tabulate(h, taus[k], moments, table[k])
-                goal = end if last else first + (done + pace - at) / (until - at) * (end - first)
-                tried = plain > 0 and last and pace == 1.0
-                short = tried and _try_slopes(row, state, nodes, table, end, rtol, largest)
-                plain, error, sloped = plain - tried, 0.0, False
-                if not short:
-                    rough = pace <= LEAST_PACE
-                    error, sloped = _try_nodes(row, state, nodes, table, goal, rough)
-                if not abs(nodes[3]) < math.inf:
-                    break
-                largest = max(largest, abs(nodes[3]))
-                if error > rtol * largest:
-                    state[EPS], state[SIGMA] = origin, nodes[0]
-                    state[FLEXIBILITY], state[CURVATURE] = flexibility, curvature
-                    pace *= 0.5
-                    continue
-                if not short:
-                    plain = CHECKED if sloped and error <= PLAIN * rtol * largest else 0
-                if derive:
-                    _derive(row, state, seeds[j], nodes, d_ranks, d_nodes, origin, short)
-                _relax(row, h, table, nodes, d_nodes, kept)
-                done = until if last else done + pace
-                pace *= 2.0
-            if not abs(state[SIGMA]) < math.inf:
-                sigma[j:], branches[j:] = math.inf, int(state[BRANCH])
-                return sigma, branches, by, by_g, by_tau
+            turning = leaving and row[KIND] == MICROSCALE and micro.turned(state, up)
+            if not turning:
+                end, until = eps[j], 1.0
+                if leaving:
+                    end = state[micro.HIGH] if up else state[micro.LOW]
+                    until = min(max((end - before) / (eps[j] - before), done), 1.0)
+                if j == 0:  # from rest to the first sample in no time
+                    _settle(row, state, end)
+                    done, entered = until, True
+                if derive and entered:
+                    _tangents(row, state, seeds[j], work.d_ranks, work.d_nodes[3])
+                entered = False
+                if done < until:
+                    part = (end, t[j] - t[j - 1], done, until)
+                    largest, plain = _follow(row, state, seeds[j], work, part, rtol, largest, plain)
+                    done = until
+                if not abs(state[SIGMA]) < math.inf:
+                    sigma[j:], branches[j:] = math.inf, int(state[BRANCH])
+                    return sigma, branches, by, by_g, by_tau
+                if not leaving and state[EPS] != end:  # no time is left on the way to it
+                    _settle(row, state, end)
+                    if derive:
+                        _tangents(row, state, seeds[j], work.d_ranks, work.d_nodes[3])
             if leaving:
                 _switch(row, state, up)
                 entered, plain = True, 0
-                continue
-            if state[EPS] != end:  # so near the end of a branch that no time is left
-                _settle(row, state, end)
-                if derive:
-                    _tangents(row, state, seeds[j], d_ranks, d_nodes[3])
-            break
-        if start:
-            kept.y[:] = -state[SIGMA]
+        if j == 0:
+            work.y[:] = -state[SIGMA]
             for p in range(count):
-                kept.by[:, p] = -d_nodes[3, p]
-        sigma[j] = _sum_up(row, state[SIGMA], d_nodes[3], kept, by[:, j], by_g[:, j], by_tau[:, j])
+                work.by[:, p] = -work.d_nodes[3, p]
+        sigma[j] = _sum_up(row, state[SIGMA], work, by[:, j], by_g[:, j], by_tau[:, j])
         branches[j] = int(state[BRANCH])
     return sigma, branches, by, by_g, by_tau
 
@@ -455,36 +442,24 @@ def stress_along(
 ) -> tuple[Array, Branches, Array]:
     """Stress of one spring (without its dashpot) along a history of its strain.
 
-    Parameters
-    ----------
-    row : array
-        A spring of any kind, with any number of relaxation terms.
-    eps, t : (n,) arrays
-        Strains and times, s.
-    height : float
-        Height of the spring, m.
-    rtol : float
-        Wanted error over the largest stress.
-    directions : (p, 2) array
-        See `springs.parameters`.
-
-    Returns
-    -------
-    tuple of arrays
-        Stress (n,), Pa; branches (n,); derivatives of the stress at a fixed elongation (p, n).
+    `eps` and `t` (n,) are strains and times, s, `height` is in m, `rtol` the wanted error over the
+    largest stress, for directions (p, 2) see `springs.parameters`. Returned are the stress (n,),
+    Pa, branches (n,), and derivatives of the stress at a fixed elongation (p, n).
     """
     own = directions[:, 1]
-    terms = row[N_COLUMNS::2]
-    out, seeds = np.zeros((len(own), eps.size)), _seeds(eps, moved=bool((own == MOVED).any()))
-    if row[KIND] == MICROSCALE and not terms.any() and not (own >= OWN_RELAXATION).any():
-        stress, ranks, branches = micro.stress_along(row, eps)
-        if len(own) == 0:
-            return stress, branches, out
-        moved = seeds[:, 0] + seeds[:, 1] * eps
-        by, _ = micro.stress_tangents_along(row, moved, stress, ranks, branches)
-        by_g = by_tau = by[:0]
-    else:
+    by = by_g = by_tau = out = np.zeros((len(own), eps.size))
+    if row.size > N_COLUMNS and (row[N_COLUMNS::2].any() or (own >= OWN_RELAXATION).any()):
+        seeds = _seeds(eps, moved=bool((own == MOVED).any()))
         stress, branches, by, by_g, by_tau = relaxed_along(row, eps, t, rtol, len(own) > 0, seeds)
+    elif row[KIND] == MICROSCALE:
+        stress, ranks, branches = micro.stress_along(row, eps)
+        if len(own):
+            first, share = _seeds(eps, moved=bool((own == MOVED).any())).T
+            moved = first + share * eps
+            by = micro.stress_tangents_along(row, moved, stress, ranks, branches)[0]
+    else:
+        stress, branches = kernels.stress_along(row, eps)
+        by = stress_tangents_along(row, eps, branches)
     for p, what in enumerate(own):
         if what == MOVED:
             out[p] = by[OF_STRAIN] / height

@@ -1,6 +1,5 @@
 """What all integrators share: the scene, its samples, how a run can end and what it finds."""
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -50,8 +49,8 @@ class Scene(NamedTuple):
 class Samples(NamedTuple):
     """The curves to fill, over the samples t (n,), counted each from the one before it in a drive.
 
-    curves (1 + springs or 1, n) holds the base stress, Pa, then the displacements above each spring
-    or of the top alone, m; slopes (p, …) are their derivatives in p directions.
+    curves (1 + springs or 1, n): base stress, Pa, then displacements above each spring or of the
+    top alone, m; slopes (p, …) are their derivatives.
     """
 
     t: Array

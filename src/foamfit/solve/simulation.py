@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -48,46 +48,23 @@ LOST = 0.03  # so large a difference is not mended by still shorter steps
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What a chain does under a drive.
+    """What a chain does under a drive."""
 
-    Attributes
-    ----------
-    time : (n_t,) array
-        Times of the samples, s.
-    displacement : (n_springs, n_t) array
-        Downward displacement w_i of the node above each spring, m.
-    base_stress : (n_t,) array
-        Stress at the sensor, Σ_1, Pa; zero outside contact.
-    height : float
-        Overall height H, m.
-    contact_end : float or None
-        Time at which the base stress of an impact returned to zero, s; None if it has not, or in
-        other drives.
-    solver : str
-        "closed form", "first order" or "second order": the simplest that the scene needs.
-    method : str
-        "closed form", "Taylor series" (explicit steps), "aggregate" (the same, for many springs
-        that carry one stress) or "Radau IIA" (implicit steps, where light masses or dashpots make
-        the scene stiff; a vibration too fast to be followed is damped out, and refused where it
-        would exceed rtol).
-    switches : (m, 5) array
-        Time (s), spring (0 at the base), branch left, branch entered, strain of that spring.
-    steps : int
-        Steps of the integrator; 0 for the closed form.
-    sensitivities : dict of str to Sensitivity
-        Derivatives by the requested parameters; one that exists on one side only is marked
-        `one_sided`.
-    """
-
-    time: Array
-    displacement: Array
-    base_stress: Array
-    height: float
+    time: Array  #: times of the samples, s, (n_t,)
+    displacement: Array  #: of the node above each spring, downward, m, (n_springs, n_t)
+    base_stress: Array  #: stress at the sensor, Pa, (n_t,); zero outside contact
+    height: float  #: overall height H, m
+    #: when the base stress of an impact was back at zero, s; None if it was not, or other drives
     contact_end: float | None
-    solver: str
+    solver: str  #: "closed form", "first order" or "second order": the simplest that is needed
+    #: "closed form", "Taylor series" (explicit steps), "aggregate" (the same, of many springs under
+    #: one stress) or "Radau IIA" (implicit steps, where light masses or dashpots make the scene
+    #: stiff; a vibration too fast to be followed is damped out, and refused if it exceeds rtol)
     method: str
+    #: time (s), spring (0 at the base), branch left, branch entered, its strain, (m, 5)
     switches: Array
-    steps: int
+    steps: int  #: of the integrator; 0 for the closed form
+    #: derivatives by the requested parameters
     sensitivities: dict[str, Sensitivity] = field(default_factory=dict)
 
     @property
@@ -102,29 +79,25 @@ def _verified(
 ) -> Motion:
     """Run a scene; where masses make its errors grow, follow it again by shorter steps and compare.
 
-    Raises
-    ------
-    SimulationError
-        If the scene has no answer within `rtol`; the message says why.
+    What has no answer within `rtol` is refused (SimulationError).
     """
     motion = scene.run(rows, heights, rtol, directions=directions)
     inside = len(scene.ends) > 2
     if len(scene.ends) == 2:  # the base stress depends on the velocity of the mass above
         inside = bool((rows[: scene.ends[0], kernels.ETA] > 0.0).any())
-    many = _many(scene, motion, FEW_STEPS) or inside or motion.method == RADAU
-    if scene.speed > 0.0 and not many and not _hard(scene, rows, heights):
+    long = _is_long(scene, motion, FEW_STEPS) or inside or motion.method == RADAU
+    if scene.speed > 0.0 and not long and not _hard(scene, rows, heights):
         return motion
-    if motion.unresolved > 0.7 * rtol:  # the comparison below leaves 0.3
-        # An explicit step goes through some 3 radians, and takes a hundredth of an implicit one.
-        explicit = max(scene.fastest_rates(rows, heights)) / 3.0 <= MOST_WORK / len(heights)
-        if not explicit:
-            motion = _finer(scene, rows, heights, rtol, directions, motion)
+
+    def run(scene: Plan, rtol: float) -> Motion:
+        return scene.run(rows, heights, rtol, directions=directions)
+
     lost = motion.unresolved
-    if lost > 0.7 * rtol:
-        if not explicit:
-            raise SimulationError(_UNRESOLVED.format(size=lost))
-        scene = scene._replace(implicit=False)
-        motion = _followed(scene, rows, heights, rtol, directions, lost)
+    if lost > 0.7 * rtol:  # the comparison below leaves 0.3
+        # An explicit step goes through some 3 radians, and takes a hundredth of an implicit one.
+        rates = scene.fastest_rates(rows, heights, scene.drag)
+        explicit = max(rates) / 3.0 <= MOST_WORK / len(heights)
+        motion, scene = _followed(scene, motion, rtol, explicit, run)
     distance = _distance_at_peak(scene, rows, heights, motion, rtol)
     if 0.3 * rtol * distance < 1e-15:
         raise SimulationError(
@@ -132,15 +105,20 @@ def _verified(
             f"rounding alone makes errors above rtol = {rtol:g}"
         )
     forced = 0 if scene.speed > 0.0 else scene.time.size
-    many = _many(scene, motion, FEW_STEPS + 2 * forced) or inside or distance < CLOSE
-    many = many and scene.solver == SECOND_ORDER
-    if not (many or motion.method == RADAU) or rtol < 1e-12:  # a finer run is rounding
+    long = _is_long(scene, motion, FEW_STEPS + 2 * forced) or inside or distance < CLOSE
+    long = long and scene.solver == SECOND_ORDER
+    if not (long or motion.method == RADAU) or rtol < 1e-12:  # a finer run is rounding
         return motion
     miss = math.inf
     for factor in (1e-2, 1e-4, 1e-6):
         if rtol * factor < 1e-14:
             break
-        finer = _followed(scene, rows, heights, rtol * factor, directions, lost)
+        try:
+            finer = run(scene, rtol * factor)
+        except SimulationError:
+            if scene.implicit is False:  # these steps follow what implicit ones lost
+                raise SimulationError(_UNRESOLVED.format(size=lost)) from None
+            raise
         miss = max(
             difference(finer.displacement, motion.displacement),
             difference(finer.base_stress, motion.base_stress),
@@ -157,34 +135,27 @@ def _verified(
     )
 
 
-def _finer(
-    scene: Plan, rows: Array, heights: Array, rtol: float, directions: Directions, motion: Motion
-) -> Motion:
-    """Follow by shorter implicit steps what longer ones have lost, if they can."""
+def _followed(
+    scene: Plan, motion: Motion, rtol: float, explicit: bool, run: Callable[[Plan, float], Motion]
+) -> tuple[Motion, Plan]:
+    """Follow the vibrations that implicit steps lost, by shorter ones or by explicit ones."""
+    lost = SimulationError(_UNRESOLVED.format(size=motion.unresolved))
+    if explicit:
+        try:
+            scene = scene._replace(implicit=False)
+            return run(scene, rtol), scene
+        except SimulationError:
+            raise lost from None
     for factor in (1e-2, 1e-4):
         if motion.steps < MOST_FOLLOWED and rtol * factor >= 1e-14:
             with suppress(SimulationError):
-                finer = scene._replace(implicit=True).run(
-                    rows, heights, rtol * factor, directions=directions
-                )
+                finer = run(scene._replace(implicit=True), rtol * factor)
                 if finer.unresolved <= 0.7 * rtol:
-                    return finer
-    return motion
+                    return finer, scene
+    raise lost
 
 
-def _followed(
-    scene: Plan, rows: Array, heights: Array, rtol: float, directions: Directions, lost: float
-) -> Motion:
-    """Run a scene; where explicit steps follow what implicit ones lost, that is why they fail."""
-    try:
-        return scene.run(rows, heights, rtol, directions=directions)
-    except SimulationError:
-        if scene.implicit is not False:
-            raise
-        raise SimulationError(_UNRESOLVED.format(size=lost)) from None
-
-
-def _many(scene: Plan, motion: Motion, few: int) -> bool:
+def _is_long(scene: Plan, motion: Motion, few: int) -> bool:
     """Whether a motion took many steps (those of springs under one stress are but switches)."""
     vibrates = len(scene.ends) > 1 and len(motion.switches) > FEW_SWITCHES
     return (motion.steps > few or vibrates) and motion.method != AGGREGATE
@@ -201,8 +172,7 @@ def _distance_at_peak(
 ) -> float:
     """Least distance, at the peak of an impact, of a spring from the end of its branch.
 
-    The peak of a fast impact is so short that no sample need lie in it: it is bracketed. In
-    equilibrium all springs are longest together.
+    The peak of a fast impact is so short that no sample need lie in it: it is bracketed.
     """
     distance = kernels.distance_to_pole(rows, heights, motion.displacement)
     if scene.solver == CLOSED_FORM:
@@ -228,23 +198,15 @@ def _distance_at_peak(
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Derivative of a response by one parameter, in SI, at fixed times.
+    """Derivative of a response by one parameter, in SI, at fixed times."""
 
-    Attributes
-    ----------
-    displacement : (n_springs, n_t) array
-        m per unit of the parameter.
-    base_stress : (n_t,) array
-        Pa per unit of the parameter. At a switch of branch its slope jumps, not its value; it jumps
-        where contact ends.
-    one_sided : bool
-        Whether the derivative does not exist, and one from above and one from below do: where like
-        springs that snap stand still together, or share a flat branch, the least change decides
-        which of them goes on. Then what is given need not be either of the two.
-    """
-
-    displacement: Array
+    displacement: Array  #: m per unit of the parameter, (n_springs, n_t)
+    #: Pa per unit of the parameter, (n_t,). At a switch of branch its slope jumps, not its value,
+    #: which jumps where contact ends.
     base_stress: Array
+    #: whether there are two derivatives, from above and from below, and this may be neither: where
+    #: like springs that snap stand still together, or share a flat branch, the least change
+    #: decides which goes on
     one_sided: bool = False
 
 

@@ -228,13 +228,7 @@ Drive = Impact | StressDrive | DisplacementDrive
 
 
 def check_scene(chain: object, drive: object) -> None:
-    """Refuse what is no chain or no drive.
-
-    Raises
-    ------
-    ValueError
-        Naming which.
-    """
+    """Refuse (ValueError) what is no chain or no drive."""
     if not isinstance(chain, Chain):
         raise InputError(f"chain is a {type(chain).__name__}; it must be a Chain")
     if not isinstance(drive, Drive):

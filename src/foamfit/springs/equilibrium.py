@@ -4,7 +4,6 @@ Along a monotone stretch each spring follows one monotone function of the common
 of their elongations has one root, whatever switches lie on the way: nothing is integrated.
 """
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 import math
@@ -29,17 +28,14 @@ from foamfit.springs.kernels import (
     strain_on,
 )
 from foamfit.springs.law import MICROSCALE, UNILATERAL
-from foamfit.springs.microscale_kernels import rank_at, strain_along, under_stress
+from foamfit.springs.microscale_kernels import rank_at, strain_along, strain_under
 
 # The least strain that an elongation is followed to is this times rounding.
 LEAST = 1e-6
 
 
 class Group(NamedTuple):
-    """Springs in series with their branches (springs,) and, of microscale ones, ranks (springs, 2).
-
-    heights (springs,) are in m.
-    """
+    """Springs in series: rows, branches, ranks (springs, 2) of microscale ones, heights (m)."""
 
     rows: Array
     branches: Branches
@@ -49,17 +45,14 @@ class Group(NamedTuple):
 
 @inner
 def _series_strain(group: Group, sigma: float, eps: Array) -> tuple[float, float, float]:
-    """Fill the strains of springs in series under one stress, from what they remember.
-
-    Returns elongation, compliance, and the size of the terms that the elongation is made of.
-    """
+    """Fill the strains of springs under one stress; elongation, compliance, size of its terms."""
     rows, branches, ranks, heights = group
     total = compliance = size = 0.0
     for i in range(rows.shape[0]):
         if rows[i, KIND] == MICROSCALE:
             rank, ever, branch = rank_at(rows[i], ranks[i, 0], ranks[i, 1], branches[i], sigma)
-            eps[i], soft, by_rank, _, pace = under_stress(rows[i], branch, rank, ever, sigma)
-            compliance += heights[i] * (soft + by_rank * pace)
+            eps[i], soft = strain_under(rows[i], branch, rank, ever, sigma)
+            compliance += heights[i] * soft
         else:
             branch = branch_at_stress(rows[i], branches[i], sigma)
             eps[i] = strain_on(rows[i], branch, sigma) if branch != OPEN else -math.inf
@@ -94,10 +87,9 @@ def _bracket(group: Group, elongation: float, sigma: float, eps: Array) -> tuple
 
 @maker
 def _split_jump(group: Group, elongation: float, low: float, high: float, eps: Array) -> float:
-    """Share out an elongation that lies inside a jump at one stress; returns that stress.
+    """Share out an elongation inside a jump at one stress, from the base up; returns the stress.
 
-    Flat branches (k_h± = 0) share it from the base up. Where a unilateral spring opens, the stress
-    is zero and the gap takes what the other springs leave.
+    Where a unilateral spring opens, the stress is zero and the gap takes what the others leave.
     """
     rows, heights, upper = group.rows, group.heights, np.empty(eps.size)
     _series_strain(group, high, upper)
@@ -116,12 +108,11 @@ def _split_jump(group: Group, elongation: float, low: float, high: float, eps: A
 
 @maker
 def equilibrate(group: Group, elongation: float, sigma: float, eps: Array) -> float:
-    """Common stress of undamped springs in series at a given elongation; fills their strains.
+    """Common stress of undamped springs in series at an elongation; fills strains and memory.
 
-    Newton's method finds it, from the eighth trial on inside a bracket that every third trial
-    halves. Where the root lies in a jump of the elongation (k_h± = 0, or a snap so narrow that
-    neighbouring numbers for the stress lie apart in it), the springs share it from the base up.
-    Branches and ranks are brought up to date.
+    Newton's method, from the eighth trial on inside a bracket that every third trial halves. Where
+    the root lies in a jump of the elongation (k_h± = 0, or a very narrow snap), they share it from
+    the base up.
     """
     rows, branches, ranks, _ = group
     found = False
@@ -162,7 +153,7 @@ def equilibrate(group: Group, elongation: float, sigma: float, eps: Array) -> fl
 def equilibrium_along(
     rows: Array, heights: Array, top: Array, sigma: Array, eps: Array, history: Branches
 ) -> None:
-    """Springs in series, undamped and massless, along a history of the top's displacement (m).
+    """Springs in series, undamped and massless, along a motion of the top (m).
 
     Fills the common stress (n,), the strains and the branches (springs, n).
     """
@@ -184,10 +175,9 @@ def equilibrium_along(
 def strains_along(
     rows: Array, heights: Array, sigma: Array, top: Array, eps: Array, history: Branches
 ) -> bool:
-    """Springs in series along a history of their stress.
+    """Springs in series along a stress: the motion of the top (n,), m, strains and branches.
 
-    Fills the displacement of the top (n,), m, and strains and branches (springs or 0, n). False if
-    a spring cannot have its stress; its strain is -inf then.
+    False if a spring cannot have its stress. `eps` and `history` may have no rows.
     """
     n, kept, total = sigma.size, eps.shape[0] > 0, 0.0
     strain, branches = np.empty(n), np.empty(n, np.int64)

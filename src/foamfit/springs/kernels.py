@@ -8,7 +8,7 @@ spring is on is its whole memory: a and d belong to the paper's flag a, c and e 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numba import njit
@@ -26,20 +26,19 @@ from foamfit.springs.law import (
     most_beyond,
 )
 
+if TYPE_CHECKING:
+    from numba.core.decorators import _JITWrapper
+
 Row = Array
 Branches = NDArray[np.int64]
 
 # Division by zero gives infinity, as in NumPy; every loop that can meet it says what it does then.
-compiled = njit(cache=True, error_model="numpy")
+_PLAIN: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
+compiled = cast("_JITWrapper", njit(**_PLAIN, cache=True))
 # For what only other loops call: without the bridge to Python, which takes long to compile; without
 # counting who holds an array, which takes long to run; with a product and a sum in one rounding,
 # which is faster and no less exact; and with the body put where it is called.
-_BRIDGELESS: dict[str, Any] = {
-    "error_model": "numpy",
-    "no_cfunc_wrapper": True,
-    "no_cpython_wrapper": True,
-    "fastmath": {"contract"},
-}
+_BRIDGELESS: dict[str, Any] = {**_PLAIN, "no_cpython_wrapper": True, "fastmath": {"contract"}}
 # An array is copied number by number: `a[:] = b` takes two seconds to compile in each process, for
 # the text of the error that shapes differ.
 _COUNTLESS: dict[str, Any] = {**_BRIDGELESS, "_nrt": False}
@@ -100,10 +99,9 @@ def fill_bistable(values: Array, row: Row) -> bool:
 
 @compiled
 def fill_microscale(values: Array, row: Row) -> bool:
-    """Write the own parameters and what follows from them; false if they are not admissible.
+    """Write own parameters and what follows from them; false if they are not admissible.
 
-    They are k0 … spread_minus, then, as far as there are any, stiffening, and softening and
-    weakening.
+    Behind spread_minus come, as far as there are any, stiffening, and softening and weakening.
     """
     count, stiffening, softening, weakening = values.size, 1.0, 0.0, 0.0
     if count == 8 or count == 10:
@@ -265,34 +263,6 @@ def branch_at_stress(row: Row, branch: int, sigma: float) -> int:
 
 
 @inner
-def stresses_on(row: Row, branch: int, eps: Array, sigma: Array) -> None:
-    """Fill the stresses at many strains on one branch."""
-    curved, k, x0, s0 = branch_shape(row, branch)
-    if not curved:
-        for j in range(eps.size):
-            sigma[j] = s0 + k * (eps[j] - x0)
-        return
-    for j in range(eps.size):
-        x = eps[j] - x0
-        sigma[j] = k * x / (1.0 - x) if x < 1.0 else math.inf
-
-
-@inner
-def strains_on(row: Row, branch: int, sigma: Array, eps: Array) -> None:
-    """Fill the strains at many stresses on one branch; -inf where a spring cannot have any."""
-    curved, k, x0, s0 = branch_shape(row, branch)
-    if curved:
-        for j in range(sigma.size):
-            eps[j] = x0 + sigma[j] / (k + sigma[j]) if sigma[j] > -k else -math.inf
-    elif k > 0.0:
-        for j in range(sigma.size):
-            eps[j] = x0 + (sigma[j] - s0) * (1.0 / k)
-    else:
-        for j in range(sigma.size):
-            eps[j] = -math.inf if branch == OPEN else x0
-
-
-@inner
 def _follow_strain(row: Row, eps: Array, sigma: Array, history: Branches) -> None:
     """Fill stress and branch along the strains of one spring from rest, a branch at a time."""
     branch, first = first_branch(row), 0
@@ -302,14 +272,25 @@ def _follow_strain(row: Row, eps: Array, sigma: Array, history: Branches) -> Non
         last = first + 1
         while last < eps.size and low < eps[last] < high:
             last += 1
-        stresses_on(row, branch, eps[first:last], sigma[first:last])
+        curved, k, x0, s0 = branch_shape(row, branch)
+        given, found = eps[first:last], sigma[first:last]  # no index of a slice is negative
+        if curved:
+            for j in range(given.size):
+                x = given[j] - x0
+                found[j] = k * x / (1.0 - x) if x < 1.0 else math.inf
+        else:
+            for j in range(given.size):
+                found[j] = s0 + k * (given[j] - x0)
         history[first:last] = branch
         first = last
 
 
 @inner
 def follow_stress(row: Row, sigma: Array, eps: Array, history: Branches) -> None:
-    """Fill strain and branch along the stresses of one spring from rest, a branch at a time."""
+    """Fill strain and branch along the stresses of one spring from rest, a branch at a time.
+
+    The strain is -inf where the spring cannot have its stress.
+    """
     branch, first = first_branch(row), 0
     while first < sigma.size:
         branch = branch_at_stress(row, branch, sigma[first])
@@ -317,7 +298,16 @@ def follow_stress(row: Row, sigma: Array, eps: Array, history: Branches) -> None
         last = first + 1
         while last < sigma.size and low < sigma[last] < high:
             last += 1
-        strains_on(row, branch, sigma[first:last], eps[first:last])
+        curved, k, x0, s0 = branch_shape(row, branch)
+        given, found = sigma[first:last], eps[first:last]
+        if curved:
+            for j in range(given.size):
+                found[j] = x0 + given[j] / (k + given[j]) if given[j] > -k else -math.inf
+        elif k > 0.0:
+            for j in range(given.size):
+                found[j] = x0 + (given[j] - s0) * (1.0 / k)
+        else:
+            found[:] = -math.inf if branch == OPEN else x0
         history[first:last] = branch
         first = last
 

@@ -24,16 +24,10 @@ LEAST_RANK = -8.3
 def derived_points(
     k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
 ) -> tuple[float, float, float, float, float]:
-    """Derive (σ_a, σ̄_c, ε_*, ε̂_a, ε̂_c) of a bistable spring in closed form.
+    """Derive σ_a and σ̄_c (Pa), ε_*, ε̂_a (-inf: e never meets a) and ε̂_c (eqs. 4 and 5).
 
-    Both quadratics are written about the known end of their branch (C2 for ε̂_c, A1 for ε̂_a),
-    where their coefficients hold no difference of nearly equal numbers.
-
-    Returns
-    -------
-    tuple of float
-        σ_a and σ̄_c in Pa; the strains ε_*, ε̂_a (eq. 4; -inf where branch e never meets
-        branch a) and ε̂_c (eq. 5).
+    Both quadratics are written about the known end of their branch (C2 for ε̂_c, A1 for ε̂_a), where
+    their coefficients hold no difference of nearly equal numbers.
     """
     sigma_a = k0 * eps_a / (1.0 - eps_a)
     sigma_c = sigma_a + dsigma
@@ -65,10 +59,9 @@ def derived_points(
 def admissible(
     k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
 ) -> bool:
-    """Tell whether the seven parameters are admissible (model: 0 < ε_a < ε_c, -1 < Δσ/σ_a <= 0, …).
+    """Tell whether the seven parameters are admissible (model, section 1).
 
-    The remaining conditions, ε_c < 1 + ε_*, ε̂_c >= ε_c and a loop of non-negative area, follow
-    from these: branch d lies above C2 and branch e below A1.
+    The conditions not asked here follow: branch d lies above C2 and branch e below A1.
     """
     return (
         0.0 < k0 < math.inf

@@ -16,7 +16,6 @@ Stress and strain grow together along any history, so that a branch ends at a st
 stress: the path of a spring is walked from end to end of its branches.
 """
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 import math
@@ -471,10 +470,7 @@ def ever_now(state: Array, rank: float) -> float:
 
 @compiled
 def stress_along(row: Row, eps: Array) -> tuple[Array, Array, Branches]:
-    """Stress, ranks (2, n) and branch of one microscale spring along a strain history, from rest.
-
-    The ranks are those of what has snapped, and of what has ever snapped.
-    """
+    """Stress, ranks of what has and has ever snapped (2, n) and branch along strains, from rest."""
     sigma, rank = np.empty(eps.size), np.empty((2, eps.size))
     branches, state = np.empty(eps.size, np.int64), np.empty(STATE)
     begin(row, state, 0.0)
@@ -529,44 +525,26 @@ def rank_at(
 
 
 @inner
-def under_stress(
+def strain_under(
     row: Row, branch: int, rank: float, ever: float, sigma: float
-) -> tuple[float, float, float, float, float]:
-    """Strain at a stress and its derivatives by stress, w and W; and that of w by the stress.
-
-    On first loading w and W are one: its derivative is that by w. The strain is -inf where the
-    spring cannot carry the tension.
-    """
-    n, never = row[STIFFENING], shares(ever)[1]
+) -> tuple[float, float]:
+    """Strain at a stress and its slope dε/dσ; -inf where the spring cannot carry the tension."""
     p, rest = shares(rank) if branch != A else (0.0, 1.0)
-    strain, soft, _, one, _ = mixture(row, branch, p, rest, never, sigma)
-    if strain == -math.inf or (branch == A and never == 1.0):
-        return strain, soft, 0.0, 0.0, 0.0
-    by_ever, pace = 0.0, 0.0
-    if branch != SNAP and never < 1.0 and row[K_SNAPPED] != row[K0]:
-        by_ever = density(ever) * (one - on_a(n, row[K0], sigma)[0])
-    if branch == A:
-        return strain, soft, 0.0, by_ever, 0.0
-    by_rank = density(rank) * (row[EPS_STAR] + sigma / (row[KC] + sigma) - one)
-    if branch != HELD:
-        pace = 1.0 / (line(row, branch)[1] * sigma)
-    return strain, soft, by_rank, by_ever, pace
+    strain, soft, _, one, _ = mixture(row, branch, p, rest, shares(ever)[1], sigma)
+    if moves(branch):
+        gap = row[EPS_STAR] + sigma / (row[KC] + sigma) - one
+        soft += density(rank) * gap / (line(row, branch)[1] * sigma)
+    return strain, soft
 
 
 @compiled
 def strain_along(row: Row, sigma: Array) -> tuple[Array, Array, Branches]:
-    """Strain, ranks (2, n) and branch of one microscale spring along a stress history, from rest.
-
-    The ranks are those of `stress_along`; the strain is -inf where the spring cannot carry the
-    tension.
-    """
+    """Strain (-inf: no such tension), ranks (2, n) and branch along a stress history, from rest."""
     eps, ranks = np.empty(sigma.size), np.empty((2, sigma.size))
     branches, branch, rank, ever = np.empty(sigma.size, np.int64), A, -math.inf, -math.inf
     for j in range(sigma.size):
         rank, ever, branch = rank_at(row, rank, ever, branch, sigma[j])
-        p, rest = shares(rank)
-        never = shares(ever)[1]
-        eps[j] = mixture(row, branch, p, rest, never, sigma[j])[0]
+        eps[j] = strain_under(row, branch, rank, ever, sigma[j])[0]
         branches[j], ranks[0, j], ranks[1, j] = branch, rank, ever
     return eps, ranks, branches
 
@@ -584,10 +562,10 @@ def carried(row: Row) -> int:
 def strain_tangents(
     row: Row, branch: int, rank: float, ever: float, sigma: float, out: Array
 ) -> tuple[float, float, float, float]:
-    """Fill the derivatives of the strain, at fixed stress and ranks, by all but the snap stresses.
+    """Fill the derivatives of the strain at fixed stress and ranks, of w by the snap stresses.
 
-    At those places stand the derivatives of the rank w at a fixed stress. Returns what
-    `under_stress` does, but for the strain.
+    Returns those of the strain by stress, w and W, and that of w by the stress; on first loading w
+    and W are one.
     """
     k0, two = row[K0], 1.0 / (row[KC] + sigma)
     p, rest, weight = 0.0, 1.0, 0.0
@@ -680,10 +658,7 @@ def tangents(
 def stress_tangents_along(
     row: Row, eps: Array, sigma: Array, ranks: Array, branches: Branches
 ) -> tuple[Array, Array]:
-    """Derivatives of the stress (8 or 11, n) along a strain history, and the slope dσ/dε (n,).
-
-    See `tangents` for what they are by.
-    """
+    """Derivatives of the stress (8 or 11, n) along strains, see `tangents`, and its slope."""
     count = carried(row)
     out, slope = np.empty((count, eps.size)), np.empty(eps.size)
     now, d_ranks = np.empty(CARRIED), np.zeros((2, CARRIED))

@@ -33,13 +33,8 @@ MOST_TERMS, MOST_SPRINGS = 10, 20
 class Model:
     """Springs from the base up and the flat vector of their parameters.
 
-    Parameters
-    ----------
-    kinds : tuple of str
-        The law of each spring: "bistable", "microscale", "linear", "unilateral" (linear without
-        tension), or one that is registered.
-    relaxation : int
-        Number of relaxation terms of every hysteretic spring.
+    `kinds` names the law of each spring; `relaxation` is the number of relaxation terms of every
+    hysteretic one.
     """
 
     kinds: tuple[str, ...]
@@ -76,13 +71,7 @@ class Model:
 
     @classmethod
     def of_result(cls, content: Mapping[str, Any]) -> Model:
-        """Model of a result (fit.json, joint.json).
-
-        Raises
-        ------
-        InputError
-            If it says no known model.
-        """
+        """Model of a result (fit.json, joint.json); refuses (InputError) what is no known model."""
         options = {name: content.get(name) is True for name in laws.OPTIONS}
         return cls.parse(with_options(content["model"], **options), content.get("relaxation", 0))
 
@@ -172,13 +161,7 @@ class Model:
         return values[-1 - count : -1] if count > 1 else np.array([total])
 
     def springs(self, values: Array) -> tuple[Spring, ...]:
-        """Springs of a flat vector of parameters.
-
-        Raises
-        ------
-        ValueError
-            If one is not admissible; the message names the parameter.
-        """
+        """Springs of a flat vector; one that is not admissible is refused by name (ValueError)."""
         springs = []
         for i, law in enumerate(self.laws):
             own = self.own(i, values)
@@ -200,17 +183,8 @@ class Model:
 def with_options(model: str, **options: bool) -> str:
     """Name of a model in which options free more parameters of the springs that have them.
 
-    Parameters
-    ----------
-    model
-        The name without options, or "auto".
-    options
-        Those of `laws.OPTIONS`, true where asked for.
-
-    Raises
-    ------
-    InputError
-        If no spring of the model has the parameters of an option.
+    `model` is the name without options, or "auto"; `options` are those of `laws.OPTIONS`, true
+    where asked for. An option whose parameters no spring of the model has is refused (InputError).
     """
     if unknown := [name for name in options if name not in laws.OPTIONS]:
         raise TypeError(f"unexpected option {unknown[0]!r}; there are {', '.join(laws.OPTIONS)}")
@@ -236,15 +210,9 @@ def exchanges(model: Model, values: Array) -> Iterator[Array]:
     """Give the chains in which two springs of one kind have exchanged some properties.
 
     A chain under a common stress shows the sum of its springs' elongations, so properties are put
-    as stresses and as elongations between them (`Law.exchanged`): with each exchange the springs
-    snap at the same stresses and the rest of the loop moves as little as it can.
-
-    Parameters
-    ----------
-    model
-        The springs.
-    values
-        Vector of parameters, (n,) SI; nuisance parameters behind those of the springs stay.
+    as stresses and elongations (`Law.exchanged`): the springs snap at the same stresses, and the
+    rest of the loop moves as little as it can. Nuisance parameters behind those of the springs in
+    `values` (n,) stay.
     """
     index, laws = model.index, model.laws
     for pair in combinations(range(len(laws)), 2):

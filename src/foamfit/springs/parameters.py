@@ -87,14 +87,9 @@ def unit_of(name: str) -> str:
 def direction(
     kinds: tuple[str, ...], name: str, relaxation: tuple[int, ...] = ()
 ) -> tuple[int, int]:
-    """Direction of the derivative by a parameter of springs of these kinds.
+    """Direction of the derivative by a parameter of springs with so many relaxation terms each.
 
-    `relaxation` has the number of relaxation terms of each spring; left out, there are none.
-
-    Raises
-    ------
-    InputError
-        If the springs have no such parameter.
+    A parameter that they do not have is refused (InputError).
     """
     if name == "site_eta":
         return -1, DRAG

@@ -17,34 +17,19 @@ MPA, MM, MG = 1e6, 1e-3, 1e-6
 class PublishedSet:
     """One published model of one specimen, SI.
 
-    Attributes
-    ----------
-    name : str
-        For example "foam-1/model-2".
-    model : str
-        Springs from the base up, for example "linear+bistable".
-    chain : Chain
-        Springs, heights, area; the specimen's mass sits between the springs of a two-spring model;
-        the published damping is the onsite damper of the striker.
-    eta : float or None
-        The published damping coefficient, Pa·s.
-    damping_ratio : float or None
-        The damping ratio that the paper states.
-    specimen_mass, density : float
-        kg and kg/m³.
-    striker_mass, striker_velocity : float
-        kg and m/s.
+    The specimen's mass sits between the springs of a two-spring model; the published damping is the
+    onsite damper of the striker.
     """
 
-    name: str
-    model: str
+    name: str  #: for example "foam-1/model-2"
+    model: str  #: springs from the base up, for example "linear+bistable"
     chain: Chain
-    eta: float | None
-    damping_ratio: float | None
-    specimen_mass: float
-    density: float
-    striker_mass: float
-    striker_velocity: float
+    eta: float | None  #: the published damping coefficient, Pa·s
+    damping_ratio: float | None  #: the damping ratio that the paper states
+    specimen_mass: float  #: kg
+    density: float  #: kg/m³
+    striker_mass: float  #: kg
+    striker_velocity: float  #: m/s
 
     @property
     def bistable(self) -> BistableSpring:

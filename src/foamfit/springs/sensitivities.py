@@ -1,27 +1,15 @@
 """Derivatives of the law by the parameters of a spring, compiled."""
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
 
+from foamfit.springs import kernels
 from foamfit.springs.kernels import (
-    EPS_A,
-    HELD,
-    K0,
-    KC,
-    KIND,
-    OPEN,
-    REMEMBERS,
-    SIGMA_C,
-    SNAP,
-    A,
     Array,
     Branches,
-    D,
-    E,
     Row,
     branch_shape,
     compiled,
@@ -42,36 +30,61 @@ from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 
 @inner
 def branch_derivative(row: Row, branch: int, own: int) -> tuple[float, float, float]:
-    """Derivatives of (k, x0, s0) of a branch of eq. 2 by a spring's own parameter k0 … kh_minus.
-
-    Across an open gap nothing acts, whatever the spring is.
-    """
-    if branch == OPEN:
+    """Derivatives of (k, x0, s0) of a branch of eq. 2 by k0 … kh_minus; none of an open gap."""
+    if branch == kernels.OPEN:
         return 0.0, 0.0, 0.0
-    if row[KIND] != BISTABLE or branch == A:
+    if row[kernels.KIND] != BISTABLE or branch == kernels.A:
         return (1.0 if own == 0 else 0.0), 0.0, 0.0
-    eps_a, v = row[EPS_A], 1.0 - row[EPS_A]
-    d_sigma_a = (eps_a / v if own == 0 else 0.0) + (row[K0] / (v * v) if own == 3 else 0.0)
-    if branch == D:
+    eps_a, v = row[kernels.EPS_A], 1.0 - row[kernels.EPS_A]
+    d_sigma_a = (eps_a / v if own == 0 else 0.0) + (row[kernels.K0] / (v * v) if own == 3 else 0.0)
+    if branch == kernels.D:
         return (1.0 if own == 5 else 0.0), (1.0 if own == 3 else 0.0), d_sigma_a
     d_sigma_c = d_sigma_a + (1.0 if own == 2 else 0.0)
     d_eps_c = 1.0 if own == 4 else 0.0
-    if branch == E:
+    if branch == kernels.E:
         return (1.0 if own == 6 else 0.0), d_eps_c, d_sigma_c
     d_kc = 1.0 if own == 1 else 0.0
-    stiff = row[KC] + row[SIGMA_C]
-    d_eps_star = d_eps_c - (row[KC] * d_sigma_c - row[SIGMA_C] * d_kc) / (stiff * stiff)
+    stiff = row[kernels.KC] + row[kernels.SIGMA_C]
+    d_eps_star = d_eps_c - (row[kernels.KC] * d_sigma_c - row[kernels.SIGMA_C] * d_kc) / (
+        stiff * stiff
+    )
     return d_kc, d_eps_star, 0.0
+
+
+@inner
+def branch_tangents(row: Row, branch: int, eps: float, moved: float, out: Array) -> None:
+    """Fill the derivatives of the stress at a strain by k0 … kh_minus, then by what moves it."""
+    slope = slope_on(row, branch, eps)
+    curved, _, x0, _ = branch_shape(row, branch)
+    x = eps - x0
+    factor = x / (1.0 - x) if curved else x
+    for own in range(OF_STRAIN):
+        dk, dx0, ds0 = branch_derivative(row, branch, own)
+        out[own] = factor * dk - slope * dx0 + ds0
+    out[OF_STRAIN] = slope * moved
+
+
+@compiled
+def stress_tangents_along(row: Row, eps: Array, branches: Branches) -> Array:
+    """Derivatives (8, n) of the stress of a spring without ranks along a strain history.
+
+    They are by k0 … kh_minus, and by the logarithm of the strain.
+    """
+    out, now = np.empty((OF_STRAIN + 1, eps.size)), np.empty(OF_STRAIN + 1)
+    for j in range(eps.size):
+        branch_tangents(row, branches[j], eps[j], eps[j], now)
+        for own in range(now.size):
+            out[own, j] = now[own]
+    return out
 
 
 class _Followed(NamedTuple):
     """Springs at one sample, and what of their derivatives is carried along.
 
-    `slope` (springs,) are dσ/dε, `change` (p, 3) the derivatives of k, x0 and s0 of the branch that
-    the direction's spring is on. Of microscale springs, `ranks` (springs, 2, n) are the ranks of
-    what has snapped, and of what has ever snapped, along the history; `by` (springs, CARRIED) the
-    derivatives of the strain by the parameters, `by_ranks` (springs, 2) by the ranks and `pace`
-    that of the first one by the stress; `d_ranks` (p, springs, 2) the derivatives of the ranks.
+    slope (springs,) is dσ/dε, change (p, 3) the derivatives of k, x0 and s0 of a branch. Of
+    microscale springs: ranks (springs, 2, n), derivatives of the strain `by` parameters (springs,
+    CARRIED) and by_ranks (springs, 2), the `pace` of the first rank with the stress, and d_ranks
+    (p, springs, 2).
     """
 
     slope: Array
@@ -89,7 +102,7 @@ def _followed(rows: Array, sigma: Array, size: int) -> _Followed:
     count, n = rows.shape[0], sigma.size
     ranks = np.zeros((count, 2, n))
     for i in range(count):
-        if rows[i, KIND] == MICROSCALE:
+        if rows[i, kernels.KIND] == MICROSCALE:
             found = strain_along(rows[i], sigma)[1]
             for j in range(n):
                 ranks[i, 0, j], ranks[i, 1, j] = found[0, j], found[1, j]
@@ -106,7 +119,7 @@ def _follow(
 ) -> None:  # fmt: skip
     """Fill what belongs to spring i at sample j."""
     branch = branches[i, j]
-    if rows[i, KIND] == MICROSCALE:
+    if rows[i, kernels.KIND] == MICROSCALE:
         w, ever = at.ranks[i, 0, j], at.ranks[i, 1, j]
         soft, by_rank, by_ever, pace = strain_tangents(rows[i], branch, w, ever, sigma, at.by[i])
         at.by_ranks[i, 0], at.by_ranks[i, 1], at.pace[i] = by_rank, by_ever, pace
@@ -131,11 +144,10 @@ def _moves_line(own: int) -> bool:
 def _mixture_tangent(at: _Followed, p: int, i: int, branch: int, own: int, held: bool) -> float:
     """Derivative of a microscale spring's strain at a fixed stress by a parameter of its own.
 
-    `own` is -1 where the parameter is another spring's; `held` says that all that ever snapped is
-    held.
+    `own` is -1 for another spring's; `held` says that all that ever snapped is held.
     """
     d_rank, d_ever = at.d_ranks[p, i, 0], at.d_ranks[p, i, 1]
-    if branch == HELD:  # what is held moves with the stress where it turned
+    if branch == kernels.HELD:  # what is held moves with the stress where it turned
         d_rank = d_ever if held else d_rank
     else:
         d_rank = at.by[i, own] if _moves_line(own) else 0.0
@@ -148,9 +160,9 @@ def _mixture_tangent(at: _Followed, p: int, i: int, branch: int, own: int, held:
 def _rank_tangents(at: _Followed, p: int, branches: Branches, common: float) -> None:
     """Let the ranks that move do so with the common stress."""
     for i in range(branches.size):
-        if branches[i] != HELD:
+        if branches[i] != kernels.HELD:
             at.d_ranks[p, i, 0] += at.pace[i] * common
-        if branches[i] == SNAP:
+        if branches[i] == kernels.SNAP:
             at.d_ranks[p, i, 1] = at.d_ranks[p, i, 0]
 
 
@@ -166,24 +178,10 @@ def equilibrium_tangents(
 ) -> tuple[Array, Array]:
     """Derivatives along a history of springs in series, undamped and massless.
 
-    Parameters
-    ----------
-    rows, heights : arrays
-        The springs.
-    sigma : (n,) array
-        Their common stress, Pa.
-    eps, branches : (springs, n) arrays
-        Their strains and branches.
-    moved_top : bool
-        Whether the displacement of the top is prescribed, or else the stress.
-    directions : (p, 2) array
-        See `parameters`.
-
-    Returns
-    -------
-    tuple of arrays
-        Derivatives of the displacements above the springs (p, springs, n), m, and of the common
-        stress (p, n), Pa, per unit of the parameters.
+    Given are their common stress `sigma` (n,), strains and branches (springs, n), and whether the
+    motion of the top is prescribed, or else the stress. Returned are the derivatives in p
+    directions (see `parameters`) of the displacements above the springs (p, springs, n), m, and of
+    the common stress (p, n), Pa.
     """
     (count, n), size = eps.shape, directions.shape[0]
     out_w, out_s = np.empty((size, count, n)), np.empty((size, n))
@@ -204,8 +202,10 @@ def equilibrium_tangents(
             for i in range(count):
                 longer[i] = 0.0
                 mine = own if i == spring and own < OWN_ETA else -1
-                if rows[i, KIND] == MICROSCALE:
-                    held = at.ranks[i, 0, j] == at.ranks[i, 1, j] and rows[i, REMEMBERS] > 0.0
+                if rows[i, kernels.KIND] == MICROSCALE:
+                    held = (
+                        at.ranks[i, 0, j] == at.ranks[i, 1, j] and rows[i, kernels.REMEMBERS] > 0.0
+                    )
                     moved = _mixture_tangent(at, p, i, branches[i, j], mine, held)
                     longer[i] = heights[i] * moved
                 elif mine >= 0:

@@ -23,25 +23,13 @@ Relaxation = Sequence[tuple[float, float]]  # frozen to a tuple of tuples
 
 
 def require(holds: bool, name: str, value: float, wanted: str) -> None:
-    """Refuse a value by the name of its parameter.
-
-    Raises
-    ------
-    InputError
-        If the condition does not hold.
-    """
+    """Refuse a value by the name of its parameter (InputError) unless a condition holds."""
     if not holds:
         raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
 
 
 def as_number(value: object, name: str) -> float:
-    """Return a value as a float, finite or not.
-
-    Raises
-    ------
-    ValueError
-        If it is no real number; the message names it.
-    """
+    """Return a real number as a float, finite or not; refuse anything else by name."""
     try:
         if not isinstance(value, str | bytes):
             return float(value)  # type: ignore[arg-type]
@@ -51,13 +39,7 @@ def as_number(value: object, name: str) -> float:
 
 
 def as_samples(values: ArrayLike, name: str) -> Array:
-    """Return values as a new array of floats, contiguous and writable.
-
-    Raises
-    ------
-    ValueError
-        If they are no real numbers; the message names them.
-    """
+    """Return real numbers as a new array of floats, contiguous and writable."""
     try:
         if np.asarray(values).dtype.kind in "biuf":
             return np.array(values, dtype=np.float64, order="C")
@@ -155,11 +137,12 @@ class Spring(ABC):
         """Fraction of micro-springs that has snapped along a stress history (Pa), if it has any."""
         return None
 
-    def stress(self, strain: ArrayLike) -> Array:
-        """Stress (Pa) along a strain history, shape (n,), from rest.
+    def snapped_along(self, strain: ArrayLike) -> Array | None:
+        """Fraction that has snapped along a strain history, (n,); None where the law has none."""
+        return None
 
-        What the spring remembers is carried along the history (eqs. 2 and 3). A single strain gives
-        a single stress.
+    def stress(self, strain: ArrayLike) -> Array:
+        """Stress (Pa) along a strain history (n,), or at one strain, from rest (eqs. 2 and 3).
 
         Raises
         ------
@@ -176,8 +159,7 @@ class Spring(ABC):
         Raises
         ------
         SimulationError
-            If the spring cannot carry a tension: beyond the pole of branch a (-k0), or any on a
-            unilateral spring.
+            If the spring cannot carry a tension: -k0 on branch a, or any on a unilateral spring.
         """
         history = _as_history(stress, "stress")
         strain = self._strain_along(history)
@@ -292,10 +274,9 @@ class LawSpring(Spring):
 
     def _slope_along(self, strain: Array) -> Array:
         step = 1e-6 * max(float(np.max(np.abs(strain))), 1e-9)
-        ends = [self._next_stress(strain, side) for side in (-step, step)]
-        return np.asarray((ends[1] - ends[0]) / (2.0 * step))
-
-    def _next_stress(self, strain: Array, step: float) -> Array:
-        """Stress after each sample of a history and a small step of the strain beyond it."""
-        paths = (np.append(strain[: j + 1], strain[j] + step) for j in range(strain.size))
-        return np.array([self._stress_along(path)[0][-1] for path in paths])
+        beside = [  # stresses after a small step back and on, from each sample of the history
+            [self._stress_along(np.append(strain[:j], strain[j - 1] + by))[0][-1] for by in steps]
+            for j in range(1, strain.size + 1)
+            for steps in ((-step, step),)
+        ]
+        return np.asarray(np.diff(beside, axis=1)[:, 0] / (2.0 * step))

@@ -5,15 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    wait,
-)
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent import futures
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -24,14 +18,14 @@ from foamfit.data.toml_file import motion_file, toml_beside
 from foamfit.errors import InputError
 from foamfit.files import is_left, read_whole, reason, sweep
 from foamfit.fitting import nuisance
+from foamfit.fitting.problem import check_fixed_and_varied
 from foamfit.one_model import Keywords, Options
 from foamfit.report.figures import TWO, inches
-from foamfit.report.folder import BATCH_FILES, MARKS, check_target, is_written
+from foamfit.report.folder import FILES, check_target, is_written
 from foamfit.report.studies import batch as tables
 from foamfit.report.studies.batch import Row
 from foamfit.results import law_in_words
 from foamfit.solve import cache, precompile
-from foamfit.springs import laws
 from foamfit.springs.model import Model, with_options
 from foamfit.study.batch_work import (
     Outcome,
@@ -52,32 +46,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _LOG = logging.getLogger(__name__)
-# What is given to an executor ahead of what it has done: tests, and bytes of their files.
+# Most tests, and most bytes of their files, that wait in an executor.
 MOST_AHEAD, MOST_BYTES = 1000, 2**28
-# Seconds between two summaries, and how much longer than both its files take to write.
+# Least time between two summaries: in seconds, and over the time that writing one takes.
 PAUSE, SHARE = 5.0, 50.0
 Tests = str | Path | Iterable[str | Path]
 Cycles = int | Sequence[int] | Literal["all"] | None
-
-
-class BatchKeywords(Keywords, total=False):
-    """The options of a fit, and parameters that it holds or varies."""
-
-    fix: Mapping[str, float] | None
-    vary: Sequence[str]
-
-
-@dataclass(frozen=True)
-class State:
-    """How far a batch is: tests done in all, of these without a fit, left, and fitted now."""
-
-    done: int
-    wrong: int
-    left: int
-    fitted: int
-
-
-Progress = Callable[[State], None]
 
 
 @dataclass
@@ -90,12 +64,11 @@ class Batch:
     toml: Path | None = None  # for all; else the one beside each
     foreign: bool = False  # whether the executor's machines may have other files
     fresh: bool = False
-    progress: Progress = lambda _: None
+    progress: Callable[[Batch], None] = lambda _: None
     rows: dict[str, tuple[Row, ...]] = field(default_factory=dict)  # by the name of the test
-    waiting: dict[Future[Outcome], tuple[str, Path, int]] = field(default_factory=dict)
-    ahead: int = 0  # bytes that wait
-    fitted: int = 0
-    wrong: int = 0
+    waiting: dict[Future[Outcome], Task] = field(default_factory=dict)
+    fitted: int = 0  # now
+    wrong: int = 0  # of all that are done, without a fit
     saved: float = field(default_factory=lambda: time.monotonic())  # when the summary was written
     took: float = 0.0  # to write it, s
 
@@ -117,9 +90,9 @@ class Batch:
         """Write summary.csv and summary.html; as a `whole` also parameters side by side."""
         rows = self.summary
         tables.write_summary(rows, self.out)
-        options = self.recipe.options
-        model = with_options(self.recipe.model, **{o: bool(options.get(o)) for o in laws.OPTIONS})
-        law = law_in_words(model, options.get("relaxation", 0))
+        options = Options(**self.recipe.options)
+        model = with_options(self.recipe.model, **options.of_springs)
+        law = law_in_words(model, options.relaxation)
         title, picture = f"{self.out.resolve().name}: {law}", None
         if whole:
             pictures, width = self.recipe.pages, self.recipe.width
@@ -131,20 +104,30 @@ class Batch:
         try:
             for i, (name, path) in enumerate(self.tests):
                 self._begin(executor, name, path)
-                while len(self.waiting) >= MOST_AHEAD or self.ahead >= MOST_BYTES:
+                while len(self.waiting) >= MOST_AHEAD or self._bytes_ahead >= MOST_BYTES:
                     self._collect(1.0)
                 self._collect(0.0)
                 while i == 0 and not self.foreign and self._is_cold() and self.waiting:
                     self._collect(1.0)  # one compiles, for all
             while self.waiting:
                 self._collect(1.0)
-        except BaseException:
+        except BaseException as error:
             for future in self.waiting:
                 future.cancel()
             with without_ctrl_c(), suppress(InputError):
                 self.save()
-            raise
+            told = " ".join(str(error).split())
+            if isinstance(error, futures.BrokenExecutor | futures.CancelledError):
+                told = f"the executor has ended: {told or 'it has given up the tests'}"
+            elif not isinstance(error, InputError):
+                raise
+            done = f"{len(self.rows)} of {counted(len(self.tests), 'test')} are done and stay"
+            raise InputError(f"{told}; {done}, call again for the others") from error
         self.save(whole=True)
+
+    @property
+    def _bytes_ahead(self) -> int:
+        return sum(task.size for task in self.waiting.values())
 
     def _is_cold(self) -> bool:
         """Whether the first fit compiles what the others need too."""
@@ -160,7 +143,7 @@ class Batch:
         try:
             data, settings, camera = read_whole(path), _bytes(toml), motion_file(toml)
             motion = None if camera is None else _bytes(camera)
-        except OSError:  # who reads the test says it better
+        except OSError:  # reading the test gives a better message
             data, settings, motion = b"", None, None
         mark = fingerprint(self.key, data, settings, motion)
         known = None if self.fresh else stored(folder, mark, self.recipe)
@@ -171,47 +154,36 @@ class Batch:
         out = None if self.foreign else folder.absolute()
         task = Task(name, path, toml, self.recipe, mark, out, content)
         try:
-            future = executor.submit(work, task)
-        except (BrokenExecutor, RuntimeError) as error:
-            raise self._ended(error) from error
-        size = len(data) + len(motion or b"") if content else 0
-        self.ahead += size
-        self.waiting[future] = (name, path, size)
+            self.waiting[executor.submit(work, task)] = task
+        except RuntimeError as error:  # it was shut down
+            raise futures.BrokenExecutor(str(error)) from error
 
     def _collect(self, seconds: float) -> None:
         """Take the fits that are done, waiting for one so long."""
-        done, _ = wait(self.waiting, seconds, FIRST_COMPLETED) if self.waiting else ((), ())
+        done, _ = futures.wait(self.waiting, seconds, futures.FIRST_COMPLETED)
         for future in [one for one in self.waiting if one in done]:
             self._take(future)
         self._save_sometimes()
 
     def _take(self, future: Future[Outcome]) -> None:
-        name, path, size = self.waiting.pop(future)
-        self.ahead -= size
+        task = self.waiting.pop(future)
         try:
-            outcome = future.result()
-        except (BrokenExecutor, CancelledError) as error:
-            raise self._ended(error) from error
+            rows, files = future.result()
+            if files is not None:
+                put(files, self.out / task.name)
+        except (futures.BrokenExecutor, futures.CancelledError, InputError):  # not written
+            raise
         except Exception as error:
-            self._keep(name, (Row(name, str(path), tables.REFUSED, _lost(error)),))
+            self._keep(task.name, (Row(task.name, str(task.path), tables.REFUSED, _lost(error)),))
             return
-        unwritten = outcome.unwritten
-        if unwritten is None and outcome.files is not None:
-            try:
-                put(outcome.files, self.out / name)
-            except InputError as error:
-                unwritten = str(error)
-        if unwritten is not None:
-            raise InputError(f"{unwritten}; {self._done_words()}")
         self.fitted += 1
-        self._keep(name, outcome.rows)
+        self._keep(task.name, rows)
         self._save_sometimes()
 
     def _keep(self, name: str, rows: tuple[Row, ...]) -> None:
         self.rows[name] = rows
         self.wrong += not all(row.has_fit for row in rows)
-        done = len(self.rows)
-        self.progress(State(done, self.wrong, len(self.tests) - done, self.fitted))
+        self.progress(self)
 
     def _save_sometimes(self) -> None:
         """Write the summary from time to time: what is killed leaves it as it was then."""
@@ -221,14 +193,6 @@ class Batch:
         self.save()
         self.saved = time.monotonic()
         self.took = self.saved - began
-
-    def _ended(self, error: BaseException) -> InputError:
-        told = " ".join(str(error).split()) or "it has given up the tests"
-        return InputError(f"the executor has ended: {told}; {self._done_words()}")
-
-    def _done_words(self) -> str:
-        done, count = len(self.rows), counted(len(self.tests), "test")
-        return f"{done} of {count} are done and stay, call again for the others"
 
 
 def batch(
@@ -244,8 +208,8 @@ def batch(
     cycles: tuple[int, int] | None = None,
     report: bool = True,
     figure_width: str = TWO,
-    progress: Progress | None = None,
-    **options: Unpack[BatchKeywords],
+    progress: Callable[[Batch], None] | None = None,
+    **options: Unpack[Keywords],
 ) -> pd.DataFrame:
     """Fit every test on its own, in parallel; a result folder for each and one summary.
 
@@ -260,7 +224,7 @@ def batch(
     out : str or Path, optional
         The folder; by default ``fits/batch/<model>``. It holds ``<test>/`` for each test, the
         result folder of its fit, ``summary.csv`` and ``summary.html``.
-    model : str
+    model, options
         As for `foamfit.fit`.
     executor : concurrent.futures.Executor, optional
         What runs the fits, as a Dask client's ``get_executor()``; tests go there and results come
@@ -283,10 +247,7 @@ def batch(
         "one" or "two" columns, or a length such as "85 mm". A test whose figures have another
         width is fitted again, as its curves are not kept.
     progress : callable, optional
-        Told the `State` after each test.
-    options
-        As for `foamfit.fit`; and ``fix``, parameters to hold at a value (SI), and ``vary``, names
-        of parameters to vary though they are held by default.
+        Given the `Batch` after each test: `rows`, `tests`, `wrong` and `fitted` say how far it is.
 
     Returns
     -------
@@ -298,15 +259,12 @@ def batch(
     InputError
         If the call is wrong, or a result cannot be written, as to a full disk.
     """
-    fix, vary = options.pop("fix", None), tuple(options.pop("vary", ()))
     each = () if cycle == "all" else cycle
     if each is not None and not isinstance(each, int):
         each = tuple(int(number) for number in each)
-    if each is not None and cycles is not None:
-        raise InputError("give either cycle or cycles, not both")
     found = run(
         tests,
-        Recipe(model, options, each, fix, vary, report, figure_width, history=cycles),
+        Recipe(model, options, each, report, figure_width, history=cycles),
         out=out,
         executor=executor,
         jobs=jobs,
@@ -326,16 +284,14 @@ def run(
     jobs: int | None = None,
     fresh: bool = False,
     specimen: str | Path | None = None,
-    progress: Progress | None = None,
-    **options: Unpack[Keywords],
+    progress: Callable[[Batch], None] | None = None,
 ) -> Batch:
-    """Do what `batch` says, and return all that is known of it.
-
-    The options of the fits are those of the recipe, or given here.
-    """
-    chosen = Options.of("batch", {**recipe.options, **options})
-    recipe = replace(recipe, model=_checked(recipe, chosen), options=vars(chosen))
+    """Do what `batch` says, and return all that is known of it."""
+    options = Options.of("batch", recipe.options)
+    recipe = replace(recipe, model=_checked(recipe.model, options), options=vars(options))
     check_jobs(jobs)
+    if recipe.cycles is not None and recipe.history is not None:
+        raise InputError("give either cycle or cycles, not both")
     if jobs is not None and executor is not None:
         raise InputError("jobs and an executor exclude each other; leave one of them out")
     inches(recipe.width)  # refuses what is no width
@@ -343,12 +299,12 @@ def run(
     if toml is not None and not toml.is_file():
         raise InputError(f"{toml}: no such file; name the TOML of the specimen of all tests")
     folder = Path("fits", "batch", recipe.model) if out is None else Path(out)
-    found, tell = find_tests(tests), progress or (lambda _: None)
-    made = Batch(folder, recipe, found, toml, executor is not None, fresh, tell)
-    check_out(folder)
+    tell = progress or (lambda _: None)
+    made = Batch(folder, recipe, find_tests(tests), toml, executor is not None, fresh, tell)
+    _check_out(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        sweep(folder.resolve(), [*(name for name, _ in made.tests), *BATCH_FILES])
+        sweep(folder.resolve(), [*(name for name, _ in made.tests), *FILES["batch.json"]])
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {reason(error)}") from None
     with _executor(executor, jobs, made) as runner:
@@ -356,33 +312,19 @@ def run(
     return made
 
 
-def _checked(recipe: Recipe, options: Options) -> str:
+def _checked(model: str, options: Options) -> str:
     """Return the model's name; refuse what no test could be fitted with."""
-    if recipe.model.strip() == "auto":
-        if recipe.fix or recipe.vary:
-            raise InputError("fix and vary belong to one model; name it instead of 'auto'")
-        if options.relaxation:
-            raise InputError(
-                f"relaxation = {options.relaxation} belongs to one model; name it instead of "
-                "'auto', which tries relaxation by itself"
-            )
+    if model.strip() == "auto":
+        options.check_auto()
         return "auto"
-    asked = {name: getattr(options, name) for name in laws.OPTIONS}
-    model = Model.parse(with_options(recipe.model, **asked), options.relaxation)
+    read = Model.parse(with_options(model, **options.of_springs), options.relaxation)
     drive = options.drive or "impact"  # which has them all; each test checks its own
-    names = (*model.names, *nuisance.names_of(drive, time_shift=True))
-    for name in (*(recipe.fix or ()), *recipe.vary):
-        if name not in names:
-            raise InputError(
-                f"parameter '{name}' is not one of the model {model.name}; "
-                f"its parameters are {', '.join(names)}"
-            )
-        if name in (recipe.fix or ()) and name in recipe.vary:
-            raise InputError(f"parameter '{name}' cannot be both fixed and varied; choose one")
-    return model.name
+    names = (*read.names, *nuisance.names_of(drive, time_shift=True))
+    check_fixed_and_varied(names, read.name, options.fix or {}, options.vary)
+    return read.name
 
 
-def check_out(out: Path) -> None:
+def _check_out(out: Path) -> None:
     """Raise InputError unless a folder is free, or holds nothing but what foamfit wrote."""
     if not out.is_dir():
         check_target(out)
@@ -390,12 +332,12 @@ def check_out(out: Path) -> None:
     try:
         for path in sorted(out.iterdir()):
             name = path.name
-            if is_left(name) or (name in BATCH_FILES and path.is_file()):
+            if is_left(name) or (name in FILES["batch.json"] and path.is_file()):
                 continue
             if path.is_dir() and not path.is_symlink():
                 inside = list(path.iterdir())
                 foreign = [inner.name for inner in inside if not is_written(inner)]
-                if not inside or (not foreign and any(one.name in MARKS for one in inside)):
+                if not inside or (not foreign and any(one.name in FILES for one in inside)):
                     continue
                 name = "/".join([name, *foreign[:1]])
             raise InputError(

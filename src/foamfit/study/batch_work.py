@@ -15,19 +15,14 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
-
-import lmfit
 
 from foamfit.api import fit
 from foamfit.codec import build, encode
 from foamfit.data.csv_file import read_test
-from foamfit.data.measurement import Measurement
 from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError, SimulationError
-from foamfit.files import scratch
-from foamfit.fitting.curves import check_time_shift, choose_drive
-from foamfit.fitting.problem import fix_and_vary, make_params
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
 from foamfit.report.studies.batch import REFUSED, Row, row_of
@@ -52,26 +47,10 @@ class Recipe:
     model: str
     options: Mapping[str, Any]
     cycles: int | tuple[int, ...] | None = None
-    fix: Mapping[str, float] | None = None
-    vary: tuple[str, ...] = ()
     pages: bool = True
     width: str = TWO  # of the figures
     laws: Mapping[str, str] = field(default_factory=laws.texts)  # texts of the user's law files
     history: tuple[int, int] | None = None  # first and last of several cycles fitted as one
-
-    def params(self, test: Measurement) -> lmfit.Parameters | None:
-        """The parameters of a test, as `fix` and `vary` want them; None for what fit chooses."""
-        shift = bool(self.options.get("time_shift", False))
-        drive = self.options.get("drive")
-        if shift:
-            check_time_shift(test, drive or choose_drive(test))
-        if self.model == "auto" or not (self.fix or self.vary):
-            return None
-        more: dict[str, Any] = {
-            name: self.options.get(name) or 0 for name in ("relaxation", *laws.OPTIONS)
-        }
-        params = make_params(test, self.model, drive, time_shift=shift, **more)
-        return fix_and_vary(params, self.model, self.fix or {}, self.vary)
 
 
 @dataclass(frozen=True)
@@ -92,24 +71,18 @@ class Task:
     content: tuple[bytes, bytes | None, bytes | None] | None = None
     version: str = field(default_factory=lambda: version("foamfit"))
 
+    @property
+    def size(self) -> int:
+        """Bytes of the content."""
+        return sum(len(one) for one in self.content or () if one)
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a test: its rows, and its files if they were to come back.
 
-    `unwritten` says why the result could not be written; then it is lost.
-    """
-
-    rows: tuple[Row, ...]
-    files: Mapping[str, bytes] | None = None
-    unwritten: str | None = None
+# What became of a test: its rows, and its files if they were to come back.
+Outcome = tuple[tuple[Row, ...], Mapping[str, bytes] | None]
 
 
 def settings_key(recipe: Recipe) -> str:
-    """What a result is made by: settings and version, not whether there is a page of it.
-
-    Nor how wide its figures are; see `stored`.
-    """
+    """What a result is made by: settings and version; of figures and pages `stored` takes care."""
     parts = asdict(replace(recipe, pages=True)) | {"foamfit": version("foamfit")}
     del parts["width"]
     texts = parts.pop("laws")
@@ -143,7 +116,10 @@ def stored(folder: Path, wanted: str, recipe: Recipe) -> tuple[Row, ...] | None:
 
 
 def work(task: Task) -> Outcome:
-    """Fit one test and write its folder whole; raises nothing that the test could be blamed for."""
+    """Fit one test and write its folder whole; raises nothing that the test could be blamed for.
+
+    InputError says why the result could not be written.
+    """
     if task.version != (own := version("foamfit")):
         raise RuntimeError(
             f"{platform.node()} has foamfit {own}, the call came from {task.version}"
@@ -168,14 +144,14 @@ def work(task: Task) -> Outcome:
         try:
             if task.out is not None:
                 save_whole(task.out, fill, swept=True)
-                return Outcome(rows)
-            with scratch() as folder:
-                fill(folder)
+                return rows, None
+            with TemporaryDirectory() as place:
+                fill(folder := Path(place))
                 found = (path for path in sorted(folder.rglob("*")) if path.is_file())
                 files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in found}
-            return Outcome(rows, files)
-        except (InputError, OSError) as error:
-            return Outcome(rows, unwritten=str(error))
+            return rows, files
+        except OSError as error:
+            raise InputError(str(error)) from None
 
 
 def put(files: Mapping[str, bytes], out: Path) -> None:
@@ -212,10 +188,10 @@ def _results(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write
     pictures: dict[str, Any] = {"pages": recipe.pages, "width": recipe.width}
     if not isinstance(recipe.cycles, tuple):
         test = read_test(path, toml, recipe.cycles, cycles=recipe.history)
-        result = fit(test, model=recipe.model, params=recipe.params(test), **recipe.options)
+        result = fit(test, model=recipe.model, **recipe.options)
         return (row_of(task.name, file, result),), partial(write_result, result, **pictures)
-    options = {"model": recipe.model, "params": recipe.params, **recipe.options}
-    found = fit_cycles(path, toml, cycles=recipe.cycles or None, **options)
+    wanted = recipe.cycles or None
+    found = fit_cycles(path, toml, cycles=wanted, model=recipe.model, **recipe.options)
     rows = list[Row]()
     for number in sorted({*found.results, *found.refused}):
         name = f"{task.name}/cycle-{number}"
@@ -233,7 +209,8 @@ def _inputs(task: Task) -> Iterator[tuple[Path, Path]]:
         yield task.path, task.toml
         return
     data, toml, motion = task.content
-    with scratch() as folder:
+    with TemporaryDirectory() as place:
+        folder = Path(place).resolve()
         path, settings = folder / task.path.name, folder / task.toml.name
         path.write_bytes(data)
         if toml is not None:

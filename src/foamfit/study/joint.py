@@ -16,21 +16,23 @@ from foamfit.arrays import Array, single_threaded
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate, rate_error
-from foamfit.errors import InputError, SimulationError
+from foamfit.errors import InputError, SimulationError, naming
 from foamfit.fitting.links import KINDS, RATES, Links
-from foamfit.fitting.problem import Problem, make_params
+from foamfit.fitting.problem import Problem, fix_and_vary, make_params
 from foamfit.fitting.search import Tracker, descend
 from foamfit.fitting.together import Together
 from foamfit.one_model import Options, Progress, identify, weigh_motion
-from foamfit.report.figures import TWO, inches
-from foamfit.report.folder import check_target, try_target
-from foamfit.report.shown import Joint, JointViews
-from foamfit.report.studies.joint import save_joint
+from foamfit.report.folder import try_target
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
-from foamfit.study.joint_estimates import common_covariance, parameters_of, with_words
 from foamfit.study.joint_fit import Map, fit_jointly
-from foamfit.study.joint_result import JointData
+from foamfit.study.joint_result import (
+    FEW_FOLDERS,
+    JointResult,
+    common_covariance,
+    parameters_of,
+    with_words,
+)
 from foamfit.study.processes import begin, workers
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
@@ -39,9 +41,7 @@ from foamfit.text import counted
 SEARCHED = 3
 # Up to so many tests are fitted in this process: most take less than a tenth of a second each.
 FEW = 100
-# Up to so many result folders are written in this process: each takes a second or two.
-FEW_FOLDERS = 3
-# Reduced χ² of a test over the largest of those, past which it is searched as well.
+# A test whose reduced χ² is so many times the largest of those is searched as well.
 FAR = 2.0
 # Steps of a descent from what another test has found.
 STEPS = 60
@@ -49,30 +49,6 @@ STEPS = 60
 ONE_FOR_ALL = 2
 # Rates that differ by less than this share are one.
 SAME_RATE = 0.02
-
-
-class JointResult(JointViews, JointData):
-    """Everything that a joint fit found, and how it is written; its fields are `JointData`'s."""
-
-    def save(
-        self: Joint,
-        folder: str | Path,
-        *,
-        jobs: int | None = None,
-        report: bool = True,
-        figure_width: str = TWO,
-    ) -> Path:
-        """Write joint.json, its page, pictures and table.tex, and a result folder per test.
-
-        An older result there is replaced as a whole, at the end. The folders of the tests are made
-        by `jobs` processes (by default one for each core). Without `report` there are tables alone.
-        Figures are "one" or "two" columns wide, or as wide as a length ("85 mm"). Returns the
-        folder.
-        """
-        inches(figure_width)  # refuses what is no width
-        check_target(folder)
-        with workers(jobs, len(self.tests), FEW_FOLDERS) as each:
-            return save_joint(self, folder, each, report=report, width=figure_width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +73,7 @@ def joint(
     report: bool = True,
     progress: Progress | None = None,
 ) -> JointResult:
-    """Fit the tests of a study together.
+    """Fit the tests of a study together; returns a `JointResult`.
 
     Parameters
     ----------
@@ -113,10 +89,6 @@ def joint(
         Of the search; by default that of the study, or 0.
     progress : callable, optional
         Told the fraction done and what is going on.
-
-    Returns
-    -------
-    JointResult
 
     Raises
     ------
@@ -151,11 +123,8 @@ def joint(
             links = joint_fit.choose_kinds(alone.problems, links, auto, starts, alone.n_eff, kinds)
         fit = fit_jointly(alone.problems, links, starts, each=each)
         tell(0.9, "evidence")
-        asked = [
-            name
-            for name in (*fit.found.shared, *fit.found.own)
-            if fit.found.links.kind(name) in RATES or name in auto
-        ]
+        every = (*fit.found.shared, *fit.found.own)
+        asked = [name for name in every if fit.found.links.kind(name) in RATES or name in auto]
         tried = joint_fit.evidence(fit.found, asked, alone.n_eff, kinds, [alone.values])
         result = JointResult(
             study=study,
@@ -220,21 +189,15 @@ def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters
     model = Model.parse(study.model, study.relaxation)
     every = [make_params(test, model, study.drive) for test in tests]
     for name in (*study.kinds, *study.held):
-        where = f"{study.path}: [parameters] {name}"
-        there = [params[name] for params in every if name in params]
+        there = [params[name].vary for params in every if name in params]
         if not there:
-            raise InputError(f"{where} is a parameter of none of these tests; leave it out")
-        tied = [one.expr for one in there if one.expr is not None]
-        if tied:
-            raise InputError(f"{where} follows from others ({tied[0]}); name those instead")
-        if name in study.held:
-            for one in there:
-                one.set(value=study.held[name], vary=False, min=-math.inf, max=math.inf)
-        elif not any(one.vary for one in there):
-            if name.endswith("_height"):
-                raise InputError(f"{where} is given by [specimen] heights; leave one of them out")
-            for one in there:
-                one.set(vary=True)
+            told = f"{name} is a parameter of none of these tests; leave it out"
+            raise InputError(f"{study.path}: [parameters] {told}")
+        fix = {name: study.held[name]} if name in study.held else {}
+        for params in every:
+            if name in params and (fix or not any(there)):
+                with naming(f"{study.path}: [parameters]"):
+                    fix_and_vary(params, study.model, fix, () if fix else (name,))
     return every
 
 
@@ -278,6 +241,7 @@ def _median_rate(rates: Sequence[float | None]) -> float | None:
 
 
 def _several(rates: Sequence[float | None]) -> bool:
+    """Whether there are tests at two rates."""
     known = [rate for rate in rates if rate is not None]
     return len(known) > 1 and max(known) > (1.0 + SAME_RATE) * min(known)
 

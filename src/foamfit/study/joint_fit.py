@@ -32,8 +32,8 @@ from foamfit.trust.scatter import Spread, common_and_spread, correlation
 # Rounds between the best values and the spreads at most, and the change of the logarithm of a
 # spread at which they end.
 ROUNDS, STILL = 12, 0.01
-# Nothing is drawn harder than by a spread of so much of the errors of a single test: with no spread
-# at all the values of the tests would be one, and nothing would say what they are undrawn.
+# Least spread by which tests are drawn, over the errors of a single test: with none the values of
+# all tests would be one, and would not tell what they are undrawn.
 LEAST_SPREAD = 0.3
 # Tests say nothing of a parameter whose logarithm has a larger error than this (a factor of 150).
 SAYS_NOTHING = 5.0
@@ -45,17 +45,12 @@ Vectors = Sequence[Array]  # Parameters of each test
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """Several tests fitted together: the best point, and the spread of what scatters.
-
-    `ranges` are those of shared values, and with ":b" of slopes by rate; see `ranges_of`.
-    `correlation` has the names of what changes from specimen to specimen, and how these parameters
-    vary together (`correlation_of`).
-    """
+    """Several tests fitted together: the best point, and the spread of what scatters."""
 
     point: JointPoint
     spreads: Mapping[str, Spread] = field(default_factory=dict)
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    correlation: tuple[tuple[str, ...], Array] = ((), np.empty((0, 0)))
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # See `ranges_of`
+    correlation: tuple[tuple[str, ...], Array] = ((), np.empty((0, 0)))  # See `correlation_of`
 
     @property
     def found(self) -> Together:
@@ -70,10 +65,7 @@ def fit_jointly(
     *,
     each: Map = map,
 ) -> JointFit:
-    """Fit tests whose parameters are linked as `links` say, and judge the fit.
-
-    Arguments are those of `fitting.together.fit_linked`; `each` maps over tests, as `map` does.
-    """
+    """Fit tests as `fitting.together.fit_linked` does, and judge the fit; `each` is like `map`."""
     found = fit_linked(problems, links, starts)
     errors = errors_of(found, each)
     point, undrawn, spreads = JointPoint(found, errors), dict[str, Array](), dict[str, Spread]()
@@ -160,13 +152,12 @@ def errors_of(found: Together, each: Map = map) -> tuple[tuple[CurveError, ...],
 
 
 def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, float]]:
-    """What the error of the law leaves open of what tests share; empty where all is noise.
+    """What the error of the law leaves open of shared values and (":b") slopes by rate.
 
-    Two things are in it, and the wider end counts. Each specimen draws a shared value its own way:
-    where it would lie (95 %), were it found from as many other specimens, is told by the fits
-    without each test in turn (a jackknife, of at most `GROUPS` groups of tests, with Student's t of
-    one less than their number). And a shared value can be held off its best one while all tests are
-    followed about as well, as for one test (`trust.ranges`).
+    The wider of two: where a value would lie (95 %) were it found from as many other specimens, by
+    fits without each test in turn (a jackknife of at most `GROUPS` groups, with Student's t of one
+    less than their number); and how far a shared value can be held off while all tests are followed
+    about as well (`trust.ranges`). Empty where all is noise.
     """
     if not point.uncertainty.errs:
         return {}
@@ -252,8 +243,7 @@ def evidence(
 ) -> tuple[tuple[Alternative, ...], dict[str, float]]:
     """Evidence for each of these kinds of each of these parameters, the others as they are.
 
-    The fits start at that fit, and at the points `near`. Then the parameters whose slope by rate
-    the tests leave open (`open_slope`), and by how much.
+    Also the parameters whose slope by rate the tests leave open, and by how much (`open_slope`).
     """
     found, wide = list[Alternative](), dict[str, float]()
     for name in names:
@@ -317,9 +307,8 @@ def _kinds_of(
 def open_slope(fit: Together, name: str) -> float:
     """Half of the 95 % interval of a parameter's slope by rate from its own value in each test.
 
-    The slope of the logarithm is of the order of one: so much doubles a value with the rate. The
-    values scatter about a law of rate as the specimens and the errors of the law make them, which
-    is in no error of a fit in which that law holds.
+    The scatter of specimens about a law of rate is in no error of a fit in which that law holds. A
+    slope (of the logarithm) of one doubles a value with the rate.
     """
     there = [name in problem.free() for problem in fit.problems]
     values = np.array(fit.value(name))[there]

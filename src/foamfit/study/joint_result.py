@@ -1,10 +1,11 @@
-"""What a joint fit found: data only, and the content of joint.json."""
+"""What a joint fit found: values, intervals, states, sentences, and the content of joint.json."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -17,89 +18,33 @@ from foamfit.fitting.links import RATES
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.fitting.together import Together
+from foamfit.report import render
+from foamfit.report.figures import TWO, inches
+from foamfit.report.folder import check_target
+from foamfit.report.shown import Joint, JointViews
+from foamfit.report.studies.joint import JointParameter, TestValue, save_joint
 from foamfit.results import SCHEMA, Fit, Loop, ParameterEstimate, loop_of, plain
 from foamfit.springs.model import Model
+from foamfit.springs.parameters import NUISANCE, unit_of
 from foamfit.study.joint_fit import Alternative, JointFit
+from foamfit.study.processes import workers
 from foamfit.study.study_file import Study
-from foamfit.text import counted
+from foamfit.text import counted, listed, percent
+from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.checklist import status_of, warnings_of
+from foamfit.trust.checklist import POOR, UNACCEPTABLE, status_of, warnings_of
 from foamfit.trust.conclude import conclude, noise_of
 
-# Keys of a parameter that only some kinds have.
-_OF_SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
-_OF_RATE = ("b", "b_stderr", "b_ci95", "b_range")
-# Questions to a search of one test.
+# Up to so many result folders are written in this process: each takes a second or two.
+FEW_FOLDERS = 3
+# Questions of the checklist that only the search of one test answers.
 _OF_A_SEARCH = ("ended", "agree")
-
-
-@dataclass(frozen=True)
-class TestValue:
-    """A parameter in one test, SI; None where the test says nothing of it."""
-
-    __test__ = False  # what pytest must not take for a test
-
-    value: float
-    stderr: float | None
-    ci95: tuple[float, float] | None
-    state: str
-    why: str
-
-
-@dataclass(frozen=True)
-class JointParameter:
-    """One parameter of a joint fit, SI.
-
-    `kind` is one of `links.KINDS` or "fixed". `value` is the common one: of a scattering parameter
-    the median specimen's, by a law of rate that at the rate of the median test, of an own one the
-    median over the tests (which has no error). `scatter` is the standard deviation of its logarithm
-    between specimens, `b` the slope of the law of rate. `tests` has its value in each test, unless
-    it is the same in all.
-    """
-
-    kind: str
-    value: float
-    unit: str
-    stderr: float | None = None
-    ci95: tuple[float, float] | None = None
-    state: str | None = None
-    why: str | None = None
-    tests: Mapping[str, TestValue] | None = None
-    scatter: float | None = None
-    scatter_stderr: float | None = None
-    scatter_ci95: tuple[float, float] | None = None
-    b: float | None = None
-    b_stderr: float | None = None
-    b_ci95: tuple[float, float] | None = None
-    # What the error of the law leaves open of it (`joint_fit.ranges_of`); None where all is noise.
-    range: tuple[float, float] | None = None
-    b_range: tuple[float, float] | None = None
-
-    def estimate(self, test: str | None = None) -> ParameterEstimate:
-        """The common value, or that of a test, as the parameter of a fit."""
-        if test is None or self.tests is None:
-            told, span = (self.state or "", self.why or ""), self.range
-            return ParameterEstimate(
-                self.value, self.stderr, self.ci95, self.unit, True, *told, range=span
-            )
-        at = self.tests[test]
-        return ParameterEstimate(at.value, at.stderr, at.ci95, self.unit, True, at.state, at.why)
-
-    def to_json_dict(self) -> dict[str, Any]:
-        """Return its part of joint.json."""
-        gone = ["tests"] if self.tests is None else []
-        gone += [key for key in _OF_SCATTER if self.kind != "scatter"]
-        gone += [key for key in _OF_RATE if self.kind not in RATES]
-        return {key: value for key, value in asdict(self).items() if key not in gone}
 
 
 def fit_of_test(
     problem: Problem, values: Array, parameters: dict[str, ParameterEstimate], note: str, seed: int
 ) -> Fit:
-    """The result of a test: its curves at the joint fit, its parameters as that has them.
-
-    `systematic` is what the ± of this test's own TOML do to a fit of it alone.
-    """
+    """The result of a test in a joint fit; `systematic` is that of a fit of this test alone."""
     problem.put(values)
     made = conclude(BestPoint(problem, values), SearchRecord(seed, 0, time.perf_counter()))
     checklist = tuple(check for check in made.checklist if check.key not in _OF_A_SEARCH)
@@ -118,8 +63,8 @@ def fit_of_test(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class JointData:
+@dataclass(frozen=True, eq=False, repr=False)
+class JointResult(JointViews):
     """Everything that a joint fit found; arrays are in the order of `tests`."""
 
     study: Study
@@ -133,7 +78,6 @@ class JointData:
     evidence: tuple[Alternative, ...]
     alone: Together  # The fits of the tests one by one
     refused: Mapping[str, str]  # File and sentence
-    # Parameters whose slope by rate the tests leave open, and by how much; see `open_slope`.
     open_slopes: Mapping[str, float] = field(default_factory=dict)
     status: str = "ok"
     warnings: tuple[str, ...] = ()
@@ -212,6 +156,26 @@ class JointData:
                 out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
         return out
 
+    def save(
+        self: Joint,
+        folder: str | Path,
+        *,
+        jobs: int | None = None,
+        report: bool = True,
+        figure_width: str = TWO,
+    ) -> Path:
+        """Write joint.json, its page, pictures and table.tex, and a result folder per test.
+
+        An older result there is replaced as a whole, at the end. The folders of the tests are made
+        by `jobs` processes (by default one for each core). Without `report` there are tables alone.
+        Figures are "one" or "two" columns wide, or as wide as a length ("85 mm"). Returns the
+        folder.
+        """
+        inches(figure_width)  # refuses what is no width
+        check_target(folder)
+        with workers(jobs, len(self.tests), FEW_FOLDERS) as each:
+            return save_joint(self, folder, each, report=report, width=figure_width)
+
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of joint.json: SI, plain types, null for what is not there.
 
@@ -232,7 +196,7 @@ class JointData:
             **{name: getattr(self, name) for name in ("status", "warnings", "sentences", "rate0")},
             "tests": {
                 name: {
-                    "file": str(self.files[t]),
+                    "file": self.files[t],
                     "drive": self.problems[t].objective.drive,
                     "rate": self.rates[t],
                     "misfit": found.misfits[t],
@@ -247,8 +211,7 @@ class JointData:
             "parameters": {name: one.to_json_dict() for name, one in self.parameters.items()},
             "covariance": {"names": self.covariance[0], "matrix": self.covariance[1]},
             "specimens": {"names": self.fit.correlation[0], "correlation": self.fit.correlation[1]},
-            "evidence": [asdict(one) for one in self.evidence],
-            **{name: getattr(self, name) for name in ("statistics", "refused", "runtime_s")},
+            **{n: getattr(self, n) for n in ("evidence", "statistics", "refused", "runtime_s")},
         }
         return dict(plain(content))
 
@@ -277,3 +240,197 @@ class JointData:
             "n_vary_alone": self.alone.n_vary,
             "chisqr_alone": self.alone.cost,
         }
+
+
+# Largest logarithm: tests may leave a value open by any number of orders of magnitude.
+LARGEST = 300.0
+# A test with at least this share of χ² is named.
+DOMINANT = 0.5
+
+
+def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
+    """Covariance of the common values and slopes, SI; see `JointResult.to_json_dict`."""
+    point, count = fit.point, len(fit.point.names)
+    scales = np.ones(count)
+    for i, name in enumerate(point.names):
+        if fit.found.links.kind(name) == "scatter":
+            one, before = fit.spreads.get(name), point.of_common(name)[0]
+            scales[i] = math.exp(min(one.mean, LARGEST)) if one else fit.found.common[name][0]
+            scales[i] *= one.stderr / before if one and before > 0.0 else 1.0
+    matrix = point.uncertainty.covariance.matrix[:count, :count]
+    return point.names, matrix * np.outer(scales, scales)
+
+
+def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, JointParameter]:
+    """All parameters of the joint fit, those of the springs first."""
+    problems = fit.found.problems
+    return {
+        name: parameter_of(fit, tests, name)
+        for name in (*problems[0].model.names, *NUISANCE)
+        if any(name in one.index and not one.is_exact(name) for one in problems)
+    }
+
+
+def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParameter:
+    """One parameter of the joint fit."""
+    found, unit, kind = fit.found, unit_of(name), fit.found.links.kind(name)
+    there = [t for t, problem in enumerate(found.problems) if name in problem.free()]
+    each = _values(fit, tests, name)
+    if not there:
+        value = float(np.median([one.value for one in each.values()]))
+        return JointParameter("fixed", value, unit, state="fixed", why="held fixed")
+    if kind == "own":
+        value = float(np.median([each[tests[t]].value for t in there]))
+        why = "one value for each test; this is their median"
+        return JointParameter(kind, value, unit, why=why, tests=each)
+    if kind == "scatter":
+        return _scattering(fit, name, each)
+    (value, *slope), span = found.common[name], fit.ranges.get(name)
+    one = _judged(fit, there[0], name, value, fit.point.of_common(name), span)
+    why = f"one value for {counted(len(there), 'test')}: {one.why}"
+    why = f"at the rate of the median test; {why}" if slope else why
+    joint = JointParameter(kind, value, unit, one.stderr, one.ci95, one.state, why, range=span)
+    if not slope:
+        return joint
+    b, (error, freedom) = slope[0], fit.point.of_common(f"{name}:b")
+    half = covariance.half_width(error, freedom)
+    known = math.isfinite(half)
+    return replace(
+        joint,
+        tests=each,
+        b=b,
+        b_stderr=error if known else None,
+        b_ci95=(b - half, b + half) if known else None,
+        b_range=fit.ranges.get(f"{name}:b"),
+    )
+
+
+def _scattering(fit: JointFit, name: str, tests: dict[str, TestValue]) -> JointParameter:
+    unit, spread, kind = unit_of(name), fit.spreads.get(name), "scatter"
+    if spread is None:
+        why = "too few tests determine it to tell its common value"
+        value = fit.found.common[name][0]
+        return JointParameter(kind, value, unit, state="not determined", why=why, tests=tests)
+    sign = -1.0 if next(iter(tests.values())).value < 0.0 else 1.0
+    value, *ends = (sign * np.exp(np.minimum([spread.mean, *spread.ci95], LARGEST))).tolist()
+    known_to = (min(ends), max(ends))
+    limits = (-math.inf, math.inf)
+    state, why = covariance.state(name, value, covariance.wider(known_to, None), abs(value), limits)
+    known = state != "not determined"
+    return JointParameter(
+        kind,
+        value,
+        unit,
+        abs(value) * spread.stderr if known else None,
+        known_to if known else None,
+        state,
+        f"common value of {counted(spread.count, 'test')}: {why}",
+        tests,
+        spread.tau,
+        spread.tau_stderr,
+        spread.tau_ci95,
+    )
+
+
+def _judged(
+    fit: JointFit,
+    test: int,
+    name: str,
+    value: float,
+    known: tuple[float, float],
+    span: tuple[float, float] | None = None,
+) -> TestValue:
+    """Judge a value by its interval, or by its range if that is wider (`trust.covariance.RULE`)."""
+    problem, (stderr, freedom) = fit.found.problems[test], known
+    limits = fit.point.bests[test].limits(name)
+    size = float(problem.sizes((name,), fit.found.values[test])[0])
+    half = covariance.half_width(stderr, freedom)
+    ends = (value - half, value + half)
+    judged = covariance.state(name, value, covariance.wider(ends, span), size, limits)
+    if not half <= covariance.NOTHING * size:
+        return TestValue(value, None, None, *judged)
+    return TestValue(value, stderr, (max(ends[0], limits[0]), min(ends[1], limits[1])), *judged)
+
+
+def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestValue]:
+    """A parameter in each test that leaves it free or holds it, in the numbers of its file."""
+    out, found = dict[str, TestValue](), fit.found
+    for t, (test, problem) in enumerate(zip(tests, found.problems, strict=True)):
+        if name not in problem.index or problem.is_exact(name):
+            continue
+        value = float(found.values[t][problem.index[name]])
+        branch = fit.point.bests[t].unreached.get(name)
+        if not problem.params[name].vary:
+            one = TestValue(value, None, None, "fixed", "held fixed")
+        elif branch is not None and found.links.kind(name) == "own":
+            why = f"branch {branch} was never reached"
+            one = TestValue(value, None, None, "not determined", why)
+        else:
+            one = _judged(fit, t, name, value, fit.point.of_test(t, name))
+        zero = problem.measurement.origins.get(name, 0.0)
+        ends = one.ci95 and (one.ci95[0] + zero, one.ci95[1] + zero)
+        out[test] = replace(one, value=value + zero, ci95=ends)
+    return out
+
+
+def with_words(result: JointResult) -> JointResult:
+    """Give a joint fit its status, warnings and sentences."""
+    lost, large = dict[str, None](), list[str]()
+    for t, (test, problem) in enumerate(zip(result.tests, result.problems, strict=True)):
+        for curve in problem.objective.counted:
+            off, measured = result.fit.found.misfits[t][curve], problem.objective.measured[curve]
+            if off is None or not off <= UNACCEPTABLE * np.std(measured) / np.ptp(measured):
+                lost[test] = None
+            elif off > POOR:
+                large.append(f"{test} ({curve} {percent(off)})")
+    share, top = max(zip(result.shares, result.tests, strict=True))
+    evidence = list[tuple[str, str, str, float]]()  # the best kind, its own, how much lower BIC is
+    for name, tried in result.tried.items():
+        mine, best = next(o for o in tried if o.chosen), min(tried, key=lambda one: one.bic)
+        evidence.append((name, best.kind, mine.kind, mine.bic - best.bic))
+    known = [rate for rate in result.rates if rate is not None]
+    shown = {
+        "parameters": list(result.parameters.items()),
+        "laws": RATES,
+        "rates": f"{min(known):.3g} to {max(known):.3g} 1/s" if known else "",
+        "slopes": [
+            (name, result.parameters[name].kind, half) for name, half in result.open_slopes.items()
+        ],
+    }
+    warnings = render.sentences(
+        "joint_warnings",
+        refused=[(Path(file).name, why.rstrip(".")) for file, why in result.refused.items()],
+        lost=list(lost),
+        large=large,
+        top=(top, share) if len(result.tests) > 3 and share > DOMINANT else None,
+        gap=result.bic - result.alone.bic(result.alone.n_eff),
+        together=span_of(result.fit.found.misfits),
+        alone=span_of(result.alone.misfits),
+        evidence=evidence,
+        **shown,
+    )
+    kinds = dict[str, list[str]]()
+    for name, one in result.parameters.items():
+        kinds.setdefault(one.kind, []).append(name)
+    sentences = render.sentences(
+        "joint_sentences",
+        tests=len(result.tests),
+        n_vary=result.fit.found.n_vary,
+        kinds=[f"{listed(names)} {kind}" for kind, names in kinds.items() if kind != "fixed"],
+        scatter=[
+            f"{name} {percent(one.scatter)} ({' to '.join(map(percent, one.scatter_ci95))})"
+            for name, one in result.parameters.items()
+            if one.scatter is not None and one.scatter_ci95 is not None
+        ],
+        **shown,
+    )
+    status = "failed" if lost else "warnings" if warnings else "ok"
+    return replace(result, status=status, warnings=warnings, sentences=sentences)
+
+
+def span_of(found: Sequence[dict[str, float | None]]) -> tuple[float, float] | None:
+    """Smallest and largest misfit of some fits, of the loop or else of the stress; None if none."""
+    names = ("stress_strain", "stress_time", "displacement_time")
+    each = (next((one[n] for n in names if one.get(n) is not None), None) for one in found)
+    known = [one for one in each if one is not None]
+    return (min(known), max(known)) if known else None

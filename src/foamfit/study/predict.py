@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from numbers import Integral
 from pathlib import Path
 
@@ -20,43 +20,26 @@ from foamfit.fitting.curves import check_drive, check_time_shift, choose_drive, 
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, descend
 from foamfit.report import render
-from foamfit.report.figures import TWO, inches
-from foamfit.report.studies.prediction import save_prediction
-from foamfit.springs.parameters import unit_of
-from foamfit.study.prediction.identified import NORMAL, HasContent, Source, read_source
-from foamfit.study.prediction.population import Population
-from foamfit.study.prediction.predicted import (
-    PARTS,
+from foamfit.report.studies.prediction import (
+    COLOURS,
     PredictedCurve,
     PredictedParameter,
-    PredictedTest,
+    Prediction,
 )
+from foamfit.springs.parameters import unit_of
+from foamfit.study.identified import NORMAL, HasContent, Population, Source, read_source
 from foamfit.text import engineering
 
-# Draws of specimens; fewer say nothing of the ends of a 95 % band.
+# Draws of specimens: by default, and at least, as fewer do not resolve the ends of a 95 % band.
 DRAWS, FEWEST = 400, 40
-# By how much the rate of a test may lie outside the fitted ones, as a factor.
+# Factor by which the rate of a test may lie outside the fitted rates.
 RATE_FACTOR = 1.25
-# Draws that are tried for each that is wanted, before the others are given up.
+# Most draws that are tried for each one wanted.
 TRIES = 5
 BAND = (0.025, 0.975)
-# Tests from which on nothing is said of how few they are; fewer do where fewer parameters change.
+# So many tests are not said to be few; fewer suffice where fewer parameters change.
 FEW_TESTS = 5
 ALIGNING = 40  # steps of the fit of what a record does not say exactly
-
-
-class Prediction(PredictedTest):
-    """A test that was not fitted, predicted with its 95 % band, and how it is written."""
-
-    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
-        """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf`` whole; returns the folder.
-
-        An older prediction there is replaced as a whole, at the end. Without `report` there is no
-        figure. It is "one" or "two" columns wide, or as wide as a length ("85 mm");
-        prediction.csv holds all that it shows.
-        """
-        inches(figure_width)  # refuses what is no width
-        return save_prediction(self, folder, report=report, width=figure_width)
 
 
 @single_threaded
@@ -69,11 +52,11 @@ def predict(
     draws: int = DRAWS,
     seed: int = 0,
 ) -> Prediction:
-    """Predict a test that was not fitted.
+    """Predict a test that was not fitted, as a `Prediction`.
 
     Height, area, mass and velocity are those of the test, and so is the rate at which laws of rate
     are evaluated. What its record does not say exactly, such as the contact time and zeros of an
-    impact, is fitted to it (`PredictedTest.aligned`). The 95 % band has these parts: what the
+    impact, is fitted to it (`Prediction.aligned`). The 95 % band has these parts: what the
     result leaves uncertain of the parameters, to first order; their scatter between specimens (of a
     joint result), drawn and simulated; the noise of the test and that of a motion that drives; and
     what the law has missed of the fitted tests beyond their noise, which grows with each cycle
@@ -90,12 +73,8 @@ def predict(
         "impact", "stress" or "displacement"; by default that of the result.
     extrapolate : bool
         Whether the rate of the test may lie outside the fitted rates by more than `RATE_FACTOR`.
-    draws, seed
+    draws, seed : int
         Draws of specimens; same seed, same numbers.
-
-    Returns
-    -------
-    Prediction
 
     Raises
     ------
@@ -120,7 +99,7 @@ def predict(
     problem = _problem(source, measurement, drive)
     objective = problem.objective
     limits = {name: (one.min, one.max) for name, one in problem.params.items()}
-    population = Population(source, problem.model.names, problem.measurement.specimen, rate, limits)
+    population = Population(source, problem.measurement.specimen, rate, limits)
     springs, aligning = _point(population, problem), _before(problem, source)
     try:
         point, aligned = _aligned(aligning, springs, population.scattering)
@@ -129,20 +108,15 @@ def predict(
         raise SimulationError(
             f"{measurement.name} cannot be predicted from {source.where}: {error}"
         ) from None
-    drawn = _draw(population, problem, point, draws, seed) if population.scattering else None
+    values, drawn, redrawn = list[Array](), list[dict[str, Array]](), 0
+    if population.scattering:
+        values, drawn, redrawn = _draw(population, problem, point, draws, seed)
     known = {"parameters": _by_parameters(population, aligning, point, tuple(aligned))}
     known |= {"motion": _by_motion(problem, point)}
-    curves = {
-        name: _curve(
-            problem,
-            name,
-            simulated.curves[name],
-            drawn,
-            source,
-            {part: sides[name] for part, sides in known.items() if name in sides},
-        )
-        for name in objective.counted
-    }
+    curves = dict[str, PredictedCurve]()
+    for name in objective.counted:
+        parts = {part: sides[name] for part, sides in known.items() if name in sides}
+        curves[name] = _curve(problem, name, simulated.curves[name], drawn, source, parts)
     changing, count = population.scattering, population.fewest if population.scattering else 0
     warnings = render.sentences(
         "predicted_warnings",
@@ -156,14 +130,14 @@ def predict(
         scattering=changing,
         held=population.held,
         untold=[one.channel for one in curves.values() if one.channel not in source.misses],
-        drawn=draws if drawn is None else len(drawn.values),
+        drawn=len(values) if changing else draws,
         draws=draws,
     )
     sentences = render.sentences(
         "predicted_sentences",
         curves=curves.values(),
         scattering=changing,
-        trends=[name for name, slope in population.trends.items() if slope],
+        trends=population.trends,
         aligned=[
             f"{name.replace('_', ' ')} {engineering(value, unit_of(name)).replace('-', '−')}"
             for name, value in aligned.items()
@@ -179,12 +153,12 @@ def predict(
         seed=int(seed),
         curves=curves,
         misfit=objective.misfit(simulated),
-        parameters=_parameters(population, springs, drawn),
+        parameters=_parameters(population, springs, values),
         rate=rate,
         fitted_rates=source.rates,
         extrapolated=bool(outside),
-        draws=0 if drawn is None else len(drawn.values),
-        redrawn=0 if drawn is None else drawn.redrawn,
+        draws=len(values),
+        redrawn=redrawn,
         held=population.held,
         sentences=sentences,
         warnings=warnings,
@@ -253,7 +227,10 @@ def _before(problem: Problem, source: Source) -> Problem:
 def _point(population: Population, problem: Problem) -> Array:
     """The common values; where they are not admissible together, those of the nearest test."""
     for values in population.candidates():
-        if _admissible(problem, values):
+        own = values[: len(problem.model.names)]
+        heights = problem.model.heights(own, problem.measurement.specimen.height)
+        known = np.all(np.isfinite(values)) and np.all(heights > 0.0) and own[-1] >= 0.0
+        if known and problem.model.rows(own) is not None:
             return values
     raise SimulationError(
         f"{population.source.where}: its common values are no admissible spring, nor are those of "
@@ -289,29 +266,15 @@ def _aligned(
     return point, {name: told[name] for name in names}
 
 
-def _admissible(problem: Problem, values: Array) -> bool:
-    """Whether a vector of parameters is an admissible chain."""
-    own = values[: len(problem.model.names)]
-    heights = problem.model.heights(own, problem.measurement.specimen.height)
-    if not (np.all(np.isfinite(values)) and np.all(heights > 0.0) and own[-1] >= 0.0):
-        return False
-    return problem.model.rows(own) is not None
-
-
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    values: list[Array]
-    curves: list[dict[str, Array]]
-    redrawn: int
-
-
-def _draw(population: Population, problem: Problem, point: Array, draws: int, seed: int) -> _Drawn:
-    """Draw and simulate until there are so many; what is not admissible is drawn again."""
+def _draw(
+    population: Population, problem: Problem, point: Array, draws: int, seed: int
+) -> tuple[list[Array], list[dict[str, Array]], int]:
+    """Draw and simulate: parameters, curves, and how many more were drawn as not admissible."""
     # What lies beyond the limits of a fit of the test is moved there, as a fit does: to draw it
     # again would leave one side of all other parameters out.
     objective, specimens, tried = problem.objective, population.draws(seed), 0
     values, curves = list[Array](), list[dict[str, Array]]()
-    limits = _limits(population, point[: len(population.names)])
+    limits = _limits(population, point[: len(population.source.parameters)])
     while len(values) < draws and tried < TRIES * draws:
         tried += 1
         one = np.clip(next(specimens), *limits)
@@ -326,7 +289,7 @@ def _draw(population: Population, problem: Problem, point: Array, draws: int, se
             f"{population.source.where}: only {len(values)} of {tried} specimens drawn from its "
             "scatter can be simulated; hold or share what it leaves undetermined"
         )
-    return _Drawn(values, curves, tried - len(values))
+    return values, curves, tried - len(values)
 
 
 def _by_parameters(
@@ -369,17 +332,17 @@ def _curve(
     problem: Problem,
     name: str,
     predicted: Array,
-    drawn: _Drawn | None,
+    drawn: list[dict[str, Array]],
     source: Source,
     known: dict[str, Array],
 ) -> PredictedCurve:
     """One curve with its band: quantiles of the draws, all other parts added in quadrature."""
     objective = problem.objective
     channel, n = objective.channel(name), predicted.size
-    parts = {part: np.zeros(n) for part in PARTS if part != "motion"} | known
+    parts = {part: np.zeros(n) for part in COLOURS if part != "motion"} | known
     low = middle = high = predicted
-    if drawn is not None:
-        ends = np.quantile([curves[name] for curves in drawn.curves], (*BAND, 0.5), axis=0)
+    if drawn:
+        ends = np.quantile([curves[name] for curves in drawn], (*BAND, 0.5), axis=0)
         low, high, middle = ends
         both = 0.5 * (high - low)
         parts["scatter"] = np.sqrt(np.maximum(both**2 - parts["parameters"] ** 2, 0.0))
@@ -387,7 +350,7 @@ def _curve(
     parts["noise"] = np.full(n, NORMAL * sigma)
     missed = source.law_error(channel, sigma / float(np.ptp(objective.measured[name])))
     parts["law_error"] = missed * span * np.sqrt(_grown(problem.measurement, source))
-    within = {"scatter"} if drawn is None else {"scatter", "parameters"}  # of the draws
+    within = {"scatter", "parameters"} if drawn else {"scatter"}  # of the draws
     more = sum(parts[part] ** 2 for part in parts.keys() - within)
     kept = np.zeros(n, dtype=bool)
     kept[objective.kept(name)] = True
@@ -398,7 +361,7 @@ def _curve(
         predicted=predicted,
         lo=middle - np.sqrt((middle - low) ** 2 + more),
         hi=middle + np.sqrt((high - middle) ** 2 + more),
-        parts={part: parts[part] for part in PARTS if part in parts},
+        parts={part: parts[part] for part in COLOURS if part in parts},
         kept=kept,
     )
 
@@ -414,20 +377,20 @@ def _grown(measurement: Measurement, source: Source) -> Array:
 
 
 def _parameters(
-    population: Population, point: Array, drawn: _Drawn | None
+    population: Population, point: Array, drawn: list[Array]
 ) -> dict[str, PredictedParameter]:
     """Each parameter at the test and its 95 % interval, within its limits."""
     half = population.quantile * np.sqrt(np.maximum(np.diag(population.covariance), 0.0))
     ends = np.array([point - half, point + half])
-    if drawn is not None:
-        ends = np.quantile(drawn.values, BAND, axis=0)
+    if drawn:
+        ends = np.quantile(drawn, BAND, axis=0)
     ends = np.clip(ends, *_limits(population, point))
-    rows = zip(population.names, point.tolist(), *ends.tolist(), strict=True)
+    rows = zip(population.source.parameters, point.tolist(), *ends.tolist(), strict=True)
     known = population.source.parameters
     return {name: PredictedParameter(known[name].kind, *row) for name, *row in rows}
 
 
 def _limits(population: Population, point: Array) -> tuple[Array, Array]:
     """Limits of the parameters in a fit of the test, which hold the point."""
-    low, high = np.array([population.limits[name] for name in population.names]).T
+    low, high = np.array([population.limits[name] for name in population.source.parameters]).T
     return np.minimum(low, point), np.maximum(high, point)

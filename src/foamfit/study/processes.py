@@ -14,11 +14,11 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
 from concurrent.futures import ThreadPoolExecutor as Threads
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from multiprocessing import connection
 from numbers import Integral
@@ -32,14 +32,14 @@ from foamfit.terminal import without_ctrl_c
 FITS = ("foamfit.study.batch_work", "foamfit.data.csv_file", "pandas", "pint")
 PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
 DRAWING = ("foamfit.report.result_figures", "foamfit.springs.kernels", *PAGES)
-# Times that a call is tried whose process ends.
+# How often a call is tried if its process ends.
 ATTEMPTS = 2
 # One thread in each process: the processes are as many as the cores.
 ONE_THREAD = {
     f"{name}_NUM_THREADS": "1"
     for name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "NUMEXPR", "VECLIB", "BLIS")
 }
-# Modules that every process of a joint fit needs, and by which most of its start is gone.
+# What the processes of a joint fit import.
 _JOINT = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
 _STARTING, _SCRIPT = threading.Lock(), ModuleType("__main__")
 
@@ -61,9 +61,9 @@ def check_jobs(jobs: int | None) -> None:
 
 
 def prepare(preload: Iterable[str]) -> None:
-    """Have the modules imported from which processes part, beside what this process does.
+    """Import modules, while this process goes on, in the one from which others are forked.
 
-    They are imported once, in a process of its own, where the system has such a start method.
+    Where the system has no such process, nothing is done.
     """
     if "forkserver" in multiprocessing.get_all_start_methods():
         from multiprocessing import forkserver
@@ -74,18 +74,12 @@ def prepare(preload: Iterable[str]) -> None:
 
 
 class Processes(Executor):
-    """Processes of this machine with one thread each, which end with the one that started them.
+    """So many processes with one thread each, which end with the one that started them.
 
     A call whose process ends is tried again in another one, `ATTEMPTS` times in all, and then
     raises `EndedError`; the calls of other processes go on. The functions must be those of modules;
-    the script that is running is not imported again, so it needs no guard.
-
-    Parameters
-    ----------
-    count : int
-        How many processes.
-    preload : tuple of str
-        Modules that are imported once, before the processes part from each other; see `prepare`.
+    the script that is running is not imported again, so it needs no guard. For `preload` see
+    `prepare`.
     """
 
     def __init__(self, count: int, preload: tuple[str, ...] = ()) -> None:
@@ -95,8 +89,7 @@ class Processes(Executor):
         )
         prepare(preload)
         self._threads = Threads(count, thread_name_prefix="foamfit")
-        self._here = threading.local()  # the pool of each thread
-        self._pools = list[ProcessPoolExecutor]()
+        self._pools = dict[int, ProcessPoolExecutor]()  # by the thread that has it
         self._stop, self._stopping = self._context.Pipe(duplex=False)
         self._stopped = False
 
@@ -107,17 +100,14 @@ class Processes(Executor):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Let the calls end that are under way, and the processes then."""
         self._threads.shutdown(wait, cancel_futures=cancel_futures)
-        for pool in self._pools:
+        for pool in list(self._pools.values()):
             pool.shutdown(wait)
         self._stopping.close()
         self._stop.close()
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """End the processes; at once if anything went wrong."""
-        if kind is None:
-            self.shutdown()
-        else:
-            self.stop()
+        self.shutdown() if kind is None else self.stop()
 
     def stop(self) -> None:
         """End the processes at once, whatever they are at."""
@@ -127,34 +117,29 @@ class Processes(Executor):
 
     def _call(self, work: Callable[[], Any]) -> Any:
         """Call in the process of this thread; run by one of the threads."""
+        from foamfit.springs import laws
+
+        thread = threading.get_ident()
         for _ in range(ATTEMPTS):
             if self._stopped:
-                raise CancelledError
+                break
+            new = thread not in self._pools
+            if new:
+                given = self._stop, laws.texts()
+                self._pools[thread] = ProcessPoolExecutor(1, self._context, _begin, given)
             try:
-                return self._submitted(work).result()
+                with _starting() if new else nullcontext():
+                    begun = self._pools[thread].submit(work)
+                return begun.result()
             except BrokenProcessPool:
-                self._here.pool.shutdown()
-                self._pools.remove(self._here.pool)
-                self._here.pool = None
+                self._pools.pop(thread).shutdown()
         if self._stopped:
             raise CancelledError
         raise EndedError(f"its process ended {ATTEMPTS} times before it was done")
 
-    def _submitted(self, work: Callable[[], Any]) -> Future[Any]:
-        pool: ProcessPoolExecutor | None = getattr(self._here, "pool", None)
-        if pool is not None:
-            return pool.submit(work)
-        from foamfit.springs import laws
-
-        pool = ProcessPoolExecutor(1, self._context, _begin, (self._stop, laws.texts()))
-        self._here.pool = pool
-        self._pools.append(pool)
-        with _starting():
-            return pool.submit(work)
-
 
 def begin(jobs: int | None, count: int, few: int) -> None:
-    """Have imported what `workers` with these arguments will need, beside what goes on here."""
+    """Import what `workers` with these arguments will need, while this process goes on."""
     if _wanted(jobs, count, few) > 1:
         prepare(_JOINT)
 
@@ -181,25 +166,23 @@ def workers(jobs: int | None, count: int, few: int) -> Iterator[Callable[..., It
 @contextmanager
 def _starting() -> Iterator[None]:
     """Start a process with one thread that does not import the running script again."""
-    with _STARTING, _set(os.environ, ONE_THREAD), _set(sys.modules, {"__main__": _SCRIPT}):
-        yield
-
-
-@contextmanager
-def _set(values: MutableMapping[str, Any], for_now: Mapping[str, Any]) -> Iterator[None]:
-    """Change some values of a mapping within, and no others, which another thread may change."""
-    before = {name: values[name] for name in for_now if name in values}
-    values.update(for_now)
-    try:
-        yield
-    finally:
-        values.update(before)
-        for name in for_now.keys() - before.keys():
-            del values[name]
+    with _STARTING:
+        script, before = sys.modules["__main__"], {n: os.environ.get(n) for n in ONE_THREAD}
+        sys.modules["__main__"] = _SCRIPT
+        os.environ.update(ONE_THREAD)
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = script
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
 
 
 def _begin(stop: connection.Connection, law_files: Mapping[str, str]) -> None:
-    """Make a process ready: Ctrl-C is for the one that started it, whose end is its own."""
+    """Prepare a process: it ignores Ctrl-C and ends with the process that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()  # what the imports have made stays
     gc.set_threshold(100_000, 20, 10)

@@ -17,7 +17,7 @@ from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.test_files import find_tests
 
-# The kind that evidence chooses, and those that it chooses from.
+# The kind of a parameter for which evidence chooses one of `KINDS`.
 AUTO = "auto"
 _EXAMPLES = {
     "tests": 'tests = ["runs/*.csv"]',

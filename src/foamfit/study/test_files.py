@@ -10,49 +10,32 @@ from pathlib import Path
 
 from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError
-from foamfit.report.folder import (
-    BATCH_FILES,
-    CYCLES_FILES,
-    JOINT_FILES,
-    MARKS,
-    PREDICTION_FILES,
-    RESULT_FILES,
-)
+from foamfit.report.folder import FILES
 from foamfit.text import listed
 
 ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
 WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
 # Stems of tables that say what the specimens are, beside the tests.
 _SPECIMENS = ("specimen", "specimens")
-_WRITTEN = (*RESULT_FILES, *CYCLES_FILES, *BATCH_FILES, *JOINT_FILES, *PREDICTION_FILES)
+_WRITTEN = set[str]().union(*FILES.values())
 
 
 def find_tests(
     patterns: str | Path | Iterable[str | Path], base: str | Path = "."
 ) -> list[tuple[str, Path]]:
-    """Find the tests that files, folders and globs name.
+    """Find the tests that files, folders and globs ("**" goes into folders) name, from `base`.
 
-    Parameters
-    ----------
-    patterns : str, Path or several of them
-        Files, folders, globs ("**" goes into folders). Of a folder, and of what a glob matches,
-        tables are taken (`ENDINGS`) that are no list of specimens, no motion that a TOML beside
-        them names as that of another test, and no result of foamfit. A file that is named itself
-        is taken unless it is a TOML.
-    base : str or Path
-        The folder that relative ones start from.
-
-    Returns
-    -------
-    list of (str, Path)
-        Names and files in the order of the files, each file once. A name is the stem of its file;
-        where two have the same, parent folders stand before it, joined by "-".
+    Of a folder, and of what a glob matches, tables are taken (`ENDINGS`) that are no list of
+    specimens, no motion that a TOML beside them names as that of another test, and no result of
+    foamfit. A file that is named itself is taken unless it is a TOML. Returned are names and files
+    in the order of the files, each file once. A name is the stem of its file; where two have the
+    same, parent folders stand before it, joined by "-".
 
     Raises
     ------
     InputError
         If a glob matches no test, a folder has none, or nothing is there at all; the message names
-        it. One of several that is not there is left to who reads it, as a broken link is.
+        it. A missing file among several is refused where it is read, as a broken link is.
     """
     given = [patterns] if isinstance(patterns, str | Path) else list(patterns)
     if not given:
@@ -96,13 +79,13 @@ def _matches(pattern: str | Path, base: Path) -> list[Path]:
 def _is_test(path: Path) -> bool:
     """Whether a file is taken where it is not named itself."""
     if not path.is_file() and (path.is_dir() or not path.is_symlink()):
-        return False  # a broken link is left to who reads it
+        return False  # a broken link is refused where it is read
     plain = path.with_suffix("") if path.suffix.lower() == ".gz" else path  # no .tar.gz
     if plain.suffix.lower() not in ENDINGS or plain.stem.lower() in _SPECIMENS:
         return False
     if path.name.startswith((".", "~$")):
         return False
-    marks = ((path.parent / mark).is_file() for mark in (*MARKS, "summary.html"))
+    marks = ((path.parent / mark).is_file() for mark in (*FILES, "summary.html"))
     return not (path.name in _WRITTEN and any(marks))
 
 

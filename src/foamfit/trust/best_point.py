@@ -1,12 +1,12 @@
 """The best point of one test or several: curves, residual, Jacobian and covariance.
 
 All that is concluded from a fit reads this: one plain simulation and one with sensitivities. The
-unknowns of several tests are what all have in common, then the own parameters of each; the sandwich
-is that of a single test (`trust.covariance`), with a block for each test.
+unknowns of several tests are what all have in common, then the own parameters of each.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,33 +19,16 @@ from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
 from foamfit.fitting.branches import unreached
 from foamfit.fitting.links import LOG_RATE, RATES, factor
-from foamfit.fitting.losses import influence, soften
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Block, Covariance, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
-from foamfit.trust.residuals.noise_process import basis_of, parts
+from foamfit.trust.residuals.noise_process import basis_of
 
 # Share of the residuals along a direction that a cycle takes at most, so that it is not all.
 MOST_TAKEN = 0.99
-
-
-def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:
-    """Weights of slopes and pseudo-residuals whose least squares have the covariance of a loss.
-
-    With the mean m of ψ'(r) over each curve (of `sizes` samples): √m and ψ(r)/√m. The normal matrix
-    of the slopes so weighted is half the curvature of the cost, and the covariance of their least
-    squares that of an M-estimate (Huber 1981, Robust Statistics, section 7.6). Under the linear
-    loss they are one and the residuals, as for priors, which follow the curves, under any loss.
-    """
-    psi, slope = influence(residual, loss)
-    weights, data = np.ones(residual.size), sum(sizes)
-    psi[data:] = residual[data:]
-    for part in parts(sizes):
-        weights[part] = max(float(slope[part].mean()), 0.05) ** 0.5
-    return weights, psi / weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,19 +50,13 @@ class BestPoint:
 
     @cached_property
     def residual(self) -> Array:
-        """Residual of curves and priors before the loss reduces large ones."""
+        """Residual of curves and priors."""
         return self.problem.objective.compare(self.simulated, self.values)
 
     @cached_property
-    def soft(self) -> Array:
-        """Residual of curves and priors, softened by the loss."""
-        objective = self.problem.objective
-        return soften(self.residual, objective.loss, objective.n_data)
-
-    @cached_property
     def cost(self) -> float:
-        """Sum of squares of the softened residual."""
-        return float(self.soft @ self.soft)
+        """Sum of squares of the residual."""
+        return float(self.residual @ self.residual)
 
     @cached_property
     def unreached(self) -> dict[str, str]:
@@ -116,29 +93,27 @@ class BestPoint:
     @cached_property
     def box(self) -> Array:
         """Lower and upper limits of the k parameters, SI, (2, k)."""
-        return np.array([self.limits(name) for name in self.names]).reshape(-1, 2).T
+        return np.reshape([self.limits(name) for name in self.names], (-1, 2)).T
 
     @cached_property
     def jacobian(self) -> Array:
         """Derivative of `residual` by them, (n_data, k)."""
-        return self.problem.linear.slopes(self.values, self.names)
-
-    @cached_property
-    def weighted(self) -> tuple[Array, Array]:
-        """Jacobian and residual whose least squares have the covariance of the loss."""
-        objective = self.problem.objective
-        weights, pseudo = m_estimate(self.residual, objective.sizes, objective.loss)
-        return self.jacobian * weights[:, None], pseudo
+        return self.problem.slopes(self.values, self.names)
 
     @cached_property
     def errors(self) -> tuple[CurveError, ...]:
         """Whether the residual of each counted curve is noise, or holds an error of the law too."""
         return curve_errors(*self.to_judge())
 
+    @cached_property
+    def scaled(self) -> Array:
+        """Jacobian by the scaled parameters, (n_data, k)."""
+        return np.asarray(self.jacobian * self.sizes)
+
     def to_judge(self, taken: Array | None = None) -> tuple[Any, ...]:
         """What `curve_errors` takes; `taken` is what a joint fit took of the noise."""
-        (jacobian, pseudo), objective = self.weighted, self.problem.objective
-        return pseudo, jacobian * self.sizes, objective.sizes, taken, objective.drive == "stress"
+        objective = self.problem.objective
+        return self.residual, self.scaled, objective.sizes, taken, objective.drive == "stress"
 
     @property
     def misfits(self) -> bool:
@@ -146,11 +121,10 @@ class BestPoint:
         return any(error.found for error in self.errors)
 
     def block(self, errors: Sequence[CurveError]) -> Block:
-        """Its part in a covariance, by the errors of its curves; as estimated with the loss."""
-        jacobian, pseudo = self.weighted
+        """Its part in a covariance, by the errors of its curves."""
         return Block(
-            jacobian * self.sizes,
-            pseudo,
+            self.scaled,
+            self.residual,
             self.problem.objective.sizes,
             [error.noise for error in errors],
             np.eye(len(self.names)),
@@ -171,7 +145,7 @@ class BestPoint:
 
     @cached_property
     def spread(self) -> Covariance:
-        """Their local covariance, as estimated with the loss."""
+        """Their local covariance."""
         return Uncertainty((self.block(self.errors),), self.sizes).covariance
 
     @cached_property
@@ -187,11 +161,11 @@ class BestPoint:
     @cached_property
     def known(self) -> list[str]:
         """Parameters that the local interval does not leave undetermined."""
-        told = self.halves <= covariance.NOTHING * self.sizes
-        return [name for name, known in zip(self.names, told, strict=True) if known]
+        known = np.flatnonzero(self.halves <= covariance.NOTHING * self.sizes)
+        return [self.names[i] for i in known]
 
     def rises(self, residual: Array) -> Array:
-        """Rise of the cost at another point, from its softened residual, as χ² of each, (k,)."""
+        """Rise of the cost at another point, from its residual, as χ² of each, (k,)."""
         return np.asarray((float(residual @ residual) - self.cost) / self.spread.inflation)
 
 
@@ -238,11 +212,9 @@ class JointPoint:
     @cached_property
     def _scales(self) -> Array:
         """Scales of the unknowns; 1 of a slope, or a logarithm."""
-        out = list[float]()
+        out, shared = list[float](), set(self.found.shared)
         for name in self.names:
-            shows = [
-                b for b in self.bests if name in self.found.shared and name in b.problem.free()
-            ]
+            shows = [b for b in self.bests if name in shared and name in b.problem.free()]
             out += shows[0].problem.sizes((name,), shows[0].values).tolist() if shows else [1.0]
         for best, own in zip(self.bests, self._own, strict=True):
             out += [best.sizes[best.names.index(name)] for name in own]
@@ -300,8 +272,9 @@ class JointPoint:
 
     def of_common(self, name: str) -> tuple[float, float]:
         """Standard error and degrees of freedom of what is in `names`; NaN of anything else."""
-        row = np.array([1.0 if one == name else 0.0 for one in self.names])
-        return self._known(np.pad(row, (0, self._scales.size - row.size)))
+        row = np.zeros(self._scales.size)
+        row[[i for i, one in enumerate(self.names) if one == name]] = 1.0
+        return self._known(row)
 
     def of_test(self, test: int, name: str) -> tuple[float, float]:
         """Standard error and degrees of freedom of a parameter of one test; NaN if unreached."""
@@ -321,14 +294,14 @@ class JointPoint:
 
     def reach(self, name: str) -> float:
         """How far a shared value is off where the cost has risen by one; 0 where it is unseen."""
-        at, plain = self.names.index(name), self.uncertainty.plain
-        off = 0.0 if plain.lost[at] else float(np.sqrt(plain.inverse[at, at]))
+        at, known = self.names.index(name), self.uncertainty
+        off = 0.0 if known.lost[at] else math.sqrt(known.inverse[at, at])
         return off * float(self._scales[at])
 
     def moved(self, name: str, change: float) -> list[Array]:
         """Values of each test with a shared one moved, and the others after it, were all linear."""
         at, out = self.names.index(name), list[Array]()
-        along = self.uncertainty.plain.inverse[:, at]
+        along = self.uncertainty.inverse[:, at]
         step = change / self._scales[at] * along / along[at]
         for block, best in zip(self.uncertainty.blocks, self.bests, strict=True):
             values = best.values.copy()
@@ -343,7 +316,7 @@ class JointPoint:
 
         Along a direction that several tests determine it took a share of each one's noise only.
         """
-        left = self.uncertainty.plain.lefts[test]
+        left = self.uncertainty.lefts[test]
         share, axes = np.linalg.eigh(left @ left.T)
         own = self.uncertainty.blocks[test].axes[0]
         return np.asarray((own @ axes) * np.sqrt(np.clip(share, 0.0, 1.0)))
@@ -353,7 +326,7 @@ class JointPoint:
         """Covariance and inverse curvature of the unknowns, whatever draws them, SI, (m, m)."""
         known = self.uncertainty
         held = known.held if known.errs else np.zeros(self._scales.size, dtype=bool)
-        alone = replace(known.bent if known.errs else known.plain, drawn=None)
+        alone = replace(known.bent if known.errs else known, drawn=None)
         free = np.ix_(~held, ~held)
         matrix, inverse = np.full((2, held.size, held.size), np.nan)
         matrix[free], inverse[free] = alone.matrix, alone.inverse
@@ -394,7 +367,9 @@ def cycle_growth(best: BestPoint) -> float | None:
         return None
     last = spans[max(spans)]
     kept = np.concatenate([objective.kept(name) for name in objective.counted])
-    return growth(*best.weighted, np.flatnonzero((kept >= last.start) & (kept < last.stop)))
+    return growth(
+        best.jacobian, best.residual, np.flatnonzero((kept >= last.start) & (kept < last.stop))
+    )
 
 
 def growth(jacobian: Array, residual: Array, rows: NDArray[np.intp]) -> float:

@@ -20,7 +20,6 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import SimulationError
 from foamfit.fitting import nuisance
-from foamfit.fitting.losses import influence
 from foamfit.results import SOURCES, Budget, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE
 from foamfit.trust.best_point import BestPoint
@@ -73,18 +72,14 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
     except SimulationError:
         return np.full(best.values.size, np.nan)
     moved = 0.5 * (after - before)
-    slope = influence(best.residual[: problem.objective.n_data], problem.objective.loss)[1]
-    root = np.sqrt(np.append(np.maximum(slope, 0.0), np.ones(len(problem.objective.priors))))
-    scaled = best.jacobian * best.sizes * root[:, None]
+    scaled = best.scaled.copy()
     # What lies at a limit stays there.
     off = np.abs(best.box - best.values[best.places]).min(axis=0, initial=np.inf)
     scaled[:, off <= AT_LIMIT * best.sizes] = 0.0
-    steps = -np.linalg.pinv(scaled, rcond=SINGULAR) @ (root * moved)
+    steps = -np.linalg.pinv(scaled, rcond=SINGULAR) @ moved
     rounding = ROUNDING * np.max(np.abs(steps), initial=0.0)
     steps = np.where(np.abs(steps) > rounding, steps, 0.0) * best.sizes
-    moves = np.zeros((best.values.size, len(best.names)))
-    moves[best.places, np.arange(len(best.names))] = 1.0
-    moves = problem.space().follow(best.values, moves, 1e-5 * best.sizes)
+    moves = problem.moves(best.values, best.names)
     return np.asarray((0.5 * (high - low) + moves @ steps) * (share / step))
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from itertools import chain, groupby
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +19,10 @@ from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import InputError
 from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
-from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, Intervals, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, split_name
-from foamfit.text import engineering, listed, percent
 from foamfit.trust import SENTENCES, say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK, covariance
@@ -39,26 +39,7 @@ STRUCTURED = 5.0
 REASONS = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Findings:
-    """The best point, how it was found, and what was measured."""
-
-    best: BestPoint
-    estimates: Mapping[str, ParameterEstimate]
-    misfit: dict[str, float | None]
-    record: SearchRecord
-    balance: EnergyAudit
-    intervals: Intervals
-
-    @property
-    def objective(self) -> Objective:
-        """What was minimised."""
-        return self.best.problem.objective
-
-    @property
-    def known(self) -> list[str]:
-        """Parameters that have a standard error."""
-        return [name for name, item in self.estimates.items() if item.stderr is not None]
+Estimates = Mapping[str, ParameterEstimate]
 
 
 def may_vanish(name: str) -> bool:
@@ -84,137 +65,136 @@ def input_first(warnings: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted(dict.fromkeys(warnings), key=lambda text: not text.startswith(ASKED)))
 
 
-def make_checklist(findings: Findings) -> tuple[Check, ...]:
+def make_checklist(
+    best: BestPoint,
+    estimates: Estimates,
+    misfit: Mapping[str, float | None],
+    record: SearchRecord,
+    balance: EnergyAudit,
+    intervals: Intervals,
+) -> tuple[Check, ...]:
     """Answer all questions, in the order of `sentences.toml`."""
-    groups = (_of_search, _of_curves, _of_parameters, _of_test, _of_what_is_left_out)
-    found = {check.key: check for answers in groups for check in answers(findings)}
+    known = [name for name, item in estimates.items() if item.stderr is not None]
+    checks = (
+        *_of_search(best, record),
+        _followed(best, misfit),
+        _at_noise(best),
+        _determined(best, estimates),
+        _visited(best, estimates),
+        *_of_intervals(best, estimates, intervals, known),
+        *_of_test(best, balance),
+        _time_shift(best, estimates, known),
+        _damping(best, known),
+    )
+    found = {check.key: check for check in checks}
     return tuple(found[key] for key in SENTENCES["check"])
 
 
 def _check(
     key: str,
     answer: bool | None,
-    case: str = "",
     *,
     warnings: Iterable[str] | None = None,
     fatal: bool = False,
     **facts: object,
 ) -> Check:
-    """Check of `sentences.toml`; `case` names its sentence if not that of the answer alone."""
-    table = SENTENCES["check"][key]
-    said = table[case or {True: "yes", False: "no", None: "unknown"}[answer]].format(**facts)
+    """Check of `sentences.toml`; `warnings` are those of a "no" there if none are given."""
+    table, section = SENTENCES["check"][key], f"check.{key}"
+    case = {True: "yes", False: "no", None: "unknown"}[answer]
+    said = say(section, case if case in table else "said", **facts)
     if warnings is None:
-        told = table.get("warning") if answer is False else None
-        warnings = [told.format(**facts)] if told else []
+        told = answer is False and "warning" in table
+        warnings = say(section, "warning", **facts).splitlines() if told else ()
     return Check(key, table["question"], answer, said, tuple(warnings), fatal)
 
 
-def _of_search(e: Findings) -> Iterator[Check]:
-    by, objective = e.record.stopped, e.objective
+def _of_search(best: BestPoint, record: SearchRecord) -> Iterator[Check]:
+    by, objective = record.stopped, best.problem.objective
     yield _check("ended", by is None, by=by, count=objective.evaluations)
-    total, agreeing = sum(count for _, count in e.record.costs), 0
+    total, agreeing = sum(count for _, count in record.costs), 0
     if by is None and total:
-        agreeing = e.record.agreeing
+        agreeing = record.agreeing
     yield _check("agree", agreeing > 1 if agreeing else None, total=total, agreeing=agreeing)
     failed, tried = objective.failures, max(objective.evaluations, 1)
     yield _check("simulated", failed <= 0.5 * tried, failed=failed, tried=tried)
-    vibrates = objective.interior_mass and len(e.best.problem.model.kinds) > 1
+    vibrates = objective.interior_mass and len(best.problem.model.kinds) > 1
     yield _check("vibration", not vibrates)
 
 
-def _of_curves(e: Findings) -> Iterator[Check]:
-    told, warnings, fatal = [], [], False
-    for name in e.objective.counted:
-        off, measured = e.misfit[name] or 0.0, e.objective.measured[name]
+def _followed(best: BestPoint, misfit: Mapping[str, float | None]) -> Check:
+    objective, curves = best.problem.objective, []
+    for name in objective.counted:
+        off, measured = misfit[name] or 0.0, objective.measured[name]
         lost = off * float(np.ptp(measured)) > UNACCEPTABLE * float(np.std(measured))
-        fatal = fatal or lost
-        told.append(f"{name.replace('_', '-')} {off:.1%}")
-        if off > POOR or lost:
-            warnings.append(say("check.followed", "lost" if lost else "large", curve=name, off=off))
-    found = ", ".join(told)
-    yield _check("followed", not warnings, warnings=warnings, fatal=fatal, misfits=found)
-    yield _at_noise(e)
+        curves.append({"name": name, "off": off, "lost": lost, "poor": off > POOR or lost})
+    fine, fatal = not any(one["poor"] for one in curves), any(one["lost"] for one in curves)
+    return _check("followed", fine, fatal=fatal, curves=curves)
 
 
-def _at_noise(e: Findings) -> Check:
+def _at_noise(best: BestPoint) -> Check:
     """Whether the residuals are noise: by their size, an error of the law, and their correlation.
 
     This is the only verdict on the noise; `Fit.at_noise` has its answer.
     """
-    objective, known, longest = e.objective, False, 1.0
-    errors = e.best.errors if e.best.names else (None,) * len(objective.counted)
-    rms = objective.rms(e.best.residual)
-    ratios, missed, warnings = list[str](), list[str](), list[str]()
+    objective, known, longest = best.problem.objective, False, 1.0
+    errors = best.errors if best.names else (None,) * len(objective.counted)
+    rms = objective.rms(best.residual)
+    seen, missed = list[dict[str, Any]](), list[dict[str, Any]]()
     for name, size, error in zip(objective.counted, objective.sizes, errors, strict=True):
-        noise, spoken = objective.noise(name), name.replace("_", "-")
-        span, tau = float(np.ptp(objective.measured[name])), error.noise.tau if error else 1.0
+        noise, tau = objective.noise(name), error.noise.tau if error else 1.0
         known, longest = known or noise.sigma > 0.0, max(longest, tau)
-        if error and error.found and span:
-            missed.append(f"{spoken} {percent(error.law / objective.factor(name) / span)}")
-        if noise.sigma <= 1e-9 * objective.scale[name]:  # too small to be seen
-            continue
-        source, most = ("stated", STATED) if noise.given else ("estimated", ESTIMATED)
-        ratio = rms[name] / noise.sigma
-        ratios.append(f"{spoken} {ratio:.2f} ({source})")
-        # Three standard deviations of the RMS of so many effective samples.
-        if ratio > most + 3.0 * math.sqrt(tau / (2.0 * size)):
-            told = say("check.noise", "large", curve=name, ratio=ratio, source=source)
-            warnings.append(told)
-    found = [say("check.noise", "ratios", ratios=", ".join(ratios))] if ratios else []
-    if missed:
-        found.append(say("check.noise", "missed", missed=", ".join(missed)))
-        warnings = [say("check.noise", "law", missed=" and ".join(missed))]
-    elif longest > STRUCTURED:
-        warnings = [say("check.noise", "long", tau=longest)]
-    if not missed and longest >= 1.05:
-        found.append(say("check.noise", "correlated", tau=longest))
-    if not warnings and not (found and known):
-        return _check("noise", None)
-    sentence = "; ".join(found)
-    sentence = sentence[0].upper() + sentence[1:]
-    return _check("noise", not warnings, warnings=warnings, found=sentence)
+        if error and error.found and (span := objective.span(name)):
+            missed.append({"name": name, "missed": error.law / span})
+        if noise.sigma > 1e-9 * objective.scale[name]:  # else too small to be seen
+            source, most = ("stated", STATED) if noise.given else ("estimated", ESTIMATED)
+            ratio = rms[name] / noise.sigma
+            # Three standard deviations of the RMS of so many effective samples.
+            large = ratio > most + 3.0 * math.sqrt(tau / (2.0 * size))
+            seen.append({"name": name, "ratio": ratio, "source": source, "large": large})
+    long, large = longest > STRUCTURED, any(one["large"] for one in seen)
+    answer = False if missed or long or large else None
+    if answer is None and known and (seen or longest >= 1.05):
+        answer = True
+    return _check("noise", answer, seen=seen, missed=missed, tau=longest, long=long)
 
 
-def _determined(e: Findings) -> Check:
+def _determined(best: BestPoint, estimates: Estimates) -> Check:
     """Whether the springs' parameters are; a small upper bound of one that may vanish is enough.
 
     A nuisance parameter that is not determined shows in the intervals of the others.
     """
-    own = {name: item for name, item in e.estimates.items() if name not in NUISANCE}
-    vanishing, warnings = [name for name in own if _vanishes(e, name)], list[str]()
-    named = [(name, item) for name, item in own.items() if name not in vanishing]
+    own = {name: item for name, item in estimates.items() if name not in NUISANCE}
+    vanishing, reasons_of = [name for name in own if _vanishes(best, name, own[name])], {}
     for state in ("not determined", "weak"):
-        of = {name: item.why for name, item in named if item.state == state}
-        groups = [(", ".join(names), why) for why, names in groupby(of, key=of.__getitem__)]
-        told = "; ".join(f"{names} ({why})" for names, why in groups)
-        if len(groups) > REASONS:
-            told = say("check.determined", "many", names=", ".join(of))
-        if of:
-            warnings.append(say("check.determined", "state", state=state.capitalize(), names=told))
+        of = {n: p.why for n, p in own.items() if p.state == state and n not in vanishing}
+        groups = groupby(of, key=of.__getitem__)
+        reasons_of[state] = [(", ".join(names), why) for why, names in groups]
     states = [item.state for item in own.values() if item.state != "fixed"]
-    zero = say("check.determined", "vanishing", names=", ".join(vanishing)) if vanishing else ""
     count, varied = states.count("determined"), len(states)
+    answer = not any(reasons_of.values())
     return _check(
-        "determined", not warnings, warnings=warnings, count=count, all=varied, vanishing=zero
+        "determined",
+        answer,
+        reasons_of=reasons_of,
+        vanishing=vanishing,
+        count=count,
+        all=varied,
+        most=REASONS,
     )
 
 
-def _vanishes(e: Findings, name: str) -> bool:
+def _vanishes(best: BestPoint, name: str, item: ParameterEstimate) -> bool:
     """Whether a parameter is consistent with zero and its upper bound is small."""
-    item = e.estimates[name]
     if item.state != "weak" or item.ci95 is None or not may_vanish(name):
         return False
-    size = float(e.best.problem.sizes((name,), e.best.values)[0])
+    size = float(best.problem.sizes((name,), best.values)[0])
     ends = (*item.ci95, *(item.range or ()))
     return bool(min(ends) <= 0.0 <= max(ends) and max(map(abs, ends)) <= WEAK * size)
 
 
-def _visited(e: Findings) -> Check:
-    problem = e.best.problem
-    wanted = [law.needed for law in problem.model.laws]
-    if not any(wanted):
-        return _check("visited", True, "linear")
-    seen = visited(problem, e.best.simulated)
+def _visited(best: BestPoint, estimates: Estimates) -> Check:
+    wanted = [law.needed for law in best.problem.model.laws]
+    seen = visited(best.problem, best.simulated)
     absent = {
         spring: [branch for branch in branches if branch not in covered(seen[spring])]
         for spring, branches in zip(seen, wanted, strict=True)
@@ -223,77 +203,70 @@ def _visited(e: Findings) -> Check:
     # It matters if a parameter that varies depends on it; its own warning says so.
     depend = any(
         item.state == "not determined" and absent.get(f"s{split_name(name)[0] + 1}")
-        for name, item in e.estimates.items()
+        for name, item in estimates.items()
     )
     answer = True if not lost else False if depend else None
-    every = listed(dict.fromkeys(chain.from_iterable(wanted)))
-    return _check("visited", answer, wanted=every, lost=", ".join(lost))
+    every = tuple(dict.fromkeys(chain.from_iterable(wanted)))
+    return _check("visited", answer, wanted=every, lost=lost)
 
 
-def _of_parameters(e: Findings) -> Iterator[Check]:
-    yield _determined(e)
-    yield _visited(e)
-    counts = Counter(item.ci95_method for item in e.estimates.values() if item.ci95_method)
-    made = ", ".join(f"{n} by {method}" for method, n in counts.items()) or "There are none"
-    answer = False if e.intervals.warnings else True if counts else None
-    yield _check("intervals", answer, warnings=e.intervals.warnings, made=made)
+def _of_intervals(
+    best: BestPoint, estimates: Estimates, intervals: Intervals, known: Sequence[str]
+) -> Iterator[Check]:
+    made = Counter(item.ci95_method for item in estimates.values() if item.ci95_method)
+    answer = False if intervals.warnings else True if made else None
+    yield _check("intervals", answer, warnings=intervals.warnings, made=made)
     stuck, natural = [], []
-    varied = tuple(name for name in e.known if e.estimates[name].vary)
-    for name, size in zip(varied, e.best.problem.sizes(varied, e.best.values), strict=True):
-        for bound in e.best.limits(name):
-            if abs(e.best.values[e.best.index[name]] - bound) > AT_LIMIT * size:
+    varied = tuple(name for name in known if estimates[name].vary)
+    for name, size in zip(varied, best.problem.sizes(varied, best.values), strict=True):
+        for bound in best.limits(name):
+            if abs(best.values[best.index[name]] - bound) > AT_LIMIT * size:
                 continue
             if bound == 0.0 and may_vanish(name):
-                natural.append(f"{name} is zero, which it may be")
+                natural.append(name)
             else:
-                stuck.append(f"{name} lies at {bound:g}")
-    yield _check("bounds", not stuck, at=", ".join([*stuck, *natural]) or "None lies at one")
+                stuck.append((name, bound))
+    yield _check("bounds", not stuck, stuck=stuck, natural=natural)
 
 
-def _of_test(e: Findings) -> Iterator[Check]:
-    test, balance = e.best.problem.measurement, e.balance
+def _of_test(best: BestPoint, balance: EnergyAudit) -> Iterator[Check]:
+    test = best.problem.measurement
     wrong = [note for note in test.notes if CONTRADICTED in note]
     asked = [note for note in test.notes if note.startswith(ASKED) and note not in wrong]
-    moves = e.objective.drive == "impact" and test.displacement is not None
+    moves = best.problem.objective.drive == "impact" and test.displacement is not None
     yield _check("velocity", not wrong if moves else None, warnings=wrong if moves else ())
     yield _check("input", not asked, warnings=asked)
     taken, warnings = balance.absorbed_over_striker, balance.energy_warnings()
-    if not warnings and (taken is None or balance.motion == INTEGRATED):
-        yield _check("energy", None, "unknown" if taken is None else "integrated")
-    else:
-        case = "returns" if taken is None else ""
-        yield _check("energy", not warnings, case, warnings=warnings, taken=taken)
+    unknown = not warnings and (taken is None or balance.motion == INTEGRATED)
+    answer = None if unknown else not warnings
+    yield _check("energy", answer, warnings=warnings, taken=taken)
     ratio, warnings = balance.impulse_ratio, balance.impulse_warnings()
     answer = None if ratio is None else not warnings
     yield _check("impulse", answer, warnings=() if ratio is None else warnings, ratio=ratio)
 
 
-def _of_what_is_left_out(e: Findings) -> Iterator[Check]:
-    yield _time_shift(e)
-    if e.objective.drive != "displacement" or not e.best.names:
-        yield _check("damping", None)
-        return
-    eta = _damping_hint(e.best, e.known) or 0.0
-    yield _check("damping", eta == 0.0, size=engineering(eta, "Pa·s"))
+def _damping(best: BestPoint, known: Sequence[str]) -> Check:
+    if best.problem.objective.drive != "displacement" or not best.names:
+        return _check("damping", None)
+    eta = _damping_hint(best, known) or 0.0
+    return _check("damping", eta == 0.0, eta=eta)
 
 
-def _time_shift(e: Findings) -> Check:
-    test = e.best.problem.measurement
-    if e.objective.time_shift:
-        if (shift := e.estimates.get("time_shift")) is None or not shift.vary:
-            return _check("time_shift", None, "held")
-        told = engineering(shift.value, "s").replace("-", "−")
-        return _check("time_shift", True, "fitted", shift=told)
+def _time_shift(best: BestPoint, estimates: Estimates, known: Sequence[str]) -> Check:
+    test, objective = best.problem.measurement, best.problem.objective
     force = test.outliers.get("stress")
-    if force is not None and force.clipped_at is not None:
-        return _check("time_shift", None, "clipped")
-    try:
-        check_time_shift(test, e.objective.drive)
-    except InputError:
-        return _check("time_shift", None)
-    late = _shift_hint(e.best, e.known) or 0.0
-    told = f"{'late' if late > 0.0 else 'early'} by {engineering(abs(late), 's')}"
-    return _check("time_shift", late == 0.0, late=told)
+    clipped = force is not None and force.clipped_at is not None
+    facts: dict[str, Any] = {"held": False, "clipped": clipped, "shift": None}
+    if objective.time_shift:
+        shift = estimates.get("time_shift")
+        facts |= {"held": shift is None or not shift.vary, "shift": shift and shift.value}
+        return _check("time_shift", None if facts["held"] else True, **facts)
+    with suppress(InputError):
+        check_time_shift(test, objective.drive)
+        if not clipped:
+            late = _shift_hint(best, known) or 0.0
+            return _check("time_shift", late == 0.0, late=late, **facts)
+    return _check("time_shift", None, **facts)
 
 
 def _shift_hint(best: BestPoint, determined: Sequence[str]) -> float | None:
@@ -322,7 +295,7 @@ def _damping_hint(best: BestPoint, determined: Sequence[str]) -> float | None:
     alone = problem.objective.drive == "displacement" and len(problem.model.kinds) == 1
     if not alone or problem.measurement.time is None or held.vary or held.value != 0.0:
         return None
-    column = problem.linear.slopes(best.values, (name,))[:, 0]
+    column = problem.slopes(best.values, (name,))[:, 0]
     size = float(problem.sizes((name,), best.values)[0])
     eta = _one_step(best, determined, column, size)
     return eta if eta is not None and eta > 0.0 else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -17,8 +17,7 @@ from foamfit.data.measurement import INTEGRATED, interior_channel
 from foamfit.errors import SimulationError
 from foamfit.fitting.branches import visited
 from foamfit.fitting.curves import MOTION_CURVES
-from foamfit.fitting.losses import LOSSES
-from foamfit.fitting.objective import MODEL_ERROR, Objective
+from foamfit.fitting.objective import MODEL_ERROR
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstimate, Switch
 from foamfit.springs import laws
@@ -29,7 +28,6 @@ from foamfit.trust.best_point import BestPoint, cycle_growth
 from foamfit.trust.budget import make_budget
 from foamfit.trust.checklist import (
     POOR,
-    Findings,
     make_checklist,
     may_vanish,
     status_of,
@@ -57,7 +55,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         correlation = Correlation(best.names, spread.correlation, spread.stderr)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals))
     balance, misfit = audit(measurement), objective.misfit(simulated)
-    checklist = make_checklist(Findings(best, estimates, misfit, record, balance, intervals))
+    checklist = make_checklist(best, estimates, misfit, record, balance, intervals)
     springs = best.values[: len(problem.model.names)]
     return Fit(
         measurement=measurement,
@@ -89,11 +87,10 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         ),
         switches=_switches(best),
         correlation=correlation,
-        notes=(*problem.notes, *_notes(best), *_noise_notes(objective), *intervals.notes),
+        notes=(*problem.notes, *_notes(best), *intervals.notes),
         checklist=checklist,
         insight=insight,
         stopped=record.stopped,
-        loss=objective.loss,
         relaxation=problem.model.relaxation,
         interior_mass=objective.interior_mass,
         noise=noise_of(best, best.errors if best.names else ()),
@@ -128,72 +125,59 @@ def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[st
     return found
 
 
-def _noise_notes(objective: Objective) -> Iterator[str]:
-    """What the noise is, what the residuals are counted in, and which samples are left out."""
-    for sentence in noise_sentences(objective.measurement):
-        yield f"Noise of {sentence}"
-    counted = objective.counted
-    floored = [name for name in counted if objective.scale[name] > objective.noise(name).sigma]
-    key = "floored" if floored else "noise"
-    yield say("note", key, curves=", ".join(floored), share=MODEL_ERROR)
-    for channel, outliers in objective.measurement.outliers.items():
-        if outliers.at.size:
-            yield say("note", "outliers", count=outliers.at.size, channel=channel)
-    if objective.time_shift and objective.drive != "impact":
-        yield say("note", "late")
-    if objective.loss != "linear":
-        yield say("note", "loss", loss=objective.loss, width=LOSSES[objective.loss])
-
-
-def _notes(best: BestPoint) -> Iterator[str]:
-    """What was left out of the model, and what it would change."""
-    yield from _inner_loops(best)
-    for one in best.problem.objective.given:
-        found, unit = float(best.values[best.index[one.name]]), unit_of(one.name)
-        told = [engineering(v, unit) if unit else f"{v:.4g}" for v in (one.mean, one.sigma)]
-        away = abs(found - one.mean) / one.sigma
-        yield say("note", "prior", name=one.name, mean=told[0], sigma=told[1], off=away)
+def _notes(best: BestPoint) -> tuple[str, ...]:
+    """What was left out of the model and what it would change, and how residuals are counted."""
     test, simulated, objective = best.problem.measurement, best.simulated, best.problem.objective
     single = len(best.problem.model.kinds) == 1
-    off = [
-        say("note", "off", curve=name.replace("_", "-"), share=share)
+    off = {
+        name: share
         for name in MOTION_CURVES
+        if test.motion == INTEGRATED
         if name not in objective.counted and (share := objective.off(simulated, name))
-    ]
-    if test.motion == INTEGRATED and off:
-        yield say("note", "integrated", curves=" and ".join(off))
-    if single and test.interior:
-        inside = map(interior_channel, sorted(test.interior))
-        yield say("note", "inside", names=", ".join(inside))
-    if objective.drive == "stress":
-        yield say("note", "smoothed")
-    if single or objective.drive != "impact" or objective.interior_mass:
-        return
-    if test.specimen.mass is None:
-        yield say("note", "mass")
-        return
+    }
+    told = say(
+        "notes",
+        "all",
+        objective=objective,
+        loops=_inner_loops(best),
+        priors=[(p, unit_of(p.name), best.values[best.index[p.name]]) for p in objective.given],
+        off=off,
+        inside=list(map(interior_channel, sorted(test.interior))) if single else [],
+        masses=None if single else _masses(best),
+        noises=noise_sentences(test),
+        floored=[n for n in objective.counted if objective.scale[n] > objective.noise(n).sigma],
+        floor=MODEL_ERROR,
+    )
+    return tuple(told.splitlines())
+
+
+def _masses(best: BestPoint) -> dict[str, Any] | None:
+    """What the masses inside a chain, which are left out, would change in an impact."""
+    objective, mass = best.problem.objective, best.problem.measurement.specimen.mass
+    if objective.drive != "impact" or objective.interior_mass:
+        return None
+    if mass is None:
+        return {"changes": [], "ended": None}
     try:
         other = replace(objective, interior_mass=True).simulate(best.values).curves
     except SimulationError as error:
-        yield say("note", "ends", error=error)
-        return
-    spoken = {"stress_time": "the base stress", "displacement_time": "the displacement"}
-    changes = []
-    for name, curve in simulated.curves.items():
+        return {"changes": [], "ended": error}
+    spoken, changes = {"stress_time": "base stress", "displacement_time": "displacement"}, []
+    for name, curve in best.simulated.curves.items():
         if name != "stress_strain" and name in other:
             share = float(np.sqrt(np.mean((curve - other[name]) ** 2)) / np.ptp(curve))
             size = "less than 0.01 %" if share < 1e-4 else percent(share)
-            changes.append(f"{spoken.get(name, name.removesuffix('_time'))} by {size}")
-    mass = test.specimen.mass * 1e6
-    yield say("note", "masses", mass=mass, changes=" and ".join(changes))
+            what = f"the {spoken[name]}" if name in spoken else name.removesuffix("_time")
+            changes.append(f"{what} by {size}")
+    return {"mass": mass, "changes": changes}
 
 
-def _inner_loops(best: BestPoint) -> Iterator[str]:
-    """Say what a partial unloading leaves in the residuals of a law that has no inner loops."""
+def _inner_loops(best: BestPoint) -> dict[str, Any] | None:
+    """What a partial unloading leaves in the residuals of a law that has no inner loops."""
     test, curve = best.problem.measurement, best.simulated.curves.get("stress_strain")
     own = [law for law in best.problem.model.laws if law.hysteretic]
     if not own or curve is None or any(law.inner_loops for law in own):
-        return
+        return None
     assert test.displacement is not None  # there is a curve along it
     assert test.stress is not None
     squares, inside, spans = (curve - test.stress) ** 2, np.zeros(curve.size, dtype=bool), []
@@ -204,16 +188,13 @@ def _inner_loops(best: BestPoint) -> Iterator[str]:
         if test.time is not None:
             told = [engineering(test.time[at], "s") for at in ends]
         spans.append(f"from {told[0]} to {told[1]}")
-    if spans and (total := float(squares.sum())) > 0.0:
-        share = float(squares[inside].sum()) / total
-        samples, held = percent(float(inside.mean())), percent(share)
-        with_loops = [law for law in map(laws.law, laws.kinds()) if law.inner_loops]
-        none, others = (
-            listed(dict.fromkeys(f"{law.title}s" for law in some)) for some in (own, with_loops)
-        )
-        none = none[0].upper() + none[1:]
-        facts = {"spans": listed(spans), "samples": samples, "squares": held}
-        yield say("note", "loops", none=none, others=others, **facts)
+    if not spans or not (total := float(squares.sum())) > 0.0:
+        return None
+    with_loops = [law for law in map(laws.law, laws.kinds()) if law.inner_loops]
+    titles = (dict.fromkeys(f"{law.title}s" for law in some) for some in (own, with_loops))
+    without, others = map(listed, titles)
+    shares = {"samples": float(inside.mean()), "squares": float(squares[inside].sum()) / total}
+    return {"spans": spans, "without": without, "others": others, **shares}
 
 
 def _estimates(
@@ -259,25 +240,17 @@ def _varied(
     if span is not None:  # it may be that of the point before the last improvement
         span = min(span[0], value), max(span[1], value)
     state, why = state_of(name, value, ends, insight, (low, high), span)
-    objective = problem.objective
+    objective, there = problem.objective, intervals.elsewhere.get(name)
     off, curve = max((objective.off(best.simulated, one) or 0.0, one) for one in objective.counted)
-    if state == "determined" and objective.interior_mass:
-        state, why = "weak", say("why", "vibration", why=why)
-    elif state == "determined" and name in intervals.elsewhere:
-        there = intervals.elsewhere[name] + problem.measurement.origins.get(name, 0.0)
-        told = engineering(there, unit) if unit else f"{there:.3g}"
-        state, why = "weak", say("why", "elsewhere", there=told, why=why)
-    elif state == "determined" and off > POOR:
-        told = curve.replace("_", "-")
-        state, why = "weak", say("why", "poor", off=off, curve=told, why=why)
+    if state == "determined" and (objective.interior_mass or there is not None or off > POOR):
+        there = None if there is None else there + problem.measurement.origins.get(name, 0.0)
+        facts = {"vibrates": objective.interior_mass, "there": there, "off": off, "curve": curve}
+        state, why = "weak", say("why", "weak", why=why, unit=unit, **facts)
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
-    if name in intervals.doubtful:
-        why = say("why", "doubtful", why=why)
-    if stalled:
-        method, why = "local covariance", say("why", "stalled", why=why)
-    elif name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf):
-        why = say("why", "astray", why=why)
+    astray = name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf)
+    doubtful, method = name in intervals.doubtful, "local covariance" if stalled else method
+    why = say("why", "interval", why=why, doubtful=doubtful, stalled=stalled, astray=astray)
     ci95, stderr = (max(ends[0], low), min(ends[1], high)), float(best.spread.stderr[column])
     return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method, span)
 
@@ -305,16 +278,13 @@ def state_of(
     if may_vanish(name) and ends[0] <= 0.0 <= ends[1] and not at_bound:
         below = any_param(split_name(name)[1]).admissible == "zero or negative"
         side, end = ("lower", ends[0]) if below else ("upper", ends[1])
-        bound = engineering(end, unit).replace("Pa s", "Pa·s").replace("-", "−")
-        key, what = "at_zero" if value == 0.0 else "zero", what.removesuffix(" interval")
-        return "weak", say("why", key, side=side, bound=bound, what=what)
+        what = what.removesuffix(" interval")
+        return "weak", say("why", "zero", value=value, side=side, bound=end, unit=unit, what=what)
     if state == "determined":
         return state, why
     past = ends[0] <= limits[0], ends[1] >= limits[1]
     if any(past) and "open" not in why:
-        limit = limits[past.index(True)]
-        told = engineering(limit, unit) if unit else f"{limit:g}"
-        why = say("why", "open", why=why, limit=told)
+        why = say("why", "open", why=why, limit=limits[past.index(True)], unit=unit)
     together = insight.combination(name, covariance.WEAK / 1.96) or insight.companion(name)
     return state, f"{why}; {together}" if together else why
 

@@ -67,19 +67,6 @@ class Covariance:
         scale = self.stderr
         return self.matrix / np.outer(scale, scale)
 
-    def with_some(self, chosen: NDArray[np.intp], other: Covariance) -> Covariance:
-        """Take these parameters from another covariance; the rest is correlated with nothing.
-
-        No variance becomes smaller: the curvature of a cost with kinks is known to some tenths.
-        """
-        variance = np.diag(self.matrix)
-        more = np.sqrt(np.fmax(variance[chosen] / np.diag(other.matrix), 1.0))
-        matrix = np.diag(variance)
-        matrix[np.ix_(chosen, chosen)] = other.matrix * np.outer(more, more)
-        inflation, freedom = self.inflation.copy(), self.freedom.copy()
-        inflation[chosen], freedom[chosen] = other.inflation * more**2, other.freedom
-        return replace(self, matrix=matrix, inflation=inflation, freedom=freedom)
-
 
 @dataclass(frozen=True, eq=False)
 class Block:
@@ -170,20 +157,27 @@ class Block:
 
 
 @dataclass(frozen=True, eq=False)
-class Sandwich:
-    """Covariance H⁻¹ JᵀΣJ H⁻¹ of m unknowns with Σ the noise of the curves of all tests, scaled.
+class Uncertainty:
+    """What the noise leaves uncertain of m unknowns at the best point of one test or several.
 
-    H is JᵀJ, or with `curvatures` (of each test, along its `Block.axes`) that of half the cost,
-    which a residual that is no noise changes (White 1982, Econometrica 50, 1). `bend` (m, m) is
-    what the bend of `Block.through` adds to H. `drawn` (d, m) are the slopes of further residuals,
-    of so much variance each (d,). All is computed along s directions of the unknowns along which
-    the residuals of all tests together have unit slopes.
+    A covariance H⁻¹ JᵀΣJ H⁻¹ with Σ the noise of the curves of all tests, scaled. H is JᵀJ, or with
+    `curvatures` (of each test, along its `Block.axes`) that of half the cost, which a residual that
+    is no noise changes (White 1982, Econometrica 50, 1). `bend` (m, m) is what the bend of
+    `Block.through` adds to H. `drawn` (d, m) are the slopes of further residuals, of so much
+    variance each (d,). All is computed along s directions of the unknowns along which the residuals
+    of all tests together have unit slopes.
     """
 
     blocks: tuple[Block, ...]
+    scales: Array  # (m,)
     drawn: tuple[Array, Array] | None = None
-    curvatures: tuple[Array, ...] | None = None
     bend: Array | None = None
+    curvatures: tuple[Array, ...] | None = None
+
+    @property
+    def errs(self) -> bool:
+        """Whether the law misses more of some test than noise."""
+        return any(block.gradient for block in self.blocks)
 
     @cached_property
     def _solved(self) -> tuple[Array, Array]:
@@ -223,13 +217,6 @@ class Sandwich:
         least = 1e-12 * power.max(initial=0.0)  # no variance is negative
         return np.asarray(axes * np.sqrt(np.maximum(power, least)))
 
-    def curved(self, bend: Array | None) -> Sandwich:
-        """The same with the curvature of the cost of each test (`Block.curvature`)."""
-        spreads = [left @ self.axes for left in self.lefts]
-        pairs = zip(self.blocks, spreads, strict=False)
-        curvatures = tuple(block.curvature(one @ one.T) for block, one in pairs)
-        return replace(self, curvatures=curvatures, bend=bend)
-
     @cached_property
     def _bread(self) -> Array:
         """H⁻¹ along the directions; where there is no curvature, that of JᵀJ."""
@@ -250,7 +237,7 @@ class Sandwich:
 
     @cached_property
     def matrix(self) -> Array:
-        """The covariance, (m, m); NaN where the tests say nothing."""
+        """The covariance of the scaled unknowns, (m, m); NaN where the tests say nothing."""
         spread = self.root @ self._bread @ self.axes
         out = spread @ spread.T
         for t, (left, block) in enumerate(self._pairs):
@@ -261,51 +248,6 @@ class Sandwich:
                 out = out + np.outer(pull, pull)
         out[self.lost, :] = out[:, self.lost] = np.nan
         return out
-
-    def covariance(self, scales: Array) -> Covariance:
-        """Covariance of the unknowns in SI, by their scales (m,)."""
-        back, m = self._bread @ self.root.T, scales.size
-        variance, doubt, most = np.zeros((3, m))
-        there = np.array([(block.through != 0.0).any(axis=0) for block in self.blocks])
-        own = there & (there.sum(axis=0) == 1)
-        effective = sum(block.effective for block in self.blocks)
-        for (left, block), mine in zip(self._pairs, own, strict=True):
-            mix = left @ back
-            variance += np.einsum("ij,ij->j", mix, block.meat @ mix)
-            doubt += block.doubt(mix)
-            most[mine] = block.effective - np.count_nonzero(mine)
-        most[~own.any(axis=0)] = effective - m
-        if self.drawn is not None:
-            mix = self.lefts[-1] @ back
-            variance += self.drawn[1] @ mix**2
-        known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
-        return Covariance(
-            self.matrix * np.outer(scales, scales),
-            np.diag(self.matrix) / np.where(self.lost, np.nan, np.diag(self.inverse)),
-            np.minimum(known, np.maximum(most, 1.0)),
-            effective,
-            tuple(one for block in self.blocks for one in block.noise),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Uncertainty:
-    """What the noise leaves uncertain of m unknowns at the best point of one test or several."""
-
-    blocks: tuple[Block, ...]
-    scales: Array  # (m,)
-    drawn: tuple[Array, Array] | None = None
-    bend: Array | None = None
-
-    @property
-    def errs(self) -> bool:
-        """Whether the law misses more of some test than noise."""
-        return any(block.gradient for block in self.blocks)
-
-    @cached_property
-    def plain(self) -> Sandwich:
-        """As if the law had no error."""
-        return Sandwich(self.blocks, self.drawn)
 
     @cached_property
     def held(self) -> NDArray[np.bool_]:
@@ -322,24 +264,62 @@ class Uncertainty:
         return np.asarray(outward > 1.96 * np.sqrt(sure))
 
     @cached_property
-    def bent(self) -> Sandwich:
-        """With the curvature of the cost, what is pressed to a limit held."""
-        if not self.held.any():
-            return self.plain.curved(self.bend)
-        free = ~self.held
-        drawn = None if self.drawn is None else (self.drawn[0][:, free], self.drawn[1])
-        bend = None if self.bend is None else self.bend[np.ix_(free, free)]
-        blocks = tuple(block.without(self.held) for block in self.blocks)
-        return Sandwich(blocks, drawn).curved(bend)
+    def bent(self) -> Uncertainty:
+        """With the curvature of the cost of each test, what is pressed to a limit held."""
+        free, one = ~self.held, self
+        if not free.all():
+            one = Uncertainty(
+                tuple(block.without(self.held) for block in self.blocks),
+                self.scales[free],
+                None if self.drawn is None else (self.drawn[0][:, free], self.drawn[1]),
+                None if self.bend is None else self.bend[np.ix_(free, free)],
+            )
+        spreads = [left @ one.axes for left in one.lefts]
+        pairs = zip(one.blocks, spreads, strict=False)
+        return replace(one, curvatures=tuple(block.curvature(s @ s.T) for block, s in pairs))
+
+    @cached_property
+    def sandwich(self) -> Covariance:
+        """The covariance, SI, with the curvature that this has."""
+        back, m = self._bread @ self.root.T, self.scales.size
+        variance, doubt, most = np.zeros((3, m))
+        there = np.array([(block.through != 0.0).any(axis=0) for block in self.blocks])
+        own = there & (there.sum(axis=0) == 1)
+        effective = sum(block.effective for block in self.blocks)
+        for (left, block), mine in zip(self._pairs, own, strict=True):
+            mix = left @ back
+            variance += np.einsum("ij,ij->j", mix, block.meat @ mix)
+            doubt += block.doubt(mix)
+            most[mine] = block.effective - np.count_nonzero(mine)
+        most[~own.any(axis=0)] = effective - m
+        if self.drawn is not None:
+            mix = self.lefts[-1] @ back
+            variance += self.drawn[1] @ mix**2
+        known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
+        return Covariance(
+            self.matrix * np.outer(self.scales, self.scales),
+            np.diag(self.matrix) / np.where(self.lost, np.nan, np.diag(self.inverse)),
+            np.minimum(known, np.maximum(most, 1.0)),
+            effective,
+            tuple(one for block in self.blocks for one in block.noise),
+        )
 
     @cached_property
     def covariance(self) -> Covariance:
-        """Covariance of the unknowns, SI."""
-        plain = self.plain.covariance(self.scales)
+        """Covariance of the unknowns, SI: with the curvature of the cost where a law errs.
+
+        That makes no variance smaller: the curvature of a cost with kinks is known to some tenths.
+        What is held is correlated with nothing.
+        """
+        plain = self.sandwich
         if not self.errs or self.held.all():
             return plain
-        free = np.flatnonzero(~self.held)
-        return plain.with_some(free, self.bent.covariance(self.scales[free]))
+        free, bent, variance = np.flatnonzero(~self.held), self.bent.sandwich, np.diag(plain.matrix)
+        more = np.sqrt(np.fmax(variance[free] / np.diag(bent.matrix), 1.0))
+        matrix, inflation, freedom = np.diag(variance), plain.inflation.copy(), plain.freedom.copy()
+        matrix[np.ix_(free, free)] = bent.matrix * np.outer(more, more)
+        inflation[free], freedom[free] = bent.inflation * more**2, bent.freedom
+        return replace(plain, matrix=matrix, inflation=inflation, freedom=freedom)
 
 
 def covariance(

@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
 from foamfit.fitting.branches import branch_of_samples
-from foamfit.fitting.losses import soften, softness
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.search import Tracker
+from foamfit.fitting.search import Tracker, squares
 from foamfit.results import Fit, rung_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
@@ -66,10 +65,7 @@ def misfit_of(objective: Objective, residual: Array) -> float:
 def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
     """RMS over the measured ranges of the samples of each block, predicted from the others.
 
-    Raises
-    ------
-    SearchStoppedError
-        If the time (`time.monotonic`) is past the deadline.
+    Raises SearchStoppedError if the time (`time.monotonic`) is past the deadline.
     """
     # With counts of its own, and each sample for itself: weighed residuals mix what is held back.
     problem, objective = best.problem, replace(best.problem.objective, weighing=None)
@@ -80,16 +76,8 @@ def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
     start, predicted = space.encode(best.values), np.empty(of_sample.size)
     for held in range(BLOCKS):
         rest = of_sample != held
-
-        def residual(point: Array, rest: Array = rest) -> Array:
-            return np.asarray(tracker.residual(space.decode(point))[rest])
-
-        def jacobian(point: Array, rest: Array = rest) -> Array:
-            values = space.decode(point)
-            moves = space.slopes(point, values)
-            return np.asarray(objective.jacobian_along(values, moves)[rest])
-
-        end = levenberg.descend(residual, jacobian, start, space.box, STEPS, enough=ENOUGH)
+        functions = squares(tracker, space, rest)
+        end = levenberg.descend(*functions, start, space.box, STEPS, enough=ENOUGH)
         there = objective.residual(space.decode(end.point))
         predicted[~rest] = there[~rest]
     return misfit_of(objective, predicted[: objective.n_data])
@@ -101,8 +89,8 @@ class Tried:
 
     `predicted` is the RMS over the range of samples that were held back, None where the time did
     not allow it; `misfit` that of all samples, not less than the simulation's own error, like the
-    chi-square `chisqr`. `residual` (n_data,) is in the order of its `curves`, and `grams` are JᵀJ
-    of each curve, J the derivative by relative changes, (n_curves, k, k).
+    chi-square `chisqr`. `curves` are the residuals of each, and `grams` their JᵀJ, J the derivative
+    by relative changes, (n_curves, k, k).
     """
 
     result: Fit
@@ -118,17 +106,13 @@ class Tried:
         self.varied = sum(item.vary for item in self.result.parameters.values())
         self.counted, self.sizes = objective.counted, objective.sizes
         self.spans = [objective.span(name) for name in self.counted]  # in the unit of the residual
-        self.residual = soften(best.residual[: objective.n_data], objective.loss)
-        slices = parts(self.sizes)
-        self.curves = [self.residual[part] for part in slices]
+        residual, slices = best.residual[: objective.n_data], parts(self.sizes)
+        self.curves = [residual[part] for part in slices]
         self.taus = [autocorrelation_time(curve) for curve in self.curves]
-        soft = softness(best.residual, objective.loss)
-        jacobian = soft[:, None] * best.jacobian * best.sizes
-        self.grams = np.array([jacobian[part].T @ jacobian[part] for part in slices])
-        pairs = zip(self.sizes, self.spans, strict=True)
-        floor = sum(n * (EXACT * span) ** 2 for n, span in pairs)
-        self.chisqr = max(float(self.residual @ self.residual), floor)
-        self.misfit = max(misfit_of(objective, self.residual), EXACT)
+        self.grams = np.array([best.scaled[part].T @ best.scaled[part] for part in slices])
+        floor = sum(n * (EXACT * s) ** 2 for n, s in zip(self.sizes, self.spans, strict=True))
+        self.chisqr = max(float(residual @ residual), floor)
+        self.misfit = max(misfit_of(objective, residual), EXACT)
         # p-values of all curves together (Bonferroni)
         self.runs_p, self.neighbours_p = (
             min(1.0, len(self.sizes) * min(map(test, self.curves)))
@@ -137,6 +121,11 @@ class Tried:
         least = min(self.runs_p, self.neighbours_p)
         self.structureless = self.chisqr <= floor or least >= LEVEL  # only noise is left
         self.errs = self.chisqr > floor and least < SURE  # an error of the model is left for sure
+
+    @property
+    def n_eff(self) -> float:
+        """Effective samples n/τ of all curves."""
+        return float(sum(n / tau for n, tau in zip(self.sizes, self.taus, strict=True)))
 
     @property
     def places(self) -> list[NDArray[np.str_]]:
@@ -171,11 +160,6 @@ def reference_of(tried: Sequence[Tried]) -> Tried:
     return min(tried, key=lambda one: one.chisqr)
 
 
-def effective_samples(reference: Tried) -> float:
-    """Effective samples n/τ of all curves."""
-    return float(sum(n / tau for n, tau in zip(reference.sizes, reference.taus, strict=True)))
-
-
 def effective_parameters(grams: Array, reference: Tried) -> int:
     """How many combinations of its parameters the curves fix against the noise.
 
@@ -186,17 +170,16 @@ def effective_parameters(grams: Array, reference: Tried) -> int:
     """
     information = np.zeros(grams.shape[1:])
     for gram, part, tau in zip(grams, reference.curves, reference.taus, strict=True):
-        variance = max(float(part @ part), 1e-300) / part.size
-        information += gram / (variance * tau)
+        information += gram / (max(float(part @ part), 1e-300) / part.size * tau)
     singular = np.sqrt(np.maximum(np.linalg.eigvalsh(information), 0.0))
     return max(int(np.count_nonzero(NOTHING * singular > 1.96)), 1)
 
 
 def criteria(one: Tried, reference: Tried) -> Criteria:
     """AICc and BIC of a model: n_eff ln(χ²/n) and the penalty for its effective parameters."""
-    n_eff = effective_samples(reference)
+    n_eff = reference.n_eff
     rank = effective_parameters(one.grams, reference)
-    fit = n_eff * math.log(max(one.chisqr, 1e-300) / one.residual.size)
+    fit = n_eff * math.log(max(one.chisqr, 1e-300) / sum(one.sizes))
     freedom = n_eff - rank - 1.0
     aicc = fit + 2.0 * rank + 2.0 * rank * (rank + 1.0) / freedom if freedom > 0.0 else math.inf
     return Criteria(rank, aicc, fit + rank * math.log(max(n_eff, 1.0)))

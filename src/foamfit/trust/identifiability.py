@@ -8,7 +8,7 @@ scale, `fitting.box.Scales.of_parameter`), so that parameters and curves can be 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -16,9 +16,9 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.fitting.box import scale_in_words
-from foamfit.fitting.branches import Section, sections
+from foamfit.fitting.branches import sections
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import listed, percent
+from foamfit.text import listed
 from foamfit.trust import say
 
 if TYPE_CHECKING:
@@ -38,11 +38,12 @@ class Insight:
     names: tuple[str, ...]  # (k,): parameters that vary and whose branch was reached
     values: Array  # (k,), SI
     sizes: Array  # (k,): their scales, SI
-    curves: tuple[str, ...]  # in the order of the rows of `scaled`
-    # (n_curves * n_samples, k): by how many standard deviations of its noise a curve moves, sample
-    # by sample, if a parameter changes by its scale; zero at samples that are not counted.
-    scaled: Array
-    sections: tuple[Section, ...]  # the stretches of the run between switches
+    # A curve and the branches of the springs along a part of it.
+    parts: tuple[tuple[str, str], ...]
+    # (n_parts, k, k): the triangle of a QR factorization of the sensitivities along each part. They
+    # are by how many standard deviations of its noise a curve moves, sample by sample, if a
+    # parameter changes by its scale; their products tell all, and the triangle keeps these.
+    triangles: Array
     silent: tuple[str, ...] = ()  # parameters that vary but whose branch was never reached
 
     @cached_property
@@ -52,10 +53,9 @@ class Insight:
         The last one is the weakest. The error is infinite where the curves do not move at all.
         """
         k = len(self.names)
-        triangle = np.linalg.qr(self.scaled, mode="r") if len(self.scaled) > k else self.scaled
+        triangle = np.linalg.qr(self.triangles.reshape(-1, k), mode="r")
         _, singular, vt = np.linalg.svd(triangle, full_matrices=True)
-        singular = np.concatenate([singular, np.zeros(k - singular.size)])
-        tiny = 1e-12 * max(float(singular[0]), 1e-300)
+        tiny = 1e-12 * max(float(singular.max(initial=0.0)), 1e-300)
         with np.errstate(divide="ignore"):
             return np.where(singular > tiny, 1.0 / singular, np.inf), vt
 
@@ -75,43 +75,20 @@ class Insight:
         scale = np.sqrt(np.diag(self.covariance))
         return np.asarray(self.covariance / np.outer(scale, scale))
 
-    def shares(self) -> tuple[tuple[tuple[str, str], ...], Array]:
-        """Parts (curve, branches), and the share of each in the information on a parameter.
+    def shares(self) -> Array:
+        """Share (k, n_parts) of each of the `parts` in the information on a parameter.
 
         The information on a parameter, all others free, is the square of what is left of its column
         of sensitivities once the other columns are projected out (Frisch and Waugh 1933,
-        Econometrica 1, 387); being a sum over samples it is shared out among them. Each row of the
-        shares (k, n_parts) adds up to one; NaN for a parameter that the curves do not tell.
-        """
-        columns, parts = [], []
-        squares = np.linalg.pinv(self.scaled, rcond=1e-12) ** 2  # (k, n): own parts, rescaled
-        each = np.split(squares, len(self.curves), axis=1)
-        for curve, own in zip(self.curves, each, strict=True):
-            for label in dict.fromkeys(section.branches for section in self.sections):
-                spans = [slice(s.start, s.stop) for s in self.sections if s.branches == label]
-                columns.append(np.sum([own[:, span].sum(axis=1) for span in spans], axis=0))
-                parts.append((curve, label))
-        shares = np.array(columns).T
-        shares[np.isnan(np.diag(self.covariance))] = np.nan
-        with np.errstate(invalid="ignore"):
-            return tuple(parts), shares / shares.sum(axis=1, keepdims=True)
-
-    def compact(self) -> Insight:
-        """Return the same in few numbers: along each part of a curve, a triangle of as many rows.
-
-        What is told of the parameters follows from the products of the columns part by part, which
-        the triangle of a QR factorization keeps. A compact one gives itself back.
+        Econometrica 1, 387); being a sum over samples it is shared out among them. Each row adds up
+        to one; NaN for a parameter that the curves do not tell.
         """
         k = len(self.names)
-        labels = list(dict.fromkeys(section.branches for section in self.sections))
-        rows = np.zeros((len(self.curves), len(labels), k, k))
-        for c, own in enumerate(np.split(self.scaled, len(self.curves))):
-            for place, label in enumerate(labels):
-                at = [np.arange(s.start, s.stop) for s in self.sections if s.branches == label]
-                triangle = np.linalg.qr(own[np.concatenate(at)], mode="r")
-                rows[c, place, : len(triangle)] = triangle
-        parts = (Section(label, i * k, (i + 1) * k) for i, label in enumerate(labels))
-        return replace(self, scaled=rows.reshape(-1, k), sections=tuple(parts))
+        own = np.linalg.pinv(self.triangles.reshape(-1, k), rcond=1e-12)  # own parts, rescaled
+        shares = np.sum(own.reshape(k, -1, k) ** 2, axis=2)
+        shares[np.isnan(np.diag(self.covariance))] = np.nan
+        with np.errstate(invalid="ignore"):
+            return np.asarray(shares / shares.sum(axis=1, keepdims=True))
 
     def weakest(self) -> tuple[float, dict[str, float]]:
         """Relative standard error along the weakest direction, and its parts over the largest."""
@@ -126,17 +103,13 @@ class Insight:
         if not self.names:
             return ""
         error, parts = self.weakest()
-        name, unseen = next(iter(parts)), error > 1e3
-        if len(parts) > 1:
-            joint = listed(f"{name} ({part:+.2g})" for name, part in parts.items())
-            key, scale = "free" if unseen else "combination", ""
-        else:
-            at = self.names.index(name)
-            key, joint = "alone" if unseen else "parameter", name
-            scale = scale_in_words(name, self.values[at], self.sizes[at])
-        joint, known = joint.replace("-", "−"), percent(error)
-        told = say("least", key, name=name, names=joint, error=known, scale=scale)
-        return say("least", "silent", names=listed(self.silent), told=told) if self.silent else told
+        joint, scale = listed(f"{name} ({part:+.2g})" for name, part in parts.items()), ""
+        if len(parts) == 1:
+            (joint,) = parts
+            at = self.names.index(joint)
+            scale = scale_in_words(joint, self.values[at], self.sizes[at])
+        names = joint.replace("-", "−")
+        return say("least", "told", names=names, error=error, scale=scale, silent=self.silent)
 
     def combination(self, name: str, loose: float) -> str:
         """Say what the data fix instead of a parameter; "" if it is loose by itself.
@@ -190,30 +163,33 @@ def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
     `noise` is one standard deviation of each counted curve, SI; of noise that is not white, the
     root of its autocorrelation time larger.
     """
-    problem, objective = best.problem, best.problem.objective
-    n, at = objective.time.size, 0
-    scaled = np.zeros((len(objective.counted) * n, len(best.names)))
-    for c, curve in enumerate(objective.counted):
+    problem, objective, k = best.problem, best.problem.objective, len(best.names)
+    labels, at = np.array(sections(problem, best.simulated)), 0
+    parts, triangles = list[tuple[str, str]](), list[Array]()
+    for curve in objective.counted:
         kept = objective.kept(curve)
-        rows = best.jacobian[at : at + kept.size] * best.sizes
-        scaled[c * n + kept] = rows / (objective.factor(curve) * noise[curve])
+        rows = best.scaled[at : at + kept.size] / (objective.factor(curve) * noise[curve])
         at += kept.size
+        for label in dict.fromkeys(labels.tolist()):
+            triangle = np.linalg.qr(rows[labels[kept] == label], mode="r")
+            parts.append((curve, label))
+            triangles.append(np.pad(triangle, ((0, k - len(triangle)), (0, 0))))
     return Insight(
         names=best.names,
         values=best.values[best.places],
         sizes=best.sizes,
-        curves=objective.counted,
-        scaled=scaled,
-        sections=sections(problem, best.simulated),
+        parts=tuple(parts),
+        triangles=np.array(triangles),
         silent=tuple(name for name in problem.free() if name in best.unreached),
     )
 
 
 def _product(names: list[str], powers: Array) -> str:
     """Write Π p_i^e_i with the largest power 1: "s2_k0·s1_k0^0.43/s1_height^0.57"."""
-    powers = powers / powers[np.argmax(np.abs(powers))]
+    order = np.argsort(-np.round(np.abs(powers), 6), kind="stable")  # rounding decides no tie
+    powers = powers / powers[order[0]]
     sides: dict[bool, list[str]] = {True: [], False: []}
-    for name, power in sorted(zip(names, powers, strict=True), key=lambda item: -abs(item[1])):
+    for name, power in ((names[i], powers[i]) for i in order):
         shown = f"{abs(power):.2f}".rstrip("0").rstrip(".")
         if abs(power) >= PART:
             sides[bool(power > 0.0)].append(name if shown == "1" else f"{name}^{shown}")

@@ -67,35 +67,33 @@ class Choice:
 def assess(
     best: BestPoint,
     choice: Choice,
-    *,
+    searched: Tracker | None = None,
     minima: Sequence[Array] = (),
-    deadline: float | None = None,
     budget: float = math.inf,
     announce: Announce = lambda _: None,
-    pulse: Callable[[], None] | None = None,
 ) -> Intervals:
     """Make the intervals that were chosen.
 
-    `minima` are points at which the descents of the search ended. It ends at the `deadline` (of
-    `time.monotonic`) with what was done; after `budget` evaluations "auto" begins no further
-    profile. `announce` is called with the expected run time before it is spent, `pulse` at every so
-    many evaluations.
+    `minima` are points at which the descents of the search ended. It ends at the deadline of what
+    has `searched` with what was done; after `budget` evaluations "auto" begins no further profile.
+    `announce` is called with the expected run time before it is spent.
     """
-    if choice.method == "local":
+    method, known = choice.method, best.known
+    if method == "local":
         return Intervals()
-    tracker = Tracker(best.problem.objective, deadline, best_cost=best.cost, pulse=pulse)
-    known = best.known
+    tracker = Tracker(best.problem.objective, best_cost=best.cost)
+    if searched is not None:
+        tracker.deadline, tracker.pulse = searched.deadline, searched.pulse
     if not known:
-        none = say("interval", "nothing")
-        return Intervals(warnings=() if choice.method == "auto" else (none,))
-    if choice.method != "auto":
-        count, by = evaluations_of(best, choice), choice.method
-        announce(say("interval", "cost", by=by, count=count, seconds=_seconds(best, count)))
-    if choice.method == "bootstrap":
+        return Intervals(warnings=() if method == "auto" else (say("interval", "nothing"),))
+    if method != "auto":
+        count = evaluations_of(best, choice)
+        announce(say("interval", "cost", by=method, count=count, seconds=_seconds(best, count)))
+    if method == "bootstrap":
         return _by_bootstrap(best, choice, tracker)
-    if choice.method == "mcmc":
+    if method == "mcmc":
         return _by_mcmc(best, choice, tracker)
-    if choice.method == "profile":
+    if method == "profile":
         return _by_profiles(best, known, minima, tracker, math.inf)
     others = [(point, tracker.consider(point)) for point in minima]
     far = np.abs(departures(best)).max(axis=1, initial=0.0)
@@ -109,14 +107,11 @@ def assess(
 
 def evaluations_of(best: BestPoint, choice: Choice) -> float:
     """Evaluations that intervals which were asked for are expected to take; 0 by default."""
-    match choice.method:
-        case "mcmc":
-            return float((choice.draws + 1) * walkers(best))
-        case "bootstrap":
-            return EVALUATIONS * choice.draws
-        case "profile":
-            return EVALUATIONS * REFITS * len(best.known)
-    return 0.0
+    if choice.method == "mcmc":
+        return float((choice.draws + 1) * walkers(best))
+    if choice.method == "bootstrap":
+        return EVALUATIONS * choice.draws
+    return EVALUATIONS * REFITS * len(best.known) if choice.method == "profile" else 0.0
 
 
 def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
@@ -156,7 +151,7 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     difference of their residuals.
     """
     if best.misfits:
-        apart, objective = (residual - best.soft)[:, None], best.problem.objective
+        apart, objective = (residual - best.residual)[:, None], best.problem.objective
         noise = zip(best.spread.noise, parts(objective.sizes), strict=True)
         spread = float(np.sum(apart[objective.n_data :] ** 2))  # of priors, of unit variance
         spread += sum(float(process.forms(apart[part])[0]) for process, part in noise)
@@ -219,32 +214,30 @@ def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]
 
 def _by_bootstrap(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
     drawn, stopped = bootstrap(best, choice.draws, choice.seed, tracker)
-    note = say("interval", "bootstrap", done=len(drawn), count=choice.draws)
-    if stopped:
-        note = say("interval", "stopped", told=note, by=stopped)
-    if len(drawn) < ENOUGH_DRAWS:
-        return Intervals(warnings=(say("interval", "few", told=note),))
+    few = len(drawn) < ENOUGH_DRAWS
+    facts = {"done": len(drawn), "count": choice.draws, "stopped": stopped, "few": few}
+    note = say("interval", "bootstrap", **facts)
     return _percentiles(best, drawn, "block bootstrap", note, stopped is None)
 
 
 def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
     chain = mcmc(best, choice.draws, choice.seed, tracker)
-    note = chain.sentence()
-    if len(chain.samples) < ENOUGH_DRAWS:
-        return Intervals(warnings=(say("interval", "none", told=note),))
-    lost = ", ".join(name for name in best.names if name not in best.known)
-    note = say("interval", "lost", told=note, names=lost) if lost else note
+    lost = [name for name in best.names if name not in best.known]
+    few = len(chain.samples) < ENOUGH_DRAWS
+    note = chain.sentence(lost, few)
     fine = chain.converged and chain.stopped is None
     made = _percentiles(best, chain.samples, "MCMC", note, fine)
     columns = chain.samples.reshape(-1, chain.walkers, len(best.names)).T  # (k, walkers, steps)
-    return replace(made, draws=dict(zip(best.names, columns, strict=True)))
+    return made if few else replace(made, draws=dict(zip(best.names, columns, strict=True)))
 
 
 def _percentiles(best: BestPoint, drawn: Array, method: str, note: str, fine: bool) -> Intervals:
     """Intervals between the 2.5th and the 97.5th percentile of what was drawn.
 
-    What is said of them is a warning if they are not what was asked for.
+    What is said of them is a warning if they are not what was asked for; too few give none.
     """
+    if len(drawn) < ENOUGH_DRAWS:
+        return Intervals(warnings=(note,))
     columns = dict(zip(best.names, np.percentile(drawn, [2.5, 97.5], axis=0).T, strict=True))
     ends = {name: (float(columns[name][0]), float(columns[name][1])) for name in best.known}
     notes, warnings = ((note,), ()) if fine else ((), (note,))

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.fitting.levenberg import Iterate, damped_step, descend
-from foamfit.fitting.losses import soften, softness
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
 from foamfit.results import Profile
 from foamfit.trust.best_point import BestPoint
@@ -44,8 +43,7 @@ class Refit:
 
     best: BestPoint
     tracker: Tracker  # Simulates, counts and ends all at its deadline
-    # Taken off the residual, before the loss: data (and means of priors) that differ from those
-    # that were fitted.
+    # Taken off the residual: data (and means of priors) that differ from those that were fitted.
     shift: Array | float = 0.0
 
     def __post_init__(self) -> None:
@@ -57,22 +55,13 @@ class Refit:
 
     def start(self) -> Iterate:
         """The best point itself."""
-        differences = self.best.residual - self.shift
-        objective = self.best.problem.objective
-        soft = soften(differences, objective.loss, objective.n_data)
-        return Iterate(self.best.values, soft, self._jacobian(differences, self.best.jacobian))
-
-    def _jacobian(self, differences: Array, slopes: Array) -> Array:
-        """Derivative of the softened residual by the scaled parameters."""
-        objective = self.best.problem.objective
-        soft = softness(differences, objective.loss, objective.n_data)
-        return np.asarray(soft[:, None] * slopes * self.best.sizes)
+        return Iterate(self.best.values, self.best.residual - self.shift, self.best.scaled)
 
     def residual(self, point: Array) -> Array | None:
         """Residual of a point that can be simulated, else None."""
-        failures = self.tracker.objective.failures
-        residual = self.tracker.residual(point, self.shift)
-        return residual if self.tracker.objective.failures == failures else None
+        objective = self.tracker.objective
+        failures, residual = objective.failures, self.tracker.residual(point, self.shift)
+        return residual if objective.failures == failures else None
 
     def rise(self, point: Array) -> float:
         """Rise of the cost from the best point; infinite where nothing can be simulated."""
@@ -101,8 +90,8 @@ class Refit:
 
         `weights` (n_data,) multiply the squares. Returns None if the start cannot be simulated.
         """
-        problem, names, sizes = self.best.problem, self.best.names, self.best.sizes
-        root, box = np.sqrt(weights), self.best.box.copy()
+        best, sizes = self.best, self.best.sizes
+        root, box = np.sqrt(weights), best.box.copy()
         if hold is not None:
             box[:, hold[0]] = hold[1]
 
@@ -112,19 +101,15 @@ class Refit:
             return np.asarray(root * self.tracker.residual(self.point(scaled, box), self.shift))
 
         def jacobian(scaled: Array) -> Array:
-            point = self.point(scaled, box)
-            slopes: Array = problem.linear.slopes(point, names) * np.reshape(root, (-1, 1))
-            if problem.objective.loss == "linear":
-                return slopes * sizes
-            return self._jacobian(problem.objective.differences(point) - self.shift, slopes)
+            slopes = best.problem.slopes(self.point(scaled, box), best.names)
+            return np.asarray(slopes * np.reshape(root, (-1, 1)) * sizes)
 
-        begin = np.clip(start[self.best.places], *box) / sizes
+        begin = np.clip(start[best.places], *box) / sizes
         first = self.residual(self.point(begin, box))
         if first is None:
             return None
-        limits = box[0] / sizes, box[1] / sizes
         end = descend(
-            residual, jacobian, begin, limits, iterations, least=self.enough, damping=1e-6
+            residual, jacobian, begin, box / sizes, iterations, least=self.enough, damping=1e-6
         )
         return replace(end, point=self.point(end.point, box))
 
@@ -136,8 +121,7 @@ class _Side:
         best = refit.best
         self.refit, self.sign, self.place = refit, sign, best.index[name]
         self.column = best.names.index(name)
-        self.quantile = float(best.quantiles[self.column])
-        self.half = float(best.halves[self.column])
+        self.quantile, self.half = float(best.quantiles[self.column]), best.halves[self.column]
         self.limit = best.limits(name)[0 if sign < 0 else 1]
         self.refits = [refit.start()]
 
@@ -159,15 +143,21 @@ class _Side:
         """Whether a better point than the best was met."""
         return min(map(self.rise, self.refits)) < -BETTER * self.quantile**2
 
+    @property
     def bracket(self) -> tuple[Iterate, Iterate | None]:
         """The outermost refit below the cut, and the next one; none if the profile is open."""
         last = max(i for i, at in enumerate(self.refits) if self.root(at) < self.quantile)
         return self.refits[last], self.refits[last + 1] if last + 1 < len(self.refits) else None
 
     @property
+    def is_open(self) -> bool:
+        """Whether no refit is above the cut."""
+        return self.bracket[1] is None
+
+    @property
     def bound(self) -> float:
         """Where the root of the rise crosses that of the cut; where it never does, the limit."""
-        inner, outer = self.bracket()
+        inner, outer = self.bracket
         if outer is None:
             return self.limit
         share = (self.quantile - self.root(inner)) / (self.root(outer) - self.root(inner))
@@ -182,15 +172,16 @@ class _Side:
             self._outward()
         met = list[Iterate]()
         for point in sorted(minima, key=lambda point: -self.sign * float(point[self.place])):
-            value, open_ = float(point[self.place]), self.bracket()[1] is None
-            edge = self.value(self.refits[-1]) if open_ else self.bound
+            value = float(point[self.place])
+            edge = self.value(self.refits[-1]) if self.is_open else self.bound
             if self.better or self.sign * (value - edge) <= PLACED * self.half:
                 break
             if self._known(point, value, met):
                 continue
-            found = self.refit.run(point, (self.column, value))
-            met += [] if found is None else [found]
-            if found is not None and self.rise(found) < self.quantile**2:
+            if (found := self.refit.run(point, (self.column, value))) is None:
+                continue
+            met.append(found)
+            if self.rise(found) < self.quantile**2:
                 # Refits farther out are of another minimum, or have stalled.
                 inside = [at for at in self.refits if self.sign * (self.value(at) - value) < 0.0]
                 self.refits = [*inside, found]
@@ -222,7 +213,7 @@ class _Side:
             if self.root(found) - self.root(last) < 0.35 * self.quantile:
                 step *= 1.6
         for _ in range(INWARD):
-            inner, outer = self.bracket()
+            inner, outer = self.bracket
             if outer is None or self.better:
                 break
             miss = min(abs(self.root(at) - self.quantile) for at in (inner, outer))
@@ -240,8 +231,7 @@ class _Side:
         """
         shift = np.zeros(len(self.refit.best.names))
         shift[self.column] = (value - self.value(near)) / self.refit.best.sizes[self.column]
-        ahead = near.gradient + near.normal @ shift
-        held = np.arange(shift.size) == self.column
+        ahead, held = near.gradient + near.normal @ shift, np.arange(shift.size) == self.column
         start = self.refit.moved(near.point, shift)
         least = self.refit.rise(start)
         for damping in FOLLOWING:
@@ -254,7 +244,11 @@ class _Side:
 
 
 class Tracing:
-    """A profile that is being followed; a side that was not begun ends at the best point."""
+    """A profile that is being followed; a side that was not begun ends at the best point.
+
+    The adjusted likelihood ratio: the rise of the cost over `Covariance.inflation` is χ² with one
+    degree of freedom also where the noise is correlated (Chandler & Bate 2007, Biometrika 94, 167).
+    """
 
     def __init__(self, best: BestPoint, name: str, tracker: Tracker) -> None:
         """Begin at the best point."""
@@ -266,11 +260,9 @@ class Tracing:
     def follow(self, minima: Sequence[Array] = ()) -> None:
         """Follow the least cost to both sides, past the 95 % cut.
 
-        The adjusted likelihood ratio: the rise of the cost over `Covariance.inflation` is χ² with
-        one degree of freedom also where the noise is correlated (Chandler & Bate 2007, Biometrika
-        94, 167). `minima` are other points at which descents ended: it goes on beyond them where
-        they are within the cut, whatever barrier lies between. It is incomplete if the deadline or
-        Ctrl-C ended it: `ci95` is then that of what was done.
+        `minima` are other points at which descents ended: it goes on beyond them where they are
+        within the cut, whatever barrier lies between. It is incomplete if the deadline or Ctrl-C
+        ended it: `ci95` is then that of what was done.
         """
         low, high = self.sides
         try:
@@ -294,16 +286,16 @@ class Tracing:
     @property
     def profile(self) -> Profile:
         """What was found so far."""
-        low, high = self.sides
+        (low, high), refits = self.sides, self.refits
         return Profile(
             name=self.name,
-            values=np.array([low.value(at) for at in self.refits]),
-            rises=np.array([low.rise(at) for at in self.refits]),
-            points=np.array([at.point for at in self.refits]),
+            values=np.array([low.value(at) for at in refits]),
+            rises=np.array([low.rise(at) for at in refits]),
+            points=np.array([at.point for at in refits]),
             cut=low.quantile**2,
             ci95=(low.bound, high.bound if self._turned else high.value(high.refits[0])),
-            open_low=low.bracket()[1] is None,
-            open_high=high.bracket()[1] is None or not self._turned,
+            open_low=low.is_open,
+            open_high=high.is_open or not self._turned,
             stopped=self.stopped,
         )
 

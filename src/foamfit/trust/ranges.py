@@ -32,10 +32,9 @@ DESCENT = 15
 
 def tolerance(best: BestPoint, errors: Sequence[CurveError] | None = None) -> float:
     """Rise of the cost up to which a description follows the curves about as well."""
-    pairs = zip(
-        best.errors if errors is None else errors, best.problem.objective.sizes, strict=True
-    )
-    return (ALIKE**2 - 1.0) * sum(size * error.law**2 for error, size in pairs)
+    found, sizes = best.errors if errors is None else errors, best.problem.objective.sizes
+    missed = sum(n * error.law**2 for error, n in zip(found, sizes, strict=True))
+    return (ALIKE**2 - 1.0) * missed
 
 
 def alike(
@@ -49,8 +48,7 @@ def alike(
     no further refit is begun.
     """
     most, refit = tolerance(best), Refit(best, tracker)
-    refit.enough = 0.01 * most
-    allowed = tracker.objective.evaluations + budget
+    refit.enough, allowed = 0.01 * most, tracker.objective.evaluations + budget
     out = [best.values, *(point for point in minima if refit.rise(point) <= most)]
     jacobian = refit.start().jacobian
     inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-12, hermitian=True)
@@ -104,9 +102,7 @@ def left_open(
 def _weights(best: BestPoint) -> Iterator[Array]:
     """Weights of the counted samples: loading, unloading, low or high stress heavier; windows."""
     objective = best.problem.objective
-    stress = objective.measurement.stress
-    assert stress is not None
-    number = np.arange(stress.size)
+    stress, number = objective.stress, np.arange(objective.time.size)
     loading, low = number <= int(np.argmax(stress)), stress < 0.5 * float(np.max(stress))
     heavy = [loading, ~loading, low, ~low]
     heavy += [number * WINDOWS // stress.size != window for window in range(WINDOWS)]

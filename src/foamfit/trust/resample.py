@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -36,18 +36,18 @@ def block_length(process: NoiseProcess, n: int) -> int:
 
 
 def _source(
-    residual: Array, like: Array, process: NoiseProcess, law: bool
+    residual: Array, process: NoiseProcess, law: bool
 ) -> Callable[[np.random.Generator], Array]:
     """What draws the noise of one curve: its process beside an error of the law, else its residual.
 
     From the residual, circular blocks with random starts (Politis & Romano 1992). A factor corrects
-    that residuals are smaller than the noise was, which was read off `like`, and that blocks break
-    correlation at their ends: sums over the curve vary as those of its noise.
+    that residuals are smaller than the noise was, and that blocks break correlation at their ends:
+    sums over the curve vary as those of its noise.
     """
     n, length = residual.size, block_length(process, residual.size)
     lags = process.autocovariance(length) / process.variance
     within = 1.0 + 2.0 * float((1.0 - np.arange(1, length) / length) @ lags[1:])
-    power = max(float(np.var(like)), 1e-300)
+    power = max(float(np.var(residual)), 1e-300)
     factor = process.variance / power * max(process.tau / within, 1.0)
     scaled = (residual - residual.mean()) * math.sqrt(factor)
 
@@ -63,23 +63,19 @@ def bootstrap(
 ) -> tuple[Array, str | None]:
     """Refit data remade from the fitted curves and blocks of the residuals.
 
-    Returned are the parameters of each, (m, k), SI, and what ended the refits early.
-
-    Where a residual holds an error of the law, that stays, and noise of the kind that is in it is
-    added to the measured curve.
-
-    Each refit descends from the best point; other minima of the cost are not searched. They are
-    fewer than asked for if the deadline or Ctrl-C ended them.
+    Returned are the parameters of each, (m, k), SI, and what ended the refits early. Where a
+    residual holds an error of the law, that stays, and noise of the kind that is in it is added to
+    the measured curve. Each refit descends from the best point; other minima are not searched.
     """
     objective = best.problem.objective
     tracker = Tracker(objective) if tracker is None else tracker
     rng = np.random.default_rng([seed, 1])
-    priors, pseudo = len(objective.priors), best.weighted[1]
+    priors = len(objective.priors)
     sources, fitted = [], best.residual[: objective.n_data].copy()
     for part, process, error in zip(
         parts(objective.sizes), best.spread.noise, best.errors, strict=True
     ):
-        sources.append(_source(best.residual[part], pseudo[part], process, error.found))
+        sources.append(_source(best.residual[part], process, error.found))
         if error.found:
             fitted[part] = 0.0
     out: list[Array] = []
@@ -110,14 +106,16 @@ class MarkovChain:
     @property
     def converged(self) -> bool:
         """Whether the chain is longer than fifty autocorrelation times, as emcee asks for."""
-        return self.steps - self.burn_in >= 50.0 * self.autocorrelation
+        return self.times >= 50.0
 
-    def sentence(self) -> str:
-        """What the autocorrelation says of the chain."""
-        times = (self.steps - self.burn_in) / self.autocorrelation
-        enough = "enough" if self.converged else "too short: at least 50 are needed"
-        told = say("interval", "chain", **vars(self), times=times, enough=enough)
-        return say("interval", "stopped", told=told, by=self.stopped) if self.stopped else told
+    @property
+    def times(self) -> float:
+        """Length of the chain over its autocorrelation time."""
+        return (self.steps - self.burn_in) / self.autocorrelation
+
+    def sentence(self, lost: Sequence[str] = (), few: bool = False) -> str:
+        """What the autocorrelation says of the chain; of what is `lost` there are no intervals."""
+        return say("interval", "chain", chain=self, lost=lost, few=few)
 
 
 def check_emcee() -> None:
@@ -139,9 +137,8 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     Flat priors within the limits; the likelihood counts n/τ samples of each curve: its sum of
     squares over the variance of its noise is divided by τ. What the test does not determine is
     sampled too and runs over its limits, so that the others are those whatever its value is. The
-    first fifth of the steps of each walker is left out. Raises InputError without emcee.
+    first fifth of the steps of each walker is left out.
     """
-    check_emcee()
     import emcee
 
     objective = best.problem.objective
@@ -166,7 +163,7 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     sampler.random_state = np.random.RandomState(bits).get_state()
     # Walkers begin half a standard error off the best point along what the test fixes, no more than
     # `FARTHEST` along the rest.
-    _, singular, axes = np.linalg.svd(best.jacobian * best.sizes, full_matrices=False)
+    _, singular, axes = np.linalg.svd(best.scaled, full_matrices=False)
     reach = 0.5 * math.sqrt(max(variances)) / np.maximum(singular, 1e-300)
     away = np.random.default_rng([seed, 2]).standard_normal((count, singular.size))
     begin = best.values[best.places] / best.sizes + np.minimum(reach, FARTHEST) * away @ axes

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from foamfit.data.measurement import Striker, interior_channel, interior_node
-from foamfit.data.tables.csv_table import Table, read_numbers
+from foamfit.data.tables.csv_table import Table, Text, find_table, read_numbers
 from foamfit.data.tables.headers import CHANNELS, WEAK, WEIGHTS, channel_of, example, in_si
 from foamfit.data.toml_file import Column, Settings
 from foamfit.data.units import is_unit
@@ -19,6 +21,147 @@ _MOTIONS = "displacement", "strain"
 TWINS = {"stress": "force", "force": "stress", "displacement": "strain", "strain": "displacement"}
 # What stress and displacement are read from, the first that there is.
 _SOURCES = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
+
+
+@dataclass(frozen=True)
+class Source:
+    """A table, the column that each channel is in, and what [columns] of the TOML says of them."""
+
+    table: Table
+    columns: dict[str, int]
+    given: dict[str, Column]
+
+    @classmethod
+    def of(cls, text: Text, given: dict[str, Column]) -> Source:
+        """Find the table of a file, and which column each channel is in."""
+        table = find_table(text, {column.column for column in given.values()})
+        return cls(table, assign_columns(table, given), given)
+
+    def factor(self, channel: str) -> float:
+        """Return what the numbers of a channel are multiplied by to be SI."""
+        return si_factor(self.table, channel, self.columns[channel], self.given.get(channel))
+
+    def only(self, channels: Iterable[str]) -> Source:
+        """Read no other channels."""
+        return replace(self, columns={c: k for c, k in self.columns.items() if c in channels})
+
+    def needed(self, settings: Settings) -> Source:
+        """Choose the channels worth reading; refuse a file that lacks one nothing can replace."""
+        table, has, motion = self.table, set(self.columns), settings.motion
+        striker = settings.striker or Striker()
+        forced, moved = bool(has & {"stress", "force"}), bool(has & set(_MOTIONS))
+        braked = bool(has & {"acceleration", "velocity"} or (moved and striker.velocity))
+        if not forced and not ("time" in has and braked and striker.mass):
+            more = "with a time and the [striker] mass an acceleration or a velocity will do, and "
+            wanted, others = ("stress", "force"), ("displacement", "time")
+            raise self._lacks(wanted, others, f"; {more}with its velocity a displacement")
+        if motion is not None:
+            own = [c for c in self.columns if c in _MOTIONS or interior_node(c)]
+            if own:
+                header = table.headers[self.columns[own[0]]].text
+                raise InputError(
+                    f"column {header!r} is a {own[0]}, but [motion] file = {motion.file.name!r} "
+                    "has the motion; leave one of them out."
+                )
+            if "time" not in has:
+                told = f"no column is a time (there are {table.listed})"
+                raise InputError(f"{told}; with [motion] it needs one like 'time (ms)'.")
+        helping = {"velocity"} if moved or "acceleration" in has else set[str]()
+        helping = {"velocity", "acceleration"} if forced else helping
+        if moved or motion is not None:
+            return self.only(has - helping)
+        for channel in has & helping - set(self.given):
+            try:  # these only help, so one whose unit does not say what it is can be left
+                self.factor(channel)
+            except InputError:
+                has.remove(channel)
+        sources = "velocity" in has or (
+            striker.velocity and (striker.mass or "acceleration" in has)
+        )
+        if "time" not in has or not sources:
+            timed = "" if "time" in has else f"{entries_of(table, has, 'time')} there, and "
+            more = f", or give {timed}the [striker] mass and velocity to integrate the motion"
+            raise self._lacks(_MOTIONS, (), more)
+        return self.only(has)
+
+    def of_motion(self) -> Source:
+        """Choose time and displacements of a file of [motion]; refuse one that lacks them."""
+        there = {c for c in self.columns if c in ("time", *_MOTIONS) or interior_node(c)}
+        for wanted in (("time",), _MOTIONS):
+            if not there & set(wanted):
+                raise self._lacks(wanted)
+        return self.only(there)
+
+    def _lacks(
+        self, wanted: tuple[str, ...], others: tuple[str, ...] = (), more: str = ""
+    ) -> InputError:
+        """Say that no column is one of the `wanted` channels, and how to name one."""
+        entry = "force" if "force" in wanted else wanted[0]
+        entries = entries_of(self.table, set(self.columns), entry, *others)
+        return InputError(
+            f"no column is a {' or a '.join(wanted)} (there are {self.table.listed}); name one "
+            f"like '{example(wanted[0])}', or write {entries} in [columns]{more}."
+        )
+
+    def left_out(self) -> dict[str, int]:
+        """Columns that could be read instead of those that are: the twins and other times."""
+        found = dict[str, int]()
+        for channel in (c for c in self.columns if c in {"time", *TWINS}):
+            twin = TWINS.get(channel, channel)
+            headers = ((k, h.rank(twin)) for k, h in enumerate(self.table.headers))
+            ranks = {k: r for k, r in headers if r is not None and k not in self.columns.values()}
+            if ranks and (twin not in self.columns or channel == "time"):
+                found[twin] = min(ranks, key=lambda k: ranks[k])
+        return found
+
+    def scale_spreads(self) -> dict[str, float]:
+        """Standard deviations of the scales of the channels that are read, each over its scale."""
+        sources = _SOURCES | {c: (c,) for c in ("velocity", "acceleration")}
+        used = {
+            name: next((c for c in cs if c in self.columns), "") for name, cs in sources.items()
+        }
+        if used["stress"] == "acceleration":  # then it is no channel of its own
+            del used["acceleration"]
+        spreads = {f"{name}_scale": self.given.get(c, _NONE).spread for name, c in used.items()}
+        return {name: spread for name, spread in spreads.items() if spread}
+
+    def note(self) -> str:
+        """Say what is read from which column, and which columns are not used."""
+        parts, table = [], self.table
+        for channel, k in self.columns.items():
+            given, header = self.given.get(channel, _NONE), table.headers[k]
+            unit = given.unit or header.unit or ""
+            by = f"{given.scale:.6g} {given.scale_unit}".strip()
+            by += f" ± {percent(given.spread)}" if given.spread else ""
+            over = _inverse(channel, unit, given) is not None
+            part = f"{channel} from {table.name(k)}" + (f" in {given.unit}" if given.unit else "")
+            part += f" {'over the sensitivity' if over else 'times'} {by}" if by != "1" else ""
+            part += ", counting down" if given.counts_down else ""
+            if channel == "force" and unit.casefold() in WEIGHTS:
+                part += f" ({WEIGHTS[unit.casefold()]}: the weight of that mass)"
+            parts.append(part)
+        used = self.columns.values()
+        rest = [repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in used]
+        return f"Read {', '.join(parts)}" + (f"; not used: {', '.join(rest)}." if rest else ".")
+
+    def sign_advice(self, channel: str) -> str:
+        """Say what makes a channel positive that is negative in compression."""
+        channel = next(c for c in _SOURCES.get(channel, (channel,)) if c in self.columns)
+        given = self.given.get(channel, _NONE)
+        entry = f"{channel} = {{ column = {quoted(self.table, self.columns[channel])}"
+        by = f'"{-given.scale:g} {given.scale_unit}"' if given.scale_unit else f"{-given.scale:g}"
+        wrong = "is negative in compression; it must be positive"
+        right = f"write {entry}, scale = {by} }}"
+        if channel.startswith("displacement"):
+            wrong = "is negative or gets smaller in compression; it must get larger"
+            right = (
+                f"write {entry}, counts_down = true }} (of a gap or a position; else scale = {by})"
+            )
+        if given.counts_down:
+            right = "leave counts_down = true out"
+        elif given.scale < 0.0:
+            right = f"leave the minus sign of scale = {given.scale:g} out"
+        return f"{channel} {wrong}: {right} in [columns]"
 
 
 def assign_columns(table: Table, given: dict[str, Column]) -> dict[str, int]:
@@ -154,65 +297,6 @@ def _inverse(channel: str, unit: str, given: Column) -> float | None:
     return in_si(channel, unit, f"1/({given.scale_unit})")
 
 
-def needed_columns(table: Table, columns: dict[str, int], settings: Settings) -> dict[str, int]:
-    """Choose the channels worth reading; refuse a file that lacks one that nothing can replace."""
-    has, striker, motion = set(columns), settings.striker or Striker(), settings.motion
-    forced, moved = bool(has & {"stress", "force"}), bool(has & set(_MOTIONS))
-    braked = bool(has & {"acceleration", "velocity"} or (moved and striker.velocity))
-    if not forced and not ("time" in has and braked and striker.mass):
-        entries = entries_of(table, has, "force", "displacement", "time")
-        raise InputError(
-            f"no column is a stress or a force (there are {table.listed}); name one like 'stress "
-            f"(MPa)', or write {entries} in [columns]; with a time and the [striker] mass an "
-            "acceleration or a velocity will do, and with its velocity a displacement."
-        )
-    if motion is not None:
-        _check_motion(table, columns, motion.file.name)
-    helping = {"velocity"} if moved or "acceleration" in has else set[str]()
-    helping = {"velocity", "acceleration"} if forced else helping
-    if moved or motion is not None:
-        return {c: k for c, k in columns.items() if c not in helping}
-    for channel in has & helping - set(settings.columns):
-        try:  # these only help, so one whose unit does not say what it is can be left
-            si_factor(table, channel, columns[channel], None)
-        except InputError:
-            has.remove(channel)
-    sources = "velocity" in has or (striker.velocity and (striker.mass or "acceleration" in has))
-    if "time" not in has or not sources:
-        timed = "" if "time" in has else f"{entries_of(table, has, 'time')} there, and "
-        raise InputError(
-            f"no column is a displacement or a strain (there are {table.listed}); name one like "
-            f"'displacement (mm)', or write {entries_of(table, has, 'displacement')} in [columns], "
-            f"or give {timed}the [striker] mass and velocity to integrate the motion."
-        )
-    return {c: k for c, k in columns.items() if c in has}
-
-
-def _check_motion(table: Table, columns: dict[str, int], name: str) -> None:
-    """Refuse a test with [motion] that has a displacement of its own, or no time."""
-    own = [c for c in columns if c in _MOTIONS or interior_node(c)]
-    if own:
-        raise InputError(
-            f"column {table.headers[columns[own[0]]].text!r} is a {own[0]}, but [motion] file = "
-            f"{name!r} has the motion; leave one of them out."
-        )
-    if "time" not in columns:
-        told = f"no column is a time (there are {table.listed})"
-        raise InputError(f"{told}; with [motion] it needs one like 'time (ms)'.")
-
-
-def motion_columns(table: Table, columns: dict[str, int]) -> dict[str, int]:
-    """Choose time and displacements of a file of [motion]; refuse one that lacks them."""
-    needed = {c: k for c, k in columns.items() if c in ("time", *_MOTIONS) or interior_node(c)}
-    for wanted, names in (("time", ["time"]), ("displacement", _MOTIONS)):
-        if not needed.keys() & set(names):
-            raise InputError(
-                f"no column is a {' or a '.join(names)} (there are {table.listed}); name one like "
-                f"'{example(wanted)}', or write {entries_of(table, set(), wanted)} in [columns]."
-            )
-    return needed
-
-
 def entries_of(table: Table, has: set[str], *channels: str) -> str:
     """Entries of [columns] for channels that the file seems to lack, by units of its headers."""
     entries = []
@@ -228,64 +312,3 @@ def entries_of(table: Table, has: set[str], *channels: str) -> str:
         unit = f', unit = "{channel_of(channel).unit}"' if k is None else ""
         entries += [f"{channel} = {{ column = {column}{unit} }}"] if channel not in has else []
     return listed(entries)
-
-
-def left_out(table: Table, needed: dict[str, int]) -> dict[str, int]:
-    """Columns that could have been read instead of those that are: the twins and other times."""
-    found: dict[str, int] = {}
-    for channel in (c for c in needed if c in {"time", *TWINS}):
-        twin = TWINS.get(channel, channel)
-        headers = ((k, h.rank(twin)) for k, h in enumerate(table.headers))
-        ranks = {k: r for k, r in headers if r is not None and k not in needed.values()}
-        if ranks and (twin not in needed or channel == "time"):
-            found[twin] = min(ranks, key=lambda k: ranks[k])
-    return found
-
-
-def scale_spreads(columns: dict[str, int], given: dict[str, Column]) -> dict[str, float]:
-    """Standard deviations of the scales of the channels that are read, each over its scale."""
-    sources = _SOURCES | {c: (c,) for c in ("velocity", "acceleration")}
-    used = {channel: next((c for c in cs if c in columns), "") for channel, cs in sources.items()}
-    if used["stress"] == "acceleration":  # then it is no channel of its own
-        del used["acceleration"]
-    spreads = {f"{channel}_scale": given.get(c, _NONE).spread for channel, c in used.items()}
-    return {name: spread for name, spread in spreads.items() if spread}
-
-
-def read_note(table: Table, needed: dict[str, int], columns: dict[str, Column]) -> str:
-    """Say what is read from which column, and which columns are not used."""
-    parts = []
-    for channel, k in needed.items():
-        given, header = columns.get(channel, _NONE), table.headers[k]
-        by, unit = f"{given.scale:.6g} {given.scale_unit}".strip(), given.unit or header.unit or ""
-        by += f" ± {percent(given.spread)}" if given.spread else ""
-        over = _inverse(channel, unit, given) is not None
-        part = f"{channel} from {table.name(k)}" + (f" in {given.unit}" if given.unit else "")
-        part += f" {'over the sensitivity' if over else 'times'} {by}" if by != "1" else ""
-        part += ", counting down" if given.counts_down else ""
-        if channel == "force" and unit.casefold() in WEIGHTS:
-            part += f" ({WEIGHTS[unit.casefold()]}: the weight of that mass)"
-        parts.append(part)
-    used = needed.values()
-    rest = [repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in used]
-    return f"Read {', '.join(parts)}" + (f"; not used: {', '.join(rest)}." if rest else ".")
-
-
-def sign_advice(
-    table: Table, columns: dict[str, int], entries: dict[str, Column], channel: str
-) -> str:
-    """Say what makes a channel positive that is negative in compression; see `check_signs`."""
-    channel = next(c for c in _SOURCES.get(channel, (channel,)) if c in columns)
-    given, motion = entries.get(channel, _NONE), channel.startswith("displacement")
-    entry = f"{channel} = {{ column = {quoted(table, columns[channel])}"
-    by = f'"{-given.scale:g} {given.scale_unit}"' if given.scale_unit else f"{-given.scale:g}"
-    wrong = "is negative in compression; it must be positive"
-    right = f"write {entry}, scale = {by} }}"
-    if motion:
-        wrong = "is negative or gets smaller in compression; it must get larger"
-        right = f"write {entry}, counts_down = true }} (of a gap or a position; else scale = {by})"
-    if given.counts_down:
-        right = "leave counts_down = true out"
-    elif given.scale < 0.0:
-        right = f"leave the minus sign of scale = {given.scale:g} out"
-    return f"{channel} {wrong}: {right} in [columns]"

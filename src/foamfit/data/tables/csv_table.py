@@ -8,24 +8,20 @@ import hashlib
 import io
 import math
 import re
+from array import array
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Integers
 from foamfit.data.measurement import MIN_ROWS, Dropped
 from foamfit.data.tables.headers import CHANNELS, Header, parse_header
 from foamfit.data.tables.layouts import blanks_as_tabs, scope_of, unpacked
 from foamfit.data.toml_file import LONGEST, read_bytes
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError, naming
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 _HEAD_ROWS = 400
 _SEPARATORS = "\t", ";", "|", ","
@@ -75,9 +71,9 @@ class Table(Text):
         """Yield (row number in the file, cells) of the lines that are not blank."""
         file = io.BytesIO(self.raw)
         lines = io.TextIOWrapper(file, self.encoding, errors="replace", newline="")
-        rows = _cells(lines, self.separator)
-        below = (row for row in rows if row[0] > self.first_row)
-        return (row for row in below if len(row[1]) > 1 or "".join(row[1]).strip())
+        for row, cells in _cells(lines, self.separator):
+            if row > self.first_row and (len(cells) > 1 or "".join(cells).strip()):
+                yield row, cells
 
     def body(self) -> bytes:
         """Return the rows below the header."""
@@ -110,19 +106,19 @@ def find_table(text: Text, names: set[str | int]) -> Table:
     """Find separator, header row and decimal sign; `names` are the columns given in the TOML."""
     lines = io.TextIOWrapper(io.BytesIO(text.raw), text.encoding, newline=None)
     head = [line.rstrip("\r\n") for line, _ in zip(lines, range(_HEAD_ROWS), strict=False)]
-    grids = {s: [cells for _, cells in _cells(head, s)] for s in _SEPARATORS}
+    grids = {s: [[c.strip() for c in cells] for _, cells in _cells(head, s)] for s in _SEPARATORS}
     whole = text.path, text.raw, text.encoding, text.sha256
     scope = scope_of(grids[","])
     if scope is not None:
         headers, first = tuple(map(parse_header, scope.headers)), scope.rows
-        row, cells = (1, tuple(c.strip() for c in grids[","][0])) if first else (0, ())
+        row, cells = (1, tuple(grids[","][0])) if first else (0, ())
         return Table(*whole, ",", ".", row, cells, first, headers, scope.clock)
     found = _header_row(grids, {n for n in names if isinstance(n, str)})
     if found is None or not any(map(_is_sample, grids[found[0]][found[1] :])):
         rows = (sum(map(_is_sample, grid)) > 2 for grid in grids.values())
         tabbed = None if any(rows) else blanks_as_tabs(text.raw.decode(text.encoding))
         if tabbed is not None:
-            return find_table(Text(text.path, tabbed.encode(), "utf-8", text.sha256), names)
+            return find_table(replace(text, raw=tabbed.encode(), encoding="utf-8"), names)
     separator, i = found or _above_numbers(grids, names)
     grid = grids[separator]
     if i < 0:  # no header
@@ -137,23 +133,19 @@ def find_table(text: Text, names: set[str | int]) -> Table:
             "must hold one table with one header."
         )
     if (longest := max(map(len, grid[i]))) > LONGEST:
-        raise InputError(
-            f"row {i + 1}: the name of a column has {longest} characters; it must have {LONGEST} "
-            "at most."
-        )
+        told = f"row {i + 1}: the name of a column has {longest} characters"
+        raise InputError(f"{told}; it must have {LONGEST} at most.")
     first, texts = _unit_row(grid, i)
-    headers = tuple(map(parse_header, texts))
-    body = [cells for cells in grid[first:] if any(c.strip() for c in cells)]
+    body = [cells for cells in grid[first:] if any(cells)]
     if not body:
         raise InputError(f"has a header in row {i + 1} but no rows of numbers below it.")
-    decimal = _decimal_sign(body, len(texts), separator)
-    cells = tuple(cell.strip() for cell in grid[i])
-    return Table(*whole, separator, decimal, i + 1, cells, first, headers)
+    decimal, headers = _decimal_sign(body, len(texts), separator), tuple(map(parse_header, texts))
+    return Table(*whole, separator, decimal, i + 1, tuple(grid[i]), first, headers)
 
 
 def _cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the number of the last line of each row, and its cells."""
-    reader = csv.reader(lines, delimiter=separator)
+    reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
     try:
         for cells in reader:
             yield reader.line_num, cells
@@ -169,7 +161,7 @@ def _header_row(grids: dict[str, list[list[str]]], names: set[str]) -> tuple[str
         numbers = False
         for i, cells in enumerate(grid):
             # On a tie the last row wins: titles and instrument settings stand above the header.
-            # Below rows of numbers it is another header, which `_refuse_cells` will meet.
+            # Below rows of numbers it is another header, which `read_numbers` refuses.
             score = _score(cells, names)
             if score > best or (score and score == best and not numbers):
                 best, found, numbers = score, (separator, i), False
@@ -186,7 +178,7 @@ def _above_numbers(grids: dict[str, list[list[str]]], names: set[str | int]) -> 
         rows = [k for k, cells in enumerate(grid) if _is_sample(cells)]
         if len(rows) < 3 or len({len(grid[k]) for k in rows[:3]}) > 1:
             continue
-        above = [k for k in range(rows[0]) if sum(c.strip() != "" for c in grid[k]) > 1]
+        above = [k for k in range(rows[0]) if sum(map(bool, grid[k])) > 1]
         if above and _unit_row(grid, above[-1] - 1)[0] == above[-1] + 1:
             above.pop()
         if above and above[-1] >= rows[0] - 3:
@@ -210,7 +202,7 @@ def _score(cells: list[str], names: set[str]) -> int:
     """How many channels and given names a row holds; 0 for a row with numbers."""
     if len(cells) < 2 or any(map(_is_number, cells)):
         return 0
-    headers = [parse_header(cell) for cell in cells if cell.strip()]
+    headers = list(map(parse_header, filter(None, cells)))
     channels = {c for c in CHANNELS for h in headers if h.rank(c) is not None}
     return len(channels) + len({n for n in names for h in headers if h.is_named(n)})
 
@@ -221,18 +213,18 @@ def _is_number(cell: str) -> bool:
 
 def _holds_numbers(cells: list[str]) -> bool:
     """Whether a row is one of numbers: two at least, and nothing else."""
-    full = [cell for cell in cells if cell.strip()]
+    full = list(filter(None, cells))
     return len(full) > 1 and all(map(_is_number, full))
 
 
 def _is_sample(cells: list[str]) -> bool:
     """Whether a row may be a sample: two numbers at least, and less of anything else."""
-    return 2 * sum(map(_is_number, cells)) > max(sum(c.strip() != "" for c in cells), 3)
+    return 2 * sum(map(_is_number, cells)) > max(sum(map(bool, cells)), 3)
 
 
 def _decimal_sign(body: list[list[str]], width: int, separator: str) -> str:
     """Comma or point; where the comma separates cells too, the numbers stand in quotation marks."""
-    values = [value.strip() for row in body for value in row[:width]]
+    values = [value for row in body for value in row[:width]]
     commas = [v for v in values if re.fullmatch(r"[+-]?\d*(?:,\d+)+(?:[eE][+-]?\d+)?", v)]
     if not commas or separator != ",":
         return "," if commas else "."
@@ -249,21 +241,21 @@ def _decimal_sign(body: list[list[str]], width: int, separator: str) -> str:
 def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
     """First row of numbers, and the headers with the units of the row beneath, if there is one."""
     texts = list(grid[i])
-    said = {cells[0].strip().casefold(): cells[1:] for cells in grid[:i] if len(cells) > 1}
+    said = {cells[0].casefold(): cells[1:] for cells in grid[:i] if len(cells) > 1}
     above = [*said.get("horizontal units", [])[:1], *said.get("vertical units", [])]
     for k, unit in enumerate(above[: len(texts)]):  # of a Tektronix MSO
-        if unit.strip() and parse_header(texts[k]).unit is None:
-            texts[k] = f"{texts[k].strip()} ({unit.strip()})"
+        if unit and parse_header(texts[k]).unit is None:
+            texts[k] = f"{texts[k]} ({unit})"
     first = _below_rule(grid, i + 1)
-    below = [cell.strip().strip("()[]") for cell in grid[first]] if first < len(grid) else []
-    units = [cell for cell in below if cell]
+    below = [cell.strip("()[]") for cell in grid[first]] if first < len(grid) else []
+    units = list(filter(None, below))
     known = [unit for unit in units if is_unit(unit, any_case=True) and not _is_number(unit)]
     if not known or 2 * len(known) < len(units) or any(map(_is_number, units)):
         return first, texts
     for k, unit in enumerate(below[: len(texts)]):
         own = parse_header(texts[k]).unit
-        if unit and texts[k].strip() and (own is None or not texts[k].strip().endswith((")", "]"))):
-            texts[k] = f"{texts[k].strip()} ({unit})"
+        if unit and texts[k] and (own is None or not texts[k].endswith((")", "]"))):
+            texts[k] = f"{texts[k]} ({unit})"
     return _below_rule(grid, first + 1), texts
 
 
@@ -275,32 +267,43 @@ def _below_rule(grid: list[list[str]], i: int) -> int:
 
 def read_numbers(
     table: Table, columns: dict[str, int]
-) -> tuple[dict[str, Array], NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[dict[str, Array], Integers, Integers]:
     """Read columns as they stand in the file: numbers, their rows, and rows without any of them.
 
     InputError names the first cell that is no number.
     """
-    try:
-        frame = _frame(table, columns)
-    except ValueError as error:
-        _refuse_cells(table, columns)
-        raise InputError(f"is no regular table ({error}).") from None
-    values = {channel: frame[str(k)].to_numpy(np.float64) for channel, k in columns.items()}
-    empty = np.all([np.isnan(one) for one in values.values()], axis=0)
-    rows = table.first_row + 1 + np.arange(len(frame))
-    if table.body().rstrip().count(b"\n") + 1 != len(frame):  # there are blank lines
-        rows = np.fromiter((number for number, _ in table.rows()), np.int64)
-        if rows.size != len(frame):
-            raise InputError("is no regular table; a row must have a cell for each column.")
-    numbers = {channel: one[~empty] for channel, one in values.items()}
-    too_many = frame[str(len(table.headers))].notna().any()
-    if too_many or not all(np.isfinite(one).all() for one in numbers.values()):
-        _refuse_cells(table, columns)
-    for channel, one in numbers.items():
-        _refuse_thousands(table, columns[channel], one)
-        if table.clock is not None and columns[channel] == 0:
-            numbers[channel] = table.clock[0] + table.clock[1] * one
-    return numbers, rows[~empty], rows[empty]
+    count, places = len(table.headers), list(columns.values())
+    strict = table.decimal == "," or b"_" in table.body()  # what float does not refuse or know
+    numbers, rows, empty = array("d"), array("q"), array("q")
+    for row, cells in table.rows():
+        try:
+            values = [float(cells[k]) for k in places]
+        except (ValueError, IndexError):
+            values = []
+        if strict or not values or len(cells) > count or not math.isfinite(sum(values)):
+            cells = [cell.strip() for cell in cells] + [""] * (count - len(cells))
+            if tuple(cells) == table.header_cells:
+                again = f"row {row} repeats the header of row {table.header_row}"
+                raise InputError(f"{again}; a file must hold one table with one header.")
+            if any(cells[count:]):
+                many = f"row {row} has {len(cells)} cells, but the header has {count}"
+                raise InputError(f"{many}; every row must have as many as the header.")
+            texts = [cells[k] for k in places]
+            if not any(texts):
+                empty.append(row)
+                continue
+            for k, text in zip(places, texts, strict=True):
+                if wrong := _wrong(text, table.decimal):
+                    raise InputError(f"row {row}, column {table.headers[k].text!r} is {wrong}.")
+            values = [float(text.replace(",", ".")) for text in texts]
+        numbers.extend(values)
+        rows.append(row)
+    read = np.array(numbers).reshape(-1, len(places)).T.copy()
+    for k, one in zip(places, read, strict=True):
+        _refuse_thousands(table, k, one)
+        if table.clock is not None and k == 0:
+            one[:] = table.clock[0] + table.clock[1] * one
+    return dict(zip(columns, read, strict=True)), np.array(rows), np.array(empty)
 
 
 def _refuse_thousands(table: Table, column: int, values: Array) -> None:
@@ -328,60 +331,17 @@ def without_cut_row(table: Table) -> tuple[Table, list[Dropped]]:
     above = table.body().rsplit(b"\n", _ABOVE)[1:]
     if len(above) < MIN_ROWS or not above[-1].strip() or b'"' in above[-1]:
         return table, []
-    *whole, last = (
-        [c.strip() for c in line.decode(table.encoding, "replace").split(table.separator)]
-        for line in above
-    )
+    texts = (line.decode(table.encoding, "replace") for line in above)
+    *whole, last = ([c.strip() for c in text.split(table.separator)] for text in texts)
     (_, sign, end), *ends = (cells[-1].partition(table.decimal) for cells in (last, *whole))
     digits, counts = {len(digits) for *_, digits in ends}, {len(cells) for cells in whole}
     point = sign and not end and not any(sign and not digits for _, sign, digits in ends)
     fewer = len(above) == _ABOVE and len(digits) == 1 and len(end) < min(digits)
-    if len(counts) > 1 or not (point or fewer or len(last) < min(counts)):
+    cut = len(counts) == 1 and (point or fewer or len(last) < min(counts))
+    if not cut or not all(map(_is_number, last)):
         return table, []
-    if not all(map(_is_number, last)):
-        return table, []
-    row, raw = table.raw.count(b"\n") + 1, table.raw.removesuffix(above[-1])
-    return replace(table, raw=raw), [
-        Dropped(1, row, row, f"the file ends within it, at {last[-1]!r}")
-    ]
-
-
-def _frame(table: Table, columns: dict[str, int]) -> pd.DataFrame:
-    """Parse rows of numbers; the columns have their places as names."""
-    import pandas as pd
-
-    # A header of our own, with one column more: that one shows if any row has too many cells.
-    excess = len(table.headers)
-    header = table.separator.join(map(str, range(excess + 1))).encode()
-    kinds = {str(k): "float64" for k in columns.values()}
-    return pd.read_csv(  # its ParserError is a ValueError
-        io.BytesIO(header + b"\n" + table.body()),
-        sep=table.separator,
-        decimal=table.decimal,
-        encoding=table.encoding,
-        usecols=[*kinds, str(excess)],
-        dtype=kinds | {str(excess): "str"},
-        keep_default_na=False,
-        na_values=[""],
-        skipinitialspace=True,
-        index_col=False,
-    )
-
-
-def _refuse_cells(table: Table, columns: dict[str, int]) -> None:
-    """Find the first bad cell, row by row, and name it."""
-    count = len(table.headers)
-    for row, cells in table.rows():
-        cells = [cell.strip() for cell in cells] + [""] * (count - len(cells))
-        if tuple(cells) == table.header_cells:
-            again = f"row {row} repeats the header of row {table.header_row}"
-            raise InputError(f"{again}; a file must hold one table with one header.")
-        if any(cells[count:]):
-            many = f"row {row} has {len(cells)} cells, but the header has {count}"
-            raise InputError(f"{many}; every row must have as many as the header.")
-        for k in columns.values() if any(cells[k] for k in columns.values()) else ():
-            if wrong := _wrong(cells[k], table.decimal):
-                raise InputError(f"row {row}, column {table.headers[k].text!r} is {wrong}.")
+    row, why = table.raw.count(b"\n") + 1, f"the file ends within it, at {last[-1]!r}"
+    return replace(table, raw=table.raw.removesuffix(above[-1])), [Dropped(1, row, row, why)]
 
 
 def _wrong(cell: str, decimal: str) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from foamfit.data.tables.columns import assign_columns, entries_of, quoted, si_factor
-from foamfit.data.tables.csv_table import Text, find_table
+from foamfit.data.tables.columns import Source, entries_of, quoted
+from foamfit.data.tables.csv_table import Text
 from foamfit.data.tables.headers import CHANNELS, channel_of
 from foamfit.data.toml_file import LONGEST, toml_beside
 from foamfit.errors import InputError
@@ -69,18 +69,18 @@ def without_toml(toml: Path, text: Text) -> InputError:
 def _columns(text: Text) -> list[str]:
     """Lines of [columns]: those that the headers answer, and the others as questions."""
     try:
-        table = find_table(text, set())
-        found = assign_columns(table, {})
+        source = Source.of(text, {})
     except InputError as error:
-        told = f"# {printable(' '.join(str(error).split()))}"
-        entries = (f'{n[0]} = {{ column = "…", unit = "{CHANNELS[n[0]].unit}" }}' for n in _WANTED)
-        pairs = zip(entries, _WANTED.values(), strict=True)
-        return [told, *(f"# {entry}  # {what}" for entry, what in pairs)]
-    lines = []
+        units = ((names[0], CHANNELS[names[0]].unit, what) for names, what in _WANTED.items())
+        asked = (
+            f'# {c} = {{ column = "…", unit = "{unit}" }}  # {what}' for c, unit, what in units
+        )
+        return [f"# {printable(' '.join(str(error).split()))}", *asked]
+    lines, table, found = [], source.table, source.columns
     for channel, k in found.items():
         name = f"{channel} = {{ column = {quoted(table, k)}"
         try:
-            si_factor(table, channel, k, None)
+            source.factor(channel)
             lines.append(f"{name} }}")
         except InputError as error:
             why = str(error).removeprefix("column ").partition(";")[0]

@@ -14,27 +14,28 @@ WEAK = 3  # rank of a header that may name the displacement
 
 
 class Channel(NamedTuple):
-    """SI unit of a channel, a usual unit for examples, and the words for it (best one first)."""
+    """SI unit of a channel, a usual unit for examples, and the words for it."""
 
     si: str
     unit: str
-    words: tuple[str, ...]
+    named: str
 
-
-def _channel(si: str, unit: str, words: str) -> Channel:
-    return Channel(si, unit, tuple(words.split()))
+    @property
+    def words(self) -> list[str]:
+        """The words, the best one first."""
+        return self.named.split()
 
 
 _MOVED = "displacement disp weg standardweg verschiebung stauchung compression"
 CHANNELS = {
-    "time": _channel("s", "ms", "time t zeit prüfzeit testzeit versuchszeit"),
-    "stress": _channel("Pa", "MPa", "stress sigma druckspannung spannung"),
-    "force": _channel("N", "N", "force load f kraft standardkraft prüfkraft druckkraft"),
-    "displacement": _channel("m", "mm", _MOVED),
-    "strain": _channel("", "%", "strain eps epsilon dehnung stauchung compression"),
-    "acceleration": _channel("m/s**2", "m/s^2", "acceleration accel deceleration beschleunigung"),
-    "velocity": _channel("m/s", "m/s", "velocity speed geschwindigkeit"),
-    "cycle": _channel("", "", ""),  # its number, where [columns] names such a column
+    "time": Channel("s", "ms", "time t zeit prüfzeit testzeit versuchszeit"),
+    "stress": Channel("Pa", "MPa", "stress sigma druckspannung spannung"),
+    "force": Channel("N", "N", "force load f kraft standardkraft prüfkraft druckkraft"),
+    "displacement": Channel("m", "mm", _MOVED),
+    "strain": Channel("", "%", "strain eps epsilon dehnung stauchung compression"),
+    "acceleration": Channel("m/s**2", "m/s^2", "acceleration accel deceleration beschleunigung"),
+    "velocity": Channel("m/s", "m/s", "velocity speed geschwindigkeit"),
+    "cycle": Channel("", "", ""),  # its number, where [columns] names such a column
 }
 _WORDS = {word for channel in CHANNELS.values() for word in channel.words}
 # Words that several quantities go by: the unit decides which it is.
@@ -73,11 +74,8 @@ class Header:
 
     def rank(self, channel: str) -> int | None:
         """How well it names a channel: 0 is best, None not at all."""
-        rank = self._rank(channel)
-        return rank if rank is None or not self.measure(channel) else rank + 4
-
-    def _rank(self, channel: str) -> int | None:
         words, node = channel_of(channel).words, interior_node(channel)
+        poor = 4 if self.measure(channel) else 0
         numbers = [word for word in self.words if word.isdecimal()]
         if [int(number) for number in numbers] != ([] if node is None else [node]):
             return None  # displacement_1 is inside the specimen
@@ -87,12 +85,12 @@ class Header:
         if set(named) & _BY_UNIT and (self.unit is None or in_si(channel, self.unit) is None):
             return None
         if len(rest) == 1 and rest[0] in words:
-            return 0 if rest[0] == words[0] else 1
+            return poor + (rest[0] != words[0])
         if _OTHER & set(rest) or not all(word in words for word in named):
             return None
         if named:
-            return 2
-        return WEAK if channel == "displacement" and _MOTION & set(rest) else None
+            return poor + 2
+        return poor + WEAK if channel == "displacement" and _MOTION & set(rest) else None
 
     def is_named(self, name: str) -> bool:
         """Whether a column name in the TOML means it: with its unit or without."""
@@ -138,11 +136,9 @@ def _fits(header: Header) -> bool:
 
 def _words(name: str) -> tuple[str, ...]:
     """Words of a name, in small letters; in brackets a channel only says where another is from."""
-
-    def aside(bracket: re.Match[str]) -> str:
-        return " ".join(("", *(w for w in _split(bracket[0]) if w not in _WORDS), ""))
-
-    return tuple(_split(re.sub(r"[(\[{][^()\[\]{}]*[)\]}]", aside, name)))
+    outside, inside = (re.split(r"[(\[{]([^()\[\]{}]*)[)\]}]", name)[i::2] for i in (0, 1))
+    aside = [[word for word in _split(text) if word not in _WORDS] for text in [*inside, ""]]
+    return tuple(w for text, more in zip(outside, aside, strict=True) for w in _split(text) + more)
 
 
 def _split(name: str) -> list[str]:

@@ -22,7 +22,7 @@ _NUMBERS = re.compile(r"\s*(?:[+-]?[\d.,]*\d[.,]?(?:e[+-]?\d+)?(?:\s+|$)){2,}", 
 
 
 class Scope(NamedTuple):
-    """The headers that an oscilloscope's preamble stands for, and how many rows it has.
+    """Headers and number of rows of an oscilloscope's preamble.
 
     `clock` is start and step, s, where the first column counts samples.
     """
@@ -80,7 +80,7 @@ def _sheet(raw: bytes, sheet: str | None) -> bytes:
 
 def scope_of(grid: list[list[str]]) -> Scope | None:
     """Return what the preamble of a Keysight, Rigol or Tektronix TDS scope says, if it is one."""
-    rows = [[cell.strip() for cell in cells] for cells in grid[:20] if cells]
+    rows = [cells for cells in grid[:20] if cells]
     first, second = (*rows, [], [])[:2]
     words = [cell.casefold() for cell in first]
     if len(second) > 1 and words[0] == "x-axis":
@@ -104,10 +104,10 @@ def _with_units(names: list[str], units: list[str]) -> list[str]:
 
 
 def blanks_as_tabs(text: str) -> str | None:
-    """Put tabs between columns that blanks separate; None if no rows of numbers are so written.
+    """Put tabs between columns that blanks separate; None if there are no such rows of numbers.
 
-    Words of the header go to the column of numbers that they stand above, and a row that lacks a
-    number is read by the places of the others.
+    Words of the header go to the column of numbers below them; in a row that lacks a number, the
+    others keep their columns.
     """
     lines = text.splitlines()
     at = [k for k, line in enumerate(lines) if _NUMBERS.fullmatch(line)]

@@ -1,4 +1,4 @@
-"""The summary of a batch: a row for each test, as CSV and as one page to read."""
+"""The summary of a batch: a row for each test, as CSV and as an HTML page."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.report.figures import image
 from foamfit.report.render import page, words
 from foamfit.report.studies.parameters import DPI as SUMMARY_DPI
-from foamfit.report.studies.parameters import Compared, plot_parameters
+from foamfit.report.studies.parameters import panels_of, plot_parameters
 from foamfit.report.summary import CURVES
 from foamfit.report.tables import (
     MISFITS,
@@ -37,7 +37,7 @@ from foamfit.text import counted, listed
 if TYPE_CHECKING:
     import pandas as pd
 
-# What a row says of a test without a result.
+# Status of a test without a result.
 REFUSED, OPEN = "refused", "not fitted"
 _STATUS = {
     "ok": "fitted",
@@ -75,9 +75,9 @@ class Row:
 
 def row_of(test: str, file: str, result: Fit) -> Row:
     """Make the row of a fit."""
-    fatal = [c for c in result.checklist if c.fatal and c.answer is False]
     error = None
     if result.status == "failed":
+        fatal = (check for check in result.checklist if check.fatal and check.answer is False)
         told = [w for check in fatal for w in (check.warnings or (check.sentence,))]
         error = " ".join(["no acceptable fit was found:", *(told or result.warnings)[:1]])
     misfit, runtime = plain(result.misfit), plain(result.runtime_s)
@@ -93,9 +93,9 @@ def table_rows(rows: Sequence[Row]) -> Iterator[list[Any]]:
     head = ["test", "file", "status", "error", *(f"misfit_{name}" for name in CURVES), "runtime_s"]
     yield [*head, *wide_head(names)]
     for row in rows:
-        cells: list[Any] = [row.test, row.file, row.status, row.error]
-        cells += [*(row.misfit.get(name) for name in CURVES), row.runtime_s]
-        yield cells + wide_cells(names, row.parameters)
+        told = [row.test, row.file, row.status, row.error]
+        misfits = map(row.misfit.get, CURVES)
+        yield [*told, *misfits, row.runtime_s, *wide_cells(names, row.parameters)]
 
 
 def table(rows: Sequence[Row]) -> pd.DataFrame:
@@ -106,11 +106,8 @@ def table(rows: Sequence[Row]) -> pd.DataFrame:
 def read_table(path: Path) -> pd.DataFrame:
     """Read a summary.csv; raise InputError if the file is not one."""
     try:
-        text = read_whole(path).decode()
-        rows = [[cell or None for cell in row] for row in csv.reader(text.splitlines(True))]
-        return _frame(
-            *([cell and re.sub("^'(?=[=+@-])", "", cell) for cell in row] for row in rows)
-        )
+        rows = csv.reader(read_whole(path).decode().splitlines(True))
+        return _frame(*([re.sub("^'(?=[=+@-])", "", cell) or None for cell in row] for row in rows))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path} is no summary of a batch: {error}") from None
 
@@ -172,16 +169,12 @@ def write_comparison(
     tests = [row.test for row in fitted]
     every = varied([row.parameters for row in fitted])
     found = {name: each for name, each in every.items() if name not in NUISANCE}
-    text = by_test_tex("Test", by_test(tests, found))
-    write_file(folder / "summary.tex", text.encode("utf-8", "replace"))
+    write_file(folder / "summary.tex", by_test_tex("Test", tests, found).encode("utf-8", "replace"))
     if not (pictures and found):
         return None
-    springs = 2 if any(name.startswith("s2_") for name in found) else 1
-    compared = [
-        Compared(name, {t: p for t, p in zip(tests, each, strict=True) if p is not None}, springs)
-        for name, each in found.items()
-    ]
-    figure = plot_parameters(f"{title} · {counts_in_words(rows)}", tests, compared, width=width)
+    figure = plot_parameters(
+        f"{title} · {counts_in_words(rows)}", tests, panels_of(tests, found), width=width
+    )
     png = image(figure, "png", SUMMARY_DPI)
     write_file(folder / "summary.png", png)
     write_file(folder / "summary.pdf", image(figure, "pdf"))

@@ -1,45 +1,145 @@
-"""The folder of a record's cycles: a result folder for each, a table, a picture, a summary."""
+"""The fits of a record's cycles: what they say, their folder, table and picture."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, TWO
+from foamfit.report.figures import TWO
 from foamfit.report.folder import save_whole, write_json, write_result, write_table, write_text
-from foamfit.report.readable import own_name, readable_unit
+from foamfit.report.plots import draw_loops
+from foamfit.report.readable import own_name
 from foamfit.report.render import words
-from foamfit.report.shown import cycles_by_test
-from foamfit.report.tables import by_test_tex
+from foamfit.report.shown import brief
+from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
+from foamfit.report.summary import CURVES
+from foamfit.report.tables import (
+    by_test,
+    by_test_tex,
+    frame,
+    names_of,
+    stacked,
+    varied,
+    wide_cells,
+    wide_head,
+)
+from foamfit.results import Fit, ParameterEstimate, plain
+from foamfit.springs.parameters import NUISANCE
+from foamfit.text import counted, percent
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from foamfit.report.result_figures import Mapped
-    from foamfit.results import Fit
-    from foamfit.study.cycle_fits import FittedCycles
 
-COLUMNS, PANEL = 4, (1.85, 1.5)  # of the picture; inches
-LEAST = 1.55  # in, of a panel
+SCHEMA = 1
+ENERGY = "dissipated_energy"
 MOST_LOOPS = 12
 MOST_NAMES = 12  # of parameters on the terminal; those of a chain are in cycles.csv
 DPI = 200
 # Panels beside the parameters: columns of cycles.csv (SI), and what these are multiplied with.
 BY_CYCLE = {
-    "start strain (%)": ("start_strain", 100.0),
-    "dissipated (kJ/m³)": ("dissipated_energy", 1e-3),
-    "misfit of the loop (%)": ("misfit_stress_strain", 100.0),
+    "start\nstrain (%)": ("start_strain", 100.0),
+    "dissipated\n(kJ/m³)": ("dissipated_energy", 1e-3),
+    "misfit of\nthe loop (%)": ("misfit_stress_strain", 100.0),
 }
-FAR = 20  # a last cycle that is so many times the first is drawn on a logarithmic axis
+
+
+@dataclass(frozen=True, eq=False)
+class CycleFits:
+    """Fits of the cycles of one record."""
+
+    test: str  #: Names of the test and of the model
+    model: str
+    recorded: tuple[int, ...]  #: Numbers of all cycles in the record
+    results: dict[int, Fit]  #: Of each cycle that could be read and fitted
+    refused: dict[int, str]  #: Why the others could not, one sentence each
+
+    @property
+    def varied(self) -> dict[str, list[ParameterEstimate | None]]:
+        """The parameters of the springs that vary in any fit, by cycle in ascending order."""
+        every = varied([one.parameters for _, one in sorted(self.results.items())])
+        return {name: each for name, each in every.items() if name not in NUISANCE}
+
+    def rows(self) -> Iterator[list[object]]:
+        """Rows of cycles.csv, the header first: SI, one row for each cycle, empty = not there."""
+        names = names_of(one.parameters for one in self.results.values())
+        head = ["cycle", "start_strain", "peak_strain", "peak_stress", ENERGY]
+        head += [*(f"misfit_{name}" for name in CURVES), "status", "error"]
+        yield [*head, *wide_head(names)]
+        for number in sorted({*self.results, *self.refused}):
+            one = self.results.get(number)
+            if one is None:
+                told = [number, *[None] * 7, "refused", self.refused[number]]
+                yield [*told, *wide_cells(names, {})]
+                continue
+            m = one.measurement
+            strain = None if m.displacement is None else m.displacement.max() / m.specimen.height
+            stress = None if m.stress is None else m.stress.max()
+            cells = [number, m.start_strain, strain, stress, one.energy.get(ENERGY)]
+            cells += [*map(one.misfit.get, CURVES), one.status, None]
+            yield [*plain(cells), *wide_cells(names, one.parameters)]
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content of cycles.json, in plain types."""
+        content: dict[str, Any] = {
+            "schema": SCHEMA,
+            "foamfit": version("foamfit"),
+            "test": self.test,
+            "model": self.model,
+            "recorded": self.recorded,
+            "fitted": sorted(self.results),
+            "refused": self.refused,
+        }
+        return dict(plain(content))
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the loops of all cycles, measured and fitted, into axes or a new figure."""
+        found = ((n, one.loop) for n, one in sorted(self.results.items()))
+        loops = (loop._replace(name=f"cycle {n}") for n, loop in found if loop is not None)
+        return draw_loops(loops, ax)
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each cycle and parameter, SI; `to_latex` of it compiles."""
+        results = sorted(self.results.items())
+        return stacked({n: frame(one.parameters) for n, one in results}, "cycle")
+
+    @property
+    def by_cycle(self) -> pd.DataFrame:
+        """Return the rows of cycles.csv, indexed by the cycle."""
+        import pandas as pd
+
+        head, *rows = self.rows()
+        return pd.DataFrame(rows, columns=[str(name) for name in head]).set_index("cycle")
+
+    def __repr__(self) -> str:
+        """Return model, misfits and parameters of the cycles."""
+        return _shown(self)
+
+    def _repr_html_(self) -> str:
+        return _shown(self, html=True)
+
+    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
+        """Write ``cycle-<n>/``, cycles.csv, cycles.png and cycles.json whole; returns the folder.
+
+        An older result there is replaced as a whole, at the end. Without `report` there are tables
+        alone. Figures are "one" or "two" columns wide, or as wide as a length ("85 mm").
+        """
+        figures.inches(figure_width)  # refuses what is no width
+        return save_cycles(self, folder, report=report, width=figure_width)
 
 
 def save_cycles(
-    found: FittedCycles,
+    found: CycleFits,
     folder: str | Path,
     *,
     report: bool = True,
@@ -56,7 +156,7 @@ def save_cycles(
 
 
 def write_cycles(
-    found: FittedCycles, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
+    found: CycleFits, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
 ) -> None:
     """Write all files of the cycles into a folder that is there; reports and pictures if wanted."""
     for number, result in found.results.items():
@@ -65,74 +165,58 @@ def write_cycles(
         write_result(result, inner, pages=pages, width=width, mapped=mapped)
     write_table(folder / "cycles.csv", found.rows())
     write_json(folder / "cycles.json", found.to_json_dict())
-    write_text(folder / "table.tex", by_test_tex("Cycle", cycles_by_test(found)))
+    numbers = [str(number) for number in sorted(found.results)]
+    write_text(folder / "table.tex", by_test_tex("Cycle", numbers, found.varied))
     if pages:
         figures.write_both(plot_cycles(found, width=width), folder / "cycles", DPI)
 
 
-def cycles_text(found: FittedCycles) -> str:
+def cycles_text(found: CycleFits) -> str:
     """Return what the command prints of the cycles of a record."""
     names = list(found.varied) if len(found.varied) <= MOST_NAMES else []
     return words("cycles", found=found, names={name: own_name(name, found.model) for name in names})
 
 
-def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
-    """Draw the loops laid over each other, and start strain, energy, misfit, parameters by cycle.
+def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
+    """Draw the loops over each other, and start strain, energy, misfit and parameters by cycle.
 
-    Bars are 95 % intervals; a hollow mark is a parameter that its cycle does not determine well.
-    `width` is "one" or "two" columns, or a length such as "85 mm".
+    For the parameters and `width` see `plot_parameters`; of very many loops some are drawn.
     """
-    results, varied = dict(sorted(found.results.items())), found.varied
+    results = dict(sorted(found.results.items()))
+    loops = [
+        loop._replace(
+            name=f"cycle {number}",
+            along=loop.along + one.measurement.start_strain,
+            label="strain from the first contact",
+        )
+        for number, one in results.items()
+        if (loop := one.loop) is not None and loop.label == "strain"
+    ]
+    keep = np.unique(np.geomspace(1, max(len(loops), 1), MOST_LOOPS).astype(int)) - 1
     head, *table = map(list[Any], found.rows())
-    panels, wide = len(BY_CYCLE) + len(varied), figures.inches(width)
-    columns = max(figures.abreast(wide, COLUMNS, LEAST), 2)
-    rows = 2 + max(0, -(-(panels - 2 * (columns - 2)) // columns))
-    told = f"{found.test} · {found.model}"
-    lines = figures.title_lines(wide, told, titled=figures.is_titled(width))
-    with figures.drawing(wide, rows * PANEL[1] + 0.13 * len(lines) + 0.4, lines) as figure:
-        grid = figure.add_gridspec(rows, columns)
-        _loops(figure.add_subplot(grid[:2, :2]), results)
-        places = [(i, j) for i in range(rows) for j in range(columns) if i > 1 or j > 1]
-        axes = [figure.add_subplot(grid[place]) for place in places[:panels]]
-        for ax, (title, (column, factor)) in zip(axes, BY_CYCLE.items(), strict=False):
-            pairs = ((row[0], row[head.index(column)]) for row in table)
-            there = [(number, factor * value) for number, value in pairs if value is not None]
-            style: dict[str, Any] = {"color": BLUE, "markersize": 3, "linewidth": 0.8}
-            if there:
-                ax.plot(*np.array(there).T, "o-", label="_each cycle alone", **style)
-            ax.set_title(title)
-        for ax, (name, each) in zip(axes[len(BY_CYCLE) :], varied.items(), strict=True):
-            points = [(n, p) for n, p in zip(results, each, strict=True) if p is not None]
-            factor, unit = readable_unit(max(abs(p.value) for _, p in points), points[0][1].unit)
-            ax.set_title(own_name(name, found.model) + (f" ({unit})" if unit else ""))
-            ax.set_ylim(figures.limits(*figures.draw_estimates(ax, points, factor)))
-        numbers = list(results)
-        for ax in axes:
-            ax.set_xlabel("cycle")
-            if numbers and numbers[-1] >= FAR * numbers[0]:
-                ax.set_xscale("log")
-            elif len(numbers) <= 8:
-                ax.set_xticks(numbers)
-        figures.legend_below(figure, figures.key_of(figure.axes))
-    return figure
+    panels = list[Panel]()
+    for title, (column, factor) in BY_CYCLE.items():
+        values = {
+            f"cycle {row[0]}": ParameterEstimate(factor * x, None, None, "", True, "determined", "")
+            for row in table
+            if (x := row[head.index(column)]) is not None
+        }
+        panels.append(Panel(column, title, values))
+    names = [f"cycle {number}" for number in results]
+    return plot_parameters(
+        f"{found.test} · {found.model}",
+        names,
+        [*panels, *panels_of(names, found.varied)],
+        width=width,
+        above=partial(draw_loops, [loops[i] for i in keep[: len(loops)]]),
+    )
 
 
-def _loops(ax: Axes, results: Mapping[int, Fit]) -> None:
-    """Measured loops over each other, from light to dark; the first and the last one fitted."""
-    import matplotlib
-
-    there = [n for n, one in results.items() if one.curves.measured_displacement is not None]
-    keep = np.unique(np.geomspace(1, max(len(there), 1), MOST_LOOPS).astype(int)) - 1
-    shown = [there[i] for i in keep if i < len(there)]
-    colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, max(len(shown), 1)))
-    for number, colour in zip(shown, colours, strict=False):
-        if (one := results[number].loop) is None:
-            continue
-        strain, label = one.along + results[number].measurement.start_strain, f"cycle {number}"
-        ax.plot(strain, one.measured / 1e3, color=colour, linewidth=0.9, label=label)
-        if one.fitted is not None and number in (shown[0], shown[-1]):
-            label = "_fitted, first and last cycle"
-            ax.plot(strain, one.fitted / 1e3, ":", color="black", linewidth=0.8, label=label)
-    ax.set(xlabel="strain from the first contact", ylabel="stress (kPa)")
-    if shown:
-        ax.legend(loc="upper left", fontsize=6.5, handlelength=1.2, labelspacing=0.25)
+def _shown(found: CycleFits, *, html: bool = False) -> str:
+    """Return how many cycles were fitted and their misfits; as HTML the parameters by cycle too."""
+    line = f"{found.model} · {len(found.results)} of {counted(len(found.recorded), 'cycle')} fitted"
+    each = (one.misfit.get("stress_strain") for one in found.results.values())
+    if known := [off for off in each if off is not None]:
+        line += f" · misfit {percent(min(known))} to {percent(max(known))}"
+    table = by_test(list(map(str, sorted(found.results))), found.varied) if html else {}
+    return brief(found.test, line, [], html, table and {"first": "cycle", **table})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,14 +11,14 @@ import numpy as np
 
 from foamfit.fitting.links import RATES, law_values
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, MEASURED, TWO, VERMILION, image
+from foamfit.report.figures import BLUE, GREY, MEASURED, TWO, VERMILION, image
 from foamfit.report.folder import save_whole, write_json, write_result, write_text
 from foamfit.report.readable import in_unit, own_name, readable, readable_unit, symbol
 from foamfit.report.render import page, words
 from foamfit.report.shown import Joint
-from foamfit.report.studies.parameters import Compared, plot_parameters
-from foamfit.report.tables import MISFITS, parameters_tex
-from foamfit.results import Fit, law_in_words
+from foamfit.report.studies.parameters import Panel, plot_parameters
+from foamfit.report.tables import MISFITS, formula, parameters_tex, symbols
+from foamfit.results import Fit, ParameterEstimate, law_in_words
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import percent
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.study.joint_result import JointParameter
 
 DPI = 180  # of the picture
 MOST_ROWS = 60  # of the table of tests on the terminal
@@ -35,9 +35,70 @@ MOST_ROWS = 60  # of the table of tests on the terminal
 LOOPS, LOOP, COLUMNS, PANEL = 6, (1.25, 1.15), 3, (2.5, 1.6)
 LEAST_LOOP, LEAST_PANEL, ROOMY = 1.05, 1.55, 2.1  # in
 MOST_LOOPS = 48
-# Tests are ordered by rate from this ratio of the largest to the smallest rate on, even if no
-# parameter follows a law of rate; rates of nominally equal tests differ by some percent.
-SEVERAL_RATES = 1.5
+SEVERAL_RATES = 1.5  # times the smallest rate; those of nominally equal tests differ by percents
+# Keys of a parameter that only some kinds have.
+_OF_SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
+_OF_RATE = ("b", "b_stderr", "b_ci95", "b_range")
+
+
+@dataclass(frozen=True)
+class TestValue:
+    """A parameter in one test, SI; None where the test says nothing of it."""
+
+    __test__ = False  # what pytest must not take for a test
+
+    value: float
+    stderr: float | None
+    ci95: tuple[float, float] | None
+    state: str
+    why: str
+
+
+@dataclass(frozen=True)
+class JointParameter:
+    """One parameter of a joint fit, SI.
+
+    `kind` is one of `links.KINDS` or "fixed". `value` is the common one: of a scattering parameter
+    the median specimen's, by a law of rate that at the rate of the median test, of an own one the
+    median over the tests (which has no error). `scatter` is the standard deviation of its logarithm
+    between specimens, `b` the slope of the law of rate. `tests` has its value in each test, unless
+    it is the same in all.
+    """
+
+    kind: str
+    value: float
+    unit: str
+    stderr: float | None = None
+    ci95: tuple[float, float] | None = None
+    state: str | None = None
+    why: str | None = None
+    tests: Mapping[str, TestValue] | None = None
+    scatter: float | None = None
+    scatter_stderr: float | None = None
+    scatter_ci95: tuple[float, float] | None = None
+    b: float | None = None
+    b_stderr: float | None = None
+    b_ci95: tuple[float, float] | None = None
+    # What the error of the law leaves open of it (`joint_fit.ranges_of`); None where all is noise.
+    range: tuple[float, float] | None = None
+    b_range: tuple[float, float] | None = None
+
+    def estimate(self, test: str | None = None) -> ParameterEstimate:
+        """The common value, or that of a test, as the parameter of a fit."""
+        if test is None or self.tests is None:
+            told, span = (self.state or "", self.why or ""), self.range
+            return ParameterEstimate(
+                self.value, self.stderr, self.ci95, self.unit, True, *told, range=span
+            )
+        at = self.tests[test]
+        return ParameterEstimate(at.value, at.stderr, at.ci95, self.unit, True, at.state, at.why)
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return its part of joint.json."""
+        gone = ["tests"] if self.tests is None else []
+        gone += [key for key in _OF_SCATTER if self.kind != "scatter"]
+        gone += [key for key in _OF_RATE if self.kind not in RATES]
+        return {key: value for key, value in asdict(self).items() if key not in gone}
 
 
 def save_joint(
@@ -56,32 +117,27 @@ def save_joint(
 
     def write(fresh: Path) -> None:
         write_json(fresh / "joint.json", found.to_json_dict())
-        write_text(fresh / "table.tex", joint_tex(found))
+        shown = _of_springs(found)
+        text = parameters_tex(
+            {name: one.estimate() for name, one in shown.items()},
+            kinds={name: one.kind for name, one in shown.items()},
+            between={name: between(one) for name, one in shown.items()},
+        )
+        write_text(fresh / "table.tex", text)
         folders, n = [fresh / name for name in found.tests], len(found.tests)
         # Where other processes make the folders, the pictures of all are drawn beside them.
         made = each(_write_test, found.test_fits(), folders, [report] * n, [width] * n)
         if report:
-            pictures = [
-                figures.write_both(draw(found, width=width), fresh / name, DPI)
-                for name, draw in (("joint", plot_joint), ("parameters", plot_compared))
-            ]
-            if width != TWO:  # the page is as wide as two columns
-                pictures = [image(draw(found), "png", DPI) for draw in (plot_joint, plot_compared)]
+            pictures = []
+            for name, draw in (("joint", plot_joint), ("parameters", plot_compared)):
+                png = figures.write_both(draw(found, width=width), fresh / name, DPI)
+                # The page is as wide as two columns.
+                pictures.append(png if width == TWO else image(draw(found), "png", DPI))
             write_text(fresh / "joint.html", joint_page(found, *pictures))
         for _ in made:
             pass
 
     return save_whole(folder, write)
-
-
-def joint_tex(found: Joint) -> str:
-    """Return table.tex: a row for each parameter of the springs."""
-    shown = _of_springs(found)
-    return parameters_tex(
-        {name: one.estimate() for name, one in shown.items()},
-        kinds={name: one.kind for name, one in shown.items()},
-        between={name: between(one) for name, one in shown.items()},
-    )
 
 
 def _of_springs(found: Joint) -> dict[str, JointParameter]:
@@ -96,7 +152,7 @@ def _write_test(one: Callable[[], Fit] | Fit, folder: Path, report: bool, width:
 
 
 def _told(found: Joint) -> dict[str, Any]:
-    """Return what text and page say alike: of joint.json, and the law in words."""
+    """Return what text and page have in common."""
     content = found.to_json_dict()
     tests, evidence = content["tests"].values(), dict[str, list[Mapping[str, Any]]]()
     for one in content["evidence"]:
@@ -116,7 +172,7 @@ def joint_text(found: Joint) -> str:
     told = _told(found)
     tests = list(told["found"]["tests"].items())[:MOST_ROWS]
     parameters = [
-        # The median of a parameter of single records means nothing.
+        # The median of a contact time or a zero means nothing.
         (name, one, "" if name in NUISANCE else in_unit((one.value,), one.unit), between(one))
         for name, one in found.parameters.items()
         if one.kind != "fixed" or one.value
@@ -127,11 +183,11 @@ def joint_text(found: Joint) -> str:
 def joint_page(found: Joint, loops: bytes, compared: bytes) -> str:
     """Return the page with two pictures (PNG)."""
     told = _told(found)
-    each = []
-    for name, one in found.parameters.items():
-        if one.tests and one.kind != "fixed":
-            size = max(abs(at.value) for at in one.tests.values())
-            each.append((one, "".join(symbol(name)), *readable_unit(size, one.unit)))
+    each = [
+        (one, "".join(symbol(name)), *readable_unit(max(abs(at.value) for at in own), one.unit))
+        for name, one in found.parameters.items()
+        if one.kind != "fixed" and (own := (one.tests or {}).values())
+    ]
     noise, known = {}, [one["noise"] for one in told["found"]["tests"].values()]
     for name in MISFITS:
         if levels := [one[name]["sigma"] for one in known if name in one]:
@@ -195,44 +251,42 @@ def plot_joint(found: Joint, *, width: str = TWO) -> Figure:
             for ax, name in zip(below, laws, strict=True):
                 _law_of_rate(ax, found, name, parted=wide / columns < ROOMY)
             axes += below
-        figures.legend_below(figure, figures.key_of(axes))
+        figures.legend_below(figure, figures.named_in(axes))
     return figure
 
 
 def plot_compared(found: Joint, *, width: str = TWO) -> Figure:
     """Draw the parameters of all tests side by side, the tests by rate where they have several."""
-    names, springs = _in_order(found), len(found.model.split("+"))
-    compared = [
-        Compared(
+    names = _in_order(found)
+    shown = {name: one for name, one in _of_springs(found).items() if one.kind != "fixed"}
+    panels = [
+        Panel(
             name,
+            formula(own),
             {names[t]: one.estimate(t) for t in names if one.tests and t in one.tests},
-            springs,
-            one.kind,
-            one.estimate() if one.kind in ("shared", "scatter") else None,
-            one.scatter,
+            kind=one.kind,
+            common=one.estimate() if one.kind in ("shared", "scatter") else None,
+            scatter=one.scatter,
         )
-        for name, one in _of_springs(found).items()
-        if one.kind != "fixed"
+        for own, (name, one) in zip(symbols(shown), shown.items(), strict=True)
     ]
     title = f"{found.name} · {found.model} · {len(names)} tests together"
-    return plot_parameters(title, list(names.values()), compared, width=width)
+    return plot_parameters(title, list(names.values()), panels, width=width)
 
 
 def _in_order(found: Joint) -> dict[str, str]:
-    """Return the names of the tests as they are shown: by rate, with it, where rates differ."""
-    rates = dict(zip(found.tests, found.rates, strict=True)) if by_rate(found) else {}
-    tests = sorted(found.tests, key=lambda test: rates.get(test) or 0.0)
-    return {t: t if rates.get(t) is None else f"{t}, {rates[t]:.2g}/s" for t in tests}
+    """Return the names of the tests as they are shown: by rate, with it, where rates differ.
 
-
-def by_rate(found: Joint) -> bool:
-    """Whether tests are ordered by rate: a parameter follows a law of rate, or rates differ."""
-    rates = [rate for rate in found.rates if rate]
-    if found.rate0 is None or min(rates) == max(rates):
-        return False
-    if any(one.kind in RATES for one in found.parameters.values()):
-        return True
-    return len(rates) == len(found.rates) and max(rates) > SEVERAL_RATES * min(rates)
+    They do so where a parameter follows a law of rate, or by more than nominally equal tests.
+    """
+    known = [rate for rate in found.rates if rate]
+    least = 1.0 if any(one.kind in RATES for one in found.parameters.values()) else SEVERAL_RATES
+    all_known = least == 1.0 or len(known) == len(found.tests)
+    if found.rate0 is None or not all_known or max(known) <= least * min(known):
+        return {test: test for test in found.tests}
+    rates = dict(zip(found.tests, found.rates, strict=True))
+    tests = sorted(found.tests, key=lambda test: rates[test] or 0.0)
+    return {t: t if rates[t] is None else f"{t}, {rates[t]:.2g}/s" for t in tests}
 
 
 def _draw_loops(axes: list[Axes], found: Joint, titles: Mapping[str, str]) -> None:
@@ -243,9 +297,9 @@ def _draw_loops(axes: list[Axes], found: Joint, titles: Mapping[str, str]) -> No
     for ax, (test, title) in zip(axes, titles.items(), strict=True):
         if (one := loops.get(test)) is None:
             continue
-        ax.plot(one.along, one.measured / factor, color=MEASURED, lw=1.5, label="_measured")
+        ax.plot(one.along, one.measured / factor, color=MEASURED, lw=1.5, label="measured")
         if one.fitted is not None:
-            ax.plot(one.along, one.fitted / factor, color=BLUE, lw=0.7, label="_fitted")
+            ax.plot(one.along, one.fitted / factor, color=BLUE, lw=0.7, label="fitted")
         ax.set_label(one.name)
         ax.set_title(title, fontsize=6)
         ax.tick_params(labelsize=5.5, length=2, pad=1.5)
@@ -258,14 +312,13 @@ def _law_of_rate(ax: Axes, found: Joint, name: str, *, parted: bool) -> None:
     """One parameter by rate, with its law; its title in two lines if `parted`."""
     one, x = found.parameters[name], np.array(found.rates, dtype=float)
     factor, unit = readable_unit(abs(one.value), one.unit)
-    told = f"{own_name(name, found.model)}{f' ({unit})' if unit else ''}:"
-    ax.set_title(f"{told}\n{one.kind}" if parted else f"{told} {one.kind}")
-    ax.set_label(f"{told} {one.kind}")
+    told = f"{own_name(name, found.model)}{f' ({unit})' if unit else ''}: {one.kind}"
+    ax.set(label=told, title=told.replace(": ", ":\n") if parted else told)
     tests = one.tests or {}
-    points = [(at, tests[test]) for at, test in zip(x, found.tests, strict=True) if test in tests]
-    figures.draw_estimates(ax, points, factor, 0.0)
-    ax.set_xscale("log")
+    ends = [tests[t].ci95 or (np.nan,) * 2 if t in tests else (np.nan,) * 2 for t in found.tests]
+    ax.vlines(x, *np.transpose(ends) / factor, color=GREY, lw=0.8, label="95 % interval")
     ax.set_xlabel("strain rate (1/s)", labelpad=1)
+    ax.set_xscale("log")
     low, high = np.nanmin(x), np.nanmax(x)
     if high < 10.0 * low:  # no two powers of ten, and minor labels overlap
         ticks = np.geomspace(low, high, 3)
@@ -274,8 +327,7 @@ def _law_of_rate(ax: Axes, found: Joint, name: str, *, parted: bool) -> None:
     if one.b is not None and found.rate0 is not None:
         rates = np.geomspace(low, high, 50)
         values = law_values(one.kind, one.value, one.b, np.log(rates / found.rate0))
-        ax.plot(rates, values / factor, label="_law of rate", color=VERMILION, linewidth=1.0)
-        y = 0.05 if one.b > 0.0 else 0.97
-        side: Any = {"ha": "right", "va": "top" if y > 0.5 else "bottom", "fontsize": 6.5}
+        ax.plot(rates, values / factor, label="law of rate", color=VERMILION, linewidth=1.0)
+        y, va = (0.05, "bottom") if one.b > 0.0 else (0.97, "top")
         told = between(one).partition(" (")[0] if parted else between(one)
-        ax.text(0.98, y, told, transform=ax.transAxes, **side)
+        ax.text(0.98, y, told, ha="right", va=va, fontsize=6.5, transform=ax.transAxes)

@@ -1,29 +1,36 @@
-"""The folder of a prediction, its text and its picture."""
+"""What the prediction of a test says, its folder, its text and its picture."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from foamfit.arrays import Array
+from foamfit.data.cycles import cycles_of
+from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
 from foamfit.report import figures
 from foamfit.report import folder as results
 from foamfit.report.figures import BLUE, INSIDE, MEASURED, TWO, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import words
+from foamfit.results import law_in_words, plain
+from foamfit.springs.model import Model
 from foamfit.text import percent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.arrays import Array
-    from foamfit.study.prediction.predicted import PredictedCurve, PredictedTest
-
+SCHEMA = 1
 PANEL = (2.6, 2.2)  # inches
-# Colour of each part of the band, and its dashes, for who sees or prints grey.
+# Colour and dashes of each part of the band; dashes tell them apart in grey.
 COLOURS: dict[str, tuple[str, Any]] = {
     "parameters": (BLUE, "-"),
     "scatter": (INSIDE[1], (0, (5, 1.2))),
@@ -32,30 +39,211 @@ COLOURS: dict[str, tuple[str, Any]] = {
     "law_error": (INSIDE[0], (0, (5, 1.2, 1, 1.2))),
 }
 # Styles of the lines and of the band; the key of the figure takes their labels.
-LINES: dict[str, Any] = {
-    "measured": {"color": MEASURED, "linewidth": 1.4, "label": "_measured"},
-    "predicted": {"color": VERMILION, "linewidth": 0.9, "label": "_predicted"},
-    "all": {"color": "black", "ls": ":", "lw": 0.9, "zorder": 3, "label": "_half width: all"},
-}
-BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0, "label": "_95 % band"}
+SEEN: Any = {"color": MEASURED, "linewidth": 1.4, "label": "measured"}
+PREDICTED: Any = {"color": VERMILION, "linewidth": 0.9, "label": "predicted"}
+BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0, "label": "95 % band"}
 
 
-def save_prediction(
-    found: PredictedTest, folder: str | Path, *, report: bool = True, width: str = TWO
-) -> Path:
-    """Write the folder whole, replacing an older prediction at the end; returns it.
+@dataclass(frozen=True, eq=False)
+class PredictedCurve:
+    """A curve of a test with its 95 % band, one row per sample, Pa or m.
 
-    Without `report` there is no figure; for its `width` see `plot_prediction`.
+    `parts` has the half width (n,) that each part that is there would give the band alone.
     """
 
-    def write(fresh: Path) -> None:
-        results.write_json(fresh / "prediction.json", found.to_json_dict())
-        results.write_table(fresh / "prediction.csv", found.rows())
-        if report:
-            figures.write_both(plot_prediction(found, width=width), fresh / "prediction")
+    channel: str  # "stress", "displacement", "displacement_1", …
+    unit: str
+    measured: Array
+    predicted: Array
+    lo: Array
+    hi: Array
+    parts: dict[str, Array]
+    kept: NDArray[np.bool_]  # Samples that count: those that the channel measured, but no outliers
 
-    check_replaceable(folder)
-    return results.save_whole(folder, write)
+    @property
+    def range(self) -> float:
+        """Measured range."""
+        return float(np.ptp(self.measured))
+
+    @property
+    def inside(self) -> float:
+        """Share of the samples that lie inside the band."""
+        within = (self.lo <= self.measured) & (self.measured <= self.hi)
+        return float(np.mean(within[self.kept]))
+
+    @property
+    def half_width(self) -> float:
+        """Half of the band, mean over the samples that count."""
+        return float(np.mean(0.5 * (self.hi - self.lo)[self.kept]))
+
+    @property
+    def widest(self) -> str:
+        """The part that makes the band widest."""
+        return max(self.parts, key=self.half_width_of)
+
+    def half_width_of(self, part: str) -> float:
+        """Half of the band that a part alone would give, mean over the samples that count."""
+        return float(np.mean(self.parts[part][self.kept])) if part in self.parts else 0.0
+
+
+@dataclass(frozen=True)
+class PredictedParameter:
+    """A parameter as it is for the test: its value, and its 95 % interval."""
+
+    kind: str  # As in joint.json; "shared" or "fixed" where the result is of one test
+    value: float
+    lo: float
+    hi: float
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """A test that was not fitted, predicted from a result, SI."""
+
+    source: str  #: Name of the result
+    joint: bool  #: Whether it is of several tests
+    measurement: Measurement  #: The test: its specimen, striker and motion are simulated
+    model: str
+    relaxation: int
+    drive: str
+    seed: int
+    curves: dict[
+        str, PredictedCurve
+    ]  # By their names in fit.json; those that the drive leaves free
+    misfit: dict[str, float | None]  #: RMS of predicted minus measured over the measured range
+    parameters: dict[str, PredictedParameter]
+    #: Mean strain rate on loading of the test and of those that were fitted, 1/s
+    rate: float | None
+    fitted_rates: tuple[float, ...]
+    extrapolated: bool  #: Whether the rate lies outside the fitted ones
+    draws: int  #: Of specimens
+    redrawn: int  #: Those more that were not admissible and were drawn again
+    held: tuple[str, ...]  #: Parameters that the result does not determine, held at their values
+    sentences: tuple[str, ...]
+    warnings: tuple[str, ...]
+    #: What the record of the test does not say exactly (contact time, zeros, striker, time shift),
+    #: fitted to it with the springs held as predicted but for what varies between specimens: values
+    #: in its own numbers
+    aligned: dict[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Tell how well it meets the record."""
+        head = f"{self.measurement.name} predicted from {self.source}"
+        return "\n  ".join((head, *self.sentences))
+
+    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
+        """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf`` whole; returns the folder.
+
+        An older prediction there is replaced as a whole, at the end. Without `report` there is no
+        figure. It is "one" or "two" columns wide, or as wide as a length ("85 mm").
+        """
+        figures.inches(figure_width)  # refuses what is no width
+
+        def write(fresh: Path) -> None:
+            results.write_json(fresh / "prediction.json", self.to_json_dict())
+            results.write_table(fresh / "prediction.csv", self.rows())
+            if report:
+                figure = plot_prediction(self, width=figure_width)
+                figures.write_both(figure, fresh / "prediction")
+
+        check_replaceable(folder)
+        return results.save_whole(folder, write)
+
+    @property
+    def law(self) -> str:
+        """The model and its relaxation in words."""
+        return law_in_words(self.model, self.relaxation)
+
+    @property
+    def inside(self) -> dict[str, float]:
+        """Share of the samples of each curve that lie inside its 95 % band."""
+        return {name: curve.inside for name, curve in self.curves.items()}
+
+    @property
+    def by_cycle(self) -> dict[int, dict[str, float]]:
+        """Misfit, over its own range, and share inside the band of each of several cycles.
+
+        They are those of the stress under a driven motion, or of the first curve.
+        """
+        curve = self.curves.get("stress_time", next(iter(self.curves.values())))
+        out = {}
+        for number, part in cycles_of(self.measurement).items():
+            kept = curve.kept[part]
+            measured, predicted, lo, hi = (
+                one[part][kept] for one in (curve.measured, curve.predicted, curve.lo, curve.hi)
+            )
+            miss = float(np.sqrt(np.mean((predicted - measured) ** 2)) / np.ptp(measured))
+            within = float(np.mean((lo <= measured) & (measured <= hi)))
+            out[number] = {"misfit": miss, "inside": within}
+        return out
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content of ``prediction.json``: SI, plain types, null = not there."""
+        m, model = self.measurement, Model.parse(self.model)
+        asked = ("relaxation", "drive", "seed", "draws", "redrawn", "rate", "fitted_rates")
+        found = ("extrapolated", "misfit", "inside", "by_cycle")
+        told = ("parameters", "held", "aligned", "warnings", "sentences")
+        content: dict[str, Any] = plain(
+            {
+                "schema": SCHEMA,
+                "foamfit": version("foamfit"),
+                "test": m.name,
+                "data_sha256": m.data_sha256,
+                "cycle": m.cycle,
+                "last_cycle": m.last_cycle,
+                "result": self.source,
+                "joint": self.joint,
+                "model": model.words,
+                **model.options,
+                **{name: getattr(self, name) for name in (*asked, *found)},
+                "curves": {
+                    name: {
+                        "range": curve.range,
+                        "half_width": curve.half_width,
+                        "half_widths": {part: curve.half_width_of(part) for part in curve.parts},
+                        "n": int(curve.kept.sum()),
+                        "unit": curve.unit,
+                    }
+                    for name, curve in self.curves.items()
+                },
+                **{name: getattr(self, name) for name in told},
+            }
+        )
+        return content
+
+    def rows(self) -> Iterator[list[object]]:
+        """Rows of prediction.csv, the header first: one row per sample, SI.
+
+        Everything that `prediction.png` shows is in them.
+        """
+        m, columns = self.measurement, dict[str, Array]()
+        if m.time is not None:
+            columns["time (s)"] = m.time
+        predicted = {curve.channel for curve in self.curves.values()}
+        for channel, values in m.channels().items():
+            if channel not in predicted:
+                columns[f"measured {channel} ({'Pa' if channel == 'stress' else 'm'})"] = values
+        for curve in self.curves.values():
+            channel, unit = curve.channel, curve.unit
+            columns[f"measured {channel} ({unit})"] = curve.measured
+            columns[f"predicted {channel} ({unit})"] = curve.predicted
+            columns[f"{channel} band low ({unit})"] = curve.lo
+            columns[f"{channel} band high ({unit})"] = curve.hi
+            for part, width in curve.parts.items():
+                columns[f"{channel} half width, {part.replace('_', ' ')} ({unit})"] = width
+            found, taken = m.outliers.get(channel), m.sampled.get(channel)
+            if found is not None and found.left_out.any():
+                columns[f"outliers of {channel} left out"] = found.left_out.astype(int)
+            if taken is not None:
+                columns[f"{channel} is measured"] = taken.astype(int)
+        height = m.specimen.height
+        if m.displacement is not None:
+            columns["measured strain"] = m.displacement / height
+        if (moved := self.curves.get("displacement_time")) is not None:
+            columns["predicted strain"] = moved.predicted / height
+        yield list(columns)
+        for row in zip(*(column.tolist() for column in columns.values()), strict=True):
+            yield list(row)
 
 
 def check_replaceable(folder: str | Path) -> None:
@@ -66,24 +254,21 @@ def check_replaceable(folder: str | Path) -> None:
     results.check_target(folder)
     place = Path(folder)
     there = sorted(path.name for path in place.iterdir()) if place.is_dir() else []
-    if others := [name for name in there if name not in results.PREDICTION_FILES]:
+    if others := [name for name in there if name not in results.FILES["prediction.json"]]:
         raise InputError(
             f"{folder} holds {others[0]}, which is no part of a prediction, so it is not replaced; "
             "choose a new or an empty folder"
         )
 
 
-def prediction_text(found: PredictedTest) -> str:
-    """Return what the command prints of a prediction.
-
-    Its table has misfit, share inside and half widths of each curve, over its measured range.
-    """
+def prediction_text(found: Prediction) -> str:
+    """Return what the command prints: misfit, share inside and half widths over the range."""
     there = [part for part in COLOURS if any(part in one.parts for one in found.curves.values())]
     return words("prediction", found=found, parts=there)
 
 
-def plot_prediction(found: PredictedTest, *, width: str = TWO) -> Figure:
-    """Draw each curve with its band, the loop, and what makes the band.
+def plot_prediction(found: Prediction, *, width: str = TWO) -> Figure:
+    """Draw each curve with its band, the loop, and the parts of the band.
 
     Above are the loop and each curve in time, below the half width that each part alone would give.
     `width` is "one" or "two" columns, or a length such as "85 mm"; what has no room beside the
@@ -111,14 +296,13 @@ def plot_prediction(found: PredictedTest, *, width: str = TWO) -> Figure:
             _in_time(upper, lower, found, curve)
         for ax in (key, *above[len(curves) :], *below[len(curves) :]):
             ax.set_axis_off()
-        told = figures.key_of(figure.axes)
-        style: Any = {"loc": "upper left", "fontsize": 7, "borderaxespad": 0.0}
-        key.legend(list(told.values()), list(told), **style)
+        told = figures.named_in(figure.axes)
+        key.legend(told.values(), told, loc="upper left", fontsize=7, borderaxespad=0.0)
         figure.align_ylabels()
     return figure
 
 
-def _loop(ax: Axes, found: PredictedTest) -> None:
+def _loop(ax: Axes, found: Prediction) -> None:
     """Stress against displacement; with the band of the stress where the motion is measured."""
     m, predicted = found.measurement, {c.channel: c for c in found.curves.values()}
     stress, moved = predicted.get("stress"), predicted.get("displacement")
@@ -129,32 +313,33 @@ def _loop(ax: Axes, found: PredictedTest) -> None:
     pressed = m.stress if stress is None else stress.predicted
     height = m.specimen.height
     factor, unit = readable_unit(float(np.max(m.stress)), "Pa")
-    ax.plot(m.displacement / height, m.stress / factor, **LINES["measured"])
-    ax.plot(motion / height, pressed / factor, **LINES["predicted"])
+    ax.plot(m.displacement / height, m.stress / factor, **SEEN)
+    ax.plot(motion / height, pressed / factor, **PREDICTED)
     if stress is not None and moved is None:
         turn = int(np.argmax(motion))
         for part in (slice(None, turn + 1), slice(turn, None)):
-            _band(ax, motion[part] / height, stress, factor, part)
+            ends = stress.lo[part] / factor, stress.hi[part] / factor
+            ax.fill_between(motion[part] / height, *ends, **BAND)
     ax.set(xlabel="strain", ylabel=f"stress ({unit})")
 
 
-def _band(ax: Axes, x: Array, curve: PredictedCurve, factor: float, part: slice) -> None:
-    ax.fill_between(x, curve.lo[part] / factor, curve.hi[part] / factor, **BAND)
-
-
-def _in_time(above: Axes, below: Axes, found: PredictedTest, curve: PredictedCurve) -> None:
+def _in_time(above: Axes, below: Axes, found: Prediction, curve: PredictedCurve) -> None:
     """One curve with its band, and the half width of each part."""
-    x, label = figures.over_time(found.measurement.time, curve.measured.size)
+    x, label = np.arange(curve.measured.size, dtype=float), "sample"
+    if (time := found.measurement.time) is not None:
+        scale, unit = readable_unit(float(np.nanmax(np.abs(time))), "s")
+        x, label = time / scale, f"time ({unit})"
     factor, unit = readable_unit(float(np.max(np.abs(curve.measured))), curve.unit)
-    _band(above, x, curve, factor, slice(None))
-    above.plot(x, curve.measured / factor, **LINES["measured"])
-    above.plot(x, curve.predicted / factor, **LINES["predicted"])
+    above.fill_between(x, curve.lo / factor, curve.hi / factor, **BAND)
+    above.plot(x, curve.measured / factor, **SEEN)
+    above.plot(x, curve.predicted / factor, **PREDICTED)
     above.set_ylabel(f"{curve.channel.replace('_', ' ')} ({unit})")
-    below.plot(x, 0.5 * (curve.hi - curve.lo) / factor, **LINES["all"])
+    style: Any = {"color": "black", "ls": ":", "lw": 0.9, "zorder": 3}
+    below.plot(x, 0.5 * (curve.hi - curve.lo) / factor, label="half width: all", **style)
     for part, (colour, dashes) in COLOURS.items():
         if part in curve.parts and np.any(curve.parts[part]):
-            style: Any = {"color": colour, "linestyle": dashes, "linewidth": 0.9}
-            told = f"_half width: {part.replace('_', ' ')}"
+            style = {"color": colour, "ls": dashes, "lw": 0.9}
+            told = f"half width: {part.replace('_', ' ')}"
             below.plot(x, curve.parts[part] / factor, label=told, **style)
     below.set_ylim(bottom=0.0)
     below.set(xlabel=label, ylabel=f"half width ({unit})")

@@ -17,7 +17,6 @@ never has the difference N (a(s; k0) - a(s; k)) of both branches. The rank of a 
 normal score w = Φ⁻¹(p). It moves with the parameters like all that is in the state.
 """
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 import math
@@ -100,13 +99,11 @@ SHARE_OF_ORDER, MOST_SCORE, MOST_GROWTH, LOOSE = 0.7, 3.0, 0.8, 0.05
 class Memory(NamedTuple):
     """What springs remember, and its series and derivatives.
 
-    rows (springs, columns) are the springs, state (springs, STATE) that of the microscale ones,
-    now (springs, N_NOW) the numbers above, series (springs, order + 2, N_MEMORY + terms) also those
-    of the relaxation. `partials` (N_PARTIALS, springs, order + 2) are filled where derivatives are
-    wanted; of these, in p `directions` (p, 2), `ranks` (p, springs) are those of what is held,
-    `evers` those of the rank up to which micro-springs have ever snapped, and `tangents` (p,
-    springs, N_TANGENTS + terms, order + 2) the series of what changes. `one_sided` (p,) marks
-    derivatives that do not exist. `scratch` is (3, CARRIED).
+    rows (springs, columns) are the springs, state (springs, STATE) that of the microscale ones, now
+    (springs, N_NOW) the numbers above, series (springs, order + 2, N_MEMORY + terms). For
+    derivatives in p `directions` (p, 2): `partials` (N_PARTIALS, springs, order + 2), `ranks` and
+    `evers` (p, springs) of what is held and has ever snapped, `tangents` (p, springs, N_TANGENTS +
+    terms, order + 2); `one_sided` (p,) marks those that do not exist. `scratch` is (3, CARRIED).
     """
 
     rows: Array
@@ -183,22 +180,19 @@ def enter_mixture(memory: Memory, i: int) -> tuple[float, float]:
 def leave(memory: Memory, i: int, eps: float, up: bool, turning: bool, d_eps: Array) -> int:
     """Let a microscale spring leave its branch, at an end or where it turns; returns the next.
 
-    d_eps (p, springs) holds the derivatives of the strain. Where the stress turns, what is held
-    from then on does not feel when it does.
+    d_eps (p, springs) are the derivatives of the strain. What is held from a turn on does not feel
+    when the stress turns.
     """
     row, state, now = memory.rows[i], memory.state[i], memory.now[i]
     if turning:
         state[micro.FLEXIBILITY] = 0.0
         micro.settle(row, state, eps)
-        branch, rank, sigma = (
-            int(state[micro.BRANCH]),
-            micro.rank_now(row, state),
-            state[micro.SIGMA],
-        )
+        branch, rank = int(state[micro.BRANCH]), micro.rank_now(row, state)
+        sigma = state[micro.SIGMA]
         ever, d_ranks = micro.ever_now(state, rank), memory.scratch[:2]
         d_ranks[:] = 0.0
         slope = micro.tangents(row, branch, rank, ever, sigma, eps, d_ranks, memory.scratch[2])
-        by_ever = micro.under_stress(row, branch, rank, ever, sigma)[3]
+        by_ever = micro.strain_tangents(row, branch, rank, ever, sigma, memory.scratch[2])[2]
         for k in range(memory.directions.shape[0]):
             own = memory.directions[k, 1]
             known = memory.directions[k, 0] == i and own < OWN_ETA
@@ -244,28 +238,6 @@ def first_turn(
             if where != 0 and (spring < 0 or when < span):
                 spring, span = i, (0.0 if when <= NOW * whole else when)
     return span, spring
-
-
-@inner
-def start_relaxed(memory: Memory, i: int, s: float) -> None:
-    """Nothing has relaxed yet of the stress at which a spring starts."""
-    total = 0.0
-    for k in range(memory.series.shape[2] - N_MEMORY):
-        z = -memory.rows[i, N_COLUMNS + 2 * k] * s
-        memory.series[i, 0, N_MEMORY + k] = z
-        total += z
-    memory.series[i, 0, RELAXED] = total
-
-
-@inner
-def start_relaxed_tangent(memory: Memory, p: int, i: int, change: float) -> None:
-    """Derivative in direction p of what `start_relaxed` writes, from that of the stress."""
-    own = memory.directions[p, 1] if memory.directions[p, 0] == i else OWN_ETA
-    for k in range(memory.series.shape[2] - N_MEMORY):
-        dz = -memory.rows[i, N_COLUMNS + 2 * k] * change
-        if own == OWN_RELAXATION + 2 * k:
-            dz -= memory.series[i, 0, EQ]
-        memory.tangents[p, i, N_TANGENTS + k, 0] = dz
 
 
 # ---------------------------------------------------------------- the motion
@@ -327,8 +299,7 @@ def _unsnapped(now: Array, m: Array, n: int) -> float:
 def strain_of_mixture(now: Array, m: Array, moving: bool, n: int) -> float:
     """Order n >= 1 of the strain of a microscale spring, but for what that of its stress adds.
 
-    `now` and `m` are the spring's own of `Memory.now` and `Memory.series`, which is filled as if
-    that were zero.
+    `now` and `m`, which is filled as if that were zero, are the spring's own of a `Memory`.
     """
     by_a = by_c = 0.0
     if not moving:
@@ -399,9 +370,8 @@ def keep(row: Row, m: Array, n: int, s_n: float) -> None:
 def longest(m: Array, now: Array, order: int, tol: float, span: float) -> float:
     """Longest step, within `span`, over which the logarithm of a stress has a good series.
 
-    `m` and `now` are the spring's own of `Memory.series` and `Memory.now`. Where nearly none, or
-    all, have snapped, the series do not show how soon the others do: a step from there ends where
-    these begin to count, at the truncation `tol`.
+    Where nearly none, or all, have snapped, the series do not show how soon the others do: a step
+    from there ends where these begin to count, at the truncation `tol`.
     """
     s, u, scale = m[0, EQ], abs(m[0, SCORE]), now[SCALE]
     change = min(MOST_SCORE, SHARE_OF_ORDER * order / u) if u > 0.0 else MOST_SCORE
@@ -425,10 +395,7 @@ def longest(m: Array, now: Array, order: int, tol: float, span: float) -> float:
 
 @inner
 def strain_at(row: Row, state: Array, now: Array, moving: bool, s: float) -> tuple[float, float]:
-    """Strain of a mixture at a stress (NaN where its law ends), and its slope dε/ds.
-
-    What it takes is the spring's own of a `Memory`.
-    """
+    """Strain of a mixture at a stress (NaN where its law ends), and its slope dε/ds."""
     branch, p, q, steep = int(state[micro.BRANCH]), state[micro.SNAPPED], state[micro.REST], 0.0
     if moving:
         if not s > 0.0:
@@ -441,10 +408,7 @@ def strain_at(row: Row, state: Array, now: Array, moving: bool, s: float) -> tup
 
 @inner
 def advance_memory(state: Array, series: Array, order: int, span: float) -> None:
-    """Carry what relaxes over a step, and where the search for the stress starts.
-
-    They are those of `Memory`.
-    """
+    """Carry what relaxes over a step, and where the search for the stress starts."""
     for i in range(state.shape[0]):
         if state[i, micro.BRANCH] >= HELD:
             reached = value_at(series[i, :, EQ], order, span)
@@ -566,10 +530,7 @@ def fill_partials(memory: Memory, i: int, moving: bool, eps: Array, order: int) 
 
 @inlined
 def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, slope: float, n: int) -> float:
-    """Order n of the derivative of (1 + Σ g) s in direction k, but for what δε_n adds.
-
-    `slope` is dΣ/dε.
-    """
+    """Order n of the derivative of (1 + Σ g) s in direction k, but for what δε_n adds."""
     d_s = memory.tangents[k, i, D_EQ]
     soft, own = memory.partials[BY_STRESS, i], memory.directions[k, 1]
     even = odd = 0.0  # two sums at once
@@ -617,15 +578,6 @@ def keep_tangent(memory: Memory, k: int, i: int, n: int, d_sig: float) -> None:
 
 
 @inner
-def advance_memory_tangents(memory: Memory, k: int, order: int, span: float) -> None:
-    """Carry the derivatives in direction k of what relaxes over a step."""
-    for i in range(memory.now.shape[0]):
-        for term in range(memory.series.shape[2] - N_MEMORY):
-            dz = memory.tangents[k, i, N_TANGENTS + term]
-            dz[0] = value_at(dz, order, span)
-
-
-@inner
 def _is_flat(row: Row, branch: int) -> bool:
     """Whether a spring is on a flat branch that nothing slows."""
     slope = row[KH_PLUS] if branch == D else row[KH_MINUS] if branch == E else 1.0
@@ -639,8 +591,7 @@ def mark_one_sided(
     """Mark the directions that would move a spring that snaps and stands still, or a plateau.
 
     One way of the parameter the spring snaps on, the other way it is held; of several springs on
-    flat branches one goes first: there are two derivatives. `eps` and `series` (p, springs, …) are
-    the series of the strains, and their derivatives.
+    flat branches one goes first: there are two derivatives.
     """
     flat = 0
     for i in range(branches.size):

@@ -1,6 +1,5 @@
 """What a step of the explicit integrator writes: samples, their derivatives, the end of contact."""
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 from foamfit.solve.explicit.series import EPS, GROUP, HEIGHT, Links, SeriesTangents, V, W, advance
@@ -90,7 +89,7 @@ def mend_kink(out: Samples, s: Array, d: SeriesTangents, knot: int) -> None:
 def delay(s: Array, d: SeriesTangents, order: int, span: float, late: Array) -> None:
     """Derivative of the time at which the base stress meets zero at the end of a step.
 
-    Where a unilateral spring has just opened it is that of the step before, which brought it there.
+    Where a unilateral spring has just opened, that of the step before stays.
     """
     fall = slope_at(s[GROUP, 0], order, span)
     for p in range(d.drag.size if fall != 0.0 else 0):
@@ -111,10 +110,10 @@ def depart(
     done: int,
     scratch: Array,
 ) -> None:
-    """Fill the samples after contact, which ends at the end of this step, at the time `now`.
+    """Fill the samples after contact, which ends with this step, at the time `now`.
 
-    A later end (scratch[0], by direction) leaves the nodes as they move until then, and the top
-    with the velocity that it has then. The rest of `scratch` (3, …) is scratch.
+    If contact ends later (by scratch[0], for each direction), the nodes move on until then, and the
+    top keeps the velocity that it has then. The rest of `scratch` (3, …) is scratch.
     """
     late, rate, place = scratch[0], scratch[1], scratch[2]
     law, nodes, groups = links.law, out.curves.shape[0] - 1, links.ends.size

@@ -9,7 +9,6 @@ which carry one stress: massless nodes have no state. In a group of several spri
 dashpot share the elongation by their compliances, at every order of the series.
 """
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 import math
@@ -70,14 +69,13 @@ CURVED, LOW, HIGH, INVERSE, N_LAW = range(N_MOVES, 10)
 class Links(NamedTuple):
     """A chain on the branches that its springs are on.
 
-    `law` (springs, N_LAW) is what `enter` writes, with dashpots in Pa·s and heights in m; `ends`
-    (groups,) is one past the last spring of each group and `mass` (groups,) the areal mass of the
-    node above it, kg/m²; `drag` is the onsite damping of the top, η_site/H in Pa·s/m, `top` what is
-    known of it.
+    `law` (springs, N_LAW) is what `enter` writes; `ends` (groups,) is one past the last spring of
+    each group, `mass` (groups,) the areal mass of the node above, kg/m², `drag` is η_site/H,
+    Pa·s/m, `top` what is known of the top.
 
-    The series of such a chain are an array (N_SERIES, springs, order + 2) of Taylor coefficients:
-    order 0 of W, V and EPS is the state. W, V and GROUP use a column for each group; the last
-    coefficient of SIG, GROUP and TILT is not used.
+    The series of a chain are an array (N_SERIES, springs, order + 2); order 0 of W, V and EPS is
+    the state. W, V and GROUP have a column for each group; the last order of SIG, GROUP and TILT is
+    not used.
     """
 
     law: Array
@@ -88,11 +86,11 @@ class Links(NamedTuple):
 
 
 class SeriesTangents(NamedTuple):
-    """Derivatives of a chain and of its series in p directions.
+    """Derivatives of a chain in p directions.
 
-    law (p, springs, N_MOVES) holds those of the first columns of `Links.law`, `drag` (p,) those of
-    the onsite damping, series (p, N_SERIES, springs, order + 2) those of the series but for TILT;
-    `live` (p,) is 1 for those that have left zero.
+    law (p, springs, N_MOVES) are those of the first columns of `Links.law`, `drag` (p,) of the
+    onsite damping, series (p, N_SERIES, springs, order + 2) of the series but for TILT; `live` (p,)
+    is 1 where one has left zero.
     """
 
     law: Array
@@ -149,10 +147,7 @@ def enter_tangents(
 
 @maker
 def make_series(count: int, order: int, directions: Branches) -> tuple[Array, SeriesTangents]:
-    """Make the series of a chain at rest, and derivatives, of branches that are yet to be entered.
-
-    All is zero but what the directions say.
-    """
+    """Make the series of a chain at rest, and derivatives, zero but for what the directions say."""
     p = directions.shape[0]
     series, ways = np.zeros((1 + p, N_SERIES, count, order + 2)), np.zeros((2, p))
     d = SeriesTangents(np.zeros((p, count, N_MOVES)), ways[0], ways[1], series[1:])
@@ -246,10 +241,7 @@ def _softness(law: Array, i: int, eps: Array, sig: Array, memory: Memory | None)
 def _strain_term(
     law: Array, i: int, eps: Array, sig: Array, n: int, memory: Memory | None
 ) -> tuple[float, float]:
-    """Order n >= 1 of a spring's strain as (known part, compliance): ε_n = known + compliance σ_n.
-
-    The compliance of a flat branch is infinite.
-    """
+    """Order n >= 1 of a strain, known + compliance · σ_n; a flat one is infinitely compliant."""
     soft = _softness(law, i, eps, sig, memory)
     if memory is None:
         if law[i, CURVED] == 0.0:
@@ -279,7 +271,7 @@ def _share_elongation(
 ) -> float:
     """Order n >= 1 of the common stress of a group that has springs without dashpot.
 
-    Fills the strains of those springs; a flat branch takes up all that the others leave.
+    Fills their strains; a flat branch takes up all that the others leave.
     """
     compliance, rest, flat = 0.0, u_n, -1
     for i in range(i0, i1):
@@ -316,8 +308,8 @@ def _damped_term(
 ) -> float:
     """Order n of the common stress of a group in which every spring has a dashpot.
 
-    Σ = (rate + Σ h_i σ_i/η_i) / Σ h_i/η_i; under a viscous top (drag > 0), whose rate is
-    (push - Σ)/drag, `rate_n` leaves that node out.
+    Σ = (rate + Σ h_i σ_i/η_i) / Σ h_i/η_i; under a viscous top (drag > 0), whose rate is (push -
+    Σ)/drag, `rate_n` leaves that node out.
     """
     total, weight = rate_n, 0.0
     for i in range(i0, i1):
@@ -408,35 +400,26 @@ def _accelerate(links: Links, s: Array, push: Array, n: int) -> None:
 
 
 @inlined
-def expand_bare(links: Links, s: Array, push: Array, order: int) -> None:
+def expand_bare(links: Links, s: Array, push: Array, order: int, memory: Memory | None) -> None:
     """Fill the series of a chain that `is_bare`, as `expand` does, asking less at each order."""
     law, w, eps, sig, group = links.law, s[W], s[EPS], s[SIG], s[GROUP]
     for n in range(order + 1):
-        for i in range(links.mass.size):
-            eps[i, n] = (w[i, n] - (w[i - 1, n] if i > 0 else 0.0)) * (1.0 / law[i, HEIGHT])
-            sig[i, n] = group[i, n] = _law_stress(law, i, eps, sig, n)
-        _accelerate(links, s, push, n)
-
-
-@inner
-def expand_remembered(links: Links, s: Array, push: Array, order: int, memory: Memory) -> None:
-    """Fill the series of a chain with memory that `is_bare`, whose springs may share a stress."""
-    law, w, eps, sig, group = links.law, s[W], s[EPS], s[SIG], s[GROUP]
-    for n in range(order + 1):
         for g in range(links.mass.size):
-            i0, i1 = springs_of(links.ends, g)
-            u_n = w[g, n] - (w[g - 1, n] if g > 0 else 0.0)
-            if n > 0 and i1 - i0 > 1:
-                group[g, n] = _share_elongation(law, i0, i1, eps, sig, u_n, n, memory)
-                continue
-            if i1 - i0 == 1:
+            u_n, i0, i1 = w[g, n] - (w[g - 1, n] if g > 0 else 0.0), g, g + 1
+            if memory is not None:
+                i0, i1 = springs_of(links.ends, g)
+            if memory is None or i1 - i0 == 1:
                 eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])
-            common = i0
-            for i in range(i0, i1):
-                sig[i, n] = _stress_term(law, i, eps, sig, n, memory)
-                if law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0:
-                    common = i  # see `_group_term`
-            group[g, n] = sig[common, n]
+                sig[i0, n] = group[g, n] = _stress_term(law, i0, eps, sig, n, memory)
+            elif n > 0:
+                group[g, n] = _share_elongation(law, i0, i1, eps, sig, u_n, n, memory)
+            else:
+                common = i0
+                for i in range(i0, i1):
+                    sig[i, n] = _stress_term(law, i, eps, sig, n, memory)
+                    if law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0:
+                        common = i  # see `_group_term`
+                group[g, n] = sig[common, n]
         _accelerate(links, s, push, n)
 
 
@@ -488,10 +471,10 @@ def expand(
 
 @inlined
 def _settle_group(links: Links, s: Array, g: int, memory: Memory | None) -> None:
-    """Share the elongation of a group anew, so that nothing piles up.
+    """Share the elongation of a group anew, so that no error piles up.
 
-    What is missed, the springs without dashpot take by their compliances; a flat branch takes all,
-    and where every spring has a dashpot they share as these would.
+    The springs without dashpot take it by their compliances; a flat branch takes all; if every
+    spring has a dashpot they share it as these would.
     """
     law, (i0, i1) = links.law, springs_of(links.ends, g)
     if i1 - i0 == 1 or (g == links.ends.size - 1 and links.top == STRESS):
@@ -523,6 +506,12 @@ def settle(links: Links, s: Array) -> None:
         _settle_group(links, s, g, None)
 
 
+@inlined
+def share_stresses(links: Links) -> bool:
+    """Whether springs have one stress, or are given it."""
+    return links.ends.size < links.law.shape[0] or links.top == STRESS
+
+
 @inner
 def share_a_stress(law: Array, ends: Branches, i: int, j: int, memory: Memory) -> bool:
     """Whether two springs bear one stress, without dashpot or relaxation."""
@@ -535,21 +524,6 @@ def share_a_stress(law: Array, ends: Branches, i: int, j: int, memory: Memory) -
     return False
 
 
-@inlined
-def _own_strain(law: Array, i: int, stress: float, memory: Memory) -> tuple[float, float]:
-    """Strain of a spring under a stress on the branch that it is on, and its slope dε/dΣ."""
-    gain, k = memory.now[i, GAIN], law[i, SLOPE]
-    s = (stress - memory.series[i, 0, RELAXED]) / gain
-    if law[i, CURVED] >= HELD:
-        moving, row = law[i, CURVED] > HELD, memory.rows[i]
-        eps, soft = strain_at(row, memory.state[i], memory.now[i], moving, s)
-        return eps, soft / gain
-    if law[i, CURVED] == 0.0:
-        return law[i, ORIGIN] + (s - law[i, OFFSET]) / k, 1.0 / (k * gain)
-    stiff = k + s
-    return law[i, ORIGIN] + s / stiff, k / (stiff * stiff * gain)
-
-
 @inner
 def _share_under(
     law: Array, i0: int, i1: int, eps: Array, softs: Array, stress: float, memory: Memory
@@ -560,12 +534,21 @@ def _share_under(
     """
     total = size = compliance = 0.0
     for i in range(i0, i1):
-        if law[i, DASHPOT] == 0.0:
-            own, soft = _own_strain(law, i, stress, memory)
-            eps[i, 0], softs[i, 0] = own, soft
-            total += law[i, HEIGHT] * own
-            size += law[i, HEIGHT] * abs(own)
-            compliance += law[i, HEIGHT] * soft
+        if law[i, DASHPOT] > 0.0:
+            continue
+        gain, k = memory.now[i, GAIN], law[i, SLOPE]
+        s = (stress - memory.series[i, 0, RELAXED]) / gain
+        if law[i, CURVED] >= HELD:
+            moving, row = law[i, CURVED] > HELD, memory.rows[i]
+            own, soft = strain_at(row, memory.state[i], memory.now[i], moving, s)
+        elif law[i, CURVED] == 0.0:
+            own, soft = law[i, ORIGIN] + (s - law[i, OFFSET]) / k, 1.0 / k
+        else:
+            own, soft = law[i, ORIGIN] + s / (k + s), k / ((k + s) * (k + s))
+        eps[i, 0], softs[i, 0] = own, soft / gain
+        total += law[i, HEIGHT] * own
+        size += law[i, HEIGHT] * abs(own)
+        compliance += law[i, HEIGHT] * softs[i, 0]
     return total, size, compliance
 
 
@@ -584,7 +567,7 @@ def _common_stress(
     """Search the stress at which the undamped springs of a group share an elongation `rest`.
 
     Returns whether it was found, their elongation, and what is left to add to the stress. Newton's
-    method within the bracket that it meets; a prescribed stress is taken as it is.
+    method in the bracket that it meets; a prescribed stress is taken as it is.
     """
     before, low, high = math.inf, -math.inf, math.inf
     total, more = 0.0, 0.0
@@ -620,8 +603,8 @@ def settle_together(
 ) -> None:
     """Bring the undamped springs of each group to one stress, at the elongation that they share.
 
-    A spring that is nearly rigid, or about to snap all at once, feels the least difference of
-    stress; without this, truncation of the strains lets their stresses part.
+    Truncation of the strains lets their stresses part: of a nearly rigid spring, or one that snaps
+    all at once, by very much.
     """
     law, eps, softs = links.law, s[EPS], s[SIG]  # until the next series, stresses are not used
     for g in range(links.ends.size):

@@ -8,20 +8,19 @@ slope dσ/dε,
 The law is continuous at its switches, so the derivatives pass from branch to branch without a jump.
 """
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 from foamfit.solve.explicit.memory import (
     BASE,
     EQ,
     GAIN,
+    N_MEMORY,
+    N_TANGENTS,
+    RELAXED,
     Memory,
-    advance_memory_tangents,
     fill_partials,
     keep_tangent,
     relaxed_tangent,
-    start_relaxed,
-    start_relaxed_tangent,
     tangent_of_mixture,
 )
 from foamfit.solve.explicit.series import (
@@ -44,8 +43,10 @@ from foamfit.solve.explicit.series import (
     product,
     springs_of,
 )
+from foamfit.solve.polynomial import value_at
 from foamfit.solve.scene import FREE, STRESS, VISCOUS
-from foamfit.springs.kernels import HELD, Array, inlined, inner, once, piece
+from foamfit.springs.kernels import HELD, N_COLUMNS, Array, inlined, inner, once, piece
+from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 
 
 @inner
@@ -97,8 +98,8 @@ def _share_tangent(
 ) -> float:
     """Order n of the derivative of a group's stress, where some springs have no dashpot.
 
-    `rest` is that of the elongation, but for the moves of the springs. Fills their δε and δσ, whose
-    known parts must be in d[SIG].
+    `rest` is that of the elongation, but for the moves of the springs. Fills their δε and δσ from
+    the known parts in d[SIG].
     """
     eps, sig = d[EPS], d[SIG]
     compliance, flat = 0.0, -1
@@ -258,8 +259,17 @@ def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memo
     for p in range(d.drag.size):
         change = _known_tangent(law, s, d.law[p], d.series[p], i, 0, memory, p)
         change += tilt[i, 0] * d.series[p, EPS, i, 0] - memory.now[i, BASE]
-        start_relaxed_tangent(memory, p, i, change / memory.now[i, GAIN])
-    start_relaxed(memory, i, stress)
+        own = memory.directions[p, 1] if memory.directions[p, 0] == i else OWN_ETA
+        for k in range(memory.series.shape[2] - N_MEMORY):
+            dz = -memory.rows[i, N_COLUMNS + 2 * k] * change / memory.now[i, GAIN]
+            if own == OWN_RELAXATION + 2 * k:
+                dz -= stress
+            memory.tangents[p, i, N_TANGENTS + k, 0] = dz
+    memory.series[i, 0, RELAXED] = 0.0
+    for k in range(memory.series.shape[2] - N_MEMORY):
+        z = -memory.rows[i, N_COLUMNS + 2 * k] * stress
+        memory.series[i, 0, N_MEMORY + k] = z
+        memory.series[i, 0, RELAXED] += z
 
 
 @piece
@@ -271,4 +281,7 @@ def advance_tangents(
         if d.live[p] > 0.0:
             advance(d.series[p], groups, order, span)
             if memory is not None:
-                advance_memory_tangents(memory, p, order, span)
+                for i in range(memory.now.shape[0]):
+                    for k in range(memory.series.shape[2] - N_MEMORY):
+                        dz = memory.tangents[p, i, N_TANGENTS + k]
+                        dz[0] = value_at(dz, order, span)

@@ -5,7 +5,6 @@ branch, the end of contact and the samples are roots and values of the same poly
 changes inside a step. Derivatives by parameters are carried along where they are asked for.
 """
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 import math
@@ -13,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from foamfit.solve import scene as scenes
 from foamfit.solve.explicit.memory import (
     Memory,
     advance_memory,
@@ -42,30 +42,16 @@ from foamfit.solve.explicit.series import (
     enter_tangents,
     expand,
     expand_bare,
-    expand_remembered,
     is_bare,
     make_series,
     settle,
     settle_together,
     share_a_stress,
+    share_stresses,
 )
 from foamfit.solve.explicit.tangents import advance_tangents, expand_tangents, start_relaxing
 from foamfit.solve.polynomial import LEAST_TRUNCATION, first_crossing, order_for, slope_at, value_at
-from foamfit.solve.scene import (
-    DONE,
-    FLAT_UNDER_STRESS,
-    LEAST_BASE,
-    MOTION,
-    NOT_FINITE,
-    STEP_UNDERFLOW,
-    STRESS,
-    TOO_MANY_STEPS,
-    Samples,
-    SceneTuple,
-    before_contact,
-    first_past,
-    log_switch,
-)
+from foamfit.solve.scene import Samples, SceneTuple, before_contact, first_past, log_switch
 from foamfit.springs.kernels import (
     BACK,
     ETA,
@@ -101,11 +87,9 @@ OF_TANGENTS = 1e3
 class Run(NamedTuple):
     """A chain on its way over the samples of a scene.
 
-    Loops that take it at every step are `inlined`: to pass it would take longer than they do.
-
-    `rows` (springs, columns) are the springs, `links` with their `branches` (springs,) the chain,
-    `s` and `d` its series and their derivatives in `directions` (p, 2), `out` the samples to fill,
-    `log` the switches to note.
+    `links` with `branches` (springs,) are its springs, `s` and `d` its series and their derivatives
+    in `directions` (p, 2), `out` the samples to fill, `log` the switches to note. Loops that take
+    it at every step are `inlined`: to pass it would take longer than they do.
     """
 
     rows: Array
@@ -144,7 +128,7 @@ def step_length(
         tried = span
         if w_scale == 0.0 or s_scale == 0.0:
             top = links.ends.size - 1
-            reach = max(w_scale, abs(s[W, top, 1]) * span if links.top != STRESS else 0.0)
+            reach = max(w_scale, abs(s[W, top, 1]) * span if links.top != scenes.STRESS else 0.0)
             load = max(s_scale, max(abs(push[0]), abs(push[1]) * span))
             for i in range(links.law.shape[0]):
                 reach = max(reach, links.law[i, HEIGHT] * abs(s[EPS, i, 1]) * span)
@@ -153,7 +137,7 @@ def step_length(
         per_load = 1.0 / load if load > 0.0 else 0.0
         base = b_scale
         if b_scale < math.inf:
-            base = max(b_scale, abs(value_at(s[GROUP, 0], order, span)), LEAST_BASE * load)
+            base = max(b_scale, abs(value_at(s[GROUP, 0], order, span)), scenes.LEAST_BASE * load)
         per_base = 1.0 / base if base > 0.0 else 0.0
         for n in (order - 1, order):
             tail = _tail(links.law, s, n, per_reach, per_load, per_base)
@@ -172,10 +156,9 @@ def tangent_length(
 ) -> float:
     """Longest step within `span` whose last two terms fall below `tol` of the derivatives so far.
 
-    A vibration or relaxation that the motion itself does not show may be in its derivatives: steps
-    that are too long for it let these grow without bound. `sizes` (p, 2) holds the largest
-    elongation and base stress of each direction. Those that begin at a high order, behind masses
-    and relaxation (`lagging`), have no size yet that could bound a step.
+    Steps too long for a vibration or relaxation that shows in derivatives alone let these grow
+    without bound. `sizes` (p, 2) are the largest elongation and base stress of each direction;
+    behind masses and relaxation (`lagging`) some have none yet that could bound a step.
     """
     for p in range(d.drag.size):
         if d.live[p] == 0.0:
@@ -220,7 +203,7 @@ def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, 
 def _enough(law: Array, s: Array, order: int, span: float, tol: float, scales: Scales) -> int:
     """Orders that are enough over a step that a switch or a sample made short."""
     w_scale, s_scale, b_scale = scales
-    base = max(b_scale, LEAST_BASE * s_scale)
+    base = max(b_scale, scenes.LEAST_BASE * s_scale)
     if w_scale == 0.0 or s_scale == 0.0 or span == 0.0:
         return order
     tail, power, per_span = 0.0, span**order, 1.0 / span
@@ -245,6 +228,7 @@ def switch(
     spring: int,
     side: int,
     switches: int,
+    push: Array,
     memory: Memory | None,
 ) -> int:
     """Change the branch of a spring, and of all that end theirs at the same time; counts them."""
@@ -278,6 +262,8 @@ def switch(
         switches = log_switch(run.log, switches, now, i, left, branches[i], eps[i, 0])
         enter(rows, i, branches[i], law, memory)
         enter_tangents(rows, i, branches[i], run.directions, run.d)
+    if memory is not None and share_stresses(run.links):
+        settle_together(run.links, run.s, order, span, push, memory)
     return switches
 
 
@@ -288,15 +274,12 @@ def switch(
 def _prescribe(
     top: int, values: Array, clock: Array, knot: int, now: float, push: Array, motion: Array
 ) -> float:
-    """Write what the top is given between samples knot and knot + 1; returns when that ends.
-
-    Times are counted from sample knot.
-    """
+    """Write what the top is given from a sample on; returns the time from it to the next one."""
     horizon = rate = 0.0
     if values.size > 1:
         horizon = clock[knot + 1]
         rate = (values[knot + 1] - values[knot]) / horizon
-    driven = motion if top == MOTION else push
+    driven = motion if top == scenes.MOTION else push
     driven[0], driven[1] = values[knot] + rate * now, rate
     return horizon
 
@@ -352,7 +335,7 @@ def _reached(links: Links, s: Array, w_scale: float) -> tuple[float, float]:
     """Largest displacement so far, and a number that is finite only if the state is."""
     top = links.ends.size - 1
     total = s[W, top, 0]
-    if links.top != STRESS:
+    if links.top != scenes.STRESS:
         w_scale = max(w_scale, abs(s[W, top, 0]))
     for i in range(links.law.shape[0]):
         w_scale = max(w_scale, links.law[i, HEIGHT] * abs(s[EPS, i, 0]))
@@ -366,9 +349,12 @@ def _first_end(
 ) -> tuple[float, int, int]:
     """First end of a branch within `span`, or turn of a spring that snaps; see `first_switch`."""
     if memory is not None:
+        fine = (
+            0.0 if run.directions.shape[0] > 0 else tol
+        )  # derivatives feel even what is negligible
         for i in range(run.branches.size):
             if run.branches[i] > HELD:
-                span = longest(memory.series[i], memory.now[i], order, tol, span)
+                span = longest(memory.series[i], memory.now[i], order, fine, span)
     span, spring, side = first_switch(run.links.law, run.s, order, span)
     if memory is not None:
         span, turning = first_turn(run.branches, run.s[EPS], order, span, c)
@@ -378,8 +364,54 @@ def _first_end(
 
 
 @inlined
+def _scales(run: Run, started: bool, reach: float, stress: float, base: float) -> Scales:
+    """Largest displacement, stress and base stress so far.
+
+    That of the base is infinite unless a mass hides the base from the blow, or a dashpot acts
+    there: it cannot be much smaller, or change faster, than the stresses of the springs.
+    """
+    for i in range(run.branches.size if started else 0):
+        stress = max(stress, abs(run.s[SIG, i, 0]))
+    if run.links.ends.size > 1 or run.links.law[0, DASHPOT] > 0.0:
+        base = max(base if started else 0.0, abs(run.s[GROUP, 0, 0]))
+    return reach, stress, base
+
+
+@inlined
+def _shorten(
+    run: Run, order: int, tol: float, span: float, sizes: Array, memory: Memory | None
+) -> float:
+    """Fill the derivatives of a step; returns the longest step within `span` for them."""
+    expand_tangents(run.links, run.s, run.d, order, memory)
+    if memory is not None:
+        mark_one_sided(memory, run.branches, run.s[EPS], run.d.series[:, EPS], order, span)
+    lagging = memory is not None
+    return tangent_length(run.links.law, run.d, order, OF_TANGENTS * tol, span, sizes, lagging)
+
+
+@inlined
+def _record(
+    run: Run,
+    orders: tuple[int, int],
+    span: float,
+    first: int,
+    done: int,
+    now: float,
+    scratch: Array,
+    ends: bool,
+) -> None:
+    """Write the samples first … done-1 of a step; where it `ends` at an event, how late that is."""
+    if first < done:
+        sample(run.links, run.s, orders[0], run.out, first, done, now, scratch[3])
+    if run.directions.shape[0] > 0:
+        sample_tangents(run.links, run.s, run.d, orders[1], run.out, first, done, now, scratch[3])
+        if ends:  # the base stress may end with this step
+            delay(run.s, run.d, orders[1], span, scratch[0])
+
+
+@inlined
 def _carry(
-    run: Run, order: int, more: int, span: float, push: Array, shared: bool, memory: Memory | None
+    run: Run, order: int, more: int, span: float, push: Array, memory: Memory | None
 ) -> None:
     """Carry the state over a step, the derivatives by `more` orders, and share elongations anew."""
     groups = run.links.ends.size
@@ -388,11 +420,28 @@ def _carry(
         advance_memory(memory.state, memory.series, order, span)
     if run.directions.shape[0] > 0:
         advance_tangents(run.d, groups, more, span, memory)
-    if shared:
+    if share_stresses(run.links):
         if memory is None:
             settle(run.links, run.s)
         else:
             settle_together(run.links, run.s, order, span, push, memory)
+
+
+@inner
+def _fill_clock(t: Array, struck: bool, clock: Array) -> None:
+    """Count the times of a drive from sample to sample: no origin then takes their digits."""
+    for j in range(1, t.size if not struck else 1):
+        clock[j] = t[j] - t[j - 1]
+
+
+@inlined
+def _passed(clock: Array, done: int, knot: int, end: float, last: bool, struck: bool) -> int:
+    """How many samples are filled after a step until `end`; its `last` one is before a kink."""
+    if struck:
+        return first_past(clock, done, end, last)
+    if last:
+        return min(knot + 2, clock.size)
+    return max(done, 1) if end > 0.0 else done
 
 
 @once
@@ -410,107 +459,73 @@ def _integrated(
     rows, heights, ends, mass, drag, top, values, speed, t = given
     tol = max(tol, LEAST_TRUNCATION)
     count, size = heights.size, directions.shape[0]
-    struck, tangent, order = speed > 0.0, size > 0, order_for(tol, MOST_ORDERS)
+    struck, order = speed > 0.0, order_for(tol, MOST_ORDERS)
     links = Links(np.empty((count, N_LAW)), ends, mass, drag, top)
-    clock = t if struck else np.zeros(t.size)
-    for j in range(1, t.size if not struck else 1):
-        clock[j] = t[j] - t[j - 1]  # each from the one before it: no origin then takes its digits
     s, d = make_series(count, order, directions)
-    branches, samples = np.empty(count, np.int64), Samples(clock, out[0], out[1:])
-    run = Run(rows, branches, links, s, d, directions, samples, log)
-    scratch = np.zeros((6, max(order + 1, max(size, out.shape[1]))))
-    late, c, push, motion = scratch[0], scratch[3], scratch[4], scratch[5]
-    sizes = np.zeros((size, 2))
-    gravity = 0.0
-    if struck:
-        push[0] = values[0]
-        gravity = values[0] / mass[mass.size - 1]
+    samples = Samples(t if struck else np.zeros(t.size), out[0], out[1:])
+    _fill_clock(t, struck, samples.t)
+    run = Run(rows, np.empty(count, np.int64), links, s, d, directions, samples, log)
+    scratch, sizes = np.zeros((6, max(order + 1, max(size, out.shape[1])))), np.zeros((size, 2))
+    push, motion = scratch[4], scratch[5]
+    push[0] = values[0] * struck  # the weight of a striker
+    gravity = push[0] / mass[mass.size - 1]
     done = begin(run, heights, start, speed, gravity, memory)
-    lagging = memory is not None
-    bare = is_bare(links, memory)
-    # Whether the base stress may be much smaller than the springs' stresses, or change faster: a
-    # mass hides the base from the blow, or a dashpot acts there.
-    apart = ends.size > 1 or links.law[0, DASHPOT] > 0.0
-    shared = ends.size < count or top == STRESS  # springs have one stress, or are given it
-    fine = 0.0 if tangent else tol  # a derivative may be of what is negligible
-    w_scale, s_scale, b_scale, pressed, knot, stalled = 0.0, 0.0, math.inf, False, 0, 0
+    bare, scales = is_bare(links, memory), (0.0, 0.0, math.inf)
+    pressed, knot, stalled = False, 0, 0
     switches = count - count  # a whole number, and no constant: one type to compile for
     now = since = 0.0  # of a drive, since the sample where it last had a kink
     for step in range(max_steps):
         if done == t.size:
-            return DONE, math.nan, step, switches
+            return scenes.DONE, math.nan, step, switches
         fresh, horizon = False, t[t.size - 1]
         if not struck:
-            if done == knot + 2:
-                knot, now, fresh = knot + 1, 0.0, True
-            since, horizon = t[knot], _prescribe(top, values, clock, knot, now, push, motion)
+            fresh = done == knot + 2
+            if fresh:
+                knot, now = knot + 1, 0.0
+            since = t[knot]
+            horizon = _prescribe(top, values, samples.t, knot, now, push, motion)
         if bare:
-            if memory is None:
-                expand_bare(links, s, push, order)
-            else:
-                expand_remembered(links, s, push, order, memory)
+            expand_bare(links, s, push, order, memory)
         elif not expand(links, s, push, motion, order, memory):
-            return FLAT_UNDER_STRESS, since + now, step, switches
-        if step > 0:
-            for i in range(count):
-                s_scale = max(s_scale, abs(s[SIG, i, 0]))
-        if apart:
-            b_scale = max(b_scale if step > 0 else 0.0, abs(s[GROUP, 0, 0]))
-        scales = w_scale, s_scale, b_scale
+            return scenes.FLAT_UNDER_STRESS, since + now, step, switches
+        scales = _scales(run, step > 0, scales[0], scales[1], scales[2])
         span = step_length(links, s, push, order, tol, horizon - now, scales)
         if not math.isfinite(span + s[GROUP, 0, order]):
-            return NOT_FINITE, since + now, step, switches
-        span, spring, side = _first_end(run, order, fine, span, c, memory)
+            return scenes.NOT_FINITE, since + now, step, switches
+        span, spring, side = _first_end(run, order, tol, span, scratch[3], memory)
         leaves = False
         if struck:
-            pressed = pressed or s[GROUP, 0, 0] > tol * s_scale
+            pressed |= s[GROUP, 0, 0] > tol * scales[1]
             span, leaves = first_lift(s, order, step == 0, pressed, span)
-            spring = -1 if leaves else spring
         least = order
         if spring >= 0 or leaves or now + span >= horizon:  # not its own error ended the step
             least = _enough(links.law, s, order, span, 1e-3 * tol, scales)
         more = min(least + 2, order)  # for what is, in time, a derivative of these
-        if tangent:
-            expand_tangents(links, s, d, more, memory)
-            if memory is not None:
-                mark_one_sided(memory, branches, s[EPS], d.series[:, EPS], more, span)
-            shorter = tangent_length(links.law, d, more, OF_TANGENTS * tol, span, sizes, lagging)
+        if size > 0:
+            shorter = _shorten(run, more, tol, span, sizes, memory)
             if shorter < span:
                 span, spring, leaves = shorter, -1, False
-        end = now + span
-        stalled = stalled + 1 if span == 0.0 else 0
+        end, stalled = now + span, stalled + 1 if span == 0.0 else 0
         if (end <= now and span > 0.0) or stalled > 4 * count + 8:
-            return STEP_UNDERFLOW, since + now, step, switches
+            return scenes.STEP_UNDERFLOW, since + now, step, switches
         last = end >= horizon and not leaves and spring < 0
         end = horizon if last else end
-        if fresh and knot > 0 and top == MOTION:
+        if fresh and top == scenes.MOTION:
             mend_kink(samples, s, d, knot)
-        first = done
-        if struck:
-            done = first_past(t, done, end, last)
-        elif last:
-            done = min(knot + 2, t.size)
-        elif end > 0.0:
-            done = max(done, 1)
-        if first < done:
-            sample(links, s, least, samples, first, done, now, c)
-        if tangent:
-            sample_tangents(links, s, d, more, samples, first, done, now, c)
-            if leaves or spring >= 0:  # the base stress may end with this step
-                delay(s, d, more, span, late)
+        first, done = done, _passed(samples.t, done, knot, end, last, struck)
+        _record(run, (least, more), span, first, done, now, scratch, leaves or spring >= 0)
         if leaves:
             depart(links, s, d, order, more, span, end, gravity, samples, done, scratch)
-            return DONE, end, step + 1, switches
+            return scenes.DONE, end, step + 1, switches
         now = end
-        _carry(run, order, more, span, push, shared, memory)
-        w_scale, total = _reached(links, s, w_scale)
+        _carry(run, order, more, span, push, memory)
+        reach, total = _reached(links, s, scales[0])
+        scales = reach, scales[1], scales[2]
         if not math.isfinite(total):
-            return NOT_FINITE, since + now, step, switches
+            return scenes.NOT_FINITE, since + now, step, switches
         if spring >= 0:
-            switches = switch(run, order, span, since + now, spring, side, switches, memory)
-            if memory is not None and shared:
-                settle_together(links, s, order, span, push, memory)
-    return TOO_MANY_STEPS, since + now, max_steps, switches
+            switches = switch(run, order, span, since + now, spring, side, switches, push, memory)
+    return scenes.TOO_MANY_STEPS, since + now, max_steps, switches
 
 
 @compiled
@@ -529,27 +544,15 @@ def integrate(
 ) -> tuple[int, float, int, int]:
     """Integrate a chain over the samples of a scene.
 
-    Parameters
-    ----------
-    rows, heights, ends, mass, values, t
-        Fields of a `Scene`, which itself would cost a call as much as a short run.
-    numbers : (5,) array
-        The scene's `drag`, `top` and `speed`, the truncation of a step relative to the motion so
-        far, and the bound on steps. An impact ends when the base stress is back at zero.
-    directions : (p, 2) array
-        What derivatives are carried along; see `springs.parameters`.
-    start : (1 + p, springs or 0) array
-        Strains, and their derivatives, from which springs never loaded before start; none: rest.
-    out : (1 + p, …) array
-        Filled with the curves and their derivatives; see `Samples`.
-    log : array
-        Filled with the switches.
+    rows, heights, ends, mass, values and t are fields of a `Scene`, which itself would cost a call
+    as much as a short run; `numbers` (5,) are its drag, top and speed, the truncation of a step
+    relative to the motion so far, and the bound on steps. An impact ends when the base stress is
+    back at zero. Derivatives are carried along in `directions` (p, 2). Springs start from strains
+    and their derivatives, `start` (1 + p, springs), or from rest (1 + p, 0). Filled are `out` (1 +
+    p, …), the curves and their derivatives (see `Samples`), and the switches, `log`.
 
-    Returns
-    -------
-    tuple
-        Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
-        taken, switches (also those past the log).
+    Returned are the outcome, the end of contact (NaN if none; without an answer, how far it came),
+    the steps taken, and the number of switches, also of those past the log.
     """
     given = (rows, heights, ends, mass, numbers[0], int(numbers[1]), values, numbers[2], t)
     return _integrated(given, numbers[3], int(numbers[4]), directions, start, out, log, None)
@@ -569,8 +572,7 @@ def integrate_with_memory(
 ) -> tuple[int, float, int, int]:
     """Integrate a chain in which springs relax or are microscale, as `integrate` does others.
 
-    Times are counted in a `unit`, s. What of the p derivatives does not exist is marked in
-    `one_sided` (p,).
+    Times are counted in a `unit`, s. Derivatives that do not exist are marked in `one_sided` (p,).
     """
     rows, heights, ends, mass, drag, top, values, speed, t = given
     order = order_for(max(tol, LEAST_TRUNCATION), MOST_ORDERS)

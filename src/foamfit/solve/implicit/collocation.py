@@ -78,16 +78,14 @@ def polynomial(first: Array | float, points: Array) -> Array:
 class Step:
     """A chain, the state that a step starts from, and what it finds at its points.
 
-    Of the state, `w` and `v` (springs,) are displacements and velocities of the nodes, `v0` those
-    of nodes with a mass (0 of the others) or a prescribed motion, `eps0` the strains, `branches`
-    the branches, between the strains `low` and `high`, `stress0` and `slope0` the stresses of the
-    law and their slopes dσ/dε; `moves` (springs, 6) are the polynomials of the nodes' motion in
-    the last step. At the points, (springs, points), z is what the nodes move beyond v0 times time,
-    `eps` the strains, `vel` the velocities of the nodes, `stress` that of the law, `total` that
-    with the dashpots, `slope` dσ/dε.
-
-    Of p derivatives, `d_w`, `d_v0`, `d_eps0` are (p, springs), `d_z`, `d_eps`, `d_total` (p,
-    springs, points), and `d_base` (p,) is that of the base stress where the last step ended.
+    `w` and `v` (springs,) are displacements and velocities of the nodes, `v0` those of nodes with a
+    mass (0 of the others) or a prescribed motion, `eps0` the strains, `branches` the branches,
+    between the strains `low` and `high`, `stress0` and `slope0` the law's stresses and slopes;
+    `moves` (springs, 6) the polynomials of the last motion. At the points, (springs, points), z is
+    what the nodes move beyond v0 times time, `eps` the strains, `vel` the velocities of the nodes,
+    `stress` that of the law, `total` that with the dashpots, `slope` dσ/dε. Of p derivatives,
+    `d_w`, `d_v0`, `d_eps0` are (p, springs), `d_z`, `d_eps`, `d_total` (p, springs, points), and
+    `d_base` (p,) is that of the last base stress.
     """
 
     def __init__(self, scene: Scene, directions: kernels.Branches) -> None:
@@ -108,7 +106,7 @@ class Step:
         self.d_base = np.zeros(p)
         own, what = directions[:, :1], directions[:, 1:]
         mine = own == np.arange(count)
-        self._longer = np.where(mine & (what == OWN_HEIGHT), 1.0, 0.0)[..., None]
+        self.longer = np.where(mine & (what == OWN_HEIGHT), 1.0, 0.0)[..., None]
         self._damped = np.where(mine & (what == OWN_ETA), 1.0, 0.0)[..., None]
         self._dragged = np.where(what == DRAG, 1.0, 0.0)
         self._lay_out(count)
@@ -265,14 +263,14 @@ class Step:
     def linearise(self, span: float) -> bool:
         """Derivatives at the points of a step that was found; false if there are none.
 
-        The equations of the step, linearised: first what the parameters and the derivatives at the
-        start of the step do to the forces while z rests, then the z that balances them.
+        First what parameters and the start of the step do to the forces while z rests, then the z
+        that balances them.
         """
         d_v = relative(self.d_v0[..., None])
-        moved = d_v * (span * NODES) - (self.eps - self.eps0[:, None]) * self._longer
+        moved = d_v * (span * NODES) - (self.eps - self.eps0[:, None]) * self.longer
         self.d_eps = self.d_eps0[..., None] + moved / self.height
         self.d_total = self.stress_tangents(self.d_eps)
-        self.d_total += self.eta * (d_v - self.stretching * self._longer) / self.height
+        self.d_total += self.eta * (d_v - self.stretching * self.longer) / self.height
         self.d_total += self.stretching * self._damped
         net = self._net(self.d_total)
         net[:, -1] -= self.drag * self.d_v0[:, -1:] + self.vel[-1] * self._dragged

@@ -5,8 +5,6 @@ something vibrates too fast to be worth following: from the follow limit on step
 floor whatever their error, and the vibration is damped out (L-stability).
 """
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
-
 from __future__ import annotations
 
 import math
@@ -31,10 +29,7 @@ AGAIN, FREELY, ARRIVED, AT_ONCE = range(4)
 
 
 class Start(NamedTuple):
-    """Where a step starts: time, base stress, whether contact has come through to the base.
-
-    `push` is the stress on the top and `push_rate` its rate.
-    """
+    """Where a step starts; `pressed` says that the blow has come through to the base."""
 
     now: float
     base: float
@@ -52,11 +47,13 @@ class Event(NamedTuple):
 
 
 @compiled
-def first_leaving(polynomials: Array, low: Array, high: Array) -> tuple[float, int, int]:
+def first_leaving(
+    polynomials: Array, order: int, low: Array, high: Array
+) -> tuple[float, int, int]:
     """First time in [0, 1] at which one of several polynomials leaves [low, high]; see `Event`."""
     when, which, side = 1.0, -1, 0
     for i in range(low.size):
-        at, where = first_crossing(polynomials[i], STAGES, low[i], high[i], 1.0)
+        at, where = first_crossing(polynomials[i], order, low[i], high[i], 1.0)
         if where != 0 and (which < 0 or at < when):
             when, which, side = at, i, where
     return when, which, side
@@ -76,15 +73,13 @@ class Control:
     """Control of the steps.
 
     `tol` is the truncation of a step relative to the motion so far, `short` the length (s) under
-    which steps are short. `weight` weighs, while the striker presses, the truncation of the base
-    stress relative to what is left of it.
-
-    `taken` and `proposed` are the lengths of the last step and the next; `floor` is the least that
-    the error may ask for; `short_in_row` counts steps that the error alone made short; `worst` is
-    the largest error let pass, over tol. `damped` is the size of all vibrations that were damped
-    out, `damping` of those in the last steps. `motion` (m), `stress` and `base` (Pa) are the
-    largest so far, `step_motion` and `step_stress` with the step that is tried. `strains` and
-    `ending` are polynomials over [0, 1] of a step: the strains and the base stress.
+    which steps are short, `weight` that of the truncation of the base stress relative to what is
+    left of it, while the striker presses. `taken` and `proposed` are the lengths of the last step
+    and the next; `floor` is the least that the error may ask for; `short_in_row` counts steps that
+    the error alone made short; `worst` is the largest error let pass, over tol. `damped` is the
+    size of all vibrations that were damped out, `damping` of those in the last steps. `motion` (m),
+    `stress` and `base` (Pa) are the largest so far, `step_…` with the step that is tried; `strains`
+    and `ending` (the base stress) polynomials over [0, 1] of a step.
     """
 
     def __init__(
@@ -152,10 +147,7 @@ class Control:
         return strains, min(self.worst * self.tol, 1e-3) * self.step_stress
 
     def note(self, span: float, last: bool) -> None:
-        """Take the scales from a step that was taken, and its length.
-
-        Let steps grow again that only the error has kept short for long.
-        """
+        """Take the scales from a step; let steps grow that only the error kept short for long."""
         step = self.step
         self.motion = max(self.motion, float((step.heights * np.abs(step.eps0)).max()))
         self.base = max(self.base, abs(float(step.total[0, -1])))
@@ -184,10 +176,10 @@ class Control:
         reach = np.abs(self.strains[:, 1:]).sum(axis=1)
         first = self.strains[:, 0]
         if ((first - reach <= low) | (first + reach >= high)).any():
-            event = Event(*first_leaving(self.strains, low, high))
+            event = Event(*first_leaving(self.strains, STAGES, low, high))
         if struck:
             ends = np.array([0.0 if start.pressed else -least]), np.array([math.inf])
-            at, _, where = first_leaving(self.ending[None], *ends)
+            at, _, where = first_leaving(self.ending[None], STAGES, *ends)
             risen = start.pressed or value_at(self.ending, 0.5 * at) > 10.0 * least
             if where != 0 and at <= event.when and risen:
                 event = Event(at, low.size, where)
@@ -196,10 +188,7 @@ class Control:
     def aim(
         self, start: Start, struck: bool, span: float, longest: float, last: bool, aimed_at: Event
     ) -> tuple[int, float, Event]:
-        """What to do with a step, for what length, and at which event.
-
-        `aimed_at` is the event that the step aims at.
-        """
+        """What to do with a step aimed at an event, for what length, and the event from then on."""
         step, found = self.step, self._first_event(start, struck)
         when, which, side = found.when, aimed_at.which, aimed_at.side
         aimed = which >= 0 and (found.which < 0 or found.which == which or when > 1.0 - 1e-9)

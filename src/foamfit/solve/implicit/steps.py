@@ -56,9 +56,8 @@ def integrate_implicit(
 ) -> tuple[int, float, int, int, float]:
     """Integrate a chain from rest (or struck) over the samples of a scene, by implicit steps.
 
-    The arguments are those of `explicit.taylor.integrate`; `tol` is the truncation of a step
-    relative to the motion so far. Returned is what that returns, and the size, relative to motion
-    and stress, of the vibrations that were damped out because they could not be followed.
+    See `explicit.taylor.integrate`. Returned are also the vibrations that were damped out because
+    they could not be followed, relative to motion and stress.
     """
     with np.errstate(all="ignore"):
         run = _Run(scene, tol, directions, start, out, log)
@@ -94,8 +93,9 @@ class _Run:
         self.nodes = slice(None) if len(out.curves) > 2 else slice(-1, None)
         duration, weight = float(self.t[-1] - (0.0 if self.struck else self.t[0])), 0.0
         if self.struck:
-            duration = min(duration, 5.0 * plain(contact_time)(scene))
-            if plain(is_overdamped)(scene):
+            given = scene.rows, scene.heights, scene.mass[-1]
+            duration = min(duration, 5.0 * plain(contact_time)(*given, scene.drag))
+            if plain(is_overdamped)(*given):
                 weight = min(1.0, tol / SMALL_BASE_ERROR)
         self.vibrations = Vibrations(scene)
         self.control = Control(self.step, self.vibrations, tol, duration, weight)
@@ -118,16 +118,13 @@ class _Run:
         if start.shape[1] > 0:
             step.eps0, step.d_eps0 = start[0].copy(), start[1:].copy()
         longer = step.d_eps0 * heights
-        own, what = step.directions.T
-        longer += (
-            (own[:, None] == np.arange(self.count)) * (what == OWN_HEIGHT)[:, None] * (step.eps0)
-        )
+        longer += step.longer[..., 0] * step.eps0
         step.w[self.above] = np.cumsum(heights * step.eps0)[self.above]
         step.d_w[:, self.above] = np.cumsum(longer[:, self.above], axis=1)
         self.control.motion = float(np.abs(heights * step.eps0).max())
         step.settle()
         self.control.stress = float(np.abs(step.stress0).max())
-        if len(own) and self.scene.top == scenes.MOTION and self.scene.ends.size == 1:
+        if len(longer) and self.scene.top == scenes.MOTION and self.scene.ends.size == 1:
             step.z[:] = 0.0
             step.eps = np.repeat(step.eps0[:, None], STAGES, axis=1)
             step.d_base = step.stress_tangents(step.d_eps0[..., None])[:, 0, 0]
@@ -149,11 +146,14 @@ class _Run:
             if not self.struck:
                 horizon, push, push_rate = self._drive(self.steps == 0 and stalled == 0)
             step.settle()
-            if self.scene.top == scenes.STRESS and self._is_flat():
+            free = (step.slope0 == 0.0) & (self.scene.rows[:, ETA] == 0.0)  # on a flat branch
+            if self.scene.top == scenes.STRESS and free[self.above].any():
                 raise _EndError(scenes.FLAT_UNDER_STRESS, self.now)
             base = self._base_stress(push)
             if horizon <= self.now:  # a single sample, or the last one
-                self._record_rest(base)
+                curves, slopes = self.out.curves[:, self.done :], self.out.slopes[..., self.done :]
+                curves[0], curves[1:] = base, step.w[self.nodes, None]
+                slopes[:, 0], slopes[:, 1:] = step.d_base[:, None], step.d_w[:, self.nodes, None]
                 raise _EndError(scenes.DONE, math.nan)
             start = Start(self.now, base, self.pressed, push, push_rate)
             span = min(horizon - self.now, self.control.proposed)
@@ -174,10 +174,7 @@ class _Run:
         raise _EndError(scenes.TOO_MANY_STEPS, self.now)
 
     def _longest_step(self, start: Start, span: float) -> tuple[float, bool, Event]:
-        """Find the longest step within `span` that is exact enough and ends no later than an event.
-
-        Returns its length, whether it ends at an event, and this.
-        """
+        """Find the longest step: its length, whether it ends at an event, and that event."""
         step, control, now = self.step, self.control, start.now
         longest, trials, event = span, 0, Event(1.0, -1, 0)
         first, first_error = span, math.inf
@@ -243,10 +240,7 @@ class _Run:
     # ---------------------------------------------------------------- the state between steps
 
     def _drive(self, fresh: bool) -> tuple[float, float, float]:
-        """Prescribe motion or stress from the last sample on, which may be reached just now.
-
-        Returns when that ends, and the stress on the top with its rate.
-        """
+        """Prescribe motion or stress from the last sample on; its end, the stress and its rate."""
         t, values, step = self.t, self.scene.values, self.step
         while self.knot < t.size - 2 and self.now >= t[self.knot + 1]:
             self.knot, fresh = self.knot + 1, True
@@ -264,12 +258,6 @@ class _Run:
             step.w[-1] = values[knot]
         step.v0[-1] = step.v[-1] = rate
         return horizon, 0.0, 0.0
-
-    def _is_flat(self) -> bool:
-        """Whether a spring under the prescribed stress that nothing slows is on a flat branch."""
-        return bool(
-            ((self.step.slope0 == 0.0) & (self.scene.rows[:, ETA] == 0.0))[self.above].any()
-        )
 
     def _base_stress(self, push: float) -> float:
         """Stress that the springs below the lowest node with a state carry together."""
@@ -291,7 +279,7 @@ class _Run:
         """Change the branch of a spring, and of all that end theirs at the same time.
 
         Returns whether a spring of the first group without dashpot opened: nothing presses on the
-        base then.
+        base.
         """
         step, opened = self.step, False
         out = np.zeros(self.count)
@@ -334,15 +322,6 @@ class _Run:
         step.carry_tangents(span)
         return True
 
-    def _record_rest(self, base: float) -> None:
-        """Write a single sample, or one that is left where the steps have ended."""
-        step, (_, curves, slopes) = self.step, self.out
-        curves[0, self.done :] = base
-        curves[1:, self.done :] = step.w[self.nodes, None]
-        if len(slopes):
-            slopes[:, 0, self.done :] = step.d_base[:, None]
-            slopes[:, 1:, self.done :] = step.d_w[:, self.nodes, None]
-
     def _mend_kink(self, jump: float) -> None:
         """Dashpots feel the mean rate where the prescribed motion has a kink of `jump`."""
         t, k, heights, eta = self.t, self.knot, self.scene.heights, self.scene.rows[:, ETA]
@@ -357,7 +336,7 @@ class _Run:
     def _fly(self) -> None:
         """Fill the samples after contact, which ended now.
 
-        A later end leaves the nodes as they move until then, and the top with the velocity that it
+        If contact ends later, the nodes move on until then, and the top keeps the velocity that it
         has then.
         """
         step, (_, curves, slopes) = self.step, self.out

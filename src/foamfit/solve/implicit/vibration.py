@@ -17,9 +17,9 @@ from foamfit.springs.kernels import ETA
 class Vibrations:
     """Vibrations of the masses, (groups,) each, between neighbours that are taken as fixed.
 
-    `own` is the rate and `fade` that of its decay, 1/s, in the last step, `stiff` the stiffness on
-    the stiffer side. `alive` is what steps did not resolve and `worst` the largest motion and
-    stress that it had at a sample; see `remember`.
+    `own` is the rate and `fade` that of its decay, 1/s, `stiff` the stiffness on the stiffer side.
+    `alive` is what steps did not resolve, `worst` the largest motion and stress that it had at a
+    sample.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -52,12 +52,11 @@ class Vibrations:
         """Add what a step was too long to show to the vibrations that the answer lacks.
 
         A mass whose velocity differs by δv from that at which the polynomial of the step sets out
-        vibrates from then on by δv/ω, of which the points of the step show no more than
-        δv/ω/(ω span). `alive` is δv/√ω of all steps so far, since a vibration whose stiffness
-        changes slowly keeps its energy over its frequency. `fading` is the rate at which it dies
-        out: of masses in a row the slowest vibration that the step is too long for decays last, and
-        moves as far as all of them together. `worst` counts what is left after `wait`, at the first
-        sample that may show it.
+        vibrates from then on by δv/ω. `alive` is δv/√ω of all steps so far: a vibration whose
+        stiffness changes slowly keeps its energy over its frequency. `fading` is the rate at which
+        it dies out: of masses in a row the slowest vibration that the step is too long for decays
+        last, and moves as far as all of them together. `worst` counts what is left after `wait`, at
+        the first sample that may show it.
         """
         scene = self.scene
         if not self.swings.any():

@@ -34,13 +34,7 @@ _asked_packages: list[bool] = []
 
 
 def law(kind: str) -> Law:
-    """Record of a kind of spring.
-
-    Raises
-    ------
-    InputError
-        If no law has that name.
-    """
+    """Record of a kind of spring; an unknown one is refused (InputError)."""
     if kind not in _LAWS:
         _load_packages()
     if kind not in _LAWS:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from foamfit.arrays import Array
 from foamfit.springs.law import BRANCH_NAMES, derived_points
@@ -137,6 +138,15 @@ class BistableSpring(Spring):
             out["A2"] = (self.eps_hat_a, self.sigma_hat_a)
         return out
 
+    def snapped_along(self, strain: ArrayLike) -> Array:
+        """Share of the way from branch a (0) to c (1) along a strain history, (n,)."""
+        history, _, branches = self._along(strain)
+        back = self.eps_hat_a or 0.0
+        on_d = (history - self.eps_a) / (self.eps_hat_c - self.eps_a)
+        on_e = (history - back) / (self.eps_c - back)
+        shares = np.choose(branches, [0.0 * history, on_d, 1.0 + 0.0 * history, on_e])
+        return np.asarray(np.clip(shares, 0.0, 1.0))
+
 
 def _sigma_a(k0: float, eps_a: float) -> float:
     """σ_a = k0 ε_a/(1-ε_a), Pa."""
@@ -205,10 +215,9 @@ def read_in_series(loop: Loop, marks: Array, share: float) -> Array:
 
 
 def _stiffness_between(rise: float, low: float, high: float) -> float:
-    """k_c of a branch c that rises by a strain `rise` from stress `low` to `high` (Pa).
+    """k_c of a branch c that rises by a strain from stress `low` to `high` (Pa).
 
-    It is the larger root k of rise (k+low)(k+high) = k (high-low). Where that equation has no root,
-    k = √(low high) comes closest to it.
+    The larger root k of rise (k+low)(k+high) = k (high-low); if none, √(low high) comes closest.
     """
     gain = max(high - low, 1e-9 * high)
     rise = max(rise, 1e-6)

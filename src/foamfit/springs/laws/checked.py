@@ -131,13 +131,7 @@ def _trial(law: Law) -> str | None:
 
 
 def check(law: Law, taken: Sequence[str]) -> None:
-    """Refuse a law with something wrong in it; `taken` are the names of the paper's laws.
-
-    Raises
-    ------
-    InputError
-        Naming the law and what would be right.
-    """
+    """Refuse (InputError) a law with something wrong in it; the names `taken` are the paper's."""
     if not isinstance(law, Law):
         raise InputError(f"{law!r} is not a foamfit.Law")
     wrong = _names(law, taken) or _missing(law) or _trial(law)

@@ -5,7 +5,6 @@ numbers and states of numbers (`laws.record`); `step` takes one of them to a str
 and returns its whole stress, that of the law, of the relaxation terms and of the dashpot.
 """
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 import math
@@ -118,8 +117,7 @@ def row_of(law: Law, values: ArrayLike) -> Array | None:
 def solver_row(law: Law, values: Array, terms: ArrayLike, room: int) -> Array | None:
     """Row of one of the paper's laws as the solver takes it; None if it is not admissible.
 
-    `values` are own parameters and eta; g and τ of the relaxation `terms` follow the columns, with
-    room for so many.
+    `values` are own parameters and eta; `room` relaxation terms have place behind the columns.
     """
     row, pairs = np.zeros(kernels.N_COLUMNS + 2 * room), np.ravel(terms)
     own, relaxing = row[: kernels.N_COLUMNS], row[kernels.N_COLUMNS :]
@@ -137,18 +135,23 @@ def solver_row(law: Law, values: Array, terms: ArrayLike, room: int) -> Array | 
 STRENGTH, TIME, MEMORY = range(3)
 
 
-class Loops(NamedTuple):
-    """Compiled loops of springs of some laws, base first.
+class Springs(NamedTuple):
+    """Springs in series: rows, states (springs, …), terms (springs, n, 3), heights, m, η."""
 
-    start(i, row, state)
-        Spring i at rest.
-    step(i, row, state, terms, eta, strain, h) -> stress
-        Takes spring i to a strain within the time h (s; 0 at once), its stress taken for linear in
-        time by the relaxation terms (n, 3). Returns the whole stress, Pa; NaN where there is none.
-    to_stress(i, row, state, terms, eta, stress, h) -> strain
-        The inverse; NaN where no strain gives that stress.
-    delayed(i, row, state, (rate, h)) -> stress
-        What of the stress of spring i depends on time, Pa.
+    rows: Array
+    states: Array
+    terms: Array
+    heights: Array
+    eta: Array
+
+
+class Loops(NamedTuple):
+    """Compiled loops of springs of some laws; i is the spring, 0 at the base.
+
+    start(i, row, state, 0) brings it to rest. step(i, springs, strain, h) takes it to a strain
+    within the time h (s; 0 at once), its stress taken for linear in time by the relaxation terms,
+    and returns the whole stress, Pa; to_stress(i, springs, stress, h) is the inverse; both NaN
+    where there is none. delayed(i, row, state, (rate, h)) is what depends on time, Pa.
     """
 
     start: Compiled
@@ -158,10 +161,9 @@ class Loops(NamedTuple):
 
 
 def _own_loops(law: Law) -> tuple[Compiled, Compiled, Compiled]:
-    """Start one spring at rest, walk it to a strain over all branches on the way, and delay it.
+    """Start one spring at rest, walk it to a strain, and give what of its stress depends on time.
 
-    The second returns its stress; the third that which depends on time, of rate (1/s) and time (s).
-    Arrays may have room for longer rows and states.
+    Rows and states may be longer than its own.
     """
     _, begin, leaves, switch, settle, viscous = compiled_functions(law)
     columns, states = sizes_of(law)
@@ -194,10 +196,7 @@ def _own_loops(law: Law) -> tuple[Compiled, Compiled, Compiled]:
 
 
 def _chosen(functions: Sequence[Compiled]) -> Compiled:
-    """One function of those of several springs: called with i, it is the i-th of them.
-
-    Its last argument is what these take: a strain, or rate and time.
-    """
+    """One function of those of several springs: called with i, it is the i-th of them."""
     first = functions[0]
 
     @compiled
@@ -218,8 +217,8 @@ def _chosen(functions: Sequence[Compiled]) -> Compiled:
 def inverse(value_at: Compiled) -> Compiled:
     """Find where value_at(given, x), which never falls with x, has a target.
 
-    find(given, start, pace, size, target) searches about `start`, first by steps of `pace`, to
-    rounding of x or of `size`, the smaller of x that count; NaN if nothing has the target.
+    find(given, start, pace, size, target) searches from `start` by steps of `pace`, to rounding of
+    x or of `size`; NaN if nothing has the target.
     """
 
     @compiled
@@ -256,19 +255,25 @@ def inverse(value_at: Compiled) -> Compiled:
     return find
 
 
+@compiled
+def trial_of(springs: Springs) -> Springs:
+    """The same springs, whose states may be tried."""
+    states, terms = springs.states.copy(), springs.terms.copy()
+    return Springs(springs.rows, states, terms, springs.heights, springs.eta)
+
+
 @cache
 def loops_of(laws: tuple[Law, ...]) -> Loops:
     """Loops of springs of these laws, base first."""
     start, walk, delayed = map(_chosen, zip(*map(_own_loops, laws), strict=True))
 
     @compiled
-    def step(
-        i: int, row: Array, state: Array, terms: Array, eta: float, eps: float, h: float
-    ) -> float:
+    def step(i: int, springs: Springs, eps: float, h: float) -> float:
+        row, state = springs.rows[i], springs.states[i]
         before, from_eps = state[SIGMA], state[EPS]
         sigma = walk(i, row, state, eps)
         out = sigma
-        for term in terms:
+        for term in springs.terms[i]:
             x = h / term[TIME]
             decay, late = math.exp(-x), 0.5 * x
             if x > 1e-4:
@@ -278,54 +283,49 @@ def loops_of(laws: tuple[Law, ...]) -> Loops:
             out += term[STRENGTH] * (sigma + term[MEMORY])
         if h > 0.0:
             rate = (eps - from_eps) / h
-            out += delayed(i, row, state, (rate, h)) + eta * rate
+            out += delayed(i, row, state, (rate, h)) + springs.eta[i] * rate
         return out
 
     @compiled
     def beside(given: Any, eps: float) -> float:
         """Stress at a strain; the spring stays where it is."""
-        i, row, state, terms, eta, h = given
-        return step(i, row, state.copy(), terms.copy(), eta, eps, h)
+        i, springs, h = given
+        return step(i, trial_of(springs), eps, h)
 
     find = inverse(beside)
 
     @compiled
-    def to_stress(
-        i: int, row: Array, state: Array, terms: Array, eta: float, sigma: float, h: float
-    ) -> float:
-        given = (i, row, state, terms, eta, h)
-        eps = find(given, state[EPS], 1e-3, 1e-3, sigma)
+    def to_stress(i: int, springs: Springs, sigma: float, h: float) -> float:
+        eps = find((i, springs, h), springs.states[i, EPS], 1e-3, 1e-3, sigma)
         if math.isfinite(eps):
-            step(i, row, state, terms, eta, eps, h)
+            step(i, springs, eps, h)
         return eps
 
     return Loops(start, step, to_stress, delayed)
 
 
-_NO_TERMS = np.empty((0, 3))
-
-
-def _followed(law: Law, values: ArrayLike) -> tuple[Loops, Array, Array]:
-    """Loops, row and state of one spring at rest."""
-    row, loops, state = row_of(law, values), loops_of((law,)), np.empty(sizes_of(law)[1])
+def _followed(law: Law, values: ArrayLike) -> tuple[Loops, Springs]:
+    """Loops of one spring at rest, of height 1."""
+    row, loops = row_of(law, values), loops_of((law,))
     assert row is not None
-    loops.start(0, row, state, 0.0)
-    return loops, row, state
+    springs = Springs(
+        row[None], np.empty((1, sizes_of(law)[1])), np.empty((1, 0, 3)), np.ones(1), np.zeros(1)
+    )
+    loops.start(0, row, springs.states[0], 0.0)
+    return loops, springs
 
 
 def stress_along(law: Law, values: ArrayLike, strain: Array) -> tuple[Array, NDArray[np.int64]]:
     """Stress (Pa) and number of the branch along a strain history (n,), from rest."""
-    loops, row, state = _followed(law, values)
+    loops, springs = _followed(law, values)
     out, branches = np.empty(strain.size), np.empty(strain.size, np.int64)
     for j, eps in enumerate(strain):
-        out[j] = loops.step(0, row, state, _NO_TERMS, 0.0, eps, 0.0)
-        branches[j] = int(state[BRANCH])
+        out[j] = loops.step(0, springs, eps, 0.0)
+        branches[j] = int(springs.states[0, BRANCH])
     return out, branches
 
 
 def strain_along(law: Law, values: ArrayLike, stress: Array) -> Array:
     """Strain along a stress history (n,), Pa, from rest; NaN where the law has no such stress."""
-    loops, row, state = _followed(law, values)
-    return np.array(
-        [loops.to_stress(0, row, state, _NO_TERMS, 0.0, sigma, 0.0) for sigma in stress]
-    )
+    loops, springs = _followed(law, values)
+    return np.array([loops.to_stress(0, springs, sigma, 0.0) for sigma in stress])

@@ -115,21 +115,8 @@ class MicroscaleSpring(Spring):
     @property
     def snap_strain(self) -> float:
         """Strain by which a micro-spring of the middle rank jumps where it first snaps through."""
-        on = {name: float(eps[0]) for name, eps in self.elastic_branches(self._middle).items()}
-        return on["c"] - on["a"]
-
-    @property
-    def _middle(self) -> Array:
-        return np.array([self.sigma_plus])
-
-    def snapped_below(self, stress: ArrayLike) -> Array:
-        """P₊: the fraction that has snapped on first loading to these stresses."""
-        return _ranks_below(stress, self.sigma_plus, self.spread_plus)
-
-    def left_below(self, stress: ArrayLike) -> Array:
-        """P₋: the fraction that is left on unloading to these stresses, P₊ at least."""
-        left = _ranks_below(stress, self.sigma_minus, self.spread_minus)
-        return np.maximum(left, self.snapped_below(stress))
+        on = self.elastic_branches(np.array([self.sigma_plus]))
+        return float(on["c"][0] - on["a"][0])
 
     def fraction_along(self, stress: ArrayLike) -> Array:
         """Fraction that has snapped along a stress history (Pa), shape (n,), from none."""
@@ -137,17 +124,22 @@ class MicroscaleSpring(Spring):
 
     def fractions_along(self, stress: ArrayLike) -> tuple[Array, Array]:
         """Fractions that have snapped, and have ever snapped, along a stress history (Pa)."""
+        from scipy.special import ndtr
+
+        from foamfit.springs import microscale_kernels
+
         history = np.atleast_1d(as_samples(stress, "stress"))
-        snapped, ever = np.empty((2, history.size))
-        p = most = 0.0
-        first, back = self.snapped_below(history), self.left_below(history)
-        again = self.snapped_below(history * math.exp(self.weakening))
-        for j in range(history.size):
-            least = max(first[j], min(again[j], most))
-            p = min(max(p, least), max(least, back[j]))
-            most = max(most, p)
-            snapped[j], ever[j] = p, most
-        return snapped, ever
+        snapped = ndtr(microscale_kernels.strain_along(self.row, history)[1][0])
+        return snapped, np.maximum.accumulate(snapped)
+
+    def snapped_along(self, strain: ArrayLike) -> Array:
+        """Fraction that has snapped along a strain history, (n,), from none."""
+        from scipy.special import ndtr
+
+        from foamfit.springs import microscale_kernels
+
+        ranks = microscale_kernels.stress_along(self.row, self._along(strain)[0])[1]
+        return np.asarray(ndtr(ranks[0]))
 
     def elastic_branches(self, stress: Array) -> dict[str, Array]:
         """Strains of branches a (none has snapped) and c (all have) at these stresses (Pa).
@@ -185,46 +177,10 @@ class MicroscaleSpring(Spring):
         return microscale_kernels.stress_tangents_along(self.row, strain, *path)[1]
 
 
-def _ranks_below(stress: ArrayLike, middle: float, spread: float) -> Array:
-    """Fraction of ranks whose snap stress lies below these stresses; none in tension."""
-    from scipy.special import ndtr
-
-    with np.errstate(divide="ignore"):
-        scores = (np.log(np.maximum(stress, 0.0)) - math.log(middle)) / spread
-    return np.asarray(ndtr(scores), dtype=float)
-
-
 @lru_cache(maxsize=256)
 def _least_star(k0: float, kc: float, stiffening: float = 1.0, softening: float = 0.0) -> float:
     """Least ε_*: with it branch c lies at or beyond branch a, softened too, at every stress."""
     return most_beyond(k0 * math.exp(-softening), kc, stiffening)[0]
-
-
-def _read(loop: Loop, marks: Array, scales: Any, more: tuple[float, ...], least: Any) -> Array:
-    """Read a spring off a loop; `more` are stiffening, softening, weakening as far as it has them.
-
-    `least(k0, kc)` is its least ε_*. See `read_off`.
-    """
-    last = float(np.max(loop.strain))
-    first = max(loop.at(0.05 * last, loading=True), 0.002 * scales.stress) / (0.05 * last)
-    k0, kc = first * 10.0 ** (1.2 * marks[0] - 0.4), scales.stress * 10.0 ** (2.3 * marks[1] - 0.5)
-    lowest = least(k0, kc)
-    star = lowest + 0.5 * marks[2] * (LAST_STRAIN - lowest)
-    plus = max(loop.at((0.2 + 0.8 * marks[3]) * last, loading=True), 0.02 * scales.stress)
-    minus = max(loop.at((0.2 + 0.7 * marks[5]) * last, loading=False), 0.01 * scales.stress)
-    spreads = 10.0 ** (1.2 * marks[[4, 6]] - 1.0)
-    return np.array([k0, kc, star, plus, spreads[0], minus, spreads[1], *more, 0.0])
-
-
-def read_off(loop: Loop, marks: Array, scales: Any, way: int) -> Array:
-    """Read a spring off a loop, given where on it its snap stresses are taken to lie.
-
-    `marks` (7,) in [0, 1]: the initial slope over that at a twentieth of the largest strain, k_c
-    over the largest stress, the place of ε_* above its least, the strains at which the median
-    micro-springs snap through and back, and the two spreads. Returned are k0 … spread_minus, and a
-    dashpot of zero (SI).
-    """
-    return _read(loop, marks, scales, (), _least_star)
 
 
 def _neighbours(values: Array, top: float) -> Iterator[Array]:
@@ -256,112 +212,75 @@ def _least_slopes(
     return (by_log_k / k0, 0.0), (sigma / (kc + sigma) ** 2, 0.0), (by_n, 0.0), (-by_log_k, 0.0)
 
 
-_BEYOND_A = Between(
-    ("k0", "kc"),
-    lambda k0, kc: (_least_star(k0, kc), LAST_STRAIN),
-    lambda k0, kc: _least_slopes(k0, kc)[:2],
-)
 _STRESSES, _SPREADS = (math.log(0.02), math.log(1.0)), (math.log(0.05), math.log(2.0))
 
-
-LAW = Law(
-    kind="microscale",
-    title="microscale spring",
-    params=(
-        replace(K0, example="0.55 MPa"),
-        replace(KC, branch="snap-through", example="0.25 MPa"),
+_PARAMS = (
+    replace(K0, example="0.55 MPa"),
+    replace(KC, branch="snap-through", example="0.25 MPa"),
+    Param(
+        "eps_star", ("ε", "*"), "", "strain at which branch c starts from zero stress",
+        (0.8, "one"), (0.0, LAST_STRAIN), box=(0.0, 1.0), least_size=0.1,
+        admissible="at least 0 and less than 1", branch="snap-through", example="0.08",
+    ),
+    Param(
+        "sigma_plus", ("σ", "+"), "Pa", "median snap-through stress", (0.5, "stress"),
+        (1e-3, 30.0), "stress", inner=_STRESSES, branch="snap-through", example="0.13 MPa",
+    ),
+    Param(
+        "spread_plus", ("s", "+"), "", "spread of the logarithm of the snap-through stress",
+        (0.4, "one"), (1e-3, 5.0), inner=_SPREADS, branch="snap-through", example="0.4",
+    ),
+    Param(
+        "sigma_minus", ("σ", "−"), "Pa", "median snap-back stress", (0.2, "stress"),
+        (1e-4, 30.0), "stress", inner=_STRESSES, branch="snap-back", example="55 kPa",
+    ),
+    Param(
+        "spread_minus", ("s", "−"), "", "spread of the logarithm of the snap-back stress",
+        (0.7, "one"), (1e-3, 5.0), inner=_SPREADS, branch="snap-back", example="0.8",
+    ),
+)  # fmt: skip
+_OPTIONAL = {
+    "stiffening": (
         Param(
-            "eps_star", ("ε", "*"), "", "strain at which branch c starts from zero stress",
-            (0.8, "one"), (0.0, LAST_STRAIN), "one", _BEYOND_A, box=(0.0, 1.0), least_size=0.1,
-            admissible="at least 0 and less than 1", branch="snap-through", example="0.08",
-        ),
-        Param(
-            "sigma_plus", ("σ", "+"), "Pa", "median snap-through stress", (0.5, "stress"),
-            (1e-3, 30.0), "stress", inner=_STRESSES, branch="snap-through", example="0.13 MPa",
-        ),
-        Param(
-            "spread_plus", ("s", "+"), "", "spread of the logarithm of the snap-through stress",
-            (0.4, "one"), (1e-3, 5.0), inner=_SPREADS, branch="snap-through", example="0.4",
-        ),
-        Param(
-            "sigma_minus", ("σ", "−"), "Pa", "median snap-back stress", (0.2, "stress"),
-            (1e-4, 30.0), "stress", inner=_STRESSES, branch="snap-back", example="55 kPa",
-        ),
-        Param(
-            "spread_minus", ("s", "−"), "", "spread of the logarithm of the snap-back stress",
-            (0.7, "one"), (1e-3, 5.0), inner=_SPREADS, branch="snap-back", example="0.8",
+            "stiffening", ("n", ""), "", "stiffening of branch a (1: the paper's)", (1.0, "one"),
+            (0.02, 50.0), inner=(math.log(0.3), math.log(3.0)), neutral=1.0, branch="a",
+            example="2.0",
         ),
     ),
-    numbered=BRANCH_NAMES,
-    functions=functions_of("microscale"),
-    branches={
-        "a": "elastic, none has snapped",
-        "snap-through": "micro-springs snap",
-        "held": "as many stay snapped",
-        "snap-back": "micro-springs snap back",
-        "reversible": "micro-springs snap through and back at one stress",
-    },
-    spring=MicroscaleSpring,
-    searched=(
-        "k0", "kc", "eps_star", "sigma_plus", "sigma_minus", "spread_plus", "spread_minus",
+    "mullins": (
+        Param(
+            "softening", ("d", ""), "", "softening of what has snapped once: k0 becomes k0·exp(-d)",
+            (0.5, "one"), (0.0, 6.0), "one", "value", inner=(0.0, 2.0), least_size=0.1,
+            admissible="zero or positive", neutral=0.0, branch="snap-back", example="0.8",
+        ),
+        Param(
+            "weakening", ("s", ""), "", "weakening of what has snapped once: σ₊ becomes σ₊·exp(-s)",
+            (0.3, "one"), (0.0, 6.0), "one", "value", inner=(0.0, 1.0), least_size=0.1,
+            admissible="zero or positive", neutral=0.0, branch="snap-through again", example="0.5",
+        ),
     ),
-    options={
-        ("stiffening",): "microscale, stiffening",
-        ("mullins",): "microscale, mullins",
-        ("stiffening", "mullins"): "microscale, stiffening, mullins",
-    },
-    read_off=read_off,
-    marks=7,
-    onset=lambda values: values[3],
-    scanned="eps_star",
-    neighbours=_neighbours,
-    exchanged=(_to_stresses, _from_stresses),
-    compared=(
-        COMPARED_K0,
-        Compared("k_c", "MPa", ("kc",), lambda kc: kc / 1e6),
-        COMPARED_ETA,
-        Compared("ε_*", "", ("eps_star",), lambda star: star),
-        Compared("σ₊", "MPa", ("sigma_plus",), lambda sigma: sigma / 1e6),
-        Compared("s₊", "", ("spread_plus",), lambda spread: spread),
-        Compared("σ₋", "MPa", ("sigma_minus",), lambda sigma: sigma / 1e6),
-        Compared("s₋", "", ("spread_minus",), lambda spread: spread),
-        COMPARED_HEIGHT,
-    ),
-    note="σ₊ and σ₋ are where half of the micro-springs have snapped on loading, and where half "
-    "have snapped back on unloading. For a single spring its branches are shown too, thin and "
-    "grey: the elastic branch a, on which none has snapped, and the densified branch c, on which "
-    "all have.",
-)  # fmt: skip
+}  # fmt: skip
+_BRANCHES = {
+    "a": "elastic, none has snapped",
+    "snap-through": "micro-springs snap",
+    "held": "as many stay snapped",
+    "snap-back": "micro-springs snap back",
+    "reversible": "micro-springs snap through and back at one stress",
+}
+_NOTE = (
+    "σ₊ and σ₋ are where half of the micro-springs have snapped on loading, and where half have "
+    "snapped back on unloading. For a single spring its branches are shown too, thin and grey: the "
+    "elastic branch a, on which none has snapped, and the densified branch c, on which all have."
+)
 
 
-# ---------------------------------------------------------------- with memory
-
-_STIFFENING = Param(
-    "stiffening", ("n", ""), "", "stiffening of branch a (1: the paper's)", (1.0, "one"),
-    (0.02, 50.0), inner=(math.log(0.3), math.log(3.0)), neutral=1.0, branch="a", example="2.0",
-)  # fmt: skip
-_SOFTENING = Param(
-    "softening", ("d", ""), "", "softening of what has snapped once: k0 becomes k0·exp(-d)",
-    (0.5, "one"), (0.0, 6.0), "one", "value", inner=(0.0, 2.0), least_size=0.1,
-    admissible="zero or positive", neutral=0.0, branch="snap-back", example="0.8",
-)  # fmt: skip
-_WEAKENING = Param(
-    "weakening", ("s", ""), "", "weakening of what has snapped once: σ₊ becomes σ₊·exp(-s)",
-    (0.3, "one"), (0.0, 6.0), "one", "value", inner=(0.0, 1.0), least_size=0.1,
-    admissible="zero or positive", neutral=0.0, branch="snap-through again", example="0.5",
-)  # fmt: skip
-_OPTIONAL = {"stiffening": (_STIFFENING,), "mullins": (_SOFTENING, _WEAKENING)}
-# Largest coordinates that start values are read off with.
-_MOST = {"softening": 2.0, "weakening": 1.0}
-
-
-def _marked(name: str, mark: float) -> float:
+def _marked(param: Param, mark: float) -> float:
     """Start value of an optional parameter from a mark in [0, 1]."""
-    return 3.0 ** (2.0 * mark - 1.0) if name == "stiffening" else _MOST[name] * mark
+    return 3.0 ** (2.0 * mark - 1.0) if param.is_logarithmic else param.start_limits[1] * mark
 
 
-def _with(*options: str) -> Law:
-    """The law with the parameters of some options."""
+def _law(*options: str) -> Law:
+    """The law with the parameters of some options; without any, of springs that forget."""
     extra = tuple(param for option in options for param in _OPTIONAL[option])
     names = tuple(param.name for param in extra)
     # What the least ε_* depends on besides k0 and kc, and where it stands among these arguments.
@@ -375,44 +294,74 @@ def _with(*options: str) -> Law:
         all_of = _least_slopes(k0, kc, **dict(zip(also, given, strict=True)))
         return tuple(all_of[place] for place in picked)
 
-    beyond = Between(("k0", "kc", *also), lambda *given: (least(*given), LAST_STRAIN), slopes)
+    def read_off(loop: Loop, marks: Array, scales: Any, way: int) -> Array:
+        """Read a spring off a loop, given where on it its snap stresses are taken to lie.
 
-    def read(loop: Loop, marks: Array, scales: Any, way: int) -> Array:
-        more = tuple(map(_marked, names, marks[7:]))
-        given = [value for name, value in zip(names, more, strict=True) if name in also]
-        return _read(loop, marks, scales, more, lambda k0, kc: least(k0, kc, *given))
+        `marks` in [0, 1]: the initial slope over that at a twentieth of the largest strain, k_c
+        over the largest stress, the place of ε_* above its least, the strains at which the median
+        micro-springs snap through and back with the spread behind each, and what is optional.
+        Returned are the own parameters and a dashpot of zero (SI).
+        """
+        last, top = float(np.max(loop.strain)), scales.stress
+        first = max(loop.at(0.05 * last, loading=True), 0.002 * top) / (0.05 * last)
+        k0, kc = first * 10.0 ** (1.2 * marks[0] - 0.4), top * 10.0 ** (2.3 * marks[1] - 0.5)
+        more = dict(zip(names, map(_marked, extra, marks[7:]), strict=True))
+        lowest = least(k0, kc, *(more[name] for name in also))
+        star = lowest + 0.5 * marks[2] * (LAST_STRAIN - lowest)
+        plus = max(loop.at((0.2 + 0.8 * marks[3]) * last, loading=True), 0.02 * top)
+        minus = max(loop.at((0.2 + 0.7 * marks[5]) * last, loading=False), 0.01 * top)
+        spreads = 10.0 ** (1.2 * marks[[4, 6]] - 1.0)
+        own = (k0, kc, star, plus, spreads[0], minus, spreads[1])
+        return np.array([*own, *more.values(), 0.0])
 
     def make(*values: float, relaxation: Relaxation = ()) -> MicroscaleSpring:
-        given: dict[str, Any] = dict(zip((*LAW.own, *names, "eta"), values, strict=True))
+        own = (param.name for param in _PARAMS)
+        given: dict[str, Any] = dict(zip((*own, *names, "eta"), values, strict=True))
         return MicroscaleSpring(relaxation=relaxation, **given)
 
-    kind = ", ".join((LAW.kind, *options))
-    return replace(
-        LAW,
+    kind = ", ".join(("microscale", *options))
+    beyond = Between(("k0", "kc", *also), lambda *given: (least(*given), LAST_STRAIN), slopes)
+    again = {"snap-through again": "what has snapped before snaps once more"} if options else {}
+    softened = " The branch a′ is that of what has snapped once." if "mullins" in options else ""
+    return Law(
         kind=kind,
-        word=LAW.kind,
-        params=tuple(
-            replace(param, coordinate=beyond) if param.name == "eps_star" else param
-            for param in (*LAW.params, *extra)
-        ),
+        word="microscale" if options else "",
+        title="microscale spring",
+        params=(*_PARAMS[:2], replace(_PARAMS[2], coordinate=beyond), *_PARAMS[3:], *extra),
+        places={"stiffening": 8, "softening": 9, "weakening": 10} if options else {},
+        numbered=BRANCH_NAMES,
         functions=functions_of(kind),
+        branches=_BRANCHES | again,
         spring=make,
-        branches={**LAW.branches, "snap-through again": "what has snapped before snaps once more"},
-        searched=("k0", "kc", *names, *LAW.searched[2:]),
-        read_off=read,
+        searched=(
+            "k0", "kc", *names, "eps_star", "sigma_plus", "sigma_minus", "spread_plus",
+            "spread_minus",
+        ),
+        options={} if options else {
+            one: ", ".join(("microscale", *one))
+            for one in (("stiffening",), ("mullins",), ("stiffening", "mullins"))
+        },
+        read_off=read_off,
         marks=7 + len(names),
-        exchanged=None,
-        compared=(*LAW.compared[:-1], *map(_compared, extra), LAW.compared[-1]),
-        places={"stiffening": 8, "softening": 9, "weakening": 10},
-        note=LAW.note
-        + (" The branch a′ is that of what has snapped once." if options[-1] == "mullins" else ""),
-        options={},
-    )
+        onset=lambda values: values[3],
+        scanned="eps_star",
+        neighbours=_neighbours,
+        exchanged=None if options else (_to_stresses, _from_stresses),
+        compared=(
+            COMPARED_K0,
+            Compared("k_c", "MPa", ("kc",), lambda kc: kc / 1e6),
+            COMPARED_ETA,
+            Compared("ε_*", "", ("eps_star",), lambda star: star),
+            Compared("σ₊", "MPa", ("sigma_plus",), lambda sigma: sigma / 1e6),
+            Compared("s₊", "", ("spread_plus",), lambda spread: spread),
+            Compared("σ₋", "MPa", ("sigma_minus",), lambda sigma: sigma / 1e6),
+            Compared("s₋", "", ("spread_minus",), lambda spread: spread),
+            *(Compared(one.symbol[0], "", (one.name,), lambda value: value) for one in extra),
+            COMPARED_HEIGHT,
+        ),
+        note=_NOTE + softened,
+    )  # fmt: skip
 
 
-def _compared(param: Param) -> Compared:
-    return Compared(param.symbol[0], "", (param.name,), lambda value: value)
-
-
-STIFFENING_LAW, MULLINS_LAW = _with("stiffening"), _with("mullins")
-MEMORY_LAW = _with("stiffening", "mullins")
+LAW, STIFFENING_LAW, MULLINS_LAW = _law(), _law("stiffening"), _law("mullins")
+MEMORY_LAW = _law("stiffening", "mullins")

@@ -49,59 +49,27 @@ class Between(NamedTuple):
 
 @dataclass(frozen=True)
 class Param:
-    """One parameter of a law.
+    """One parameter of a law; "Your own law" in the documentation explains the fields.
 
     Numbers are multiples of a scale of the test: "one", "strain" (the largest), "stress" (the
     largest, Pa), "slope" (stress over strain, Pa), "damping" (Pa·s) or "duration" (s).
-
-    Parameters
-    ----------
-    name : str
-        As in s1_<name>.
-    symbol : tuple of str
-        Letter and index, ("ε", "a").
-    unit : str
-        SI, "" for a pure number.
-    what : str
-        What it is, in words for a table.
-    start : (float, str)
-        Start value, where nothing is known, and its scale.
-    bounds : (float, float)
-        Limits of the search.
-    scale : str
-        The scale of `bounds`.
-    coordinate : "logarithm", "value" or Between
-        What the search moves in.
-    box, inner : (float, float), optional
-        Limits of the coordinate, and those of random start values; by default those of `bounds`.
-    least_size : float
-        A value below this share of its scale is measured by that share when its uncertainty is
-        judged; so may a parameter that can be zero be.
-    admissible : str
-        One of `ADMISSIBLE`.
-    neutral : float, optional
-        The value at which the parameter has no effect.
-    branch : str
-        The branch that a test must reach for the parameter to leave a trace.
-    example : str
-        A value with its unit as a file states it.
     """
 
-    name: str
-    symbol: tuple[str, str] = ("", "")
-    unit: str = ""
-    what: str = ""
-    start: tuple[float, str] = (1.0, "one")
-    bounds: tuple[float, float] = (1e-3, 1e3)
-    scale: str = "one"
-    coordinate: str | Between = "logarithm"
-    box: tuple[float, float] | None = None
-    inner: tuple[float, float] | None = None
-    least_size: float = 0.0
-    admissible: str = "positive"
-    neutral: float | None = None
-    branch: str = ""
-    example: str = ""
+    name: str  #: as in s1_<name>
+    symbol: tuple[str, str] = ("", "")  #: letter and index, ("ε", "a")
+    unit: str = ""  #: SI, "" for a pure number
+    what: str = ""  #: what it is, in words for a table
+    start: tuple[float, str] = (1.0, "one")  #: start value, where nothing is known, and its scale
+    bounds: tuple[float, float] = (1e-3, 1e3)  #: limits of the search
+    scale: str = "one"  #: the scale of `bounds`
+    coordinate: str | Between = "logarithm"  #: what the search moves in; or "value", or Between
+    box: tuple[float, float] | None = None  #: limits of the coordinate; by default `bounds`
+    inner: tuple[float, float] | None = None  #: those of random start values; by default `box`
+    least_size: float = 0.0  #: least share of its scale that its uncertainty is compared with
+    admissible: str = "positive"  #: one of `ADMISSIBLE`
+    neutral: float | None = None  #: the value at which the parameter has no effect
+    branch: str = ""  #: the branch that a test must reach for the parameter to leave a trace
+    example: str = ""  #: a value with its unit as a file states it
 
     @property
     def is_logarithmic(self) -> bool:
@@ -135,29 +103,16 @@ class Param:
 class Functions(NamedTuple):
     """How a spring is followed along its strain: functions that Numba compiles.
 
-    fill(values, row) -> bool
-        Writes the own parameters and what follows from them into `row`; False if they are not
-        admissible.
-    begin(row, state)
-        Sets the state of a spring at rest: strain, stress, branch, then what else the law
-        remembers.
-    leaves(row, state, strain) -> bool
-        Whether the spring leaves its branch before it reaches a strain.
-    switch(row, state, up)
-        Goes to the end of the branch, upwards or downwards in strain, and on to the next.
-    settle(row, state, strain)
-        Brings the state to a strain on its branch.
-    viscous(row, state, rate, h) -> float, optional
-        Stress (Pa) that depends on time, added to that of the state, which was reached at a strain
-        rate (1/s) within the time h (s; 0 at the instant of contact). It may keep numbers in the
-        own part of the state. Without time it is not called.
+    "Your own law" in the documentation says what each must do.
     """
 
-    fill: Callable[..., bool]
-    begin: Callable[..., None]
-    leaves: Callable[..., bool]
-    switch: Callable[..., None]
-    settle: Callable[..., None]
+    fill: Callable[..., bool]  #: fill(values, row): write own parameters; False if not admissible
+    begin: Callable[..., None]  #: begin(row, state): set the state of a spring at rest
+    leaves: Callable[..., bool]  #: leaves(row, state, strain): whether the branch ends before it
+    switch: Callable[..., None]  #: switch(row, state, up): to the end of the branch, and the next
+    settle: Callable[..., None]  #: settle(row, state, strain): to a strain on the branch
+    #: viscous(row, state, rate, h): stress (Pa) that depends on time, for the strain rate (1/s) and
+    #: length (s) of the last step
     viscous: Callable[..., float] | None = None
 
 
@@ -185,96 +140,51 @@ def _no_neighbours(values: Array, top: float) -> Iterator[Array]:
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """A kind of spring.
+    """A kind of spring."""
 
-    Parameters
-    ----------
-    kind : str
-        The word of a model's name: "bistable", "linear+bistable".
-    params : tuple of Param
-        Its own parameters, in the order of `Functions.fill`; dashpot, relaxation terms and height
-        come by themselves.
-    functions : Functions or callable that returns them
-        How it is followed.
-    columns, states : int
-        Length of a row and of a state; by default one number per parameter, and strain, stress and
-        branch alone.
-    branches : mapping
-        Branches by their number, the first at rest: name and what the spring does on it.
-    title : str
-        The spring in words, "bistable spring".
-    hysteretic : bool
-        Whether it has a loop, and may relax.
-    spring : callable, optional
-        Makes the spring of own parameters, eta, and relaxation=; `register` gives a `LawSpring`.
-    searched : tuple of str, optional
-        Order of the coordinates of the search; by default the parameters, those last that are
-        relative to others.
-    read_off : callable, optional
-        read_off(loop, marks, scales, way) gives the own parameters and eta, read off a measured
-        loop where `marks` (n,) in [0, 1] place them. Without one, start values are random.
-    read_in_series : callable, optional
-        The same for one of several springs: (loop, marks, share of the height).
-    marks, ways : int
-        Number of marks, and of ways to read a loop.
-    onset : callable, optional
-        Stress at which the spring starts to snap, of its own parameters; springs that can be
-        exchanged are ordered by it. By default the first parameter.
-    scanned, strata : str
-        A parameter along which the cost may have several minima, and one over whose range the
-        points from which the search descends are spread.
-    neighbours : callable
-        neighbours(values, largest stress) gives own parameters of springs with nearly the same
-        loop, from which the search begins again.
-    exchanged : pair of callables, optional
-        (values, height) to stresses and elongations, and back: what springs in series exchange.
-    points, compared : tuples
-        What the report lists beside the parameters, and what a comparison shows.
-    note : str
-        What the report says about the marks of the figure.
-    inner_loops, remembers : bool
-        Whether partial unloading leaves the branch; whether the spring remembers more than its
-        branch.
-    published : bool
-        Whether the paper publishes parameters of it.
-    numbered : tuple of str, optional
-        Names of the branches by their numbers; by default the order of `branches`.
-    options : mapping
-        Options of a fit that free more parameters: the law with them.
-    word : str
-        The word of a model's name, where it is not `kind`.
-    places : mapping
-        Places of derivatives by parameters, where these are not in the order of `params`.
-    """
-
-    kind: str
+    kind: str  #: the word of a model's name: "bistable", "linear+bistable"
+    #: its own parameters, in the order of `Functions.fill`; dashpot, relaxation terms and height
+    #: come by themselves
     params: tuple[Param, ...]
-    functions: Functions | Callable[[], Functions]
-    columns: int = 0
-    states: int = OWN
+    functions: Functions | Callable[[], Functions]  #: how it is followed, or a callable for these
+    columns: int = 0  #: length of a row; by default one number per parameter
+    states: int = OWN  #: length of a state; by default strain, stress and branch
+    #: branches by their number, the first at rest: name and what the spring does on it
     branches: Mapping[str, str] = field(default_factory=lambda: {"line": "the law"})
-    title: str = ""
-    hysteretic: bool = True
+    title: str = ""  #: the spring in words, "bistable spring"
+    hysteretic: bool = True  #: whether it has a loop, and may relax
+    #: makes the spring of own parameters, eta, and relaxation=; by default `register` gives one
     spring: Callable[..., Any] | None = None
+    #: order of the coordinates of the search; by default those last that are relative to others
     searched: tuple[str, ...] = ()
+    #: read_off(loop, marks, scales, way): own parameters and eta, read off a measured loop where
+    #: `marks` (n,) in [0, 1] place them; without one, start values are random
     read_off: Callable[[Loop, Array, Any, int], Array] | None = None
+    #: the same for one of several springs: (loop, marks, share of the height)
     read_in_series: Callable[[Loop, Array, float], Array] | None = None
-    marks: int = 5
-    ways: int = 1
+    marks: int = 5  #: number of marks
+    ways: int = 1  #: number of ways to read a loop
+    #: stress at which the spring starts to snap, of its own parameters, by which exchangeable
+    #: springs are ordered; by default the first parameter
     onset: Callable[..., float] | None = None
-    scanned: str = ""
-    strata: str = ""
+    scanned: str = ""  #: a parameter along which the cost may have several minima
+    strata: str = ""  #: one over whose range the points from which the search descends are spread
+    #: neighbours(values, largest stress): own parameters of springs with nearly the same loop, from
+    #: which the search begins again
     neighbours: Callable[[Array, float], Iterator[Array]] = _no_neighbours
+    #: (values, height) to stresses and elongations, and back: what springs in series exchange
     exchanged: tuple[Callable[[Array, float], Array], Callable[[Array, float], Array]] | None = None
-    points: tuple[PointOf, ...] = ()
-    compared: tuple[Compared, ...] = ()
-    note: str = ""
-    inner_loops: bool = True
-    remembers: bool = True
-    published: bool = False
-    numbered: tuple[str, ...] = ()
+    points: tuple[PointOf, ...] = ()  #: what the report lists beside the parameters
+    compared: tuple[Compared, ...] = ()  #: what a comparison shows
+    note: str = ""  #: what the report says about the marks of the figure
+    inner_loops: bool = True  #: whether partial unloading leaves the branch
+    remembers: bool = True  #: whether the spring remembers more than its branch
+    published: bool = False  #: whether the paper publishes parameters of it
+    numbered: tuple[str, ...] = ()  #: names of branches by numbers, if not those of `branches`
+    #: options of a fit that free more parameters: the law with them
     options: Mapping[tuple[str, ...], str] = field(default_factory=dict)
-    word: str = ""
+    word: str = ""  #: the word of a model's name, where it is not `kind`
+    #: places of derivatives by parameters, where these are not in the order of `params`
     places: Mapping[str, int] = field(default_factory=dict)
 
     @cached_property
@@ -311,13 +221,7 @@ class Law:
         return tuple(branch for branch in self.branches if branch in shown)
 
     def make(self, values: Sequence[float], relaxation: Sequence[tuple[float, float]]) -> Any:
-        """Make the spring of its own parameters and eta.
-
-        Raises
-        ------
-        InputError
-            If they are not admissible, or the law is not registered yet.
-        """
+        """Make the spring of its own parameters and eta; refuses what is not admissible."""
         if self.spring is None:
             raise InputError(f"law '{self.kind}' is not known yet: register it first")
         return self.spring(*values, **({"relaxation": relaxation} if self.hysteretic else {}))
@@ -366,8 +270,10 @@ STRENGTH = Param(
     "g", ("g", ""), "", "strength of a relaxation term", (0.2, "one"), (0.0, 10.0), "one",
     "value", inner=(0.0, 1.0), least_size=0.1, admissible="zero or positive", example="0.5",
 )  # fmt: skip
+# The least time is about that of a sample, of which a record has 1500 at most: what relaxes faster
+# acts as a dashpot, and explicit steps would have to follow it.
 RELAXATION_TIME = Param(
-    "tau", ("τ", ""), "s", "time of a relaxation term", (0.05, "duration"), (1e-4, 30.0),
+    "tau", ("τ", ""), "s", "time of a relaxation term", (0.05, "duration"), (1e-3, 30.0),
     "duration", inner=(math.log(0.002), math.log(1.0)), example="0.2 s",
 )  # fmt: skip
 HEIGHT = Param(

@@ -40,8 +40,8 @@ def functions_of(kind: str) -> Callable[[], Functions]:
 def steeper(values: Array, kc: int, start: int, top: float, low: float) -> Iterator[Array]:
     """Give springs with another k_c whose branch c has the same strain at the largest stress.
 
-    A steep branch c shows in few samples: where k_c alone changes, it misses them altogether. `kc`
-    and `start` are the places of k_c and of the strain where branch c begins, at the stress `low`.
+    A search that moves k_c alone misses a steep branch c. `kc` and `start` are the places of k_c
+    and of the strain where branch c begins, at the stress `low`.
     """
     for other in top * STEEP:
         moved = values.copy()

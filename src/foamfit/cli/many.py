@@ -1,4 +1,4 @@
-"""`foamfit batch`: every test on its own, in parallel, resumable."""
+"""`foamfit batch` and `joint`: many tests, each on its own or in one fit."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from foamfit.terminal import say
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from foamfit.study.batch import State
+    from foamfit.study.batch import Batch
 
 PATIENCE = 10  # s in which a scheduler must answer
 
@@ -70,7 +70,7 @@ def batch(
     if jobs is not None and scheduler is not None:
         raise InputError("--jobs and --scheduler exclude each other; leave one of them out")
     output.check()
-    search, (alone, several) = keywords_of(asked), cycles_of(asked["cycle"])
+    search, cycles = keywords_of(asked), cycles_of(asked)
     from foamfit.study import processes
 
     if scheduler is None:
@@ -79,15 +79,10 @@ def batch(
     from foamfit.study.batch import run
     from foamfit.study.batch_work import Recipe
 
-    cycles = alone if several is None else several
-    if asked["cycles"] is not None and asked["cycle"] is not None:
-        raise InputError("give either --cycle or --cycles, not both")
     recipe = Recipe(
         model=asked["model"],
-        options={},
+        options=search,
         cycles=cycles,
-        fix=asked["fix"] or None,
-        vary=asked["vary"],
         pages=not output.no_report,
         width=output.figure_width,
         history=asked["cycles"],
@@ -100,12 +95,13 @@ def batch(
         progress_line(output.silent, "batch") as line,
     ):
 
-        def tell(state: State) -> None:
-            what = f"{state.done} done, {state.wrong} without a fit, {state.left} left"
-            line.progress(state.fitted / max(state.fitted + state.left, 1), what)
+        def tell(made: Batch) -> None:
+            done, left = len(made.rows), len(made.tests) - len(made.rows)
+            told = f"{done} done, {made.wrong} without a fit, {left} left"
+            line.progress(made.fitted / max(made.fitted + left, 1), told)
 
-        search |= {"out": output.out, "executor": executor, "jobs": jobs, "progress": tell}
-        found = run(tests, recipe, fresh=fresh, specimen=specimen, **search)
+        where: Any = {"out": output.out, "executor": executor, "jobs": jobs, "progress": tell}
+        found = run(tests, recipe, fresh=fresh, specimen=specimen, **where)
     rows = found.summary
 
     def content() -> list[dict[str, Any]]:
@@ -145,3 +141,65 @@ def _cluster(address: str) -> Iterator[Executor]:
         if not client.scheduler_info()["workers"]:
             say("foamfit: the scheduler has no worker yet, the tests wait for one", err=True)
         yield client.get_executor(pure=False)
+
+
+@main.command()
+@click.argument("study", metavar="STUDY.toml", type=options.FILE)
+@options.option("--jobs", "Processes. Default: one for each core.", options.COUNT)
+@options.option(
+    "--seed", "The same tests and seed give the same numbers. Default: 0.", options.WHOLE
+)
+@options.output("fits/<STUDY>", "joint.json")
+def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> int:
+    """Fit the tests of STUDY.toml together: shared, own, scattering, rate-dependent parameters.
+
+    Writes joint.json, joint.html, pictures, table.tex and a result folder for each test. Exit codes
+    are those of foamfit fit; a test that cannot be read is left out with a warning.
+
+    \b
+    STUDY.toml, for example:
+        name = "shoe foam, new heel"
+        tests = ["new-heel-comp-*_raw.txt"]     # files, folders, globs, relative to this file
+        specimen = "heel.toml"                  # of all tests; default: the TOML beside each
+        model = "microscale"
+        relaxation = 1
+        drive = "displacement"                  # default: what each test allows
+        [parameters]                            # what is not named is "own"
+        s1_k0 = "shared"                        # one value for all tests
+        s1_kc = "own"                           # one value for each
+        s1_sigma_plus = "scatter"               # one for each, log-normal about a common value
+        s1_sigma_minus = "log rate"             # v (1 + b ln(rate/rate0)), rate0 of the median test
+        s1_tau1 = "power rate"                  # v (rate/rate0)^b
+        s1_g1 = "auto"                          # shared, own or a law of rate, by evidence
+        s1_eps_star = 0.3                       # held at a number (SI)
+    Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
+    """
+    output.check(without_report=False)
+    folder = output.folder(Path("fits", study.stem), [study])
+    from foamfit.study.study_file import read_study
+
+    read = read_study(study)
+    output.folder(folder, [path for _, path in read.tests])
+    with options.compiling(output.silent, read.model, read.relaxation) as compile_rest:
+        from foamfit.report.studies.joint import joint_text
+        from foamfit.study.joint import joint as fit_jointly
+        from foamfit.study.joint_result import FEW_FOLDERS
+        from foamfit.study.processes import begin
+
+        compile_rest()
+        if not output.no_report:
+            begin(jobs, len(read.tests), FEW_FOLDERS)
+        with progress_line(output.silent, "joint fit") as line:
+            found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
+        output.finish(
+            found.save,
+            folder / "joint.html",
+            found.to_json_dict,
+            lambda: joint_text(found),
+            jobs=jobs,
+            figure_width=output.figure_width,
+        )
+    if found.status != "failed":
+        return 0
+    say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
+    return NOT_ACCEPTABLE

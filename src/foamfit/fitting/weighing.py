@@ -1,0 +1,37 @@
+"""Weights of residuals where the motion that drives is itself uncertain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from foamfit.arrays import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Weighing:
+    """What turns residuals of covariance v + SSᵀ into residuals of covariance v.
+
+    v is diagonal, the noise of each sample; the columns of S are what one standard deviation along
+    each mode of the motion does to the residual. With S' = S/√v = U d Vᵀ the residual r becomes
+    √v (1 + S'S'ᵀ)^(-1/2) r/√v. `levels` (n,) are √v, `axes` (n, m) is U, and `less` (m,) is
+    1 - (1 + d²)^(-1/2).
+    """
+
+    levels: Array
+    axes: Array
+    less: Array
+
+    @classmethod
+    def of(cls, uncertain: Array, levels: Array) -> Weighing:
+        """Make it from S (n, m) and √v (n,)."""
+        axes, size, _ = np.linalg.svd(uncertain / levels[:, None], full_matrices=False)
+        return cls(levels, axes, 1.0 - 1.0 / np.sqrt(1.0 + size**2))
+
+    def __call__(self, rows: Array) -> Array:
+        """Weigh residuals (n,), or columns of their derivatives (n, k)."""
+        levels, less = self.levels, self.less
+        if rows.ndim == 2:
+            levels, less = levels[:, None], less[:, None]
+        return np.asarray(rows - levels * (self.axes @ (less * (self.axes.T @ (rows / levels)))))
