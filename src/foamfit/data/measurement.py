@@ -41,6 +41,9 @@ class Specimen:
     heights: tuple[float, ...] | None = None
 
 
+GRAVITY = 9.80665  # standard gravity, m/s²
+
+
 @dataclass(frozen=True)
 class Striker:
     """Mass, kg, and velocity at contact, m/s, of the striker; either may be unknown.

@@ -128,7 +128,7 @@ def _spikes(values: Array, least: float, time: Array, weights: Array) -> Mask:
 def _weights(time: Array, even: bool) -> Array:
     """Weights (windows, samples) of "sample minus local cubic", one window if all are the same.
 
-    They are zero across a pause, and where the middle sample alone holds the cubic.
+    They are zero where the window spans a pause, or where only its middle sample fixes the cubic.
     """
     windows = _windows(time)[: 1 if even else None]
     weights = np.empty(windows.shape)

@@ -1,7 +1,7 @@
 """From the samples of a file to one loading and unloading, with time zero where contact starts.
 
-`condition` holds the steps in their order. Each returns a new `Record`, with a note on each thing
-that was changed or left out.
+`condition` runs the steps in order. Each step returns a new `Record` with a note on everything that
+it has changed or left out.
 """
 
 from __future__ import annotations

@@ -20,9 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from scipy.constants import g as standard_gravity
-
-from foamfit.data.measurement import Noise, Specimen, Striker, Window, interior_node
+from foamfit.data.measurement import GRAVITY, Noise, Specimen, Striker, Window, interior_node
 from foamfit.data.units import (
     is_unit,
     parse_quantity,
@@ -47,7 +45,7 @@ class _Quantity(NamedTuple):
 
 
 class _Other(NamedTuple):
-    """What a key that is no quantity may be, and how that is told."""
+    """Which values a key without a unit may have, and how a message states them."""
 
     valid: Callable[[Any], bool]
     right: str
@@ -245,7 +243,7 @@ def _value(section: str, key: str, value: Any, spreads: dict[str, float]) -> Any
 
 def _striker(values: dict[str, Any]) -> Striker | None:
     if "gravity" in values:
-        values["gravity"] = standard_gravity if values["gravity"] else 0.0
+        values["gravity"] = GRAVITY if values["gravity"] else 0.0
     return Striker(**values) if values else None
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.constants import g as gravity
 
 from foamfit.arrays import Array
 from foamfit.data.contact import ELSEWHERE, Levels, Start
-from foamfit.data.measurement import NoiseLevel, Record, Striker
+from foamfit.data.measurement import GRAVITY, NoiseLevel, Record, Striker
 from foamfit.data.noise import MIN_REST, NOTHING, Level, level_on_line, line_at, mean_level, smooth
 from foamfit.text import engineering, percent
 
@@ -213,20 +212,19 @@ def flight_of(
 ) -> tuple[Striker, list[str]]:
     """Compare the striker's flight with its velocity ± `spread`, m/s, and find whether it falls.
 
-    Returns the striker, with the gravity that its flight shows where the TOML does not say it, and
-    what to tell.
+    Returns the striker, with gravity from its flight if the TOML does not state it, and the notes.
     """
     n, w, given, notes = start.first - 2, record.displacement, striker.velocity, list[str]()
     if not given:
         return striker, notes
-    gain = percent(share := gravity * float(record.instants[span.end - 1] - start.time) / given)
+    gain = percent(share := GRAVITY * float(record.instants[span.end - 1] - start.time) / given)
     if w is not None and n >= 8:
         noise, t = levels["displacement"], record.instants[:n] - start.time
         (half, speed, _), variance = np.polyfit(t, w[:n], 2, cov="unscaled")
         sigma = noise.sigma * float(np.sqrt(noise.time))
         shown, error = 2.0 * float(half), 2.0 * sigma * float(np.sqrt(variance[0, 0]))
-        none = start.gauge == "flight" and 4.0 * error < gravity
-        if falls := shown > 4.0 * error and abs(shown - gravity) < 0.2 * gravity + 2.0 * error:
+        none = start.gauge == "flight" and 4.0 * error < GRAVITY
+        if falls := shown > 4.0 * error and abs(shown - GRAVITY) < 0.2 * GRAVITY + 2.0 * error:
             error = sigma * float(np.sqrt(variance[1, 1]))
             told = (
                 f"before contact the striker accelerates by {engineering(shown, 'm/s²')}: it "
@@ -239,7 +237,7 @@ def flight_of(
         else:
             speed, error = level_on_line(t, w[:n], 0.0, noise)[1][:2]
         if striker.gravity is None and (falls or none):
-            striker = replace(striker, gravity=gravity if falls else 0.0)
+            striker = replace(striker, gravity=GRAVITY if falls else 0.0)
         off, error = abs(speed - given), float(np.hypot(error, spread))
         if off > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
             notes.append(

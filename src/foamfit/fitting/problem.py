@@ -117,7 +117,7 @@ def fix_and_vary(
 def check_fixed_and_varied(
     names: Iterable[str], model: str, fix: Mapping[str, float], vary: Iterable[str]
 ) -> None:
-    """Refuse what is none of these parameters, or both fixed and varied (InputError)."""
+    """Refuse an unknown parameter, or one that is both fixed and varied (InputError)."""
     for name in (*fix, *vary):
         if name not in names:
             raise InputError(

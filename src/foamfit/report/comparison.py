@@ -178,7 +178,7 @@ class Side:
     def evaluate(
         self, names: Sequence[str], formula: Callable[..., Any]
     ) -> ParameterEstimate | None:
-        """Return a function of parameters with its error; None where there is none."""
+        """Return a function of parameters with its error; None if a parameter is missing."""
         if not names or any(name not in self.estimates for name in names):
             return None
         try:

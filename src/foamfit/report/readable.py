@@ -67,7 +67,7 @@ class Readable:
         return f"{self.value} ± {self.stderr}" if self.stderr else self.value
 
     def with_unit(self, told: str) -> str:
-        """Append the unit to a number of this parameter, unless there is none."""
+        """Append the unit to a number of this parameter, if it has one."""
         return f"{told} {self.unit}".removesuffix(" –") if told else ""
 
     @property

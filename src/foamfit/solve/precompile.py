@@ -121,7 +121,7 @@ def at_first_use(
     """Compile beside the body what the fit of a model needs and is not in the cache.
 
     The body calls what is given before it simulates; `tell` is called if there is anything to do.
-    Left out, the log says so, and what this process has compiled is known.
+    Without `tell` the log says so, and loops that this process has compiled count as done.
     """
     from foamfit.solve.explicit.taylor import integrate
     from foamfit.solve.relaxation import relaxed_along

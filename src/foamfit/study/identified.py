@@ -168,7 +168,7 @@ def _file(path: Path) -> Path:
     if (path / "joint.json").is_file():
         return path / "joint.json"
     if not (path / "fit.json").is_file() and (path / "cycles.json").is_file():
-        raise InputError(f"{path} holds the fits of several cycles; name one, as {path}/cycle-1")
+        raise InputError(f"{path} contains fits of several cycles; name one, as {path}/cycle-1")
     return path / "fit.json"
 
 
@@ -283,8 +283,8 @@ def _misses(tests: list[Mapping[str, Any]]) -> dict[str, list[Miss]]:
     return found
 
 
-# Own parameters follow the rate if that lowers BIC by so much, in so many tests or more whose
-# logarithms of the rate have a larger standard deviation than this.
+# Own parameters follow the rate if this lowers BIC by at least the first number, there are at least
+# as many tests as the second, and ln(rate) scatters by more than the third.
 EVIDENCE, FEWEST_OF_TREND, SAME_RATE = 2.0, 5, 0.05
 
 

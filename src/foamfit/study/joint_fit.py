@@ -32,8 +32,8 @@ from foamfit.trust.scatter import Spread, common_and_spread, correlation
 # Rounds between the best values and the spreads at most, and the change of the logarithm of a
 # spread at which they end.
 ROUNDS, STILL = 12, 0.01
-# Least spread by which tests are drawn, over the errors of a single test: with none the values of
-# all tests would be one, and would not tell what they are undrawn.
+# Least spread of a scattering parameter, over the error of a single test: with zero spread all
+# tests would have one value, and their own values would stay unknown.
 LEAST_SPREAD = 0.3
 # Tests say nothing of a parameter whose logarithm has a larger error than this (a factor of 150).
 SAYS_NOTHING = 5.0

@@ -150,8 +150,8 @@ class Loops(NamedTuple):
 
     start(i, row, state, 0) brings it to rest. step(i, springs, strain, h) takes it to a strain
     within the time h (s; 0 at once), its stress taken for linear in time by the relaxation terms,
-    and returns the whole stress, Pa; to_stress(i, springs, stress, h) is the inverse; both NaN
-    where there is none. delayed(i, row, state, (rate, h)) is what depends on time, Pa.
+    and returns the whole stress, Pa; to_stress(i, springs, stress, h) is the inverse; both return
+    NaN without a solution. delayed(i, row, state, (rate, h)) is the stress that depends on time.
     """
 
     start: Compiled
