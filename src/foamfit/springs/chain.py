@@ -50,7 +50,8 @@ class ChainArrays(NamedTuple):
 
     rows (n_springs, columns) are the springs, all with room for as many relaxation terms as the one
     with the most has; heights (m) and masses (kg) are (n_springs,), top (1,) is the number of
-    springs; `heavy` tells whether there are masses inside, `damped` dashpots.
+    springs; `heavy` tells whether there are masses inside, `damped` dashpots. `stiffness` is
+    Σ h k_c, J/m²; of laws of a file it is NaN.
     """
 
     rows: Array
@@ -59,6 +60,7 @@ class ChainArrays(NamedTuple):
     top: NDArray[np.int64]
     heavy: bool
     damped: bool
+    stiffness: float
 
 
 @dataclass(frozen=True, init=False)
@@ -156,6 +158,8 @@ class Chain:
     @cached_property
     def arrays(self) -> ChainArrays:
         """The chain as the kernels know it."""
+        from foamfit.springs.kernels import KC
+
         room = max(self.relaxation)
         if self.is_registered:
             own = [
@@ -163,13 +167,15 @@ class Chain:
             ]
         else:
             own = [one.solver_row(room) for one in self.springs]
+        rows, heights = padded(own), np.array(self.heights)
         return ChainArrays(
-            rows=padded(own),
-            heights=np.array(self.heights),
+            rows=rows,
+            heights=heights,
             masses=np.array(self.masses),
             top=np.array([len(self.springs)]),
             heavy=any(mass > 0.0 for mass in self.masses[:-1]),
             damped=any(spring.eta > 0.0 for spring in self.springs),
+            stiffness=math.nan if self.is_registered else float(heights @ rows[:, KC]),
         )
 
 

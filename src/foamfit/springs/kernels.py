@@ -333,7 +333,10 @@ def tangent_along(row: Row, eps: Array, branches: Branches) -> Array:
 @compiled
 def fault(t: Array) -> int:
     """First sample that is not finite, or not later than the one before it; -1 if there is none."""
-    for j in range(t.size):
+    rises = math.isfinite(t[0]) and math.isfinite(t[-1])
+    for j in range(1, t.size):  # without a branch, several samples are compared at once
+        rises &= t[j] > t[j - 1]
+    for j in range(t.size if not rises else 0):
         if not math.isfinite(t[j]) or (j > 0 and t[j] <= t[j - 1]):
             return j
     return -1

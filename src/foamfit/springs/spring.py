@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from foamfit.springs.kernels import Row
     from foamfit.springs.laws.record import Law
 
+FLOAT = np.dtype(np.float64)
 Relaxation = Sequence[tuple[float, float]]  # frozen to a tuple of tuples
 
 
@@ -41,8 +42,9 @@ def as_number(value: object, name: str) -> float:
 def as_samples(values: ArrayLike, name: str) -> Array:
     """Return real numbers as a new array of floats, contiguous and writable."""
     try:
-        if np.asarray(values).dtype.kind in "biuf":
-            return np.array(values, dtype=np.float64, order="C")
+        given = np.asarray(values)
+        if given.dtype.kind in "biuf":
+            return given.copy() if given.dtype is FLOAT else given.astype(FLOAT, order="C")
     except (TypeError, ValueError):  # rows of several lengths
         pass
     raise InputError(f"{name} must be an array of numbers")
