@@ -16,7 +16,7 @@ HERE = Path(__file__).parent
 PICTURES = HERE / "pictures"
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # Width and height of a window of which the upper part is seen.
-WINDOW = {"width": 1200, "height": 760}
+WINDOW = {"width": 1200, "height": 850}
 
 
 def tell(name: str) -> None:
