@@ -15,6 +15,8 @@ from foamfit.arrays import Array
 # Steps in a row after which the Jacobian is only updated, and how far the gain of such a step may
 # be from the expected one, as a share of it.
 UPDATES, PREDICTED = 6, 0.5
+# Damping of the first step of what follows a move; more, until it lowers the cost.
+FOLLOWING = (1e-9, 1e-6, 1e-3, 0.1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +98,16 @@ def damped_step(gradient: Array, normal: Array, damping: float, held: NDArray[np
         scale = np.maximum(np.diag(own), 1e-12 * max(float(np.trace(own)), 1e-300))
         step[moving] = np.linalg.solve(own + damping * np.diag(scale), -gradient[moving])
     return step
+
+
+def following(at: Iterate, shift: Array, held: NDArray[np.bool_]) -> list[Array]:
+    """Steps that move what is `held` by a shift, alone and with all else following to first order.
+
+    Where the data hardly fix what follows, the whole step may lead far off: each is damped more
+    than the one before it.
+    """
+    ahead = at.gradient + at.normal @ shift
+    return [shift, *(shift + damped_step(ahead, at.normal, one, held) for one in FOLLOWING)]
 
 
 def descend(

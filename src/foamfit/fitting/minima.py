@@ -13,11 +13,12 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.fitting.box import Space
+from foamfit.fitting.levenberg import Iterate, following
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.search import MISSING, Tracker, descend, has_several, rank
+from foamfit.fitting.search import MISSING, Tracker, descend, has_several, rank, squares
 from foamfit.springs.laws.record import Law
 from foamfit.springs.model import exchanges
-from foamfit.springs.parameters import NUISANCE, relaxation_names, split_name
+from foamfit.springs.parameters import relaxation_names, split_name
 
 # Most minima whose springs exchange properties, and most descents from each but the best.
 EXCHANGES, EXCHANGED = 8, 16
@@ -27,16 +28,17 @@ DETOUR = 0.5
 # Ends of the search whose cost is above the best by less than so many variances of the noise are
 # settled anew, at most so many; points of the box closer than the last are one minimum.
 NEAR, MINIMA, SAME = 40.0, 24, 0.02
-# Steps of a scan: share of the box, the most to
-# each side, and the rise of the cost, in variances of what is left of the curves, at which it ends.
-STEP, STEPS, TOO_HIGH = 0.06, 12, 150.0
+# Steps of a scan: the first and the least as a share of the box, and the most to each side. Rise of
+# the cost, in variances of what is left of the curves, above which a step is halved; its change
+# below which the next one is doubled.
+STEP, SHORTEST, STEPS, TOO_HIGH, FLAT = 0.04, 0.015, 12, 300.0, 4.0
 
 
 def scan_places(tracker: Tracker, space: Space) -> bool:
     """Descend from points whose ε_a or ε_* is moved step by step; say whether one is better.
 
-    At each step the other parameters of the springs follow, then all are free. Springs in series
-    are left to `exchange_springs`.
+    At each step the other parameters follow, then all are free. Springs in series are left to
+    `exchange_springs`.
     """
     if tracker.best_values is None or has_several(space.model):
         return False
@@ -44,29 +46,39 @@ def scan_places(tracker: Tracker, space: Space) -> bool:
     left = max(cost, tracker.objective.floor) / tracker.objective.n_data
     scanned = {law.scanned for law in space.model.laws}
     for column, one in enumerate(space.coordinates):
-        if one.short not in scanned:
-            continue
-        held = {space.names[one.place], *NUISANCE}
-        free = tuple(name for name in space.free if name not in held)
-        for step in (STEP, -STEP):
-            at, values = space.encode(best)[column], best
+        for sign in (1.0, -1.0) if one.short in scanned else ():
+            values, step, before = best, sign * STEP, cost
             for _ in range(STEPS):
-                at += step * (space.box[1] - space.box[0])[column]
-                if not space.box[0][column] < at < space.box[1][column]:
+                point = _moved(tracker, space, space.encode(values), column, step)
+                if point is None:
                     break
-                point = space.encode(values)
-                point[column] = at
-                values = space.decode(point)
-                fixed = replace(space, values=values, free=free)
-                rise, point = descend(tracker, fixed, fixed.encode(values), 30, enough=1e-4)
-                if rise > cost + TOO_HIGH * left:
-                    break
-                values = fixed.decode(point)
+                free = tuple(name for name in space.free if name != space.names[one.place])
+                fixed = replace(space, values=space.decode(point), free=free)
+                now, point = descend(tracker, fixed, fixed.encode(fixed.values), 30, enough=1e-4)
+                if now > cost + TOO_HIGH * left:
+                    step *= 0.5
+                    if abs(step) < SHORTEST:
+                        break
+                    continue
+                step *= 2.0 if abs(now - before) < FLAT * left else 1.0
+                values, before = fixed.decode(point), now
                 end = descend(tracker, space, space.encode(values), 60)[1]
                 if not _among(met, end):
                     met.append(end)
                     tracker.ends.append(space.decode(end))
     return tracker.best_cost < cost
+
+
+def _moved(tracker: Tracker, space: Space, point: Array, column: int, share: float) -> Array | None:
+    """Move one coordinate by a share of the box, the others following; None beyond the box."""
+    (low, high), (residual, jacobian) = space.box, squares(tracker, space)
+    held = np.arange(point.size) == column
+    shift = np.where(held, share * (high - low), 0.0)
+    if not low[column] < (point + shift)[column] < high[column]:
+        return None
+    at = Iterate(point, residual(point), jacobian(point))
+    steps = following(at, shift, held)
+    return rank(tracker, space, [np.clip(point + step, low, high) for step in steps])[0][1]
 
 
 def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
