@@ -28,9 +28,10 @@ DETOUR = 0.5
 # Ends of the search whose cost is above the best by less than so many variances of the noise are
 # settled anew, at most so many; points of the box closer than the last are one minimum.
 NEAR, MINIMA, SAME = 40.0, 24, 0.02
-# Steps of a scan: the first and the least as a share of the box, and the most to each side. Rise of
-# the cost, in variances of what is left of the curves, above which a step is halved; its change
-# below which the next one is doubled.
+# Steps of a scan: the first and the least as a share of the box, and the most to each side, half as
+# many where the curves miss more than noise: minima so near are equally good there. Rise of the
+# cost, in variances of what is left of the curves, above which a step is halved; its change below
+# which the next one is doubled.
 STEP, SHORTEST, STEPS, TOO_HIGH, FLAT = 0.04, 0.015, 12, 300.0, 4.0
 
 
@@ -48,7 +49,7 @@ def scan_places(tracker: Tracker, space: Space) -> bool:
     for column, one in enumerate(space.coordinates):
         for sign in (1.0, -1.0) if one.short in scanned else ():
             values, step, before = best, sign * STEP, cost
-            for _ in range(STEPS):
+            for _ in range(STEPS if cost <= tracker.objective.floor else STEPS // 2):
                 point = _moved(tracker, space, space.encode(values), column, step)
                 if point is None:
                     break
