@@ -213,7 +213,7 @@ def test_a_shift_without_two_channels_in_time_is_refused(changed, missing):
 def test_the_command_fits_a_shift_and_refuses_it_without_time(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     test = fabricated_csv(tmp_path)
-    monkeypatch.setattr("foamfit.report.folder.save_result", lambda *_, **__: None)
+    monkeypatch.setattr("foamfit.api.FitResult.save", lambda *_, **__: None)
     call = ["fit", str(test), "--starts", "4", "--json", "--time-shift"]
     out = CliRunner().invoke(main, call)
     assert out.exit_code == 0

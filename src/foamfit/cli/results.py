@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -124,13 +125,8 @@ def predict(
 
         compile_rest()
         found = study.predict(result, measurement, **asked)
-        output.finish(
-            found.save,
-            folder / "prediction.png",
-            found.to_json_dict,
-            lambda: prediction_text(found),
-            figure_width=output.figure_width,
-        )
+        page, text = folder / "prediction.png", partial(prediction_text, found)
+        output.finish(found.save, page, found.to_json_dict, text)
 
 
 @main.command()

@@ -10,13 +10,12 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from uncertainties import correlated_values_norm
-from uncertainties.core import AffineScalarFunc
+from uncertainties import correlated_values_norm, nominal_value, std_dev
 
 from foamfit.codec import build, reading
 from foamfit.errors import InputError
@@ -32,7 +31,7 @@ from foamfit.springs.laws.record import ETA, RELAXATION_TIME, STRENGTH, Compared
 from foamfit.springs.model import Model
 from foamfit.springs.published import PublishedSet
 from foamfit.springs.published import published as published_sets
-from foamfit.text import signed, significant
+from foamfit.text import significant
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,7 +42,7 @@ _GIVEN: dict[str, Any] = dict.fromkeys(
     ("drive", "status", "stopped", "data_sha256", "correlation")
 )  # which a published set lacks, or an older fit.json
 NOTHING = 3.0  # standard error over value beyond which a difference is meaningless
-WORST_FIRST = ("not determined", "weak", "determined", "fixed")
+WORST_FIRST = ("not determined", "weak", "determined", "fixed", "published")
 VAGUE = "its standard error is many times its value, so the test does not determine it"
 
 
@@ -98,11 +97,8 @@ class Row:
 class Pair:
     """One result beside its reference."""
 
-    test: str
-    model: str
-    drive: str
-    status: str
-    reference: str
+    side: Side
+    other: Side
     rows: tuple[Row, ...]
     remarks: tuple[str, ...]
 
@@ -165,15 +161,25 @@ class Side:
     label: str
     model: Model
     estimates: Mapping[str, ParameterEstimate]
-    numbers: Mapping[str, Any]  # the values with their errors, correlated
-    given: Mapping[str, Any]  # content of fit.json
+    numbers: Mapping[str, Any] = field(compare=False)  # the values with their errors, correlated
+    given: Mapping[str, Any] = field(compare=False)  # content of fit.json
     source: PublishedSet | None = None
+
+    @property
+    def law(self) -> str:
+        """The model and its relaxation in words."""
+        return law_in_words(self.model.name, self.model.relaxation)
+
+    @property
+    def families(self) -> list[str]:
+        """The kinds of the springs, of which all without hysteresis are "linear"."""
+        return [one.kind if one.hysteretic else "linear" for one in self.model.laws]
 
     @property
     def unpublished(self) -> str:
         """The first kind of spring that has no published parameters, or ""."""
-        laws = map(law, self.model.kinds)
-        return next((one.kind for one in laws if one.hysteretic and not one.published), "")
+        kinds = (one.kind for one in self.model.laws if one.hysteretic and not one.published)
+        return next(kinds, "")
 
     def evaluate(
         self, names: Sequence[str], formula: Callable[..., Any]
@@ -185,14 +191,10 @@ class Side:
             found = formula(*(self.numbers[name] for name in names))
         except (ZeroDivisionError, ValueError):
             return None
-        rank = {state: i for i, state in enumerate(WORST_FIRST)}
         parts = (self.estimates[name] for name in names)
-        worst = min(parts, key=lambda part: rank.get(part.state, len(rank)))
-        value, error = found, 0.0
-        if isinstance(found, AffineScalarFunc):
-            value, error = found.nominal_value, found.std_dev
-        error = 0.0 if worst.state == "not determined" else error
-        return replace(worst, value=float(value), stderr=error or None)
+        worst = min(parts, key=lambda part: WORST_FIRST.index(part.state))
+        error = 0.0 if worst.state == "not determined" else std_dev(found)
+        return replace(worst, value=float(nominal_value(found)), stderr=error or None)
 
 
 def side_of(result: Result) -> Side:
@@ -207,8 +209,7 @@ def side_of(result: Result) -> Side:
         estimates = {n: build(ParameterEstimate, p, {}) for n, p in given["parameters"].items()}
         known = given.get("correlation") or {"names": (), "matrix": ()}
         numbers = _with_errors(estimates, known["names"], known["matrix"])
-        told = law_in_words(model.name, model.relaxation)
-        label = f"{about[0]}: {told}, {about[1]} drive"
+        label = f"{about[0]}: {law_in_words(model.name, model.relaxation)}, {about[1]} drive"
         return Side(label, model, estimates, numbers, _GIVEN | dict(given))
 
 
@@ -248,23 +249,11 @@ def published_side(name: str) -> Side:
 
 
 def _pair(side: Side, other: Side) -> Pair:
-    families = [[_family(kind) for kind in one.model.kinds] for one in (side, other)]
-    unpublished = side.unpublished if other.source is not None else ""
     about: dict[str, Any] = {"side": side, "other": other}
-    differ = families[0] != families[1]
-    nothing = words("incomparable", unpublished=unpublished, differ=differ, **about)
+    nothing = words("incomparable", **about)
     rows = (*_spring_rows(side, other, nothing), *_damping_rows(side, other, nothing))
     ratios = any("/" in row.name for row in rows)
-    remarks = sentences("remarks", nothing=nothing, ratios=ratios, **about)
-    status, stopped = side.given["status"], side.given.get("stopped")
-    status = f"{status}, stopped by {stopped}" if stopped else status
-    model = law_in_words(side.model.name, side.model.relaxation)
-    drive = str(side.given["drive"])
-    return Pair(side.given["test"], model, drive, status, other.label, rows, remarks)
-
-
-def _family(kind: str) -> str:
-    return kind if law(kind).hysteretic else "linear"
+    return Pair(side, other, rows, sentences("remarks", nothing=nothing, ratios=ratios, **about))
 
 
 def _total(*parts: Any) -> Any:
@@ -303,15 +292,15 @@ def _row(
 
 
 def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
-    kinds, theirs = side.model.kinds, other.model.kinds
-    several = len(kinds) > 1
+    kinds, several = side.model.kinds, len(side.model.kinds) > 1
+    pairs = enumerate(zip(side.families, other.families, strict=False), start=1)
+    alike = {i for i, (own, theirs) in pairs if own == theirs}
     for i, kind in enumerate(kinds, start=1):
-        alike = i <= len(theirs) and _family(theirs[i - 1]) == _family(kind)
         for one in _quantities(kind, side.model.relaxation):
             eta = one.of == (ETA.name,)
             names = [f"s{i}_{part}" for part in one.of]
             value = side.evaluate(names, one.formula)
-            reference = other.evaluate(names, one.formula) if alike else None
+            reference = other.evaluate(names, one.formula) if i in alike else None
             # The damping of a single spring stands with the onsite damper.
             if value is None or (eta and not several):
                 continue
@@ -345,9 +334,8 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
     if ratio is not None:
         # ζ is η over a root, so it is known as well as η unless k_c is undetermined.
         unknown = ratio.state == "not determined" and value.state != "fixed"
-        known = replace(ratio, state=ratio.state if unknown else value.state)
-        zeta = Row(0, "ζ", "", known.value, known.stderr, known.state, None, None, damping.remark)
-        yield replace(zeta, reference=item.damping_ratio)
+        state, told = ratio.state if unknown else value.state, damping.remark
+        yield Row(0, "ζ", "", ratio.value, ratio.stderr, state, item.damping_ratio, None, told)
 
 
 # ---------------------------------------------------------------- as a text and as a figure
@@ -355,30 +343,7 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
 
 def comparison_text(comparison: Comparison) -> str:
     """Return a comparison as aligned text, at most 100 columns wide, no newline at the end."""
-    reference = "published" if comparison.with_published else "reference"
-    titles = ("parameter", "unit", "fitted", reference, "deviation", "", "state")
-    pairs = []
-    for pair in comparison.pairs:
-        whole = {remark[:-1].casefold() for remark in pair.remarks}
-        apart = dict[str, list[str]]()
-        for row in pair.rows:
-            if row.remark and row.remark.casefold() not in whole:
-                apart.setdefault(row.remark, []).append(row.label)
-        ratio = any(row.name == "ζ" for row in pair.rows)  # then a published set is beside it
-        item = published_sets[pair.reference.removeprefix("published ")] if ratio else None
-        pairs.append((pair, [titles, *map(_cells, pair.rows)], apart, item))
-    return words("comparison", pairs=pairs, with_published=comparison.with_published)
-
-
-def _cells(row: Row) -> tuple[str, ...]:
-    off = "not compared" if row.remark and row.reference is not None else None
-    values = _with_error(row.value, row.stderr), _with_error(row.reference, row.reference_stderr)
-    deviation = off or _signed(row.percent, " %"), _signed(row.standard_errors, " s.e.")
-    return (row.label, row.unit or "–", *values, *deviation, row.state)
-
-
-def _signed(value: float | None, unit: str) -> str:
-    return "" if value is None else signed(value, 0 if abs(value) >= 99.5 else 1) + unit
+    return words("comparison", comparison=comparison, with_error=_with_error)
 
 
 def _with_error(value: float | None, stderr: float | None) -> str:
@@ -402,8 +367,8 @@ def plot_comparison(
     """
     reference = "published" if comparison.with_published else "reference"
     tests = [
-        f"{pair.reference.removeprefix('published ') if reference == 'published' else pair.test}, "
-        f"{pair.drive}"
+        f"{pair.other.source.name if pair.other.source else pair.side.given['test']}, "
+        f"{pair.side.given['drive']}"
         for pair in comparison.pairs
     ]
     if len(set(tests)) < len(tests):

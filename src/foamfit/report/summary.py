@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -92,19 +91,20 @@ def _table(rows: list[Readable], *, short: bool, across: int) -> list[list[str]]
     Several parameters `across` have their values alone, with errors where two have room.
     """
     ranged = any(row.range for row in rows)
-    value = {"value": "value"} if short and ranged else {"value ± stderr": "with_error"}
-    columns = {"parameter": "label"} | value | {"unit": "unit", "95 % interval": "interval"}
-    columns |= ({"range": "range"} if ranged else {}) | {"state": "state"}
+    bare = across == 3 or (across == 1 and short and ranged)
+    columns = {"parameter": "label"}
+    columns |= {"value": "value"} if bare else {"value ± stderr": "with_error"}
+    columns |= {"unit": "unit"}
     if across == 1:
-        return [[*columns], *([getattr(row, one) for one in columns.values()] for row in rows)]
-    value = {"value ± stderr": "with_error"} if across == 2 else {"value": "value"}
-    columns = {"parameter": "label"} | value | {"unit": "unit"}
+        columns |= {"95 % interval": "interval"} | ({"range": "range"} if ranged else {})
+        columns |= {"state": "state"}
     tall = -(-len(rows) // across)
-    blocks = [[*columns] * across]
-    for row in range(tall):
-        cells = ([getattr(one, c) for c in columns.values()] for one in rows[row::tall])
-        blocks.append([*itertools.chain(*cells)])
-    return [[*block, *[""] * (len(blocks[0]) - len(block))] for block in blocks]
+    every = [
+        [getattr(one, column) for one in rows[row::tall] for column in columns.values()]
+        for row in range(tall)
+    ]
+    head = [*columns] * across
+    return [head, *([*cells, *[""] * (len(head) - len(cells))] for cells in every)]
 
 
 def _cut(line: str) -> str:
