@@ -15,7 +15,7 @@ from click.testing import CliRunner
 import fabricated
 import foamfit as ff
 import foamfit.report.figures
-import foamfit.report.page
+import foamfit.report.summary
 from conftest import AREA, HEIGHT, small_pictures, synthetic_impact, synthetic_loop
 from foamfit import one_model
 from foamfit.cli import main
@@ -24,9 +24,8 @@ from foamfit.fitting.curves import default_weights
 from foamfit.fitting.objective import Objective
 from foamfit.report.comparison import compare, comparison_text
 from foamfit.report.folder import load_result
-from foamfit.report.page import render_report
 from foamfit.report.plots import plot_fit
-from foamfit.report.summary import summary_text
+from foamfit.report.summary import render_report, summary_text
 from foamfit.springs.model import Model
 
 BISTABLE = Model.parse("bistable")

@@ -15,13 +15,16 @@ from foamfit.one_model import SEARCHED, Keywords, Options, Progress, identify, j
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
 from foamfit.report.plots import draw_panel
+from foamfit.report.readable import readable
 from foamfit.report.result_figures import Mapped
 from foamfit.report.samples import dataset
-from foamfit.report.shown import fit_shown
+from foamfit.report.shown import Shown, brief
+from foamfit.report.summary import compared
 from foamfit.report.tables import frame
 from foamfit.results import Fit
 from foamfit.solve.precompile import at_first_use
 from foamfit.springs.model import Model
+from foamfit.text import percent
 from foamfit.trust.intervals import Announce
 
 if TYPE_CHECKING:
@@ -30,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-class FitResult(Fit):
+class FitResult(Shown, Fit):
     """The result of a fit: parameters, intervals, curves and verdict."""
 
     def plot(self, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
@@ -53,12 +56,12 @@ class FitResult(Fit):
         about = {"test": self.measurement.name, "model": self.words}
         return dataset(self.draws, **about) if self.draws else None
 
-    def __repr__(self) -> str:
+    def _shown(self, *, html: bool = False) -> str:
         """Return status, model, misfit and parameters."""
-        return fit_shown(self)
-
-    def _repr_html_(self) -> str:
-        return fit_shown(self, html=True)
+        told = ", ".join(f"{name} {percent(off)}" for name, off in compared(self).items())
+        line = f"{self.law}, {self.drive} drive · status {self.status} · misfit: {told or '–'}"
+        rows = [readable(name, p) for name, p in self.parameters.items() if p.state != "fixed"]
+        return brief(self.measurement.name, line, rows, html)
 
     def save(
         self,

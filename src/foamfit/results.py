@@ -488,6 +488,7 @@ class Fit:
 
         test = self.measurement
         asked = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
+        found = ("visited", "misfit", "weights", "statistics", "noise", "energy")
         model = Model.parse(self.model)
         optional = {
             "correlation": self.correlation,
@@ -517,8 +518,7 @@ class Fit:
             "model": model.words,
             **{name: getattr(self, name) for name in ("checklist", "parameters")},
             "derived": self._derived(),
-            **{name: getattr(self, name) for name in ("visited", "misfit", "weights")},
-            **{name: getattr(self, name) for name in ("statistics", "noise", "energy")},
+            **{name: getattr(self, name) for name in found},
             "outliers": {
                 channel: {name: getattr(found, name) for name in ("at", "values", "clipped_at")}
                 for channel, found in test.outliers.items()

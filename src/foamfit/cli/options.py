@@ -123,9 +123,9 @@ class Output:
 
     def check(self, *, without_report: bool = True) -> None:
         """Refuse --open beside --json (a browser may print too), or where no page is made."""
-        given = "no-report" if self.no_report and not without_report else ""
-        given = "json" if self.as_json else given
-        if self.opening and given:
+        pageless = self.no_report and not without_report
+        if self.opening and (self.as_json or pageless):
+            given = "json" if self.as_json else "no-report"
             raise InputError(f"--open and --{given} exclude each other; leave one of them out")
 
     def folder(self, default: Path, inputs: Iterable[Path]) -> Path:

@@ -108,7 +108,11 @@ class Comparison:
     """Results beside the published sets that they belong to, or beside the first of them."""
 
     pairs: tuple[Pair, ...]
-    with_published: bool
+
+    @property
+    def reference(self) -> str:
+        """What the results stand beside, in a word."""
+        return "published" if all(pair.other.source for pair in self.pairs) else "reference"
 
 
 def compare(results: Sequence[Result], published: str | None = None) -> Comparison:
@@ -118,16 +122,13 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
     where a test names none, all are put beside the first of them. InputError if a result cannot be
     read, the set is unknown, or there is nothing to compare with.
     """
-    if published is not None:
-        published_side(published)  # refuses one that is not there
     sides = [side_of(result) for result in results]
     if not sides:
         raise InputError("nothing to compare; give at least one result folder")
     belongs = [published or (None if s.unpublished else recognised(s.given["test"])) for s in sides]
     found = [published_side(name) for name in belongs if name is not None]
     if len(found) == len(sides):
-        pairs = zip(sides, found, strict=True)
-        return Comparison(tuple(_pair(one, other) for one, other in pairs), with_published=True)
+        return Comparison(tuple(map(_pair, sides, found)))
     if len(sides) == 1:
         kind, test = sides[0].unpublished, sides[0].given["test"]
         raise InputError(
@@ -136,7 +137,7 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
             else f"the test '{test}' names no published set; choose one by --published "
             f"({', '.join(published_sets)}), or give a second result"
         )
-    return Comparison(tuple(_pair(side, sides[0]) for side in sides[1:]), with_published=False)
+    return Comparison(tuple(_pair(side, sides[0]) for side in sides[1:]))
 
 
 def recognised(test: str) -> str | None:
@@ -365,11 +366,10 @@ def plot_comparison(
     What is neither compared nor lost (`Row.lost`) is left out. For `path` and `width` see
     `plots.plot_fit`.
     """
-    reference = "published" if comparison.with_published else "reference"
+    sources = [pair.other.source for pair in comparison.pairs]
     tests = [
-        f"{pair.other.source.name if pair.other.source else pair.side.given['test']}, "
-        f"{pair.side.given['drive']}"
-        for pair in comparison.pairs
+        f"{pair.side.given['test'] if source is None else source.name}, {pair.side.given['drive']}"
+        for source, pair in zip(sources, comparison.pairs, strict=True)
     ]
     if len(set(tests)) < len(tests):
         tests = [f"{i}: {name}" for i, name in enumerate(tests, start=1)]
@@ -380,8 +380,8 @@ def plot_comparison(
                 one = found.setdefault(row.label, Panel(row.label, _math(row.label), {}, {}))
                 one.tests[test] = _estimate(row.value, row.stderr, row.unit, row.state)
                 theirs = row.reference or 0.0, row.reference_stderr
-                one.references[test] = _estimate(*theirs, row.unit, reference)
-    title = f"fitted parameters beside {reference} ones"
+                one.references[test] = _estimate(*theirs, row.unit, comparison.reference)
+    title = f"fitted parameters beside {comparison.reference} ones"
     figure = plot_parameters(title, tests, list(found.values()), width=width)
     return figures.save(figure, path)
 

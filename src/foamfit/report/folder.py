@@ -16,10 +16,10 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, reason, replacing
 from foamfit.report.figures import TWO
-from foamfit.report.page import render_report
 from foamfit.report.result_figures import Mapped, draw_all
 from foamfit.report.samples import FILE as SAMPLES
 from foamfit.report.samples import write_samples
+from foamfit.report.summary import render_report
 from foamfit.report.tables import numbers_of, parameters_tex, with_head
 from foamfit.results import SCHEMA, Fit, plain
 
@@ -103,8 +103,11 @@ def save_somewhere(
     raise InputError(told)
 
 
-def check_target(folder: str | Path) -> None:
-    """Raise InputError unless `folder` is free, empty or an older result that may be replaced."""
+def check_target(folder: str | Path, *, of: str | None = None) -> None:
+    """Raise InputError unless `folder` is free, empty or an older result that may be replaced.
+
+    `of` is the kind of result (one of `FILES`) where those of other kinds may not be replaced.
+    """
     folder = Path(folder)
     try:
         place = folder.resolve()
@@ -115,7 +118,7 @@ def check_target(folder: str | Path) -> None:
                 "as a whole; choose a folder of its own"
             )
         if place.is_dir():
-            _check_replaceable(folder, place)
+            _check_replaceable(folder, place, of)
         elif os.path.lexists(place):
             raise InputError(f"{folder} is a file; choose a new or an empty folder")
         for there in (place, next(path for path in place.parents if path.exists())):
@@ -129,7 +132,7 @@ def check_target(folder: str | Path) -> None:
         ) from error
 
 
-def _check_replaceable(folder: Path, place: Path) -> None:
+def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
     """Refuse an existing folder at `place` that must not or cannot be replaced."""
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
@@ -145,6 +148,11 @@ def _check_replaceable(folder: Path, place: Path) -> None:
             raise InputError(
                 f"{folder} holds {path.name}, which foamfit did not write, so it is not replaced; "
                 "move that or choose another folder"
+            )
+        if of is not None and path.name not in FILES[of]:
+            raise InputError(
+                f"{folder} holds {path.name}, which is no part of a {Path(of).stem}, so it is not "
+                "replaced; choose a new or an empty folder"
             )
 
 

@@ -184,12 +184,9 @@ def _frame_type() -> Any:
         def to_latex(self, *args: Any, **options: Any) -> Any:
             """Return the table as LaTeX with booktabs; arguments as those of pandas."""
             texts = self.columns.difference(["symbol"])
-            plain = pd.DataFrame(self).assign(
-                **{name: self[name].map(_cell) for name in texts if self[name].dtype.kind in "OT"}
-            )
-            plain = plain.rename(index=_cell, columns=_cell).rename_axis(
-                index=[escaped(one or "") for one in plain.index.names]
-            )
+            plain = pd.DataFrame(self).assign(**{name: self[name].map(_cell) for name in texts})
+            names = [escaped(name or "") for name in plain.index.names]
+            plain = plain.rename(index=_cell, columns=_cell).rename_axis(index=names)
             chosen: Any = {"multirow": False, "na_rep": "--"} | options
             return plain.to_latex(*args, **chosen)
 

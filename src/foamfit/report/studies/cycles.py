@@ -17,7 +17,7 @@ from foamfit.report.folder import save_whole, write_json, write_result, write_ta
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import own_name
 from foamfit.report.render import words
-from foamfit.report.shown import brief
+from foamfit.report.shown import Shown, brief
 from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
 from foamfit.report.summary import CURVES
 from foamfit.report.tables import (
@@ -52,8 +52,8 @@ BY_CYCLE = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class CycleFits:
+@dataclass(frozen=True, eq=False, repr=False)
+class CycleFits(Shown):
     """Fits of the cycles of one record."""
 
     test: str  #: Names of the test and of the model
@@ -118,12 +118,16 @@ class CycleFits:
 
         return pd.DataFrame(list(self.rows())).set_index("cycle")
 
-    def __repr__(self) -> str:
-        """Return model, misfits and parameters of the cycles."""
-        return _shown(self)
-
-    def _repr_html_(self) -> str:
-        return _shown(self, html=True)
+    def _shown(self, *, html: bool = False) -> str:
+        """Return how many cycles were fitted and their misfits; in HTML their parameters too."""
+        line = (
+            f"{self.model} · {len(self.results)} of {counted(len(self.recorded), 'cycle')} fitted"
+        )
+        each = (one.misfit.get("stress_strain") for one in self.results.values())
+        if known := [off for off in each if off is not None]:
+            line += f" · misfit {percent(min(known))} to {percent(max(known))}"
+        table = by_test(list(map(str, sorted(self.results))), self.varied) if html else {}
+        return brief(self.test, line, [], html, table and {"first": "cycle", **table})
 
     def save(
         self,
@@ -198,13 +202,3 @@ def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
         width=width,
         above=partial(draw_loops, [loops[i] for i in keep[: len(loops)]]),
     )
-
-
-def _shown(found: CycleFits, *, html: bool = False) -> str:
-    """Return how many cycles were fitted and their misfits; as HTML the parameters by cycle too."""
-    line = f"{found.model} · {len(found.results)} of {counted(len(found.recorded), 'cycle')} fitted"
-    each = (one.misfit.get("stress_strain") for one in found.results.values())
-    if known := [off for off in each if off is not None]:
-        line += f" · misfit {percent(min(known))} to {percent(max(known))}"
-    table = by_test(list(map(str, sorted(found.results))), found.varied) if html else {}
-    return brief(found.test, line, [], html, table and {"first": "cycle", **table})

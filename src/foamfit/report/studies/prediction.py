@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
-from foamfit.errors import InputError
 from foamfit.report import figures
 from foamfit.report import folder as results
 from foamfit.report.figures import BLUE, INSIDE, MEASURED, TWO, VERMILION
@@ -152,7 +151,8 @@ class Prediction:
                 figure = plot_prediction(self, width=figure_width)
                 figures.write_both(figure, fresh / "prediction")
 
-        check_replaceable(folder)
+        # A result of another kind may be the one that is predicted from.
+        results.check_target(folder, of="prediction.json")
         return results.save_whole(folder, write)
 
     @property
@@ -238,21 +238,6 @@ class Prediction:
         if (moved := self.curves.get("displacement_time")) is not None:
             columns["predicted strain"] = moved.predicted / height
         return columns
-
-
-def check_replaceable(folder: str | Path) -> None:
-    """Raise InputError unless `folder` is free, empty or an older prediction.
-
-    A result of another kind is not replaced: it may be the one that is predicted from.
-    """
-    results.check_target(folder)
-    place = Path(folder)
-    there = {path.name for path in place.iterdir()} if place.is_dir() else set()
-    if others := there - results.FILES["prediction.json"]:
-        raise InputError(
-            f"{folder} holds {min(others)}, which is no part of a prediction, so it is not "
-            "replaced; choose a new or an empty folder"
-        )
 
 
 def prediction_text(found: Prediction) -> str:
