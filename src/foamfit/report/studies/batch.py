@@ -65,11 +65,6 @@ class Row:
         """Whether there is an acceptable fit."""
         return self.status in ("ok", "warnings")
 
-    @property
-    def is_written(self) -> bool:
-        """Whether there is a result folder."""
-        return self.status not in (REFUSED, OPEN)
-
 
 def row_of(test: str, file: str, result: Fit) -> Row:
     """Make the row of a fit."""
