@@ -84,7 +84,8 @@ def finding(comparison: Comparison) -> str:
     """Say how many parameters were recovered, and name those that were not."""
     missed, lost, compared = [], [], 0
     for section in comparison.pairs:
-        where = f"{section.reference.removeprefix('published ')}, {section.drive} drive"
+        reference = section.other.label.removeprefix("published ")
+        where = f"{reference}, {section.side.given['drive']} drive"
         for row in section.rows:
             errors = row.standard_errors
             if errors is not None:

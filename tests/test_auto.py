@@ -21,8 +21,7 @@ from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers, Specimen, Striker
 from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.problem import make_problem
-from foamfit.report.page import render_report
-from foamfit.report.summary import summary_text
+from foamfit.report.summary import render_report, summary_text
 from foamfit.springs import laws
 from foamfit.springs.model import Model
 from foamfit.trust import evidence

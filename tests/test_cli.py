@@ -221,7 +221,7 @@ def test_the_terminal_is_one_screen_and_verbose_says_the_rest(
 ) -> None:
     found = fabricated.result(notes=("Noise of stress 30 kPa, given.",))
     monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: found)
-    monkeypatch.setattr("foamfit.report.folder.save_result", lambda *_, **__: None)
+    monkeypatch.setattr("foamfit.api.FitResult.save", lambda *_, **__: None)
     short = accepted("fit", RECONSTRUCTION).stdout
     assert len(short.splitlines()) <= 24
     assert "rows: 601 read, 601 used" in short

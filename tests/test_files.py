@@ -210,7 +210,7 @@ def test_a_full_disk_loses_no_numbers(here: Path, monkeypatch: pytest.MonkeyPatc
     def full(*_: object, **__: object) -> None:
         raise InputError("the result cannot be written to r: No space left on device")
 
-    monkeypatch.setattr(foamfit.report.folder, "save_result", full)
+    monkeypatch.setattr(foamfit.api.FitResult, "save", full)
     call = ["fit", str(RECONSTRUCTION), "--starts", "1", "--max-time", "0.1", "--out", "r"]
     result = CliRunner().invoke(main, call)
     assert result.exit_code == 1
@@ -244,10 +244,10 @@ def test_what_cannot_be_written_in_the_end_is_saved_beside(
     def denied(_: object, folder: Path, **__: object) -> None:
         if folder.name == "r":
             raise InputError("the result cannot be written to r: No space; choose another folder")
-        save_result(*(_, folder), **__)
+        save(*(_, folder), **__)
 
-    save_result = foamfit.report.folder.save_result
-    monkeypatch.setattr(foamfit.report.folder, "save_result", denied)
+    save = foamfit.api.FitResult.save
+    monkeypatch.setattr(foamfit.api.FitResult, "save", denied)
     result = CliRunner().invoke(main, [*CALL, "--no-report"])
     (saved,) = names(here)
     assert result.exit_code == 1

@@ -80,9 +80,9 @@ def test_json_for_a_program_and_a_browser_exclude_each_other(
 
 
 def test_cycles_open_their_picture(opened: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    found = SimpleNamespace(results={1: fabricated.result(status="failed")})
+    failed = {1: fabricated.result(status="failed")}
+    found = SimpleNamespace(results=failed, save=lambda *_, **__: None)
     monkeypatch.setattr("foamfit.study.cycles.fit_cycles", lambda *_, **__: found)
-    monkeypatch.setattr("foamfit.report.studies.cycles.save_cycles", lambda *_, **__: None)
     monkeypatch.setattr("foamfit.report.studies.cycles.cycles_text", lambda _: "told")
     told = CliRunner().invoke(
         main, ["fit", str(RECONSTRUCTION), "--cycle", "all", "--out", "r", "--open"]

@@ -21,7 +21,6 @@ from foamfit.cli import main
 from foamfit.cli import progress as module
 from foamfit.cli.progress import ProgressLine, progress_line
 from foamfit.one_model import Options
-from foamfit.report import folder
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.evidence import misfit_of
 
@@ -90,7 +89,7 @@ def test_a_terminal_shows_what_is_done_a_bar_the_best_misfit_and_the_time_left(
     terminal: Terminal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "stderr", terminal.stream)
-    monkeypatch.setattr(folder, "save_result", lambda *_, **__: None)
+    monkeypatch.setattr(api.FitResult, "save", lambda *_, **__: None)
     with pytest.raises(SystemExit) as ended:
         main(["fit", str(RECONSTRUCTION), "--starts", "6", "--out", "r"])
     assert ended.value.code == 0

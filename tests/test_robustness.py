@@ -15,7 +15,7 @@ from click.testing import CliRunner
 import fabricated
 import foamfit as ff
 import foamfit.report.figures
-import foamfit.report.page
+import foamfit.report.summary
 from conftest import AREA, HEIGHT, small_pictures, synthetic_impact, synthetic_loop
 from foamfit import one_model
 from foamfit.cli import main
@@ -24,9 +24,8 @@ from foamfit.fitting.curves import default_weights
 from foamfit.fitting.objective import Objective
 from foamfit.report.comparison import compare, comparison_text
 from foamfit.report.folder import load_result
-from foamfit.report.page import render_report
 from foamfit.report.plots import plot_fit
-from foamfit.report.summary import summary_text
+from foamfit.report.summary import render_report, summary_text
 from foamfit.springs.model import Model
 
 BISTABLE = Model.parse("bistable")
@@ -213,7 +212,7 @@ def test_a_shift_without_two_channels_in_time_is_refused(changed, missing):
 def test_the_command_fits_a_shift_and_refuses_it_without_time(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     test = fabricated_csv(tmp_path)
-    monkeypatch.setattr("foamfit.report.folder.save_result", lambda *_, **__: None)
+    monkeypatch.setattr("foamfit.api.FitResult.save", lambda *_, **__: None)
     call = ["fit", str(test), "--starts", "4", "--json", "--time-shift"]
     out = CliRunner().invoke(main, call)
     assert out.exit_code == 0

@@ -51,7 +51,6 @@ import foamfit
 test = foamfit.read_test(sys.argv[1])
 marks.append(time.perf_counter())
 from foamfit import api
-from foamfit.report.folder import save_result
 from contextlib import closing
 from foamfit.cli.options import Drawers
 with closing(Drawers()) as drawers:
@@ -59,7 +58,7 @@ with closing(Drawers()) as drawers:
     marks.append(time.perf_counter())
     result = api.fit(test)
     marks.append(time.perf_counter())
-    save_result(result, sys.argv[2], mapped=drawers.map)
+    result.save(sys.argv[2], mapped=drawers.map)
     marks.append(time.perf_counter())
 print(*(after - before for before, after in zip(marks, marks[1:])))
 gc.freeze()  # as the command: what is left goes with the process

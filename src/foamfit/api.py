@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import lmfit
 
@@ -12,14 +13,18 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
 from foamfit.one_model import SEARCHED, Keywords, Options, Progress, identify, judge
 from foamfit.report.figures import TWO, inches
-from foamfit.report.folder import save_result
+from foamfit.report.folder import save_whole, write_result
 from foamfit.report.plots import draw_panel
+from foamfit.report.readable import readable
+from foamfit.report.result_figures import Mapped
 from foamfit.report.samples import dataset
-from foamfit.report.shown import fit_shown
+from foamfit.report.shown import Shown, brief
+from foamfit.report.summary import compared
 from foamfit.report.tables import frame
 from foamfit.results import Fit
 from foamfit.solve.precompile import at_first_use
 from foamfit.springs.model import Model
+from foamfit.text import percent
 from foamfit.trust.intervals import Announce
 
 if TYPE_CHECKING:
@@ -28,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-class FitResult(Fit):
+class FitResult(Shown, Fit):
     """The result of a fit: parameters, intervals, curves and verdict."""
 
     def plot(self, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
@@ -51,22 +56,31 @@ class FitResult(Fit):
         about = {"test": self.measurement.name, "model": self.words}
         return dataset(self.draws, **about) if self.draws else None
 
-    def __repr__(self) -> str:
+    def _shown(self, *, html: bool = False) -> str:
         """Return status, model, misfit and parameters."""
-        return fit_shown(self)
+        told = ", ".join(f"{name} {percent(off)}" for name, off in compared(self).items())
+        line = f"{self.law}, {self.drive} drive · status {self.status} · misfit: {told or '–'}"
+        rows = [readable(name, p) for name, p in self.parameters.items() if p.state != "fixed"]
+        return brief(self.measurement.name, line, rows, html)
 
-    def _repr_html_(self) -> str:
-        return fit_shown(self, html=True)
-
-    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
-        """Write the result folder whole, as `report.folder.save_result` does; returns it.
+    def save(
+        self,
+        folder: str | Path,
+        *,
+        report: bool = True,
+        figure_width: str = TWO,
+        mapped: Mapped = map,
+    ) -> Path:
+        """Write the result folder whole, replacing an older one at the end; returns it.
 
         Without `report` it has neither report.html nor figures. Its figure is "one" or "two"
         columns wide, or as wide as a length ("85 mm"); with ", pdf" behind that all figures of the
-        report are written as PDF too, with ", untitled" they have no title.
+        report are written as PDF too, with ", untitled" they have no title. `mapped` draws the
+        figures, as the `map` of an executor does.
         """
         inches(figure_width)  # refuses what is no width
-        return save_result(self, folder, report=report, width=figure_width)
+        drawn: Any = {"pages": report, "width": figure_width, "mapped": mapped}
+        return save_whole(folder, partial(write_result, self, **drawn))
 
 
 @single_threaded

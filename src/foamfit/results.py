@@ -127,6 +127,12 @@ class Profile:
         """Whether it was followed to both ends."""
         return self.stopped is None
 
+    def rows(self) -> Iterator[dict[str, object]]:
+        """Give its rows of profiles.csv, SI."""
+        about = {"chi2 of the 95 % cut": self.cut, "complete": self.complete}
+        for value, rise in zip(self.values.tolist(), self.rises.tolist(), strict=True):
+            yield {"name": self.name, "value": value, "chi2": rise, **about}
+
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
@@ -215,12 +221,13 @@ class Budget:
         """Combine all contributions to a parameter by their squares, SI."""
         return math.hypot(*self.contributions[name].values())
 
-    def rows(self) -> Iterator[list[object]]:
-        """Give the rows of budget.csv, the header first: SI, but for the last column."""
-        yield ["name", *SOURCES, "combined", "scale", "combined over scale"]
+    def rows(self) -> Iterator[dict[str, object]]:
+        """Give the rows of budget.csv: SI, but for the last column."""
         for name, row in self.contributions.items():
             total, scale = self.combined(name), self.scales[name]
-            yield [name, *(plain(row[source]) for source in SOURCES), total, scale, total / scale]
+            parts = {source: plain(row[source]) for source in SOURCES}
+            sums = {"combined": total, "scale": scale, "combined over scale": total / scale}
+            yield {"name": name, **parts, **sums}
 
 
 @dataclass(frozen=True)
@@ -330,40 +337,17 @@ class Ladder:
         """The model whose result was taken."""
         return next(rung for rung in self.rungs if rung.chosen)
 
-    def rows(self) -> Iterator[list[object]]:
-        """Rows of ladder.csv, the header first; a list of names is joined by blanks."""
+    def rows(self) -> Iterator[dict[str, object]]:
+        """Give the rows of ladder.csv; a list of names is joined by blanks."""
         misfits = [rung.misfit for rung in self.rungs]
         curves = [name for name in misfits[0] if any(one.get(name) is not None for one in misfits)]
-        rest = [n for n in Rung.__dataclass_fields__ if n not in ("model", "damping", "misfit")]
-        yield ["model", "damping", *(f"misfit_{name}" for name in curves), *rest]
         for rung in self.rungs:
-            cells = (plain(getattr(rung, name)) for name in rest)
-            told = (" ".join(cell) if isinstance(cell, list) else cell for cell in cells)
-            yield [rung.model, rung.damping, *(rung.misfit.get(name) for name in curves), *told]
-
-
-def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dict[str, Snapping]:
-    """Return how each spring of micro-springs snaps along an overall strain and a base stress (Pa).
-
-    A single spring's snapping follows from its strain, that in a chain from the stress if all its
-    springs are in equilibrium, else it is not known.
-    """
-    out, springs = {}, chain.springs
-    for i, spring in enumerate(springs, start=1):
-        if not spring.law.remembers:
-            continue
-        own = (
-            None
-            if any(one.eta or one.relaxation or one.law.is_viscous for one in springs)
-            else stress
-        )
-        if len(springs) == 1:
-            own = None if strain is None else np.asarray(spring.stress(strain))
-        if own is not None and np.all(np.isfinite(own)):
-            fraction = spring.fraction_along(own)
-            if fraction is not None:
-                out[f"s{i}"] = Snapping(fraction, own)
-    return out
+            row: dict[str, Any] = plain(rung)
+            off = {f"misfit_{name}": row["misfit"].get(name) for name in curves}
+            cells = {"model": row.pop("model"), "damping": row.pop("damping"), **off}
+            del row["misfit"]
+            cells |= {k: " ".join(v) if isinstance(v, list) else v for k, v in row.items()}
+            yield cells
 
 
 def loop_of(test: Measurement, along: Array | None, over_time: Array | None) -> Loop | None:
@@ -477,9 +461,26 @@ class Fit:
 
     @property
     def snapping(self) -> dict[str, Snapping]:
-        """How each microscale spring snapped, where that is known; see `snapping_of`."""
+        """How each spring of micro-springs snapped along the fitted curves, where that is known.
+
+        That of a single spring follows from its strain; in a chain it follows from the stress if
+        all springs are in equilibrium and no striker is part of the motion.
+        """
+        springs, strain, out = self.springs, self.strain, dict[str, Snapping]()
+        viscous = any(one.eta or one.relaxation or one.law.is_viscous for one in springs.values())
         stress = self.curves.measured_stress if self.drive == "stress" else self.curves.stress
-        return snapping_of(self.chain, self.strain, None if self.drive == "impact" else stress)
+        stress = None if viscous or self.drive == "impact" else stress
+        for name, spring in springs.items():
+            if not spring.law.remembers:
+                continue
+            own = stress
+            if len(springs) == 1:
+                own = None if strain is None else np.asarray(spring.stress(strain))
+            if own is not None and np.all(np.isfinite(own)):
+                fraction = spring.fraction_along(own)
+                if fraction is not None:
+                    out[name] = Snapping(fraction, own)
+        return out
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``fit.json``: SI, plain types, null for what is not there."""
@@ -487,6 +488,7 @@ class Fit:
 
         test = self.measurement
         asked = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
+        found = ("visited", "misfit", "weights", "statistics", "noise", "energy")
         model = Model.parse(self.model)
         optional = {
             "correlation": self.correlation,
@@ -516,8 +518,7 @@ class Fit:
             "model": model.words,
             **{name: getattr(self, name) for name in ("checklist", "parameters")},
             "derived": self._derived(),
-            **{name: getattr(self, name) for name in ("visited", "misfit", "weights")},
-            **{name: getattr(self, name) for name in ("statistics", "noise", "energy")},
+            **{name: getattr(self, name) for name in found},
             "outliers": {
                 channel: {name: getattr(found, name) for name in ("at", "values", "clipped_at")}
                 for channel, found in test.outliers.items()

@@ -70,19 +70,14 @@ def say(text: str, *, err: bool = False, newline: bool = True) -> None:
     except OSError as error:
         if err:
             return
-        drop_output()
+        nowhere = os.open(os.devnull, os.O_WRONLY)  # for what stdout holds, and all further output
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
         if not isinstance(error, BrokenPipeError):
             raise InputError(
                 f"standard output cannot be written: {error.strerror or error}; give it room or "
                 "redirect it elsewhere"
             ) from None
-
-
-def drop_output() -> None:
-    """Discard what stdout still holds and all further output."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, sys.stdout.fileno())
-    os.close(nowhere)
 
 
 class TerminatedError(KeyboardInterrupt):

@@ -27,10 +27,15 @@ def quantity(value: float, unit: str | None) -> str:
     return engineering(value, unit) if unit else f"{value:.4g}"
 
 
-def number(value: float) -> str:
-    """Write a number with four digits and a minus sign; "–" for one that is not finite."""
-    if not math.isfinite(value):
+def number(value: float | None) -> str:
+    """Write a number with four digits and a minus sign, an integer with all its digits.
+
+    "–" stands for None and for one that is not finite.
+    """
+    if value is None or not math.isfinite(value):
         return "–"
+    if isinstance(value, int):
+        return str(value)
     if value == 0 or 1e-3 <= abs(value) < 1e6:
         decimals = 0 if value == 0 else max(0, 3 - math.floor(math.log10(abs(value))))
         return f"{value:.{decimals}f}".replace("-", "−")
@@ -58,6 +63,16 @@ def signed(value: float, decimals: int) -> str:
     """Write a difference with its sign and a minus, zero without: "+1.2", "−0.3", "0.0"."""
     shown = f"{value:+.{decimals}f}"
     return shown[1:] if float(shown) == 0.0 else shown.replace("-", "−")
+
+
+def field(value: float | str, width: int = 10) -> str:
+    """Write a number right-aligned into a field of a fixed width, a blank before it."""
+    for digits in range(9, 0, -1):
+        text = value if isinstance(value, str) else f"{value:.{digits}G}"
+        text += ".0" if isinstance(value, float) and text.lstrip("-").isdigit() else ""
+        if len(text) < width:
+            return text.rjust(width)
+    raise ValueError(f"{value} has no room in {width} columns")
 
 
 def counted(count: int, noun: str) -> str:

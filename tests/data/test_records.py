@@ -18,8 +18,7 @@ from foamfit.data.energy import audit
 from foamfit.data.measurement import Outliers
 from foamfit.errors import InputError
 from foamfit.fitting.curves import check_drive
-from foamfit.report.page import render_report
-from foamfit.report.summary import summary_text
+from foamfit.report.summary import render_report, summary_text
 
 SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
 STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'

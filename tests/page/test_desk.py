@@ -318,8 +318,8 @@ def test_turned_curves_are_those_of_a_simulation(drive):
         measurement = replace(measurement, noise=noise)
     turning = Turning(measurement, "bistable", drive=drive)
     before = turning.turn({})
-    drawn = turning.turn({"s1_k0": 1.3 * before.values["s1_k0"]})
-    spring = ff.BistableSpring(**{n[3:]: v for n, v in drawn.values.items() if n[:3] == "s1_"})
+    drawn = turning.turn({"s1_k0": 1.3 * turning.named["s1_k0"]})
+    spring = ff.BistableSpring(**{n[3:]: v for n, v in turning.named.items() if n[:3] == "s1_"})
     chain = ff.Chain([spring], [1.19e-3], measurement.specimen.area)
     drives = {
         "impact": ff.Impact(7e-3, 2.0),
@@ -380,7 +380,7 @@ def test_the_fraction_snapped_of_a_bistable_spring_is_its_way_along_d_and_e():
 
 def test_what_is_not_admissible_is_named():
     turning = Turning(ff.read_test(TEST), "bistable")
-    before = turning.turn({}).values["s1_eps_c"]
+    before = turning.named["s1_eps_c"]
     drawn = turning.turn({"s1_eps_c": 0.01})
     assert "eps_c = 0.01 is not admissible" in drawn.error
     assert drawn.curves == {}
@@ -397,9 +397,10 @@ def test_sliders_reach_around_the_values_and_stay_admissible():
 
 
 def test_the_heights_of_a_chain_keep_their_sum():
-    drawn = Turning(ff.read_test(TEST), "linear+bistable").turn({"s1_height": 0.4e-3})
-    assert drawn.values["s1_height"] == 0.4e-3
-    assert drawn.values["s2_height"] == pytest.approx(0.79e-3)
+    turning = Turning(ff.read_test(TEST), "linear+bistable")
+    turning.turn({"s1_height": 0.4e-3})
+    assert turning.named["s1_height"] == 0.4e-3
+    assert turning.named["s2_height"] == pytest.approx(0.79e-3)
 
 
 @pytest.mark.parametrize("make", [synthetic_impact, synthetic_loop])

@@ -13,11 +13,10 @@ import foamfit as ff
 from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
 from foamfit.data.describe import describe
 from foamfit.data.energy import audit
-from foamfit.report.page import render_report
 from foamfit.report.readable import readable
 from foamfit.report.result_figures import draw_all
 from foamfit.report.studies.batch import row_of
-from foamfit.report.summary import conclusions, summary_text
+from foamfit.report.summary import conclusions, render_report, summary_text
 from foamfit.report.tables import names_of
 from foamfit.results import ParameterEstimate
 

@@ -14,7 +14,7 @@ import fabricated
 import foamfit as ff
 import foamfit.report.figures
 import foamfit.report.folder
-import foamfit.report.page
+import foamfit.report.summary
 from conftest import small_pictures
 from foamfit.errors import InputError
 from foamfit.report.folder import check_target, load_result

@@ -10,9 +10,8 @@ import pytest
 
 import fabricated
 from foamfit.data.energy import audit
-from foamfit.report.page import render_report
 from foamfit.report.readable import number, readable
-from foamfit.report.summary import conclusions, summary_text
+from foamfit.report.summary import conclusions, render_report, summary_text
 
 
 class Page(HTMLParser):

@@ -17,7 +17,7 @@ from foamfit.errors import InputError
 from foamfit.report.figures import STYLE, image, laid_out
 from foamfit.report.plots import origin_word, plot_fit, plot_response
 from foamfit.report.readable import readable_unit
-from foamfit.report.report_plots import plot_snapping
+from foamfit.report.result_figures import plot_snapping
 from foamfit.results import Switch
 
 

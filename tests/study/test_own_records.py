@@ -188,7 +188,7 @@ def test_the_band_holds_what_a_noisy_motion_leaves_uncertain(tmp_path):
     for one in made:
         curve = one.curves["stress_strain"]
         assert curve.half_width_of("motion") > 0.0
-        assert "stress half width, motion (Pa)" in next(one.rows())
+        assert "stress half width, motion (Pa)" in one.columns
 
 
 # ------------------------------------------------------------------------------- a weighed motion

@@ -18,8 +18,7 @@ from foamfit.fitting.branches import FLIGHT, sections
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.report.comparison import published_side
-from foamfit.report.page import render_report
-from foamfit.report.summary import summary_text
+from foamfit.report.summary import render_report, summary_text
 from foamfit.results import Intervals
 from foamfit.springs.chain import Impact
 from foamfit.trust import checklist

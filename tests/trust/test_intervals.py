@@ -28,7 +28,7 @@ from foamfit.errors import InputError
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord, Tracker
 from foamfit.one_model import Found, judge
-from foamfit.report.report_plots import plot_profiles
+from foamfit.report.result_figures import plot_profiles
 from foamfit.results import Profile
 from foamfit.trust import intervals, resample
 from foamfit.trust.best_point import BestPoint

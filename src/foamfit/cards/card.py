@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +32,7 @@ from foamfit.files import check_file, write_file
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, VERMILION, image, laid_out
 from foamfit.report.readable import readable_unit
-from foamfit.report.render import environment
+from foamfit.report.render import environment, words
 from foamfit.results import Fit, law_in_words, plain
 from foamfit.saved import SavedJoint, load
 from foamfit.study.identified import HasContent, read_source
@@ -119,40 +118,6 @@ def read_records(result: object) -> list[Record]:
     raise InputError(f"a card is made of a result of fit or joint, not of {result!r}")
 
 
-def draw(
-    name: str, misfit: Mapping[str, float | None], records: Sequence[Record], curves: Curves
-) -> Figure:
-    """Draw the records with law and card along them, and the loading curves to their ends."""
-    known = {name: value for name, value in misfit.items() if value is not None}
-    told = ", ".join(f"{name} {percent(value)}" for name, value in known.items())
-    shown = sorted(records, key=lambda one: one.rate or 0.0)
-    if len(shown) > MOST:
-        shown = [shown[0], shown[len(shown) // 2], shown[-1]]
-    width = WIDTH * (len(shown) + 1)
-    title = figures.title_lines(width, name, f"misfit: {told}")
-    factor, unit = readable_unit(max(float(one.stress.max()) for one in shown), "Pa")
-    with figures.drawing(width, HEIGHT, title) as figure:
-        axes = figure.subplots(1, len(shown) + 1)
-        for ax, one in zip(axes, shown, strict=False):
-            loops = ((one.strain, one.stress), (one.motion, one.fitted), (one.motion, one.card))
-            drawn = {
-                name: ax.plot(strain, stress / factor, **style)[0]
-                for (name, style), (strain, stress) in zip(STYLES.items(), loops, strict=True)
-            }
-            rate = "rate not known" if one.rate is None else f"{significant(one.rate, 3)} 1/s"
-            ax.set(title=rate, xlabel="strain", ylabel=f"stress ({unit})")
-        ax, inside = axes[-1], curves.measured
-        factor, unit = readable_unit(float(curves.stress.max()), "Pa")
-        shades = np.linspace(1.0, 0.4, len(curves.rates))[::-1]
-        for shade, stress in zip(shades, curves.stress / factor, strict=True):
-            style: Any = {"color": VERMILION, "alpha": float(shade), "linewidth": 1.0}
-            ax.plot(curves.strain[:inside], stress[:inside], **style)
-            ax.plot(curves.strain[inside - 1 :], stress[inside - 1 :], linestyle=":", **style)
-        ax.set(title="loading; dotted: extrapolated", xlabel="strain", ylabel=f"stress ({unit})")
-        figures.legend_below(figure, drawn)
-    return figure
-
-
 # Of each format: ending of its file, what begins a comment, and what stands for an unknown density:
 # a parameter that is nowhere defined, which the solvers refuse.
 FORMATS = {
@@ -217,7 +182,6 @@ class Card:
         slopes = pa * np.diff(self.curves.stress) / np.diff(self.curves.strain)
         values = {
             **{"card": self, "mass": mass, "length": length, "time": time, "stress": stress},
-            "version": version("foamfit"),
             "density": unknown if self.density is None else dense * self.density,
             "modulus": float(slopes[:, : self.curves.measured - 1].max()),
             "stiffest": float(slopes.max()),
@@ -225,10 +189,10 @@ class Card:
             "strain": self.curves.strain.tolist(),
             "stresses": (pa * stresses).tolist(),
         }
-        told = _words("comments", **values).encode("ascii", "replace").decode()
-        lines = [line for one in told.splitlines() for line in textwrap.wrap(one, _LINE)]
+        told = (one.encode("ascii", "replace").decode() for one in _lines("comments", **values))
+        lines = (line for one in told for line in textwrap.wrap(one, _LINE))
         values["comments"] = "\n".join(f"{sign} {line}" for line in lines)
-        template = _templates().get_template(f"{self.format}{ending}")
+        template = environment().get_template(f"{self.format}{ending}")
         return f"{template.render(values).rstrip()}\n"
 
     def _written(self) -> tuple[Array, Array]:
@@ -245,7 +209,7 @@ class Card:
 
     def __repr__(self) -> str:
         """Tell what the card is and what it loses, as the command prints it."""
-        return _words("terminal", card=self)
+        return "\n".join(_lines("terminal", card=self))
 
     def save(self, path: str | Path) -> Path:
         """Write the card, PATH.json, PATH.png and PATH.pdf; returns the path.
@@ -256,7 +220,7 @@ class Card:
         files = [path, *(path.with_name(f"{path.name}.{form}") for form in ("json", "png", "pdf"))]
         for one in files:
             check_file(one)
-        figure = draw(f"{self.name} as {self.format}", self.misfit, self.records, self.curves)
+        figure = draw(self)
         with laid_out(figure):
             pictures = (image(figure, "png"), image(figure, "pdf"))
         told = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
@@ -269,6 +233,38 @@ class Card:
                     written.unlink()
                 raise
         return path
+
+
+def draw(card: Card) -> Figure:
+    """Draw the records with law and card along them, and the loading curves to their ends."""
+    misfits = (f"{what} {percent(off)}" for what, off in card.misfit.items() if off is not None)
+    shown, curves = sorted(card.records, key=lambda one: one.rate or 0.0), card.curves
+    if len(shown) > MOST:
+        shown = [shown[0], shown[len(shown) // 2], shown[-1]]
+    width = WIDTH * (len(shown) + 1)
+    told = f"{card.name} as {card.format}", f"misfit: {', '.join(misfits)}"
+    title = figures.title_lines(width, *told)
+    factor, unit = readable_unit(max(float(one.stress.max()) for one in shown), "Pa")
+    with figures.drawing(width, HEIGHT, title) as figure:
+        axes = figure.subplots(1, len(shown) + 1)
+        for ax, one in zip(axes, shown, strict=False):
+            loops = ((one.strain, one.stress), (one.motion, one.fitted), (one.motion, one.card))
+            drawn = {
+                name: ax.plot(strain, stress / factor, **style)[0]
+                for (name, style), (strain, stress) in zip(STYLES.items(), loops, strict=True)
+            }
+            rate = "rate not known" if one.rate is None else f"{significant(one.rate, 3)} 1/s"
+            ax.set(title=rate, xlabel="strain", ylabel=f"stress ({unit})")
+        ax, inside = axes[-1], curves.measured
+        factor, unit = readable_unit(float(curves.stress.max()), "Pa")
+        shades = np.linspace(1.0, 0.4, len(curves.rates))[::-1]
+        for shade, stress in zip(shades, curves.stress / factor, strict=True):
+            style: Any = {"color": VERMILION, "alpha": float(shade), "linewidth": 1.0}
+            ax.plot(curves.strain[:inside], stress[:inside], **style)
+            ax.plot(curves.strain[inside - 1 :], stress[inside - 1 :], linestyle=":", **style)
+        ax.set(title="loading; dotted: extrapolated", xlabel="strain", ylabel=f"stress ({unit})")
+        figures.legend_below(figure, drawn)
+    return figure
 
 
 @single_threaded
@@ -325,7 +321,7 @@ def card(
         replace(one, card=replay(unloading)) for one, replay in zip(records, replays, strict=True)
     ]
     known = [one.density for one in records if one.density is not None]
-    told = _words(
+    warnings = _lines(
         "warnings",
         source=source,
         format=format,
@@ -347,7 +343,7 @@ def card(
             "card": _rms(one.misfit_of_card for one in records),
         },
         density=float(np.mean(known)) if known else None,
-        warnings=tuple(told.splitlines()),
+        warnings=tuple(warnings),
         records=tuple(records),
     )
     if out is not None:
@@ -379,25 +375,6 @@ def _rms(values: Iterable[float | None]) -> float | None:
     return float(np.sqrt(np.mean(np.square(known)))) if known else None
 
 
-def _templates() -> Any:
-    from jinja2 import PackageLoader
-
-    made = environment().overlay(loader=PackageLoader("foamfit.cards"))
-    made.filters["field"] = _field
-    return made
-
-
-def _words(name: str, **values: Any) -> str:
-    """Return a text of a template, without empty lines."""
-    told = _templates().get_template(f"{name}.txt").render(**values)
-    return "\n".join(line for line in told.splitlines() if line.strip())
-
-
-def _field(value: float | str, width: int = 10) -> str:
-    """Write a number right-aligned into a field of a fixed width, a blank before it."""
-    for digits in range(9, 0, -1):
-        text = value if isinstance(value, str) else f"{value:.{digits}G}"
-        text += ".0" if isinstance(value, float) and text.lstrip("-").isdigit() else ""
-        if len(text) < width:
-            return text.rjust(width)
-    raise ValueError(f"{value} has no room in {width} columns")
+def _lines(name: str, **values: Any) -> list[str]:
+    """Return the lines of a text, without empty ones."""
+    return [line for line in words(name, **values).splitlines() if line.strip()]

@@ -188,23 +188,18 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
             return progress_line(output.silent, "fit", limit, says=not output.quiet)
 
         found = fit_as_asked(test, specimen, asked, begin)
-        from foamfit.report import folder as result_folder
-        from foamfit.report.studies import cycles
+        from foamfit.report.studies.cycles import cycles_text
         from foamfit.report.summary import summary_text
         from foamfit.results import Fit
 
-        save: Callable[..., object]
         if isinstance(found, Fit):
             page, which, failed = "report.html", "", found.status == "failed"
-            save, content = partial(result_folder.save_result, found), found.to_json_dict
-            text = partial(summary_text, found, verbose=verbose)
+            content, text = found.to_json_dict, partial(summary_text, found, verbose=verbose)
         else:
             page, which = "cycles.png", " of any cycle"
             failed = all(one.status == "failed" for one in found.results.values())
-            save, content = partial(cycles.save_cycles, found), partial(_content_of, found)
-            text = partial(cycles.cycles_text, found)
-        drawn = {"width": output.figure_width, "mapped": drawers.map}
-        output.finish(save, folder / page, content, text, **drawn)
+            content, text = partial(_content_of, found), partial(cycles_text, found)
+        output.finish(found.save, folder / page, content, text, mapped=drawers.map)
     if failed:
         say(f"foamfit: no acceptable fit{which} was found; see {folder}", err=True)
     return NOT_ACCEPTABLE if failed else 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,11 +105,7 @@ def batch(
         found = run(tests, recipe, fresh=fresh, specimen=specimen, **where)
     rows = found.summary
 
-    def content() -> list[dict[str, Any]]:
-        head, *cells = table_rows(rows)
-        return [dict(zip(head, row, strict=True)) for row in cells]
-
-    output.show(content, lambda: summary_words(rows))
+    output.show(lambda: table_rows(rows), lambda: summary_words(rows))
     output.tell_written(found.out / "summary.html")
     wrong = sum(not row.has_fit for row in rows)
     if not wrong:
@@ -191,14 +188,8 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
             begin(jobs, len(read.tests), FEW_FOLDERS)
         with progress_line(output.silent, "joint fit") as line:
             found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
-        output.finish(
-            found.save,
-            folder / "joint.html",
-            found.to_json_dict,
-            lambda: joint_text(found),
-            jobs=jobs,
-            figure_width=output.figure_width,
-        )
+        page, text = folder / "joint.html", partial(joint_text, found)
+        output.finish(found.save, page, found.to_json_dict, text, jobs=jobs)
     if found.status != "failed":
         return 0
     say(f"foamfit: no acceptable fit was found; see {folder}", err=True)

@@ -123,9 +123,9 @@ class Output:
 
     def check(self, *, without_report: bool = True) -> None:
         """Refuse --open beside --json (a browser may print too), or where no page is made."""
-        given = "no-report" if self.no_report and not without_report else ""
-        given = "json" if self.as_json else given
-        if self.opening and given:
+        pageless = self.no_report and not without_report
+        if self.opening and (self.as_json or pageless):
+            given = "json" if self.as_json else "no-report"
             raise InputError(f"--open and --{given} exclude each other; leave one of them out")
 
     def folder(self, default: Path, inputs: Iterable[Path]) -> Path:
@@ -148,15 +148,16 @@ class Output:
         page: Path,
         content: Callable[[], Any],
         text: Callable[[], str],
-        **drawn: Any,
+        **options: Any,
     ) -> None:
         """Save a result in the folder of `page`; print it, even if that fails, and where it is."""
         from foamfit.report.folder import save_somewhere
 
+        options |= {"report": not self.no_report, "figure_width": self.figure_width}
         try:
             with progress_line(self.silent, "result") as line, without_ctrl_c():
                 line.progress(1.0, "writing the report")
-                save_somewhere(save, page.parent, report=not self.no_report, **drawn)
+                save_somewhere(save, page.parent, **options)
         finally:
             self.show(content, text)
         self.tell_written(page)

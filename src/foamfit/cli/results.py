@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -110,12 +111,13 @@ def predict(
     output.check(without_report=False)
     from foamfit.data.csv_file import read_test
     from foamfit.data.toml_file import toml_beside
-    from foamfit.report.studies.prediction import check_replaceable, prediction_text
+    from foamfit.report.folder import check_target
+    from foamfit.report.studies.prediction import prediction_text
     from foamfit.study.identified import read_source
 
     toml = toml_beside(test)
     default = Path("predictions", toml.stem)
-    check_replaceable(output.out or default)
+    check_target(output.out or default, of="prediction.json")
     folder = output.folder(default, (test, specimen or toml, result))
     read_source(result)  # a wrong path is reported before anything is compiled
     with options.compiling(output.silent) as compile_rest:
@@ -124,13 +126,8 @@ def predict(
 
         compile_rest()
         found = study.predict(result, measurement, **asked)
-        output.finish(
-            found.save,
-            folder / "prediction.png",
-            found.to_json_dict,
-            lambda: prediction_text(found),
-            figure_width=output.figure_width,
-        )
+        page, text = folder / "prediction.png", partial(prediction_text, found)
+        output.finish(found.save, page, found.to_json_dict, text)
 
 
 @main.command()

@@ -60,7 +60,6 @@ class Drawn:
 
     curves: dict[str, tuple[Array, Array]]
     misfit: dict[str, float | None]
-    values: dict[str, float]
     points: dict[str, tuple[float, float]] = field(default_factory=dict)  # strain, stress
     chain: dict[str, Array] = field(default_factory=dict)
     error: str = ""
@@ -129,7 +128,7 @@ class Turning:
             springs = problem.model.springs(values[: len(problem.model.names)])
             simulated = problem.objective.simulate(values, everything=True)
         except (InputError, SimulationError) as error:
-            return Drawn({}, {}, self.named, error=str(error))
+            return Drawn({}, {}, error=str(error))
         m, drive, found = problem.measurement, self.drive, simulated.curves
         without_time = found.get("stress_strain")  # along the measured motion
         stress = m.stress if drive == "stress" else found.get("stress_time", without_time)
@@ -139,7 +138,7 @@ class Turning:
         curves = {n: xy for n, xy in panels.items() if n in self.measured}
         alone = len(springs) == 1 and not problem.model.relaxation
         points = springs[0].corners if alone else {}
-        return Drawn(curves, problem.objective.misfit(simulated), self.named, points, chain)
+        return Drawn(curves, problem.objective.misfit(simulated), points, chain)
 
     def _chained(
         self, springs: Sequence[Spring], motion: Motion, strain: Array, stress: Array

@@ -13,10 +13,10 @@ from typing import Any, ClassVar
 import click
 import panel as pn
 import param
-from jinja2 import Environment, FileSystemLoader
 from panel.custom import JSComponent
 
 from foamfit.cli.fit import fit as fit_command
+from foamfit.report.render import environment
 
 TEMPLATES = Path(__file__).with_name("templates")
 WIDE: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
@@ -31,14 +31,9 @@ def style(name: str) -> str:
     return (TEMPLATES / f"{name}.css").read_text(encoding="utf-8")
 
 
-_PIECES = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True).get_template(
-    "pieces.html"
-)
-
-
 def piece(name: str, *given: Any) -> str:
     """Return a piece of `templates/pieces.html`; all texts in it are escaped."""
-    return str(getattr(_PIECES.module, name)(*given))
+    return str(getattr(environment().get_template("pieces.html").module, name)(*given))
 
 
 class Upload(JSComponent):

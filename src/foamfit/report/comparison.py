@@ -10,13 +10,12 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from uncertainties import correlated_values_norm
-from uncertainties.core import AffineScalarFunc
+from uncertainties import correlated_values_norm, nominal_value, std_dev
 
 from foamfit.codec import build, reading
 from foamfit.errors import InputError
@@ -32,7 +31,7 @@ from foamfit.springs.laws.record import ETA, RELAXATION_TIME, STRENGTH, Compared
 from foamfit.springs.model import Model
 from foamfit.springs.published import PublishedSet
 from foamfit.springs.published import published as published_sets
-from foamfit.text import signed, significant
+from foamfit.text import significant
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,7 +42,7 @@ _GIVEN: dict[str, Any] = dict.fromkeys(
     ("drive", "status", "stopped", "data_sha256", "correlation")
 )  # which a published set lacks, or an older fit.json
 NOTHING = 3.0  # standard error over value beyond which a difference is meaningless
-WORST_FIRST = ("not determined", "weak", "determined", "fixed")
+WORST_FIRST = ("not determined", "weak", "determined", "fixed", "published")
 VAGUE = "its standard error is many times its value, so the test does not determine it"
 
 
@@ -98,11 +97,8 @@ class Row:
 class Pair:
     """One result beside its reference."""
 
-    test: str
-    model: str
-    drive: str
-    status: str
-    reference: str
+    side: Side
+    other: Side
     rows: tuple[Row, ...]
     remarks: tuple[str, ...]
 
@@ -112,7 +108,11 @@ class Comparison:
     """Results beside the published sets that they belong to, or beside the first of them."""
 
     pairs: tuple[Pair, ...]
-    with_published: bool
+
+    @property
+    def reference(self) -> str:
+        """What the results stand beside, in a word."""
+        return "published" if all(pair.other.source for pair in self.pairs) else "reference"
 
 
 def compare(results: Sequence[Result], published: str | None = None) -> Comparison:
@@ -122,16 +122,13 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
     where a test names none, all are put beside the first of them. InputError if a result cannot be
     read, the set is unknown, or there is nothing to compare with.
     """
-    if published is not None:
-        published_side(published)  # refuses one that is not there
     sides = [side_of(result) for result in results]
     if not sides:
         raise InputError("nothing to compare; give at least one result folder")
     belongs = [published or (None if s.unpublished else recognised(s.given["test"])) for s in sides]
     found = [published_side(name) for name in belongs if name is not None]
     if len(found) == len(sides):
-        pairs = zip(sides, found, strict=True)
-        return Comparison(tuple(_pair(one, other) for one, other in pairs), with_published=True)
+        return Comparison(tuple(map(_pair, sides, found)))
     if len(sides) == 1:
         kind, test = sides[0].unpublished, sides[0].given["test"]
         raise InputError(
@@ -140,7 +137,7 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
             else f"the test '{test}' names no published set; choose one by --published "
             f"({', '.join(published_sets)}), or give a second result"
         )
-    return Comparison(tuple(_pair(side, sides[0]) for side in sides[1:]), with_published=False)
+    return Comparison(tuple(_pair(side, sides[0]) for side in sides[1:]))
 
 
 def recognised(test: str) -> str | None:
@@ -165,15 +162,25 @@ class Side:
     label: str
     model: Model
     estimates: Mapping[str, ParameterEstimate]
-    numbers: Mapping[str, Any]  # the values with their errors, correlated
-    given: Mapping[str, Any]  # content of fit.json
+    numbers: Mapping[str, Any] = field(compare=False)  # the values with their errors, correlated
+    given: Mapping[str, Any] = field(compare=False)  # content of fit.json
     source: PublishedSet | None = None
+
+    @property
+    def law(self) -> str:
+        """The model and its relaxation in words."""
+        return law_in_words(self.model.name, self.model.relaxation)
+
+    @property
+    def families(self) -> list[str]:
+        """The kinds of the springs, of which all without hysteresis are "linear"."""
+        return [one.kind if one.hysteretic else "linear" for one in self.model.laws]
 
     @property
     def unpublished(self) -> str:
         """The first kind of spring that has no published parameters, or ""."""
-        laws = map(law, self.model.kinds)
-        return next((one.kind for one in laws if one.hysteretic and not one.published), "")
+        kinds = (one.kind for one in self.model.laws if one.hysteretic and not one.published)
+        return next(kinds, "")
 
     def evaluate(
         self, names: Sequence[str], formula: Callable[..., Any]
@@ -185,14 +192,10 @@ class Side:
             found = formula(*(self.numbers[name] for name in names))
         except (ZeroDivisionError, ValueError):
             return None
-        rank = {state: i for i, state in enumerate(WORST_FIRST)}
         parts = (self.estimates[name] for name in names)
-        worst = min(parts, key=lambda part: rank.get(part.state, len(rank)))
-        value, error = found, 0.0
-        if isinstance(found, AffineScalarFunc):
-            value, error = found.nominal_value, found.std_dev
-        error = 0.0 if worst.state == "not determined" else error
-        return replace(worst, value=float(value), stderr=error or None)
+        worst = min(parts, key=lambda part: WORST_FIRST.index(part.state))
+        error = 0.0 if worst.state == "not determined" else std_dev(found)
+        return replace(worst, value=float(nominal_value(found)), stderr=error or None)
 
 
 def side_of(result: Result) -> Side:
@@ -207,8 +210,7 @@ def side_of(result: Result) -> Side:
         estimates = {n: build(ParameterEstimate, p, {}) for n, p in given["parameters"].items()}
         known = given.get("correlation") or {"names": (), "matrix": ()}
         numbers = _with_errors(estimates, known["names"], known["matrix"])
-        told = law_in_words(model.name, model.relaxation)
-        label = f"{about[0]}: {told}, {about[1]} drive"
+        label = f"{about[0]}: {law_in_words(model.name, model.relaxation)}, {about[1]} drive"
         return Side(label, model, estimates, numbers, _GIVEN | dict(given))
 
 
@@ -248,23 +250,11 @@ def published_side(name: str) -> Side:
 
 
 def _pair(side: Side, other: Side) -> Pair:
-    families = [[_family(kind) for kind in one.model.kinds] for one in (side, other)]
-    unpublished = side.unpublished if other.source is not None else ""
     about: dict[str, Any] = {"side": side, "other": other}
-    differ = families[0] != families[1]
-    nothing = words("incomparable", unpublished=unpublished, differ=differ, **about)
+    nothing = words("incomparable", **about)
     rows = (*_spring_rows(side, other, nothing), *_damping_rows(side, other, nothing))
     ratios = any("/" in row.name for row in rows)
-    remarks = sentences("remarks", nothing=nothing, ratios=ratios, **about)
-    status, stopped = side.given["status"], side.given.get("stopped")
-    status = f"{status}, stopped by {stopped}" if stopped else status
-    model = law_in_words(side.model.name, side.model.relaxation)
-    drive = str(side.given["drive"])
-    return Pair(side.given["test"], model, drive, status, other.label, rows, remarks)
-
-
-def _family(kind: str) -> str:
-    return kind if law(kind).hysteretic else "linear"
+    return Pair(side, other, rows, sentences("remarks", nothing=nothing, ratios=ratios, **about))
 
 
 def _total(*parts: Any) -> Any:
@@ -303,15 +293,15 @@ def _row(
 
 
 def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
-    kinds, theirs = side.model.kinds, other.model.kinds
-    several = len(kinds) > 1
+    kinds, several = side.model.kinds, len(side.model.kinds) > 1
+    pairs = enumerate(zip(side.families, other.families, strict=False), start=1)
+    alike = {i for i, (own, theirs) in pairs if own == theirs}
     for i, kind in enumerate(kinds, start=1):
-        alike = i <= len(theirs) and _family(theirs[i - 1]) == _family(kind)
         for one in _quantities(kind, side.model.relaxation):
             eta = one.of == (ETA.name,)
             names = [f"s{i}_{part}" for part in one.of]
             value = side.evaluate(names, one.formula)
-            reference = other.evaluate(names, one.formula) if alike else None
+            reference = other.evaluate(names, one.formula) if i in alike else None
             # The damping of a single spring stands with the onsite damper.
             if value is None or (eta and not several):
                 continue
@@ -345,9 +335,8 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
     if ratio is not None:
         # ζ is η over a root, so it is known as well as η unless k_c is undetermined.
         unknown = ratio.state == "not determined" and value.state != "fixed"
-        known = replace(ratio, state=ratio.state if unknown else value.state)
-        zeta = Row(0, "ζ", "", known.value, known.stderr, known.state, None, None, damping.remark)
-        yield replace(zeta, reference=item.damping_ratio)
+        state, told = ratio.state if unknown else value.state, damping.remark
+        yield Row(0, "ζ", "", ratio.value, ratio.stderr, state, item.damping_ratio, None, told)
 
 
 # ---------------------------------------------------------------- as a text and as a figure
@@ -355,30 +344,7 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
 
 def comparison_text(comparison: Comparison) -> str:
     """Return a comparison as aligned text, at most 100 columns wide, no newline at the end."""
-    reference = "published" if comparison.with_published else "reference"
-    titles = ("parameter", "unit", "fitted", reference, "deviation", "", "state")
-    pairs = []
-    for pair in comparison.pairs:
-        whole = {remark[:-1].casefold() for remark in pair.remarks}
-        apart = dict[str, list[str]]()
-        for row in pair.rows:
-            if row.remark and row.remark.casefold() not in whole:
-                apart.setdefault(row.remark, []).append(row.label)
-        ratio = any(row.name == "ζ" for row in pair.rows)  # then a published set is beside it
-        item = published_sets[pair.reference.removeprefix("published ")] if ratio else None
-        pairs.append((pair, [titles, *map(_cells, pair.rows)], apart, item))
-    return words("comparison", pairs=pairs, with_published=comparison.with_published)
-
-
-def _cells(row: Row) -> tuple[str, ...]:
-    off = "not compared" if row.remark and row.reference is not None else None
-    values = _with_error(row.value, row.stderr), _with_error(row.reference, row.reference_stderr)
-    deviation = off or _signed(row.percent, " %"), _signed(row.standard_errors, " s.e.")
-    return (row.label, row.unit or "–", *values, *deviation, row.state)
-
-
-def _signed(value: float | None, unit: str) -> str:
-    return "" if value is None else signed(value, 0 if abs(value) >= 99.5 else 1) + unit
+    return words("comparison", comparison=comparison, with_error=_with_error)
 
 
 def _with_error(value: float | None, stderr: float | None) -> str:
@@ -400,11 +366,10 @@ def plot_comparison(
     What is neither compared nor lost (`Row.lost`) is left out. For `path` and `width` see
     `plots.plot_fit`.
     """
-    reference = "published" if comparison.with_published else "reference"
+    sources = [pair.other.source for pair in comparison.pairs]
     tests = [
-        f"{pair.reference.removeprefix('published ') if reference == 'published' else pair.test}, "
-        f"{pair.drive}"
-        for pair in comparison.pairs
+        f"{pair.side.given['test'] if source is None else source.name}, {pair.side.given['drive']}"
+        for source, pair in zip(sources, comparison.pairs, strict=True)
     ]
     if len(set(tests)) < len(tests):
         tests = [f"{i}: {name}" for i, name in enumerate(tests, start=1)]
@@ -415,8 +380,8 @@ def plot_comparison(
                 one = found.setdefault(row.label, Panel(row.label, _math(row.label), {}, {}))
                 one.tests[test] = _estimate(row.value, row.stderr, row.unit, row.state)
                 theirs = row.reference or 0.0, row.reference_stderr
-                one.references[test] = _estimate(*theirs, row.unit, reference)
-    title = f"fitted parameters beside {reference} ones"
+                one.references[test] = _estimate(*theirs, row.unit, comparison.reference)
+    title = f"fitted parameters beside {comparison.reference} ones"
     figure = plot_parameters(title, tests, list(found.values()), width=width)
     return figures.save(figure, path)
 

@@ -7,20 +7,21 @@ import os
 import re
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
+from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, reason, replacing
 from foamfit.report.figures import TWO
-from foamfit.report.page import render_report
 from foamfit.report.result_figures import Mapped, draw_all
 from foamfit.report.samples import FILE as SAMPLES
 from foamfit.report.samples import write_samples
-from foamfit.report.tables import parameters_tex
-from foamfit.results import SCHEMA, Fit, ParameterEstimate, plain
+from foamfit.report.summary import render_report
+from foamfit.report.tables import numbers_of, parameters_tex, with_head
+from foamfit.results import SCHEMA, Fit, plain
 
 # Files of each kind of result, by the file that marks it. Folders of older versions, which wrote
 # other files too, are replaced as well.
@@ -42,26 +43,11 @@ class _TriedError(Exception):
     """Ends a trial of whether a folder can be written."""
 
 
-def save_result(
-    result: Fit, folder: str | Path, *, report: bool = True, width: str = TWO, mapped: Mapped = map
-) -> Path:
-    """Write the result folder whole, replacing an older one at the end.
-
-    It is made with its parents; InputError if something else stands there (see `check_target`) or
-    it cannot be written, and nothing is changed then. ``profiles.csv`` is written where there are
-    profiles, ``ladder.csv`` where there is a ladder, ``budget.csv`` where the budget says more
-    than the parameters. Without `report` there are tables alone; for `width` and `mapped` see
-    `foamfit.report.result_figures.draw_all`. Returns the folder.
-    """
-    return save_whole(
-        folder, lambda fresh: write_result(result, fresh, pages=report, width=width, mapped=mapped)
-    )
-
-
 def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool = False) -> Path:
     """Let `write` fill a new folder, which replaces an older result at the end; returns it.
 
-    `swept` is that of `foamfit.files.replacing`.
+    It is made with its parents; InputError if something else stands there (see `check_target`) or
+    it cannot be written, and nothing is changed then. `swept` is that of `foamfit.files.replacing`.
     """
     folder = Path(folder)
     check_target(folder)
@@ -117,8 +103,11 @@ def save_somewhere(
     raise InputError(told)
 
 
-def check_target(folder: str | Path) -> None:
-    """Raise InputError unless `folder` is free, empty or an older result that may be replaced."""
+def check_target(folder: str | Path, *, of: str | None = None) -> None:
+    """Raise InputError unless `folder` is free, empty or an older result that may be replaced.
+
+    `of` is the kind of result (one of `FILES`) where those of other kinds may not be replaced.
+    """
     folder = Path(folder)
     try:
         place = folder.resolve()
@@ -129,7 +118,7 @@ def check_target(folder: str | Path) -> None:
                 "as a whole; choose a folder of its own"
             )
         if place.is_dir():
-            _check_replaceable(folder, place)
+            _check_replaceable(folder, place, of)
         elif os.path.lexists(place):
             raise InputError(f"{folder} is a file; choose a new or an empty folder")
         for there in (place, next(path for path in place.parents if path.exists())):
@@ -143,7 +132,7 @@ def check_target(folder: str | Path) -> None:
         ) from error
 
 
-def _check_replaceable(folder: Path, place: Path) -> None:
+def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
     """Refuse an existing folder at `place` that must not or cannot be replaced."""
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
@@ -159,6 +148,11 @@ def _check_replaceable(folder: Path, place: Path) -> None:
             raise InputError(
                 f"{folder} holds {path.name}, which foamfit did not write, so it is not replaced; "
                 "move that or choose another folder"
+            )
+        if of is not None and path.name not in FILES[of]:
+            raise InputError(
+                f"{folder} holds {path.name}, which is no part of a {Path(of).stem}, so it is not "
+                "replaced; choose a new or an empty folder"
             )
 
 
@@ -214,22 +208,25 @@ def load_result(folder: str | Path) -> dict[str, Any]:
 def write_result(
     result: Fit, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
 ) -> None:
-    """Write all files of a result into a folder that is there; the report and figures if wanted."""
+    """Write all files of a result into a folder that is there; the report and figures if wanted.
+
+    ``profiles.csv`` is written where there are profiles, ``ladder.csv`` where there is a ladder,
+    ``budget.csv`` where the budget says more than the parameters. For `width` and `mapped` see
+    `foamfit.report.result_figures.draw_all`.
+    """
     figures = draw_all(result, width, mapped) if pages else ()  # which begins to draw
     write_json(folder / "fit.json", result.to_json_dict())
-    write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
+    told = ("unit", "state", "why", "ci95_method")
+    parameters = (
+        {"name": name, **plain(numbers_of(p)), **{key: getattr(p, key) for key in told}}
+        for name, p in result.parameters.items()
+    )
+    write_table(folder / "parameters.csv", parameters)
     write_text(folder / "table.tex", parameters_tex(result.parameters))
-    # Python floats are written with as many digits as they have, numpy's with their type's name.
-    samples = zip(*(column.tolist() for column in result.columns.values()), strict=True)
-    write_table(folder / "curves.csv", [result.columns.keys(), *samples])
+    write_columns(folder / "curves.csv", result.columns)
     if result.intervals is not None and result.intervals.profiles:
-        head = ["name", "value", "chi2", "chi2 of the 95 % cut", "complete"]
-        rows = (
-            [one.name, value, rise, one.cut, one.complete]
-            for one in result.intervals.profiles
-            for value, rise in zip(one.values.tolist(), one.rises.tolist(), strict=True)
-        )
-        write_table(folder / "profiles.csv", [head, *rows])
+        rows = (row for profile in result.intervals.profiles for row in profile.rows())
+        write_table(folder / "profiles.csv", rows)
     if result.draws:
         write_samples(folder / SAMPLES, result.draws)
     if pages and result.budget is not None and result.budget.telling:
@@ -262,16 +259,13 @@ def write_text(path: Path, content: str) -> None:
     path.write_text(content, encoding="utf-8", errors="replace")
 
 
-def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
-    """Write rows of cells as CSV."""
-    path.write_bytes(csv_bytes(rows))
+def write_table(path: Path, rows: Iterable[Mapping[str, object]]) -> None:
+    """Write rows, which have the same columns, as CSV."""
+    path.write_bytes(csv_bytes(with_head(rows)))
 
 
-def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[list[object]]:
-    ends = (f"{span}_{end}" for span in ("ci95", "range") for end in ("low", "high"))
-    rest = ("systematic", "unit", "state", "why", "ci95_method")
-    yield ["name", "value", "stderr", *ends, *rest]
-    for name, p in parameters.items():
-        spans = (*(p.ci95 or (None, None)), *(p.range or (None, None)))
-        numbers = plain([p.value, p.stderr, *spans, p.systematic])
-        yield [name, *numbers, p.unit, p.state, p.why, p.ci95_method]
+def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
+    """Write columns, named in the first row, as CSV."""
+    # Python floats are written with as many digits as they have, numpy's with their type's name.
+    samples = zip(*(column.tolist() for column in columns.values()), strict=True)
+    path.write_bytes(csv_bytes([columns, *samples]))

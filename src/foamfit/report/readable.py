@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from foamfit import text
 from foamfit.results import ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
+from foamfit.text import number
 
 # Parameters that belong to no spring: symbol, index, and their name in reports if it differs. Those
 # of springs are in the records of laws.
@@ -111,13 +111,6 @@ def in_unit(values: Sequence[float], unit: str) -> str:
         return ""
     factor, name = readable_unit(max(map(abs, values)), unit)
     return f"{' to '.join(number(value / factor) for value in values)} {name}".rstrip()
-
-
-def number(value: float | None) -> str:
-    """Return a number with four digits, an integer with all its digits, None as a dash."""
-    if value is None:
-        return "–"
-    return text.number(value) if isinstance(value, float) else str(value)
 
 
 def symbol(name: str) -> tuple[str, str]:

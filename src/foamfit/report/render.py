@@ -9,7 +9,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from foamfit import text
-from foamfit.report.readable import in_unit, number
+from foamfit.report.readable import in_unit
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -17,23 +17,24 @@ if TYPE_CHECKING:
 
 @functools.cache
 def environment() -> Environment:
-    """Return the templates of all pages and texts, with the filters that write numbers."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+    """Return the templates of all pages, texts and cards, with the filters that write numbers."""
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, select_autoescape
 
     made = Environment(
-        loader=PackageLoader("foamfit.report"),
+        loader=ChoiceLoader([PackageLoader(f"foamfit.{of}") for of in ("report", "cards", "page")]),
         extensions=["jinja2.ext.do"],
         autoescape=select_autoescape(("html",)),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters = (text.percent, text.engineering, text.significant, text.counted, text.listed)
-    made.filters.update({one.__name__: one for one in (*filters, number, in_unit)})
-    made.filters.update(paragraphs=_paragraphs, aligned=_aligned, exp=math.exp)
+    for name in ("percent", "engineering", "significant", "signed", "number", "field"):
+        made.filters[name] = getattr(text, name)
+    made.filters.update(counted=text.counted, listed=text.listed, in_unit=in_unit, exp=math.exp)
+    made.filters.update(paragraphs=_paragraphs, aligned=_aligned)
     made.filters["png"] = lambda png: "data:image/png;base64," + base64.b64encode(png).decode()
-    made.globals["version"] = version("foamfit")
     made.filters["spoken"] = lambda name: name.replace("_", "-")
+    made.globals["version"] = version("foamfit")
     return made
 
 

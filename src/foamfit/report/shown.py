@@ -8,25 +8,15 @@ from typing import TYPE_CHECKING, Any
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page
-from foamfit.report.summary import compared
 from foamfit.report.tables import frame, stacked
-from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import counted, percent, wrapped
+from foamfit.text import counted, wrapped
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
 Joint = Any  # `foamfit.study.joint_result.JointResult`, or `foamfit.saved.SavedJoint`, read back
-
-
-def fit_shown(result: Fit, *, html: bool = False) -> str:
-    """Return status, model, misfit and parameters of a fit."""
-    told = ", ".join(f"{name} {percent(off)}" for name, off in compared(result).items())
-    line = f"{result.law}, {result.drive} drive · status {result.status} · misfit: {told or '–'}"
-    rows = [readable(name, p) for name, p in result.parameters.items() if p.state != "fixed"]
-    return brief(result.measurement.name, line, rows, html)
 
 
 def brief(title: str, line: str, rows: Sequence[Readable], html: bool, table: Any = None) -> str:
@@ -38,7 +28,22 @@ def brief(title: str, line: str, rows: Sequence[Readable], html: bool, table: An
     return "\n".join([*wrapped(f"{title}: {line}", 2), *wrapped(", ".join(told), 2)])
 
 
-class JointViews:
+class Shown:
+    """A result that Python shows in a few lines, and a notebook as a line and a table."""
+
+    def _shown(self, *, html: bool = False) -> str:
+        """Return it as text, or as HTML."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        """Return it in a few lines."""
+        return self._shown()
+
+    def _repr_html_(self) -> str:
+        return self._shown(html=True)
+
+
+class JointViews(Shown):
     """What Python and notebooks show of a joint fit."""
 
     def plot(self: Joint, ax: Axes | None = None) -> Axes:
@@ -61,17 +66,10 @@ class JointViews:
             frames[test] = frame(each, kind=kinds, scatter={}, b={})
         return stacked(frames, "test")
 
-    def __repr__(self: Joint) -> str:
-        """Return name, model, status and the common values."""
-        return _joint_shown(self)
-
-    def _repr_html_(self: Joint) -> str:
-        return _joint_shown(self, html=True)
-
-
-def _joint_shown(found: Joint, *, html: bool = False) -> str:
-    """Return model, tests, status and the common values of a joint fit."""
-    line = f"{found.model} · {counted(len(found.tests), 'test')} together · status {found.status}"
-    common = {n: p for n, p in found.parameters.items() if p.kind != "fixed" and n not in NUISANCE}
-    rows = [readable(name, p.estimate()) for name, p in common.items()]
-    return brief(found.name, line, rows, html)
+    def _shown(self: Joint, *, html: bool = False) -> str:
+        """Return name, model, tests, status and the common values."""
+        line = f"{self.model} · {counted(len(self.tests), 'test')} together · status {self.status}"
+        every = self.parameters.items()
+        common = {n: p for n, p in every if p.kind != "fixed" and n not in NUISANCE}
+        rows = [readable(name, p.estimate()) for name, p in common.items()]
+        return brief(self.name, line, rows, html)

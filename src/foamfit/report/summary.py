@@ -1,18 +1,21 @@
-"""What a fit found, in words: the sentences that begin every report, and the terminal."""
+"""What a fit found: the sentences that begin every report, the terminal and the HTML report."""
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from foamfit.data.measurement import interior_channel
+from foamfit.fitting.branches import covered
+from foamfit.report.plots import origin_word
 from foamfit.report.readable import Readable, readable
-from foamfit.report.render import sentences, table, words
+from foamfit.report.render import page, sentences, table, words
+from foamfit.report.result_figures import Images, draw_all
 from foamfit.results import STATED, Fit, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, counted, percent, wrapped
+from foamfit.trust.covariance import RULE
 
 CURVES = {
     "stress_time": "stress-time",
@@ -92,19 +95,20 @@ def _table(rows: list[Readable], *, short: bool, across: int) -> list[list[str]]
     Several parameters `across` have their values alone, with errors where two have room.
     """
     ranged = any(row.range for row in rows)
-    value = {"value": "value"} if short and ranged else {"value ± stderr": "with_error"}
-    columns = {"parameter": "label"} | value | {"unit": "unit", "95 % interval": "interval"}
-    columns |= ({"range": "range"} if ranged else {}) | {"state": "state"}
+    bare = across == 3 or (across == 1 and short and ranged)
+    columns = {"parameter": "label"}
+    columns |= {"value": "value"} if bare else {"value ± stderr": "with_error"}
+    columns |= {"unit": "unit"}
     if across == 1:
-        return [[*columns], *([getattr(row, one) for one in columns.values()] for row in rows)]
-    value = {"value ± stderr": "with_error"} if across == 2 else {"value": "value"}
-    columns = {"parameter": "label"} | value | {"unit": "unit"}
+        columns |= {"95 % interval": "interval"} | ({"range": "range"} if ranged else {})
+        columns |= {"state": "state"}
     tall = -(-len(rows) // across)
-    blocks = [[*columns] * across]
-    for row in range(tall):
-        cells = ([getattr(one, c) for c in columns.values()] for one in rows[row::tall])
-        blocks.append([*itertools.chain(*cells)])
-    return [[*block, *[""] * (len(blocks[0]) - len(block))] for block in blocks]
+    every = [
+        [getattr(one, column) for one in rows[row::tall] for column in columns.values()]
+        for row in range(tall)
+    ]
+    head = [*columns] * across
+    return [head, *([*cells, *[""] * (len(head) - len(cells))] for cells in every)]
 
 
 def _cut(line: str) -> str:
@@ -181,14 +185,12 @@ def _unknown(parameters: dict[str, ParameterEstimate]) -> dict[str, dict[str, li
     """Group the parameters that are not determined, or weakly, by their state and its reason."""
     found = dict[str, dict[str, list[str]]]()
     for state in ("not determined", "weak"):
-        groups = dict[str, list[str]]()
-        for name, p in parameters.items():
-            if p.state == state:
-                groups.setdefault(p.why, []).append(name)
+        every = {name: p.why for name, p in parameters.items() if p.state == state}
+        reasons = dict.fromkeys(every.values())
+        groups = {why: [name for name, own in every.items() if own == why] for why in reasons}
         told = "; ".join(f"{', '.join(names)} ({why})" for why, names in groups.items())
         if len(told) > LONGEST:
-            every = [name for name, p in parameters.items() if p.state == state]
-            groups = {"see why in the report": every}
+            groups = {"see why in the report": list(every)}
         if groups:
             found[state] = groups
     return found
@@ -213,3 +215,36 @@ def tables(result: Fit) -> dict[str, list[list[str]]]:
         "cycles": table("by_cycle", found=found) if found else [],
         "ladder_rows": table("ladder", ladder=ladder) if ladder else [],
     }
+
+
+def render_report(result: Fit, figures: Mapping[str, Images | None] | None = None) -> str:
+    """Return the report as one self-contained HTML page.
+
+    `figures` are those of `draw_all`, if they are drawn already.
+    """
+    drawn = dict(draw_all(result)) if figures is None else figures
+    plain, springs, insight = result.to_json_dict(), result.springs, result.insight
+    parts, shares = ((), None) if insight is None else (insight.parts, insight.shares())
+    correlation = None if insight is None else insight.correlation
+    if result.correlation is not None:  # better known
+        correlation = result.correlation.matrix
+    return page(
+        "report",
+        result=result,
+        origin=origin_word(result),
+        conclusions=conclusions(result),
+        determined=determined(result),
+        misfits=misfits(result),
+        statistics=plain["statistics"],
+        springs=springs,
+        seen={name: covered(result.visited.get(name, ())) for name in springs},
+        parameters=[readable(name, p) for name, p in result.parameters.items()],
+        rule=RULE,
+        energy={k: x for k, x in plain["energy"].items() if type(x) in (int, float)},
+        energy_sentences=plain["energy"].get("sentences") or [],
+        answers=ANSWERS,
+        parts=[] if shares is None else list(zip(parts, shares.T.tolist(), strict=True)),
+        correlation=[] if correlation is None else correlation.tolist(),
+        **tables(result),
+        figures=drawn,
+    )

@@ -33,7 +33,6 @@ _TEXT |= {letter: f"{{{letter}}}" for letter in "[]*"}  # at the start of a row 
 _LAST_LETTER = "ſ"  # that pdfLaTeX sets without further packages
 # Misfits in a table with a row for each test.
 MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
-PARTS = ("", "_stderr", "_lo", "_hi", "_state")  # of a parameter, in a row for each test
 Parameters = Mapping[str, ParameterEstimate]
 ByTest = Mapping[str, Sequence[ParameterEstimate | None]]
 
@@ -87,18 +86,23 @@ def varied(each: Sequence[Parameters]) -> dict[str, list[ParameterEstimate | Non
     return out
 
 
-def wide_head(names: Iterable[str]) -> list[str]:
-    """Return the columns of parameters in a table with a row for each test."""
-    return [f"{name}{part}" for name in names for part in PARTS]
+def with_head(rows: Iterable[Mapping[str, object]]) -> Iterator[Iterable[object]]:
+    """Give the names of the columns of a table, then the cells of each row."""
+    for i, row in enumerate(rows):
+        yield from ([row] if i == 0 else [])
+        yield row.values()
 
 
-def wide_cells(names: Iterable[str], parameters: Parameters) -> list[Any]:
-    """Return the cells of a test below `wide_head`, SI; None where there is nothing."""
-    cells = list[Any]()
-    for p in map(parameters.get, names):
-        known = p and (p.value, p.stderr, *(p.ci95 or (None, None)), p.state)
-        cells += known or (None,) * len(PARTS)
-    return list(plain(cells))
+def wide(each: Sequence[Parameters]) -> Iterator[dict[str, Any]]:
+    """Give the parameters of each test as a row of a table, SI; None where there is nothing."""
+    names = names_of(each)
+    for parameters in each:
+        row = dict[str, Any]()
+        for name, p in zip(names, map(parameters.get, names), strict=True):
+            low, high = (p and p.ci95) or (None, None)
+            row |= {name: p and p.value, f"{name}_stderr": p and p.stderr}
+            row |= {f"{name}_lo": low, f"{name}_hi": high, f"{name}_state": p and p.state}
+        yield plain(row)
 
 
 def by_test(tests: Sequence[str], parameters: ByTest) -> dict[str, Any]:
@@ -144,13 +148,18 @@ def frame(parameters: Mapping[str, Any], **more: Mapping[str, Any]) -> pd.DataFr
 
 def _rows(parameters: Mapping[str, Any], more: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     for own, (name, p) in zip(symbols(parameters), parameters.items(), strict=True):
-        ends = (*(p.ci95 or (None, None)), *(getattr(p, "range", None) or (None, None)))
-        spans = zip(("ci95_low", "ci95_high", "range_low", "range_high"), ends, strict=True)
-        row = {"parameter": name, "symbol": formula(own), "value": p.value}
-        row |= {"stderr": p.stderr, **dict(spans), "systematic": getattr(p, "systematic", None)}
+        row = {"parameter": name, "symbol": formula(own), **numbers_of(p)}
         row |= {key: values.get(name) for key, values in more.items()}
         known = {key: np.nan if one is None else one for key, one in row.items()}
         yield known | {"unit": getattr(p, "unit", ""), "state": p.state}
+
+
+def numbers_of(p: Any) -> dict[str, float | None]:
+    """Return the numbers of a parameter by the names of their columns, SI; None = not there."""
+    (low, high), (least, most) = p.ci95 or (None, None), p.range or (None, None)
+    ends = {"ci95_low": low, "ci95_high": high, "range_low": least, "range_high": most}
+    systematic = getattr(p, "systematic", None)  # which a joint fit does not tell
+    return {"value": p.value, "stderr": p.stderr, **ends, "systematic": systematic}
 
 
 def stacked(frames: Mapping[Any, pd.DataFrame], name: str) -> pd.DataFrame:
@@ -175,12 +184,9 @@ def _frame_type() -> Any:
         def to_latex(self, *args: Any, **options: Any) -> Any:
             """Return the table as LaTeX with booktabs; arguments as those of pandas."""
             texts = self.columns.difference(["symbol"])
-            plain = pd.DataFrame(self).assign(
-                **{name: self[name].map(_cell) for name in texts if self[name].dtype.kind in "OT"}
-            )
-            plain = plain.rename(index=_cell, columns=_cell).rename_axis(
-                index=[escaped(one or "") for one in plain.index.names]
-            )
+            plain = pd.DataFrame(self).assign(**{name: self[name].map(_cell) for name in texts})
+            names = [escaped(name or "") for name in plain.index.names]
+            plain = plain.rename(index=_cell, columns=_cell).rename_axis(index=names)
             chosen: Any = {"multirow": False, "na_rep": "--"} | options
             return plain.to_latex(*args, **chosen)
 

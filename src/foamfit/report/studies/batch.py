@@ -5,11 +5,10 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
 
 import numpy as np
 
@@ -24,11 +23,10 @@ from foamfit.report.tables import (
     MISFITS,
     by_test,
     by_test_tex,
-    names_of,
     unit_of_all,
     varied,
-    wide_cells,
-    wide_head,
+    wide,
+    with_head,
 )
 from foamfit.results import Fit, ParameterEstimate, plain
 from foamfit.springs.parameters import NUISANCE
@@ -67,11 +65,6 @@ class Row:
         """Whether there is an acceptable fit."""
         return self.status in ("ok", "warnings")
 
-    @property
-    def is_written(self) -> bool:
-        """Whether there is a result folder."""
-        return self.status not in (REFUSED, OPEN)
-
 
 def row_of(test: str, file: str, result: Fit) -> Row:
     """Make the row of a fit."""
@@ -87,42 +80,42 @@ def row_of(test: str, file: str, result: Fit) -> Row:
 # ------------------------------------------------------------------------------- the table
 
 
-def table_rows(rows: Sequence[Row]) -> Iterator[list[Any]]:
-    """Rows of summary.csv, the header first: SI, a row for each test, empty = not there."""
-    names = names_of(row.parameters for row in rows)
-    head = ["test", "file", "status", "error", *(f"misfit_{name}" for name in CURVES), "runtime_s"]
-    yield [*head, *wide_head(names)]
-    for row in rows:
-        told = [row.test, row.file, row.status, row.error]
-        misfits = map(row.misfit.get, CURVES)
-        yield [*told, *misfits, row.runtime_s, *wide_cells(names, row.parameters)]
+def table_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Rows of summary.csv: SI, one for each test, None = not there."""
+    return [
+        {name: getattr(row, name) for name in ("test", "file", "status", "error")}
+        | {f"misfit_{name}": row.misfit.get(name) for name in CURVES}
+        | {"runtime_s": row.runtime_s, **parameters}
+        for row, parameters in zip(rows, wide([row.parameters for row in rows]), strict=True)
+    ]
 
 
 def table(rows: Sequence[Row]) -> pd.DataFrame:
     """The rows of summary.csv as pandas reads them."""
-    return _frame(*table_rows(rows))
+    return _frame(table_rows(rows))
 
 
 def read_table(path: Path) -> pd.DataFrame:
     """Read a summary.csv; raise InputError if the file is not one."""
     try:
-        rows = csv.reader(read_whole(path).decode().splitlines(True))
-        return _frame(*([re.sub("^'(?=[=+@-])", "", cell) or None for cell in row] for row in rows))
+        cells = csv.reader(read_whole(path).decode().splitlines(True))
+        head, *rows = ([re.sub("^'(?=[=+@-])", "", one) or None for one in row] for row in cells)
+        return _frame([dict(zip(head, row, strict=True)) for row in rows])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path} is no summary of a batch: {error}") from None
 
 
-def _frame(head: list[Any], *cells: list[Any]) -> pd.DataFrame:
+def _frame(rows: list[dict[Any, Any]]) -> pd.DataFrame:
     import pandas as pd
 
-    frame = pd.DataFrame(cells, columns=head)
-    words = ("test", "file", "status", "error", *(n for n in head if n.endswith("_state")))
-    return frame.astype({name: float for name in head if name not in words})
+    words = ("test", "file", "status", "error")
+    numbers = (name for name in rows[0] if name not in words and not name.endswith("_state"))
+    return pd.DataFrame(rows).astype(dict.fromkeys(numbers, float))
 
 
 def write_summary(rows: Sequence[Row], folder: Path) -> None:
     """Write summary.csv whole."""
-    write_file(folder / "summary.csv", csv_bytes(table_rows(rows)))
+    write_file(folder / "summary.csv", csv_bytes(with_head(table_rows(rows))))
 
 
 def counts_in_words(rows: Sequence[Row]) -> str:
@@ -194,7 +187,6 @@ def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | N
         counts=counts_in_words(rows),
         rows=shown,
         total=len(rows),
-        links=[f"{quote(row.test)}/report.html" for row in shown],
         reports=[(folder / row.test / "report.html").is_file() for row in shown],
         parameters=by_test([row.test for row in shown], varied([row.parameters for row in shown])),
         misfits={curve: told for curve, told in MISFITS.items() if curve in measured},

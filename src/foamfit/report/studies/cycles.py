@@ -17,18 +17,16 @@ from foamfit.report.folder import save_whole, write_json, write_result, write_ta
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import own_name
 from foamfit.report.render import words
-from foamfit.report.shown import brief
+from foamfit.report.shown import Shown, brief
 from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
 from foamfit.report.summary import CURVES
 from foamfit.report.tables import (
     by_test,
     by_test_tex,
     frame,
-    names_of,
     stacked,
     varied,
-    wide_cells,
-    wide_head,
+    wide,
 )
 from foamfit.results import Fit, ParameterEstimate, plain
 from foamfit.springs.parameters import NUISANCE
@@ -54,8 +52,8 @@ BY_CYCLE = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class CycleFits:
+@dataclass(frozen=True, eq=False, repr=False)
+class CycleFits(Shown):
     """Fits of the cycles of one record."""
 
     test: str  #: Names of the test and of the model
@@ -70,24 +68,24 @@ class CycleFits:
         every = varied([one.parameters for _, one in sorted(self.results.items())])
         return {name: each for name, each in every.items() if name not in NUISANCE}
 
-    def rows(self) -> Iterator[list[object]]:
-        """Rows of cycles.csv, the header first: SI, one row for each cycle, empty = not there."""
-        names = names_of(one.parameters for one in self.results.values())
-        head = ["cycle", "start_strain", "peak_strain", "peak_stress", ENERGY]
-        head += [*(f"misfit_{name}" for name in CURVES), "status", "error"]
-        yield [*head, *wide_head(names)]
-        for number in sorted({*self.results, *self.refused}):
-            one = self.results.get(number)
-            if one is None:
-                told = [number, *[None] * 7, "refused", self.refused[number]]
-                yield [*told, *wide_cells(names, {})]
-                continue
-            m = one.measurement
-            strain = None if m.displacement is None else m.displacement.max() / m.specimen.height
-            stress = None if m.stress is None else m.stress.max()
-            cells = [number, m.start_strain, strain, stress, one.energy.get(ENERGY)]
-            cells += [*map(one.misfit.get, CURVES), one.status, None]
-            yield [*plain(cells), *wide_cells(names, one.parameters)]
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Rows of cycles.csv: SI, one for each cycle, None = not there."""
+        every = {n: self.results.get(n) for n in sorted({*self.results, *self.refused})}
+        parameters = wide([{} if one is None else one.parameters for one in every.values()])
+        names = ["start_strain", "peak_strain", "peak_stress", ENERGY]
+        names += [f"misfit_{name}" for name in CURVES]
+        for (number, one), own in zip(every.items(), parameters, strict=True):
+            cells: list[Any] = [None] * len(names)
+            status = "refused"
+            if one is not None:
+                m, status = one.measurement, one.status
+                moved, height = m.displacement, m.specimen.height
+                strain = None if moved is None else moved.max() / height
+                stress = None if m.stress is None else m.stress.max()
+                cells = [m.start_strain, strain, stress, one.energy.get(ENERGY)]
+                cells += map(one.misfit.get, CURVES)
+            told = {"status": status, "error": self.refused.get(number)}
+            yield {"cycle": number, **dict(zip(names, plain(cells), strict=True)), **told, **own}
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of cycles.json, in plain types."""
@@ -118,41 +116,36 @@ class CycleFits:
         """Return the rows of cycles.csv, indexed by the cycle."""
         import pandas as pd
 
-        head, *rows = self.rows()
-        return pd.DataFrame(rows, columns=[str(name) for name in head]).set_index("cycle")
+        return pd.DataFrame(list(self.rows())).set_index("cycle")
 
-    def __repr__(self) -> str:
-        """Return model, misfits and parameters of the cycles."""
-        return _shown(self)
+    def _shown(self, *, html: bool = False) -> str:
+        """Return how many cycles were fitted and their misfits; in HTML their parameters too."""
+        line = (
+            f"{self.model} · {len(self.results)} of {counted(len(self.recorded), 'cycle')} fitted"
+        )
+        each = (one.misfit.get("stress_strain") for one in self.results.values())
+        if known := [off for off in each if off is not None]:
+            line += f" · misfit {percent(min(known))} to {percent(max(known))}"
+        table = by_test(list(map(str, sorted(self.results))), self.varied) if html else {}
+        return brief(self.test, line, [], html, table and {"first": "cycle", **table})
 
-    def _repr_html_(self) -> str:
-        return _shown(self, html=True)
-
-    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
+    def save(
+        self,
+        folder: str | Path,
+        *,
+        report: bool = True,
+        figure_width: str = TWO,
+        mapped: Mapped = map,
+    ) -> Path:
         """Write ``cycle-<n>/``, cycles.csv, cycles.png and cycles.json whole; returns the folder.
 
         An older result there is replaced as a whole, at the end. Without `report` there are tables
-        alone. Figures are "one" or "two" columns wide, or as wide as a length ("85 mm").
+        alone. Figures are "one" or "two" columns wide, or as wide as a length ("85 mm"); `mapped`
+        draws those of the cycles, as the `map` of an executor does.
         """
         figures.inches(figure_width)  # refuses what is no width
-        return save_cycles(self, folder, report=report, width=figure_width)
-
-
-def save_cycles(
-    found: CycleFits,
-    folder: str | Path,
-    *,
-    report: bool = True,
-    width: str = TWO,
-    mapped: Mapped = map,
-) -> Path:
-    """Write the folder whole, replacing an older result at the end; returns it.
-
-    For `report`, `width` and `mapped` see `foamfit.report.folder.save_result`.
-    """
-    return save_whole(
-        folder, lambda fresh: write_cycles(found, fresh, pages=report, width=width, mapped=mapped)
-    )
+        drawn: Any = {"pages": report, "width": figure_width, "mapped": mapped}
+        return save_whole(folder, partial(write_cycles, self, **drawn))
 
 
 def write_cycles(
@@ -193,13 +186,12 @@ def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
         if (loop := one.loop) is not None and loop.label == "strain"
     ]
     keep = np.unique(np.geomspace(1, max(len(loops), 1), MOST_LOOPS).astype(int)) - 1
-    head, *table = map(list[Any], found.rows())
-    panels = list[Panel]()
+    rows, panels = list(found.rows()), list[Panel]()
     for title, (column, factor) in BY_CYCLE.items():
+        known = {f"cycle {row['cycle']}": row[column] for row in rows if row[column] is not None}
         values = {
-            f"cycle {row[0]}": ParameterEstimate(factor * x, None, None, "", True, "determined", "")
-            for row in table
-            if (x := row[head.index(column)]) is not None
+            cycle: ParameterEstimate(factor * x, None, None, "", True, "determined", "")
+            for cycle, x in known.items()
         }
         panels.append(Panel(column, title, values))
     names = [f"cycle {number}" for number in results]
@@ -210,13 +202,3 @@ def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
         width=width,
         above=partial(draw_loops, [loops[i] for i in keep[: len(loops)]]),
     )
-
-
-def _shown(found: CycleFits, *, html: bool = False) -> str:
-    """Return how many cycles were fitted and their misfits; as HTML the parameters by cycle too."""
-    line = f"{found.model} · {len(found.results)} of {counted(len(found.recorded), 'cycle')} fitted"
-    each = (one.misfit.get("stress_strain") for one in found.results.values())
-    if known := [off for off in each if off is not None]:
-        line += f" · misfit {percent(min(known))} to {percent(max(known))}"
-    table = by_test(list(map(str, sorted(found.results))), found.varied) if html else {}
-    return brief(found.test, line, [], html, table and {"first": "cycle", **table})

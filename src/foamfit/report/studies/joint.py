@@ -169,15 +169,9 @@ def _told(found: Joint) -> dict[str, Any]:
 
 def joint_text(found: Joint) -> str:
     """Return what the command prints of a joint fit."""
-    told = _told(found)
-    tests = list(told["found"]["tests"].items())[:MOST_ROWS]
-    parameters = [
-        # The median of a contact time or a zero means nothing.
-        (name, one, "" if name in NUISANCE else in_unit((one.value,), one.unit), between(one))
-        for name, one in found.parameters.items()
-        if one.kind != "fixed" or one.value
-    ]
-    return words("joint", parameters=parameters, tests=tests, **told)
+    every = {n: p for n, p in found.parameters.items() if p.kind != "fixed" or p.value}
+    given: Any = {"parameters": every, "nuisance": NUISANCE, "between": between, "most": MOST_ROWS}
+    return words("joint", **given, **_told(found))
 
 
 def joint_page(found: Joint, loops: bytes, compared: bytes) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
-from foamfit.errors import InputError
 from foamfit.report import figures
 from foamfit.report import folder as results
 from foamfit.report.figures import BLUE, INSIDE, MEASURED, TWO, VERMILION
@@ -65,11 +63,18 @@ class PredictedCurve:
         """Measured range."""
         return float(np.ptp(self.measured))
 
+    def met(self, part: slice) -> tuple[float, float]:
+        """Return misfit, over its own range, and share inside the band of a part of the samples."""
+        kept, measured = self.kept[part], self.measured[part]
+        off = (self.predicted[part] - measured)[kept]
+        within = (self.lo[part] <= measured) & (measured <= self.hi[part])
+        misfit = np.sqrt(np.mean(off**2)) / np.ptp(measured[kept])
+        return float(misfit), float(np.mean(within[kept]))
+
     @property
     def inside(self) -> float:
         """Share of the samples that lie inside the band."""
-        within = (self.lo <= self.measured) & (self.measured <= self.hi)
-        return float(np.mean(within[self.kept]))
+        return self.met(slice(None))[1]
 
     @property
     def half_width(self) -> float:
@@ -141,12 +146,13 @@ class Prediction:
 
         def write(fresh: Path) -> None:
             results.write_json(fresh / "prediction.json", self.to_json_dict())
-            results.write_table(fresh / "prediction.csv", self.rows())
+            results.write_columns(fresh / "prediction.csv", self.columns)
             if report:
                 figure = plot_prediction(self, width=figure_width)
                 figures.write_both(figure, fresh / "prediction")
 
-        check_replaceable(folder)
+        # A result of another kind may be the one that is predicted from.
+        results.check_target(folder, of="prediction.json")
         return results.save_whole(folder, write)
 
     @property
@@ -166,16 +172,8 @@ class Prediction:
         They are those of the stress under a driven motion, or of the first curve.
         """
         curve = self.curves.get("stress_time", next(iter(self.curves.values())))
-        out = {}
-        for number, part in cycles_of(self.measurement).items():
-            kept = curve.kept[part]
-            measured, predicted, lo, hi = (
-                one[part][kept] for one in (curve.measured, curve.predicted, curve.lo, curve.hi)
-            )
-            miss = float(np.sqrt(np.mean((predicted - measured) ** 2)) / np.ptp(measured))
-            within = float(np.mean((lo <= measured) & (measured <= hi)))
-            out[number] = {"misfit": miss, "inside": within}
-        return out
+        each = {n: curve.met(part) for n, part in cycles_of(self.measurement).items()}
+        return {n: {"misfit": off, "inside": inside} for n, (off, inside) in each.items()}
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``prediction.json``: SI, plain types, null = not there."""
@@ -211,11 +209,9 @@ class Prediction:
         )
         return content
 
-    def rows(self) -> Iterator[list[object]]:
-        """Rows of prediction.csv, the header first: one row per sample, SI.
-
-        Everything that `prediction.png` shows is in them.
-        """
+    @property
+    def columns(self) -> dict[str, Array]:
+        """The columns of prediction.csv, one value per sample, SI: all that its picture shows."""
         m, columns = self.measurement, dict[str, Array]()
         if m.time is not None:
             columns["time (s)"] = m.time
@@ -241,24 +237,7 @@ class Prediction:
             columns["measured strain"] = m.displacement / height
         if (moved := self.curves.get("displacement_time")) is not None:
             columns["predicted strain"] = moved.predicted / height
-        yield list(columns)
-        for row in zip(*(column.tolist() for column in columns.values()), strict=True):
-            yield list(row)
-
-
-def check_replaceable(folder: str | Path) -> None:
-    """Raise InputError unless `folder` is free, empty or an older prediction.
-
-    A result of another kind is not replaced: it may be the one that is predicted from.
-    """
-    results.check_target(folder)
-    place = Path(folder)
-    there = sorted(path.name for path in place.iterdir()) if place.is_dir() else []
-    if others := [name for name in there if name not in results.FILES["prediction.json"]]:
-        raise InputError(
-            f"{folder} holds {others[0]}, which is no part of a prediction, so it is not replaced; "
-            "choose a new or an empty folder"
-        )
+        return columns
 
 
 def prediction_text(found: Prediction) -> str:
