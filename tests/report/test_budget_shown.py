@@ -86,10 +86,12 @@ def test_the_report_has_the_budget_as_table_and_picture() -> None:
     text = render_report(result, figures)
     page = text[text.index("Uncertainty budget") :]
     head, row = (part.split("</tr>")[0] for part in page.split("<tr>")[1:3])
-    assert head.count("<th") == 5  # three sources, combined, and the corner
+    assert head.count("<th") == 6  # the corner, three sources, combined, the bars
     assert "mass" not in head
     for share in ("1 %", "2 %", "2.4 %"):  # √(1 + 1 + 4)
         assert f">{share}<" in row
+    widths = [float(bar.split("%")[0]) for bar in row.split("width: ")[1:]]
+    assert widths == pytest.approx([100 / 6, 100 / 6, 400 / 6], abs=0.1)  # 1, 1, 4 of 6
     assert "± 0.11" in text  # of k0 = 5.5 MPa
     assert "Systematic is one standard deviation" in text
 
