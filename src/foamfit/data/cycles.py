@@ -22,6 +22,7 @@ _LOWEST, _LOADED, _STILL_LOADED = 0.02, 0.01, 0.05
 # it, and the number of places that are tried for its foot.
 _EARLY, _FEWEST, _PLACES = 0.1, 5, 400
 _SURE = 4.0  # standard errors by which a stress is below zero
+_STRETCH = 1000  # samples in which the next turn is looked for first
 _BEGUN = 3.0  # times the least load: above it the first rise has certainly begun
 
 
@@ -265,16 +266,21 @@ def find_turns(values: Array, back: float | None = None) -> Integers:
     """
     if back is None:
         back = max(_TURN * float(np.ptp(values)), 8.0 * noise_level(values))
-    turns, up, best, most = list[int](), True, 0, float(values[0])
-    for i, value in enumerate(values.tolist()):
-        ahead = value - most if up else most - value
-        if ahead > 0.0:
-            best, most = i, value
-        elif ahead < -back:
-            turns.append(best)
-            up, best, most = not up, i, value
-    if up or not turns:  # the record ends on its way up
-        turns.append(best)
+    # From a turn on, ever longer stretches are searched for the next.
+    turns, first, sign, length = list[int](), 0, 1.0, _STRETCH
+    while True:
+        ahead = sign * values[first : first + length]
+        gone = np.maximum.accumulate(ahead) - ahead > back
+        end = int(np.argmax(gone))
+        if gone[end]:
+            turns.append(first + int(np.argmax(ahead[:end])))
+            first, sign, length = first + end, -sign, _STRETCH
+        elif first + length < values.size:
+            length *= 2
+        else:
+            break
+    if sign > 0.0 or not turns:  # the record ends on its way up
+        turns.append(first + int(np.argmax(ahead)))
     return np.array(turns, dtype=np.int64)
 
 

@@ -272,38 +272,57 @@ def read_numbers(
 
     InputError names the first cell that is no number.
     """
-    count, places = len(table.headers), list(columns.values())
-    strict = table.decimal == "," or b"_" in table.body()  # what float does not refuse or know
-    numbers, rows, empty = array("d"), array("q"), array("q")
-    for row, cells in table.rows():
-        try:
-            values = [float(cells[k]) for k in places]
-        except (ValueError, IndexError):
-            values = []
-        if strict or not values or len(cells) > count or not math.isfinite(sum(values)):
-            cells = [cell.strip() for cell in cells] + [""] * (count - len(cells))
-            if tuple(cells) == table.header_cells:
-                again = f"row {row} repeats the header of row {table.header_row}"
-                raise InputError(f"{again}; a file must hold one table with one header.")
-            if any(cells[count:]):
-                many = f"row {row} has {len(cells)} cells, but the header has {count}"
-                raise InputError(f"{many}; every row must have as many as the header.")
-            texts = [cells[k] for k in places]
-            if not any(texts):
-                empty.append(row)
-                continue
-            for k, text in zip(places, texts, strict=True):
-                if wrong := _wrong(text, table.decimal):
-                    raise InputError(f"row {row}, column {table.headers[k].text!r} is {wrong}.")
-            values = [float(text.replace(",", ".")) for text in texts]
-        numbers.extend(values)
-        rows.append(row)
-    read = np.array(numbers).reshape(-1, len(places)).T.copy()
+    places, empty = list(columns.values()), list[int]()
+    read = _plain_numbers(table, places)
+    if read is None:
+        read, rows, empty = _checked_numbers(table, places)
+    else:
+        rows = np.arange(table.first_row + 1, table.first_row + 1 + read.shape[1])
     for k, one in zip(places, read, strict=True):
         _refuse_thousands(table, k, one)
         if table.clock is not None and k == 0:
             one[:] = table.clock[0] + table.clock[1] * one
-    return dict(zip(columns, read, strict=True)), np.array(rows), np.array(empty)
+    return dict(zip(columns, read, strict=True)), rows, np.array(empty, dtype=np.int64)
+
+
+def _plain_numbers(table: Table, places: list[int]) -> Array | None:
+    """Read the columns (k, n) at once; None unless each row has finite numbers in them."""
+    text = table.body().rstrip(b"\r\n").decode(table.encoding, "replace")
+    if table.decimal == ",":
+        text = "" if "." in text or table.separator == "," else text.replace(",", ".")
+    kinds = [(str(k), "f8" if k in places else "U1") for k in range(len(table.headers))]
+    try:
+        lines = io.StringIO(text, newline=None)
+        read = np.loadtxt(lines, kinds, None, table.separator, quotechar='"', ndmin=1)
+    except ValueError:
+        return None
+    numbers = np.array([read[str(k)] for k in places])
+    # A line that is blank, or a cell that spans several, would shift the numbers of the rows.
+    whole = read.size == text.count("\n") + 1 and np.isfinite(numbers).all()
+    return numbers if whole else None
+
+
+def _checked_numbers(table: Table, places: list[int]) -> tuple[Array, Integers, list[int]]:
+    """Read the columns (k, n) cell by cell, as `read_numbers`."""
+    numbers, rows, empty, count = array("d"), array("q"), list[int](), len(table.headers)
+    for row, cells in table.rows():
+        cells = [cell.strip() for cell in cells] + [""] * (count - len(cells))
+        if tuple(cells) == table.header_cells:
+            again = f"row {row} repeats the header of row {table.header_row}"
+            raise InputError(f"{again}; a file must hold one table with one header.")
+        if any(cells[count:]):
+            many = f"row {row} has {len(cells)} cells, but the header has {count}"
+            raise InputError(f"{many}; every row must have as many as the header.")
+        texts = [cells[k] for k in places]
+        if not any(texts):
+            empty.append(row)
+            continue
+        for k, text in zip(places, texts, strict=True):
+            if wrong := _wrong(text, table.decimal):
+                raise InputError(f"row {row}, column {table.headers[k].text!r} is {wrong}.")
+        numbers.extend(float(text.replace(",", ".")) for text in texts)
+        rows.append(row)
+    return np.array(numbers).reshape(-1, len(places)).T.copy(), np.array(rows), empty
 
 
 def _refuse_thousands(table: Table, column: int, values: Array) -> None:
