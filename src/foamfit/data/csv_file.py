@@ -221,7 +221,7 @@ def _record(source: Source, settings: Settings) -> Record:
         displacement,
         numbers.get("velocity"),
         acceleration,
-        inside,
+        interior=inside,
         cycle=numbers.get("cycle"),
         numbers=rows,
         dropped=tuple(dropped),

@@ -191,26 +191,18 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     ]
     loaded = (level - offset) / (float(stress[top]) - offset)
     if offset < 0.0:
-        notes.append(
-            f"The stress between the cycles, {engineering(offset, 'Pa')}, is taken off as the "
-            "sensor's offset: without contact the specimen bears none."
-        )
+        notes.append(_offset_note("between the cycles", offset))
     elif loaded > _STILL_LOADED:
         notes.append(
             "Check: the specimen stays under load between the cycles, by "
             f"{percent(loaded)} of the peak stress."
         )
-    origins = record.origins | {"start_strain": contact / height}
-    origins["stress_zero"] += offset
-    origins["displacement_zero"] += contact
-    origins |= {} if record.time is None else {"contact_time": time}
+    moved = record.shifted("stress", offset).shifted("displacement", contact)
+    moved = moved if record.time is None else moved.shifted("time", time)
     moved = replace(
-        record,
-        time=None if record.time is None else record.time - time,
-        stress=stress - offset,
-        displacement=w - contact,
+        moved,
         interior={node: values - passed(values) for node, values in record.interior.items()},
-        origins=origins,
+        origins=moved.origins | {"start_strain": contact / height},
         notes=(*cut_to_cycle(record, cycles, cycle).notes, *notes),
     )
     cut = moved.without(slice(cycle.end, None), f"after cycle {end_of}")
@@ -231,11 +223,14 @@ def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
     zero, error = float(np.median(rest)), float(np.std(rest)) / float(np.sqrt(rest.size))
     if zero > -_SURE * error:
         return record
-    origins = record.origins | {"stress_zero": record.origins.get("stress_zero", 0.0) + zero}
-    errors, stress = record.zeros | {"stress": error}, record.stress - zero
-    return replace(record, stress=stress, origins=origins, zeros=errors).noted(
-        f"The stress between the first two cycles, {engineering(zero, 'Pa')}, is taken off as the "
-        "sensor's offset: without contact the specimen bears none."
+    record = replace(record.shifted("stress", zero), zeros=record.zeros | {"stress": error})
+    return record.noted(_offset_note("between the first two cycles", zero))
+
+
+def _offset_note(when: str, zero: float) -> str:
+    return (
+        f"The stress {when}, {engineering(zero, 'Pa')}, is taken off as the sensor's offset: "
+        "without contact the specimen bears none."
     )
 
 

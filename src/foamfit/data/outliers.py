@@ -230,9 +230,7 @@ def notes_on(record: Record, spikes: dict[str, int], found: dict[str, Outliers])
     return notes + [note for note, rows in record.standstills.items() if rows.any()]
 
 
-def fresh_samples(
-    values: Array | Mask,
-) -> tuple[Integers, Integers]:
+def fresh_samples(values: Array | Mask) -> tuple[Integers, Integers]:
     """Samples at which a value is new, and for how many samples each is held."""
     fresh = np.append(0, np.flatnonzero(np.diff(values) != 0) + 1)
     return fresh, np.diff(np.append(fresh, len(values)))
@@ -272,12 +270,9 @@ def fill_staircase(record: Record) -> Record:
         if name == "stress" or name in record.sampled or len(lengths) < MIN_ROWS or step < 2:
             continue
         knots = np.union1d(fresh, (fresh + lengths - step)[lengths > 3 * step])
-        record = record.changed(name, np.interp(time, time[knots], values[knots]))
-        taken = np.zeros(len(values), dtype=bool)
-        taken[knots] = True
-        record = replace(record, sampled=record.sampled | {name: taken})
         shown = "The displacement" if name == "displacement" else name
-        record = record.noted(
+        line = np.interp(time, time[knots], values[knots])
+        record = record.interpolated(name, line, knots).noted(
             f"{shown} is held for about {step} samples at a time; it is interpolated between the "
             f"{len(fresh)} instants where it is fresh."
         )

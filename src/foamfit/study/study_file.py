@@ -8,7 +8,7 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from foamfit.data.toml_file import check_keys, is_range, load_toml
+from foamfit.data.toml_file import COUNT, FLAG, RANGE, Rule, check_keys, load_toml
 from foamfit.errors import InputError
 from foamfit.fitting.curves import DRIVES
 from foamfit.fitting.links import KINDS
@@ -19,14 +19,24 @@ from foamfit.study.test_files import find_tests
 
 # The kind of a parameter for which evidence chooses one of `KINDS`.
 AUTO = "auto"
-_EXAMPLES = {
-    "tests": 'tests = ["runs/*.csv"]',
-    "model": 'model = "microscale"',
-    "name": 'name = "new heel"',
-    "specimen": 'specimen = "foam.toml"',
+_EXAMPLES = {"tests": 'tests = ["runs/*.csv"]', "model": 'model = "microscale"'}
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip())
+
+
+_RULES = {
+    "name": Rule(_is_text, 'text, like name = "new heel"'),
+    "specimen": Rule(_is_text, 'text, like specimen = "foam.toml"'),
+    "seed": Rule(lambda v: type(v) is int and v >= 0, "a whole number from 0 up"),
+    "cycle": COUNT,
+    "cycles": RANGE._replace(right=f"{RANGE.right}, without cycle"),
+    "starts": COUNT,
+    "drive": Rule(lambda v: v in DRIVES, f"one of {', '.join(DRIVES)}"),
+    **dict.fromkeys(OPTIONS, FLAG),
 }
-_LEAST = {"seed": 0, "cycle": 1, "starts": 1}  # of whole numbers
-_KEYS = (*_EXAMPLES, *_LEAST, "cycles", "relaxation", *OPTIONS, "drive", "specimens", "parameters")
+_KEYS = (*_RULES, "tests", "model", "relaxation", "specimens", "parameters")
 
 
 @dataclass(frozen=True)
@@ -67,23 +77,10 @@ def _read(path: Path, content: Mapping[str, Any]) -> Study:
     for key in ("tests", "model"):
         if key not in content:
             raise InputError(f"{key} is missing; give it like {_EXAMPLES[key]}")
-    for key, value in content.items():
-        admissible, wanted = True, ""
-        if key in ("name", "specimen"):
-            admissible = isinstance(value, str) and bool(value.strip())
-            wanted = f"text, like {_EXAMPLES[key]}"
-        elif key in _LEAST:
-            admissible = type(value) is int and value >= _LEAST[key]
-            wanted = f"a whole number from {_LEAST[key]} up"
-        elif key == "drive":
-            admissible, wanted = value in DRIVES, f"one of {', '.join(DRIVES)}"
-        elif key in OPTIONS:
-            admissible, wanted = isinstance(value, bool), "true or false"
-        elif key == "cycles":
-            admissible = is_range(value) and "cycle" not in content
-            wanted = "the numbers of the first and the last one, like [1, 3], without cycle"
-        if not admissible:
-            raise InputError(f"{key} = {value!r} must be {wanted}")
+    for key, rule in _RULES.items():
+        both = key == "cycles" and "cycle" in content
+        if key in content and (both or not rule.valid(content[key])):
+            raise InputError(f"{key} = {content[key]!r} must be {rule.right}")
     model = Model.of_result(content)
     tests = _tests(path, content["tests"])
     kinds, held = _parameters(content.get("parameters", {}), model)
