@@ -140,10 +140,10 @@ def toml_beside(test: Path) -> Path:
     return plain.parent / f"{plain.stem}.toml"
 
 
-def read_bytes(path: Path, otherwise: str, most: int | None = None) -> bytes:
-    """Read a file, its first bytes if `most` are given; `otherwise` says what would be right."""
+def read_bytes(path: Path, otherwise: str) -> bytes:
+    """Read a file; `otherwise` says what would be right."""
     try:
-        return read_whole(path, most)
+        return read_whole(path)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {otherwise}.") from None
     except OSError as error:

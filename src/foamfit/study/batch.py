@@ -104,7 +104,10 @@ class Batch:
         try:
             for i, (name, path) in enumerate(self.tests):
                 self._begin(executor, name, path)
-                while len(self.waiting) >= MOST_AHEAD or self._bytes_ahead >= MOST_BYTES:
+                while (
+                    len(self.waiting) >= MOST_AHEAD
+                    or sum(task.size for task in self.waiting.values()) >= MOST_BYTES
+                ):
                     self._collect(1.0)
                 self._collect(0.0)
                 while i == 0 and not self.foreign and self._is_cold() and self.waiting:
@@ -124,10 +127,6 @@ class Batch:
             done = f"{len(self.rows)} of {counted(len(self.tests), 'test')} are done and stay"
             raise InputError(f"{told}; {done}, call again for the others") from error
         self.save(whole=True)
-
-    @property
-    def _bytes_ahead(self) -> int:
-        return sum(task.size for task in self.waiting.values())
 
     def _is_cold(self) -> bool:
         """Whether the first fit compiles what the others need too."""
@@ -178,7 +177,6 @@ class Batch:
             return
         self.fitted += 1
         self._keep(task.name, rows)
-        self._save_sometimes()
 
     def _keep(self, name: str, rows: tuple[Row, ...]) -> None:
         self.rows[name] = rows

@@ -41,7 +41,7 @@ _KEYS = (*_RULES, "tests", "model", "relaxation", "specimens", "parameters")
 
 @dataclass(frozen=True)
 class Study:
-    """What a study says; `tests` are names and files, `specimens` the TOML of each (or None).
+    """What a study says; `tests` are names, files, and the TOML of each (None: beside it).
 
     `kinds` has the kind of each parameter that is named, one of `links.KINDS` or "auto"; `held`
     the values (SI) of those that are held.
@@ -49,8 +49,7 @@ class Study:
 
     path: Path
     name: str
-    tests: tuple[tuple[str, Path], ...]
-    specimens: tuple[Path | None, ...]
+    tests: tuple[tuple[str, Path, Path | None], ...]
     model: str
     relaxation: int
     drive: str | None
@@ -82,13 +81,12 @@ def _read(path: Path, content: Mapping[str, Any]) -> Study:
         if key in content and (both or not rule.valid(content[key])):
             raise InputError(f"{key} = {content[key]!r} must be {rule.right}")
     model = Model.of_result(content)
-    tests = _tests(path, content["tests"])
+    tests = _tests(path, content)
     kinds, held = _parameters(content.get("parameters", {}), model)
     return Study(
         path=path,
         name=content.get("name") or path.stem,
         tests=tests,
-        specimens=_specimens(path, content, [name for name, _ in tests]),
         model=model.name,
         relaxation=model.relaxation,
         drive=content.get("drive"),
@@ -101,7 +99,9 @@ def _read(path: Path, content: Mapping[str, Any]) -> Study:
     )
 
 
-def _tests(path: Path, patterns: Any) -> tuple[tuple[str, Path], ...]:
+def _tests(path: Path, content: Mapping[str, Any]) -> tuple[tuple[str, Path, Path | None], ...]:
+    """Tests, and the TOML of each: its own in [specimens], else that of all."""
+    patterns = content["tests"]
     patterns = [patterns] if isinstance(patterns, str) else patterns
     if not isinstance(patterns, list) or not all(isinstance(p, str) for p in patterns):
         raise InputError(f"tests must be a list like {_EXAMPLES['tests']}")
@@ -113,20 +113,16 @@ def _tests(path: Path, patterns: Any) -> tuple[tuple[str, Path], ...]:
         raise InputError(
             f"tests names {'one test' if found else 'none'}; a joint fit needs at least two"
         )
-    return tuple(found)
-
-
-def _specimens(path: Path, content: Mapping[str, Any], names: list[str]) -> tuple[Path | None, ...]:
-    """The TOML of each test: its own in [specimens], else that of all; None = beside the test."""
-    own = content.get("specimens", {})
+    own, names = content.get("specimens", {}), [name for name, _ in found]
     if not isinstance(own, dict):
         raise InputError(f'specimens must be a table of tests, like {names[0]} = "a.toml"')
     check_keys("[specimens]", own, names)
     for name, value in own.items():
         if not isinstance(value, str):
             raise InputError(f"[specimens] {name} = {value!r} must be the name of a TOML")
-    given = [own.get(name, content.get("specimen")) for name in names]
-    return tuple(None if one is None else path.parent / one for one in given)
+    tomls = (own.get(name, content.get("specimen")) for name in names)
+    places = (None if toml is None else path.parent / toml for toml in tomls)
+    return tuple((*test, place) for test, place in zip(found, places, strict=True))
 
 
 def _parameters(table: Any, model: Model) -> tuple[dict[str, str], dict[str, float]]:
