@@ -31,7 +31,7 @@ class Cycle:
     """One loading and unloading among the samples of a slow test: `first` up to `end`.
 
     `number` is that of the record's own column of cycles, or counts from 1; `place` counts from 0.
-    Several cycles as one history have a `last` number and their last peak at `turn`.
+    The last peak is at `turn`; several cycles as one history have a `last` number.
     """
 
     number: int
@@ -39,19 +39,8 @@ class Cycle:
     first: int
     top: int
     end: int
+    turn: int
     last: int | None = None
-    turn: int = -1
-
-    @property
-    def last_top(self) -> int:
-        """Sample of the last peak."""
-        return self.top if self.last is None else self.turn
-
-    @property
-    def name(self) -> str:
-        """What it is called: "cycle 2", "cycles 1 to 3"."""
-        one = f"cycle {self.number}"
-        return one if self.last is None else f"cycles {self.number} to {self.last}"
 
 
 def find_cycles(record: Record) -> list[Cycle]:
@@ -86,7 +75,7 @@ def find_cycles(record: Record) -> list[Cycle]:
         if fall[0] - fall.min() > _UNLOADED * size:
             end = top + int(np.argmax(fall <= fall.min() + 0.005 * size)) + 1
         number = place + 1 if column is None else round(float(column[top]))
-        found.append(Cycle(number, place, first, top, end))
+        found.append(Cycle(number, place, first, top, end, turn=top))
     return found
 
 
@@ -134,9 +123,11 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
     notes = []
     if n > 1 or end - start < len(record):
         order = "" if number == cycle.place + 1 else f" (number {cycle.place + 1} in the file)"
-        used = "is used" if cycle.last is None else "are used as one history"
+        named, used = f"Cycle {number}", "is used"
+        if cycle.last is not None:
+            named, used = f"Cycles {number} to {cycle.last}", "are used as one history"
         notes.append(
-            f"{cycle.name.capitalize()}{order} of {n} {used}: {end - start} of {len(record)} "
+            f"{named}{order} of {n} {used}: {end - start} of {len(record)} "
             f"samples, {start} before and {len(record) - end} after are cut."
         )
     largest = max(cycles, key=lambda one: float(w[one.top])).number
@@ -147,7 +138,7 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
             f"cycle {largest} of {n} reaches all of it (--cycle {largest}, or [window] cycle = "
             f"{largest})."
         )
-    last = cycle.last_top
+    last = cycle.turn
     if end == len(record) and w[last] - w[last:].min() <= _UNLOADED * size:
         notes.append("The record has no unloading, so nothing in it determines unloading.")
     after = f"after cycle {number if cycle.last is None else cycle.last}"
@@ -163,7 +154,7 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     foam does not pull its platen for long. The strain not recovered is `origins["start_strain"]`.
     """
     w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
-    turn, end_of = cycle.last_top, number if cycle.last is None else cycle.last
+    turn, end_of = cycle.turn, number if cycle.last is None else cycle.last
     assert w is not None  # it has cycles
     free = float(np.median(_stress_between(record, cycles, cycle.place - 1)))
     mean = smooth(stress, max(1, (top - cycle.first) // 100))

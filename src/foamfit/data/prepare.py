@@ -75,7 +75,7 @@ def condition(
     first = cycles.cut_to_cycle(record, found, found[0]) if found else record
     curves = first.curves("acceleration")
     levels = {c: estimated_noise(v) for c, v in curves.items()} | held
-    used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record))
+    used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record), turn=0)
     if impact:
         start = contact.start_of_impact(first, levels)
         start = replace(start, gauge=zeros.gauge_before(first, start, levels, known))

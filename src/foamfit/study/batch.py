@@ -10,7 +10,6 @@ from concurrent import futures
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Unpack
 
@@ -33,7 +32,6 @@ from foamfit.study.batch_work import (
     Task,
     fingerprint,
     put,
-    settings_key,
     stored,
     work,
 )
@@ -71,11 +69,6 @@ class Batch:
     wrong: int = 0  # of all that are done, without a fit
     saved: float = field(default_factory=lambda: time.monotonic())  # when the summary was written
     took: float = 0.0  # to write it, s
-
-    @cached_property
-    def key(self) -> str:
-        """What the results are made by."""
-        return settings_key(self.recipe)
 
     @property
     def summary(self) -> list[Row]:
@@ -144,7 +137,7 @@ class Batch:
             motion = None if camera is None else _bytes(camera)
         except OSError:  # reading the test gives a better message
             data, settings, motion = b"", None, None
-        mark = fingerprint(self.key, data, settings, motion)
+        mark = fingerprint(self.recipe.key, data, settings, motion)
         known = None if self.fresh else stored(folder, mark, self.recipe)
         if known is not None:
             self._keep(name, tuple(replace(row, file=str(path)) for row in known))
