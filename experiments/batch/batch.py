@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 
 import foamfit as ff
-from foamfit.study.batch_work import Recipe, Task, fingerprint, put, settings_key, stored, work
+from foamfit.study.batch_work import Recipe, Task, fingerprint, put, stored, work
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
@@ -119,7 +119,7 @@ def measure_overhead(place: Path) -> dict[str, Any]:
     """What a test costs beside its fit: read, compared, written; and the whole command."""
     make_tests(place / "tests", TINY, 601)
     recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=False)
-    key, spent = settings_key(recipe), [0.0, 0.0]
+    key, spent = recipe.key, [0.0, 0.0]
     from foamfit.study import batch_work
 
     real: Callable[..., Any] = batch_work.fit
@@ -187,7 +187,7 @@ def measure_parts(place: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, pages in {"no report": False, "reports": True}.items():
         recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=pages)
-        key, path = settings_key(recipe), paths[0]
+        key, path = recipe.key, paths[0]
         mark = fingerprint(key, path.read_bytes(), toml.read_bytes(), None)
         content = path.read_bytes(), toml.read_bytes(), None
         outcome = work(Task(path.stem, path, toml, recipe, mark, None, content))

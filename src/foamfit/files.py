@@ -23,6 +23,7 @@ from uuid import uuid4
 
 from foamfit.errors import InputError
 
+_HOST = re.sub(r"[^\w-]", "-", platform.node())[:40] or "host"
 # Marks this process; another one may have its number later, or in another container.
 _TOKEN = uuid4().hex[:8]
 # Age, s, at which a temporary file of a process that cannot be checked counts as abandoned.
@@ -65,16 +66,10 @@ def write_file(path: str | Path, content: bytes) -> None:
             path.write_bytes(content)
             return
         target = path.resolve()  # a link stays a link
-        sweep(target.parent, [target.name])
-        fresh = _beside(target, "new")
-        try:
+        with replacing(target, folder=False) as fresh:
             fresh.write_bytes(content)
             if target.exists():
                 shutil.copymode(target, fresh)
-            fresh.replace(target)
-        except BaseException:  # KeyboardInterrupt too must leave everything as it was
-            fresh.unlink(missing_ok=True)
-            raise
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path} cannot be written: {reason(error)}") from None
 
@@ -98,33 +93,44 @@ def _harmless(cell: object) -> object:
 
 
 @contextmanager
-def replacing(folder: Path, *, swept: bool = False) -> Iterator[Path]:
-    """Give an empty folder beside `folder` (resolved) to write into, which replaces it at the end.
+def replacing(target: Path, *, folder: bool = True, swept: bool = False) -> Iterator[Path]:
+    """Give a path beside `target` (resolved) to write to, which replaces it at the end.
 
-    A caller that writes many folders into one has it `swept` once: sweeping for each would take a
-    time that grows with the square of their number.
+    It is an empty `folder`, or else a file that the body makes. A caller that writes many folders
+    into one has it `swept` once: sweeping for each would take a time that grows with the square of
+    their number.
     """
-    made = [parent for parent in folder.parents if not parent.exists()]
-    fresh, old = _beside(folder, "new"), _beside(folder, "old")
+    made = [parent for parent in target.parents if not parent.exists()]
+    fresh, old = _beside(target, "new"), _beside(target, "old")
     try:
         if not swept:
-            sweep(folder.parent, [folder.name])
-        fresh.mkdir(parents=True)
+            sweep(target.parent, [target.name])
+        if folder:
+            fresh.mkdir(parents=True)
         yield fresh
-        if folder.exists():
-            folder.rename(old)
-        fresh.rename(folder)
+        if folder and target.exists():
+            target.rename(old)
+        fresh.replace(target)
     except BaseException:  # KeyboardInterrupt too must leave everything as it was
-        if old.exists() and not folder.exists():
-            old.rename(folder)
-        shutil.rmtree(fresh, ignore_errors=True)
+        if old.exists() and not target.exists():
+            old.rename(target)
+        _remove(fresh)
         for parent in made:
             with suppress(OSError):
                 parent.rmdir()
         raise
     finally:
-        if folder.exists():  # else the old one is the last copy
-            shutil.rmtree(old, ignore_errors=True)
+        if target.exists():  # else the old one is the last copy
+            _remove(old)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or a folder as far as the system allows."""
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
 
 
 def reason(error: BaseException) -> str:
@@ -134,7 +140,7 @@ def reason(error: BaseException) -> str:
 
 def _beside(path: Path, ending: str) -> Path:
     """Return a temporary name beside a path."""
-    owner = f"{_host()}.{os.getpid()}.{_TOKEN}{uuid4().hex[:8]}"
+    owner = f"{_HOST}.{os.getpid()}.{_TOKEN}{uuid4().hex[:8]}"
     return path.with_name(f".{_short(path.name)}.{owner}.{ending}")
 
 
@@ -142,10 +148,6 @@ def _short(name: str) -> str:
     """Return a name to which an ending can be added: its own if that is short enough."""
     raw = os.fsencode(name)
     return name if len(raw) <= 100 else f"{name[:20]}~{hashlib.sha256(raw).hexdigest()[:12]}"
-
-
-def _host() -> str:
-    return re.sub(r"[^\w-]", "-", platform.node())[:40] or "host"
 
 
 _LEFT = re.compile(
@@ -173,20 +175,18 @@ def sweep(folder: Path, names: Iterable[str]) -> None:
         path = None if found is None else targets.get(found["name"])
         if found is None or path is None or _lives(found, left):
             continue
-        with suppress(OSError):
-            if found["ending"] == "old" and not path.exists():
+        if found["ending"] == "old" and not path.exists():
+            with suppress(OSError):
                 left.rename(path)
-            elif left.is_dir():
-                shutil.rmtree(left)
-            else:
-                left.unlink()
+        else:
+            _remove(left)
 
 
 def _lives(found: re.Match[str], left: Path) -> bool:
     """Whether the process that made a temporary file may still run."""
     process = int(found["process"])
     # A process of another machine cannot be asked, nor one of a system without POSIX signals.
-    if found["host"] != _host() or os.name != "posix":
+    if found["host"] != _HOST or os.name != "posix":
         with suppress(OSError):
             return time.time() - left.stat().st_mtime < _ABANDONED
         return True

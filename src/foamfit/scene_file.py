@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from foamfit.data.csv_file import read_history
 from foamfit.data.toml_file import check_keys, load_toml
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError
-from foamfit.files import read_whole, write_file
+from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.solve.simulation import Response
 from foamfit.springs import laws
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
@@ -191,8 +190,6 @@ def check_target(path: Path) -> None:
 def write_response(response: Response, path: Path) -> None:
     """Write a response as CSV, SI, one row per sample; an older file stays if that fails."""
     nodes = range(1, len(response.displacement) + 1)
-    header = [RESPONSE, *(f"displacement_{i} (m)" for i in nodes)]
+    header = [*RESPONSE.split(","), *(f"displacement_{i} (m)" for i in nodes)]
     columns = [response.time, response.base_stress, response.strain, *response.displacement]
-    text = io.StringIO()
-    np.savetxt(text, np.transpose(columns), "%s", ",", header=",".join(header), comments="")
-    write_file(path, text.getvalue().encode())
+    write_file(path, csv_bytes([header, *np.transpose(columns).tolist()]))

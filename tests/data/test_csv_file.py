@@ -1,5 +1,6 @@
 """What a test file may look like, and how one that cannot be used is refused."""
 
+import re
 import time
 
 import numpy as np
@@ -7,6 +8,9 @@ import pytest
 
 from conftest import DATA, refused
 from foamfit.data.csv_file import read_test
+from foamfit.data.tables import csv_table
+from foamfit.data.tables.csv_table import find_table, read_numbers, read_text
+from foamfit.errors import InputError
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not here")
 
@@ -41,6 +45,46 @@ def expect(test):
 
 
 # What is read.
+
+
+@pytest.mark.parametrize(
+    ("lines", "at_once"),
+    [
+        (numbers(), True),
+        ([f'"{row}"'.replace(",", '","') for row in numbers()], True),
+        ([row + " " for row in numbers()], True),
+        ([row.replace(",", ", ") for row in numbers()], True),
+        ([*numbers(), "", ""], True),
+        (numbers(";", ","), True),
+        ([row.replace(",", ",2.5 and more,") for row in numbers(";", ",")], False),
+        ([*numbers()[:20], "", *numbers()[20:]], False),
+        ([*numbers()[:20], ",,", *numbers()[20:]], False),
+        ([row + "," for row in numbers()], False),
+        (['"0\n",0,0', *numbers()[1:]], False),
+    ],
+)
+def test_numbers_read_at_once_are_those_read_cell_by_cell(tmp_path, monkeypatch, lines, at_once):
+    separator = ";" if ";" in lines[0] else ","
+    header = separator.join(("time (ms)", "stress (MPa)", "displacement (mm)"))
+    path = tmp_path / "test.csv"
+    path.write_text("\r\n".join(["A title", header, *lines]), encoding="utf-8", newline="")
+    table = find_table(read_text(path, "a table"), set())
+    assert (csv_table._plain_numbers(table, [0, 2]) is not None) == at_once
+    columns = {"time": 0, "displacement": 2}
+    try:
+        read = read_numbers(table, columns)
+    except InputError as error:
+        read = str(error)
+    monkeypatch.setattr(csv_table, "_plain_numbers", lambda *_: None)
+    if isinstance(read, str):
+        with pytest.raises(InputError, match=re.escape(read)):
+            read_numbers(table, columns)
+        return
+    slow = read_numbers(table, columns)
+    for name, values in slow[0].items():
+        np.testing.assert_array_equal(read[0][name], values)
+    np.testing.assert_array_equal(read[1], slow[1])
+    np.testing.assert_array_equal(read[2], slow[2])
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 
 from conftest import EXPERIMENTS
 from foamfit import read_test
+from foamfit.data.cycles import find_turns
 from foamfit.data.measurement import Record, Specimen, Striker, Window
 from foamfit.data.noise import noise_level
 from foamfit.data.outliers import fill_staircase
@@ -570,3 +571,17 @@ def test_noise_is_estimated_from_the_signal():
 )
 def test_values_for_people(value, unit, text):
     assert engineering(value, unit) == text
+
+
+@pytest.mark.parametrize("n", [1, 2, 50, 3000, 40_000])
+@pytest.mark.parametrize("back", [0.0, 1.0, 30.0, 1e3])
+def test_a_motion_turns_where_it_goes_back_by_more_than_so_much(n, back):
+    values = np.round(np.cumsum(np.random.default_rng(n).normal(size=n)), 1)
+    turns, up, best = list[int](), True, 0
+    for i, value in enumerate(values):
+        if (value > values[best]) if up else (value < values[best]):
+            best = i
+        elif abs(value - values[best]) > back:
+            turns, up, best = [*turns, best], not up, i
+    turns += [best] if up or not turns else []
+    np.testing.assert_array_equal(find_turns(values, back), turns)

@@ -54,7 +54,7 @@ def found(tmp_path_factory) -> JointResult:
     fit = fit_jointly(problems, Links(KINDS, x), [vectors])
     here = tmp_path_factory.mktemp("study") / "study.toml"
     study = Study(
-        here, "a & b", tuple((name, here) for name in names), (None,) * 3, "microscale", 0,
+        here, "a & b", tuple((name, here, None) for name in names), "microscale", 0,
         "displacement", KINDS, {}, 0, None, None,
     )  # fmt: skip
     return JointResult(

@@ -176,7 +176,7 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
     from foamfit.study.study_file import read_study
 
     read = read_study(study)
-    output.folder(folder, [path for _, path in read.tests])
+    output.folder(folder, [path for _, path, _ in read.tests])
     with options.compiling(output.silent, read.model, read.relaxation) as compile_rest:
         from foamfit.report.studies.joint import joint_text
         from foamfit.study.joint import joint as fit_jointly

@@ -221,7 +221,7 @@ def _record(source: Source, settings: Settings) -> Record:
         displacement,
         numbers.get("velocity"),
         acceleration,
-        inside,
+        interior=inside,
         cycle=numbers.get("cycle"),
         numbers=rows,
         dropped=tuple(dropped),
@@ -255,8 +255,8 @@ def _channels(
         if measure:
             notes.append(f"The strain is converted from the {measure} strain {header.text!r}.")
     # An instrument's header may announce the number of samples.
-    for row, line in enumerate(table.raw.split(b"\n", table.first_row)[: table.first_row], 1):
-        match = re.match(rb"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE)
+    for row, line in enumerate(table.content.split("\n", table.first_row)[: table.first_row], 1):
+        match = re.match(r"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE | re.ASCII)
         if match and int(match[1]) != rows.size:
             told = f"announces {int(match[1])} samples, the table has {rows.size}"
             notes.append(f"Check: row {row} {told}.")

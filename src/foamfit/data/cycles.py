@@ -22,6 +22,7 @@ _LOWEST, _LOADED, _STILL_LOADED = 0.02, 0.01, 0.05
 # it, and the number of places that are tried for its foot.
 _EARLY, _FEWEST, _PLACES = 0.1, 5, 400
 _SURE = 4.0  # standard errors by which a stress is below zero
+_STRETCH = 1000  # samples in which the next turn is looked for first
 _BEGUN = 3.0  # times the least load: above it the first rise has certainly begun
 
 
@@ -30,7 +31,7 @@ class Cycle:
     """One loading and unloading among the samples of a slow test: `first` up to `end`.
 
     `number` is that of the record's own column of cycles, or counts from 1; `place` counts from 0.
-    Several cycles as one history have a `last` number and their last peak at `turn`.
+    The last peak is at `turn`; several cycles as one history have a `last` number.
     """
 
     number: int
@@ -38,19 +39,8 @@ class Cycle:
     first: int
     top: int
     end: int
+    turn: int
     last: int | None = None
-    turn: int = -1
-
-    @property
-    def last_top(self) -> int:
-        """Sample of the last peak."""
-        return self.top if self.last is None else self.turn
-
-    @property
-    def name(self) -> str:
-        """What it is called: "cycle 2", "cycles 1 to 3"."""
-        one = f"cycle {self.number}"
-        return one if self.last is None else f"cycles {self.number} to {self.last}"
 
 
 def find_cycles(record: Record) -> list[Cycle]:
@@ -85,7 +75,7 @@ def find_cycles(record: Record) -> list[Cycle]:
         if fall[0] - fall.min() > _UNLOADED * size:
             end = top + int(np.argmax(fall <= fall.min() + 0.005 * size)) + 1
         number = place + 1 if column is None else round(float(column[top]))
-        found.append(Cycle(number, place, first, top, end))
+        found.append(Cycle(number, place, first, top, end, turn=top))
     return found
 
 
@@ -133,9 +123,11 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
     notes = []
     if n > 1 or end - start < len(record):
         order = "" if number == cycle.place + 1 else f" (number {cycle.place + 1} in the file)"
-        used = "is used" if cycle.last is None else "are used as one history"
+        named, used = f"Cycle {number}", "is used"
+        if cycle.last is not None:
+            named, used = f"Cycles {number} to {cycle.last}", "are used as one history"
         notes.append(
-            f"{cycle.name.capitalize()}{order} of {n} {used}: {end - start} of {len(record)} "
+            f"{named}{order} of {n} {used}: {end - start} of {len(record)} "
             f"samples, {start} before and {len(record) - end} after are cut."
         )
     largest = max(cycles, key=lambda one: float(w[one.top])).number
@@ -146,7 +138,7 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
             f"cycle {largest} of {n} reaches all of it (--cycle {largest}, or [window] cycle = "
             f"{largest})."
         )
-    last = cycle.last_top
+    last = cycle.turn
     if end == len(record) and w[last] - w[last:].min() <= _UNLOADED * size:
         notes.append("The record has no unloading, so nothing in it determines unloading.")
     after = f"after cycle {number if cycle.last is None else cycle.last}"
@@ -162,7 +154,7 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     foam does not pull its platen for long. The strain not recovered is `origins["start_strain"]`.
     """
     w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
-    turn, end_of = cycle.last_top, number if cycle.last is None else cycle.last
+    turn, end_of = cycle.turn, number if cycle.last is None else cycle.last
     assert w is not None  # it has cycles
     free = float(np.median(_stress_between(record, cycles, cycle.place - 1)))
     mean = smooth(stress, max(1, (top - cycle.first) // 100))
@@ -190,26 +182,18 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     ]
     loaded = (level - offset) / (float(stress[top]) - offset)
     if offset < 0.0:
-        notes.append(
-            f"The stress between the cycles, {engineering(offset, 'Pa')}, is taken off as the "
-            "sensor's offset: without contact the specimen bears none."
-        )
+        notes.append(_offset_note("between the cycles", offset))
     elif loaded > _STILL_LOADED:
         notes.append(
             "Check: the specimen stays under load between the cycles, by "
             f"{percent(loaded)} of the peak stress."
         )
-    origins = record.origins | {"start_strain": contact / height}
-    origins["stress_zero"] += offset
-    origins["displacement_zero"] += contact
-    origins |= {} if record.time is None else {"contact_time": time}
+    moved = record.shifted("stress", offset).shifted("displacement", contact)
+    moved = moved if record.time is None else moved.shifted("time", time)
     moved = replace(
-        record,
-        time=None if record.time is None else record.time - time,
-        stress=stress - offset,
-        displacement=w - contact,
+        moved,
         interior={node: values - passed(values) for node, values in record.interior.items()},
-        origins=origins,
+        origins=moved.origins | {"start_strain": contact / height},
         notes=(*cut_to_cycle(record, cycles, cycle).notes, *notes),
     )
     cut = moved.without(slice(cycle.end, None), f"after cycle {end_of}")
@@ -230,11 +214,14 @@ def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
     zero, error = float(np.median(rest)), float(np.std(rest)) / float(np.sqrt(rest.size))
     if zero > -_SURE * error:
         return record
-    origins = record.origins | {"stress_zero": record.origins.get("stress_zero", 0.0) + zero}
-    errors, stress = record.zeros | {"stress": error}, record.stress - zero
-    return replace(record, stress=stress, origins=origins, zeros=errors).noted(
-        f"The stress between the first two cycles, {engineering(zero, 'Pa')}, is taken off as the "
-        "sensor's offset: without contact the specimen bears none."
+    record = replace(record.shifted("stress", zero), zeros=record.zeros | {"stress": error})
+    return record.noted(_offset_note("between the first two cycles", zero))
+
+
+def _offset_note(when: str, zero: float) -> str:
+    return (
+        f"The stress {when}, {engineering(zero, 'Pa')}, is taken off as the sensor's offset: "
+        "without contact the specimen bears none."
     )
 
 
@@ -265,16 +252,21 @@ def find_turns(values: Array, back: float | None = None) -> Integers:
     """
     if back is None:
         back = max(_TURN * float(np.ptp(values)), 8.0 * noise_level(values))
-    turns, up, best, most = list[int](), True, 0, float(values[0])
-    for i, value in enumerate(values.tolist()):
-        ahead = value - most if up else most - value
-        if ahead > 0.0:
-            best, most = i, value
-        elif ahead < -back:
-            turns.append(best)
-            up, best, most = not up, i, value
-    if up or not turns:  # the record ends on its way up
-        turns.append(best)
+    # From a turn on, ever longer stretches are searched for the next.
+    turns, first, sign, length = list[int](), 0, 1.0, _STRETCH
+    while True:
+        ahead = sign * values[first : first + length]
+        gone = np.maximum.accumulate(ahead) - ahead > back
+        end = int(np.argmax(gone))
+        if gone[end]:
+            turns.append(first + int(np.argmax(ahead[:end])))
+            first, sign, length = first + end, -sign, _STRETCH
+        elif first + length < values.size:
+            length *= 2
+        else:
+            break
+    if sign > 0.0 or not turns:  # the record ends on its way up
+        turns.append(first + int(np.argmax(ahead)))
     return np.array(turns, dtype=np.int64)
 
 

@@ -94,12 +94,10 @@ def join(record: Record, frames: Frames) -> Record:
         if not slower:
             record = record.changed(channel, _averaged(at[good], values[good], time))
             continue
-        record = record.changed(channel, _through(at[good], values[good], time))
-        taken = np.zeros(time.size, dtype=bool)
-        taken[_nearest(time, at[good & there])] = True
-        record = replace(record, sampled=record.sampled | {channel: taken}).noted(
-            f"{int(taken.sum())} of {time.size} samples have a frame of the {channel}; between "
-            "them it is interpolated and does not count as measured."
+        taken = _nearest(time, at[good & there])
+        record = record.interpolated(channel, _through(at[good], values[good], time), taken).noted(
+            f"{np.unique(taken).size} of {time.size} samples have a frame of the {channel}; "
+            "between them it is interpolated and does not count as measured."
         )
     return record
 

@@ -150,16 +150,34 @@ class Window:
     last: int | None = None  # of several that are one history; by default none but `cycle`
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Samples:
+    """What a `Record` and the `Measurement` made of it both hold; see there."""
+
+    interior: dict[int, Array] = field(default_factory=dict)
+    sampled: dict[str, Mask] = field(default_factory=dict)
+    zeros: dict[str, float] = field(default_factory=dict)
+    origins: dict[str, float] = field(default_factory=dict)
+    derived: tuple[str, ...] = ()
+    braked: bool = False
+    notes: tuple[str, ...] = ()
+
+    def curves(self, *more: str) -> dict[str, Array]:
+        """Stress, displacement, `more` and displacements inside, as far as they are there."""
+        names = ("stress", "displacement", *more)
+        found = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return found | {interior_channel(node): values for node, values in self.interior.items()}
+
+
 @dataclass(frozen=True, eq=False)
-class Record:
+class Record(Samples):
     """The channels of a test in SI, each of shape (n,) or None where the file lacks it.
 
     Time, s, stress, Pa, displacement, m, velocity, m/s, and deceleration of the top, m/s² (positive
-    in compression), and displacements of masses inside, m, by their number. `excess` is what the
-    file has beyond the straight line that bridges outliers, 0 elsewhere; `clipped` marks samples of
-    a clipped force; `standstills` those in which the gauge stood still, each with the sentence on
-    it. `cycle` is what a column of cycle numbers says, `numbers` are the rows in the file (None:
-    from 1). The others are those of `Measurement`.
+    in compression). `excess` is what the file has beyond the straight line that bridges outliers, 0
+    elsewhere; `clipped` marks samples of a clipped force; `standstills` those in which the gauge
+    stood still, each with the sentence on it. `cycle` is what a column of cycle numbers says,
+    `numbers` are the rows in the file (None: from 1).
     """
 
     time: Array | None
@@ -167,20 +185,13 @@ class Record:
     displacement: Array | None
     velocity: Array | None = None
     acceleration: Array | None = None
-    interior: dict[int, Array] = field(default_factory=dict)
     excess: dict[str, Array] = field(default_factory=dict)
     clipped: Mask | None = None
     cycle: Array | None = None
     numbers: Integers | None = None
     dropped: tuple[Dropped, ...] = ()
-    sampled: dict[str, Mask] = field(default_factory=dict)
     standstills: dict[str, Mask] = field(default_factory=dict)
-    derived: tuple[str, ...] = ()
-    braked: bool = False
     motion: str = MEASURED
-    notes: tuple[str, ...] = ()
-    zeros: dict[str, float] = field(default_factory=dict)
-    origins: dict[str, float] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Count the samples."""
@@ -203,12 +214,6 @@ class Record:
         still: Mask = np.logical_or.reduce([none, *self.standstills.values()])
         return still
 
-    def curves(self, *more: str) -> dict[str, Array]:
-        """Stress, displacement, `more` and displacements inside, as far as they are there."""
-        names = ("stress", "displacement", *more)
-        found = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return found | {interior_channel(node): values for node, values in self.interior.items()}
-
     def channel(self, name: str) -> Array | None:
         """Return a channel by its name; "displacement_1" is the mass inside above spring 1."""
         node = interior_node(name)
@@ -221,6 +226,20 @@ class Record:
         if node is None:
             return replace(self, **{name: values})  # type: ignore[arg-type]
         return replace(self, interior=self.interior | {node: values})
+
+    def shifted(self, name: str, by: float) -> Record:
+        """Take a value off the time or another channel; `origins` say how much was taken off."""
+        values = self.channel(name)
+        assert values is not None  # its values have shown what is to be taken off
+        key = "contact_time" if name == "time" else f"{name}_zero"
+        origins = self.origins | {key: self.origins.get(key, 0.0) + by}
+        return replace(self.changed(name, values - by), origins=origins)
+
+    def interpolated(self, name: str, values: Array, taken: Any) -> Record:
+        """Put values into a channel of which only the samples `taken` count as measured."""
+        counts = np.zeros(len(self), dtype=bool)
+        counts[taken] = True
+        return replace(self.changed(name, values), sampled=self.sampled | {name: counts})
 
     def noted(self, *notes: str) -> Record:
         """Add sentences to what was done."""
@@ -251,7 +270,7 @@ class Record:
 
 
 @dataclass(frozen=True, eq=False)
-class Measurement:
+class Measurement(Samples):
     """One test, conditioned and in SI: compression positive, time zero where contact starts.
 
     Attributes
@@ -310,8 +329,6 @@ class Measurement:
     striker: Striker | None = None
     noise: Noise = field(default_factory=Noise)
     motion: str | None = None
-    notes: tuple[str, ...] = ()
-    interior: dict[int, Array] = field(default_factory=dict)
     outliers: dict[str, Outliers] = field(default_factory=dict)
     contact: str = "file"
     count: RowCount | None = None
@@ -319,12 +336,7 @@ class Measurement:
     cycles: tuple[int, ...] = (1,)
     last_cycle: int | None = None
     start_strain: float = 0.0
-    sampled: dict[str, Mask] = field(default_factory=dict)
-    zeros: dict[str, float] = field(default_factory=dict)
-    origins: dict[str, float] = field(default_factory=dict)
     acceleration: Array | None = None
-    derived: tuple[str, ...] = ()
-    braked: bool = False
     block: int = 1
     uncertainties: dict[str, float] = field(default_factory=dict)
     standstills: tuple[tuple[float, float], ...] = ()
@@ -344,6 +356,4 @@ class Measurement:
 
     def channels(self) -> dict[str, Array]:
         """Stress, displacement, acceleration and displacements inside, as far as they are there."""
-        names = ("stress", "displacement", "acceleration")
-        found = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return found | {interior_channel(node): values for node, values in self.interior.items()}
+        return self.curves("acceleration")

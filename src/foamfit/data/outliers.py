@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from foamfit.arrays import Array, Integers, Mask
 from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Outliers, Record
@@ -109,7 +110,9 @@ def _spikes(values: Array, least: float, time: Array, weights: Array) -> Mask:
     from scipy.ndimage import maximum_filter1d
 
     out, own = np.zeros(values.size, dtype=bool), weights[:, _HALF]
-    residual = np.einsum("ws,ws->w", weights, _windows(values)) / np.where(own, own, 1.0)
+    residual = np.einsum("ws,ws->w", weights, sliding_window_view(values, _WIDTH)) / np.where(
+        own, own, 1.0
+    )
     usual = np.sqrt(robust_variance(residual * np.sqrt(own)) / np.where(own, own, 1.0))
     off, own = np.abs(residual), np.broadcast_to(own, residual.shape)
     # Beside a spike the cubic is off too: only the farthest of five is one.
@@ -130,7 +133,7 @@ def _weights(time: Array, even: bool) -> Array:
 
     They are zero where the window spans a pause, or where only its middle sample fixes the cubic.
     """
-    windows = _windows(time)[: 1 if even else None]
+    windows = sliding_window_view(time, _WIDTH)[: 1 if even else None]
     weights = np.empty(windows.shape)
     for first in range(0, len(windows), _CHUNK):  # all at once would take much memory
         x = windows[first : first + _CHUNK] - windows[first : first + _CHUNK, [_HALF]]
@@ -139,13 +142,9 @@ def _weights(time: Array, even: bool) -> Array:
         weights[first : first + _CHUNK] = -(powers @ at_middle)[:, :, 0]
     weights[:, _HALF] += 1.0
     step = np.diff(time)
-    pause = _windows(step, _WIDTH - 1).max(axis=1) > _PAUSE * float(np.median(step))
+    pause = sliding_window_view(step, _WIDTH - 1).max(axis=1) > _PAUSE * float(np.median(step))
     unjudged = pause | (weights[:, _HALF] < _OPEN)
     return np.where(unjudged[:, None], 0.0, weights) if unjudged.any() else weights
-
-
-def _windows(values: Array, width: int = _WIDTH) -> Array:
-    return np.lib.stride_tricks.sliding_window_view(values, width)
 
 
 def bridge_outliers(record: Record) -> Record:
@@ -230,9 +229,7 @@ def notes_on(record: Record, spikes: dict[str, int], found: dict[str, Outliers])
     return notes + [note for note, rows in record.standstills.items() if rows.any()]
 
 
-def fresh_samples(
-    values: Array | Mask,
-) -> tuple[Integers, Integers]:
+def fresh_samples(values: Array | Mask) -> tuple[Integers, Integers]:
     """Samples at which a value is new, and for how many samples each is held."""
     fresh = np.append(0, np.flatnonzero(np.diff(values) != 0) + 1)
     return fresh, np.diff(np.append(fresh, len(values)))
@@ -272,12 +269,9 @@ def fill_staircase(record: Record) -> Record:
         if name == "stress" or name in record.sampled or len(lengths) < MIN_ROWS or step < 2:
             continue
         knots = np.union1d(fresh, (fresh + lengths - step)[lengths > 3 * step])
-        record = record.changed(name, np.interp(time, time[knots], values[knots]))
-        taken = np.zeros(len(values), dtype=bool)
-        taken[knots] = True
-        record = replace(record, sampled=record.sampled | {name: taken})
         shown = "The displacement" if name == "displacement" else name
-        record = record.noted(
+        line = np.interp(time, time[knots], values[knots])
+        record = record.interpolated(name, line, knots).noted(
             f"{shown} is held for about {step} samples at a time; it is interpolated between the "
             f"{len(fresh)} instants where it is fresh."
         )

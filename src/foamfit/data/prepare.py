@@ -75,7 +75,7 @@ def condition(
     first = cycles.cut_to_cycle(record, found, found[0]) if found else record
     curves = first.curves("acceleration")
     levels = {c: estimated_noise(v) for c, v in curves.items()} | held
-    used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record))
+    used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record), turn=0)
     if impact:
         start = contact.start_of_impact(first, levels)
         start = replace(start, gauge=zeros.gauge_before(first, start, levels, known))
@@ -143,8 +143,7 @@ def cut_to_contact(record: Record, start: contact.Start, span: zeros.Span) -> Re
     if not span.returned:
         record = record.noted("Check: the record ends before the stress has returned to zero.")
     if record.time is not None:
-        origins = record.origins | {"contact_time": start.time}
-        record = replace(record, time=record.time - start.time, origins=origins)
+        record = record.shifted("time", start.time)
     return record.between(span.first, span.end, "before contact starts", "after contact ends")
 
 
@@ -277,17 +276,19 @@ def start_within_height(record: Record, specimen: Specimen, striker: Striker) ->
     """Move the start of an impact that was too early: its motion goes farther than the height."""
     w, most = record.displacement, 0.97 * specimen.height
     assert w is not None  # measured or integrated by now
-    assert record.time is not None  # it is an impact
     over, rough = float(w.max()) - most, 0.5 if "stress" in record.derived else 0.2
     if not striker.velocity or not 0.03 * specimen.height <= over < rough * specimen.height:
         return record
-    late, origins = over / striker.velocity, dict(record.origins)
-    origins["contact_time"] += late
+    late = over / striker.velocity
+    record = record.shifted("time", late)
     if record.motion == MEASURED:
-        origins["displacement_zero"] += over
-    told = f"Contact is taken to be {engineering(late, 's')} later, where the motion does not go "
-    record = replace(record, time=record.time - late, displacement=w - over, origins=origins)
-    return record.noted(told + "farther than the height.")
+        record = record.shifted("displacement", over)
+    else:  # it has no zero in the file
+        record = record.changed("displacement", w - over)
+    return record.noted(
+        f"Contact is taken to be {engineering(late, 's')} later, where the motion does not go "
+        "farther than the height."
+    )
 
 
 def checks(

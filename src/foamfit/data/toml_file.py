@@ -44,7 +44,7 @@ class _Quantity(NamedTuple):
     spread: str = ""
 
 
-class _Other(NamedTuple):
+class Rule(NamedTuple):
     """Which values a key without a unit may have, and how a message states them."""
 
     valid: Callable[[Any], bool]
@@ -57,7 +57,12 @@ def is_range(cycles: Any) -> bool:
     return pair and all(type(one) is int and one > 0 for one in cycles)
 
 
-_SECTIONS: dict[str, dict[str, _Quantity | _Other]] = {
+COUNT = Rule(lambda v: type(v) is int and v > 0, "a whole number from 1 up")
+RANGE = Rule(is_range, "the numbers of the first and the last one, like [1, 3]")
+FLAG = Rule(lambda v: type(v) is bool, "true or false")
+
+
+_SECTIONS: dict[str, dict[str, _Quantity | Rule]] = {
     "specimen": {
         "height": _Quantity("m", "1.19 mm", "height"),
         "diameter": _Quantity("m", "5 mm", "diameter"),
@@ -68,18 +73,18 @@ _SECTIONS: dict[str, dict[str, _Quantity | _Other]] = {
     "striker": {
         "mass": _Quantity("kg", "7 g", "striker_mass"),
         "velocity": _Quantity("m/s", "1.75 m/s", "velocity"),
-        "gravity": _Other(lambda v: type(v) is bool, "true or false"),
+        "gravity": FLAG,
     },
     "noise": {"stress": _Quantity("Pa", "20 kPa"), "displacement": _Quantity("m", "2 um")},
     "window": {
         "start": _Quantity("s", "0.5 ms"),
         "end": _Quantity("s", "2 ms"),
-        "cycle": _Other(lambda v: type(v) is int and v > 0, "a whole number from 1 up"),
-        "cycles": _Other(is_range, "the numbers of the first and the last one, like [1, 3]"),
+        "cycle": COUNT,
+        "cycles": RANGE,
     },
     "data": {
-        "duplicates": _Other(lambda v: v in ("average", "refuse"), "one of average, refuse"),
-        "sheet": _Other(lambda v: isinstance(v, str), 'a name, like "Sheet1"'),
+        "duplicates": Rule(lambda v: v in ("average", "refuse"), "one of average, refuse"),
+        "sheet": Rule(lambda v: isinstance(v, str), 'a name, like "Sheet1"'),
     },
 }
 _SCALE = "4444.4 N/V"
@@ -135,10 +140,10 @@ def toml_beside(test: Path) -> Path:
     return plain.parent / f"{plain.stem}.toml"
 
 
-def read_bytes(path: Path, otherwise: str, most: int | None = None) -> bytes:
-    """Read a file, its first bytes if `most` are given; `otherwise` says what would be right."""
+def read_bytes(path: Path, otherwise: str) -> bytes:
+    """Read a file; `otherwise` says what would be right."""
     try:
-        return read_whole(path, most)
+        return read_whole(path)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {otherwise}.") from None
     except OSError as error:
@@ -190,7 +195,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
             raise InputError(f"name = {name!r} must be a printable text in quotation marks.")
         if len(name) > LONGEST:
             raise InputError(f"name has {len(name)} characters; it must have {LONGEST} at most.")
-        priors, window = _table(document, "priors"), values["window"]
+        priors, window, striker = _table(document, "priors"), values["window"], values["striker"]
         for key, value in priors.items():  # which keys there are depends on the model
             if not isinstance(value, str):
                 raise InputError(f'[priors] {key} = {value!r} must be like "5.5 ± 0.1 MPa".')
@@ -198,10 +203,12 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
             raise InputError("[window] has both cycle and cycles; give one of them.")
         if "cycles" in window:
             window["cycle"], window["last"] = window.pop("cycles")
+        if "gravity" in striker:
+            striker["gravity"] = GRAVITY if striker["gravity"] else 0.0
         return Settings(
             name=name,
             specimen=_specimen(values["specimen"], spreads),
-            striker=_striker(values["striker"]),
+            striker=Striker(**striker) if striker else None,
             noise=Noise(**values["noise"]),
             window=Window(**window),
             columns=_columns(_table(document, "columns"), channels),
@@ -222,7 +229,7 @@ def _table(document: dict[str, Any], name: str, within: str = "") -> dict[str, A
 def _value(section: str, key: str, value: Any, spreads: dict[str, float]) -> Any:
     """Check and return what a key says, in SI, and put its ± into `spreads`."""
     where, several, kind = f"[{section}] {key}", key == "heights", _SECTIONS[section][key]
-    if isinstance(kind, _Other):
+    if isinstance(kind, Rule):
         if not kind.valid(value):
             raise InputError(f"{where} = {value!r} must be {kind.right}.")
         return value
@@ -239,12 +246,6 @@ def _value(section: str, key: str, value: Any, spreads: dict[str, float]) -> Any
             raise InputError(f'{where} = "{v}" must be positive.')
         numbers.append(number)
     return tuple(numbers) if several else numbers[0]
-
-
-def _striker(values: dict[str, Any]) -> Striker | None:
-    if "gravity" in values:
-        values["gravity"] = GRAVITY if values["gravity"] else 0.0
-    return Striker(**values) if values else None
 
 
 def _specimen(values: dict[str, Any], spreads: dict[str, float]) -> Specimen:

@@ -91,7 +91,7 @@ def take_zeros(
     With too few rows before the contact of an impact, the end of the record shows the zero of the
     force; without those, the file's own zero of the channel stands.
     """
-    origins, errors, n = dict[str, float](), dict[str, float](), span.rest
+    errors, n = dict[str, float](), span.rest
     for name, values in first.curves("acceleration").items():
         if name in record.derived:
             continue
@@ -121,11 +121,8 @@ def take_zeros(
             if abs(zero.value) > (0.0 if top else 1e-3 * np.ptp(values)):
                 label, size = "The displacement" if top else name, engineering(zero.value, "m")
                 note = f"{label} at contact, {size}, is taken off ({source})."
-        whole = record.channel(name)
-        assert whole is not None  # the record has the channels of its first cycle
-        record = record.changed(name, whole - zero.value).noted(*[note] * bool(note))
-        origins[f"{name}_zero"] = zero.value
-    return replace(record, origins=origins, zeros=errors)
+        record = record.shifted(name, zero.value).noted(*[note] * bool(note))
+    return replace(record, zeros=errors)
 
 
 def _zero_at_rest(

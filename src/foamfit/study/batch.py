@@ -10,7 +10,6 @@ from concurrent import futures
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Unpack
 
@@ -33,7 +32,6 @@ from foamfit.study.batch_work import (
     Task,
     fingerprint,
     put,
-    settings_key,
     stored,
     work,
 )
@@ -72,11 +70,6 @@ class Batch:
     saved: float = field(default_factory=lambda: time.monotonic())  # when the summary was written
     took: float = 0.0  # to write it, s
 
-    @cached_property
-    def key(self) -> str:
-        """What the results are made by."""
-        return settings_key(self.recipe)
-
     @property
     def summary(self) -> list[Row]:
         """A row for each test, or for each of its cycles, in the order of the tests."""
@@ -104,7 +97,10 @@ class Batch:
         try:
             for i, (name, path) in enumerate(self.tests):
                 self._begin(executor, name, path)
-                while len(self.waiting) >= MOST_AHEAD or self._bytes_ahead >= MOST_BYTES:
+                while (
+                    len(self.waiting) >= MOST_AHEAD
+                    or sum(task.size for task in self.waiting.values()) >= MOST_BYTES
+                ):
                     self._collect(1.0)
                 self._collect(0.0)
                 while i == 0 and not self.foreign and self._is_cold() and self.waiting:
@@ -125,10 +121,6 @@ class Batch:
             raise InputError(f"{told}; {done}, call again for the others") from error
         self.save(whole=True)
 
-    @property
-    def _bytes_ahead(self) -> int:
-        return sum(task.size for task in self.waiting.values())
-
     def _is_cold(self) -> bool:
         """Whether the first fit compiles what the others need too."""
         model = self.recipe.model
@@ -145,7 +137,7 @@ class Batch:
             motion = None if camera is None else _bytes(camera)
         except OSError:  # reading the test gives a better message
             data, settings, motion = b"", None, None
-        mark = fingerprint(self.key, data, settings, motion)
+        mark = fingerprint(self.recipe.key, data, settings, motion)
         known = None if self.fresh else stored(folder, mark, self.recipe)
         if known is not None:
             self._keep(name, tuple(replace(row, file=str(path)) for row in known))
@@ -178,7 +170,6 @@ class Batch:
             return
         self.fitted += 1
         self._keep(task.name, rows)
-        self._save_sometimes()
 
     def _keep(self, name: str, rows: tuple[Row, ...]) -> None:
         self.rows[name] = rows

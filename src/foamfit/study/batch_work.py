@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -52,6 +52,16 @@ class Recipe:
     laws: Mapping[str, str] = field(default_factory=laws.texts)  # texts of the user's law files
     history: tuple[int, int] | None = None  # first and last of several cycles fitted as one
 
+    @cached_property
+    def key(self) -> str:
+        """What results are made by: settings and version; `stored` compares figures and pages."""
+        parts = asdict(replace(self, pages=True)) | {"foamfit": version("foamfit")}
+        del parts["width"]
+        texts = parts.pop("laws")
+        if any(laws.is_registered(kind) for kind in self.model.split("+")):
+            parts["laws"] = sorted(texts.values())
+        return json.dumps(parts, sort_keys=True)
+
 
 @dataclass(frozen=True)
 class Task:
@@ -81,18 +91,8 @@ class Task:
 Outcome = tuple[tuple[Row, ...], Mapping[str, bytes] | None]
 
 
-def settings_key(recipe: Recipe) -> str:
-    """What a result is made by: settings and version; of figures and pages `stored` takes care."""
-    parts = asdict(replace(recipe, pages=True)) | {"foamfit": version("foamfit")}
-    del parts["width"]
-    texts = parts.pop("laws")
-    if any(laws.is_registered(kind) for kind in recipe.model.split("+")):
-        parts["laws"] = sorted(texts.values())
-    return json.dumps(parts, sort_keys=True)
-
-
 def fingerprint(key: str, data: bytes, toml: bytes | None, motion: bytes | None) -> str:
-    """Identify what a result is made from: settings and version (`settings_key`), and files."""
+    """Identify what a result is made from: settings and version (`Recipe.key`), and files."""
     parts = (data, toml) if motion is None else (data, toml, motion)
     digests = (None if part is None else hashlib.sha256(part).hexdigest() for part in parts)
     return hashlib.sha256(json.dumps([key, *digests]).encode()).hexdigest()

@@ -151,9 +151,8 @@ def joint(
 def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], dict[str, str]]:
     """Read all tests; those that cannot be used are refused, each with its sentence."""
     found, refused = list[tuple[str, Path, Measurement]](), dict[str, str]()
-    pairs = list(zip(study.tests, study.specimens, strict=True))
-    for i, ((name, path), specimen) in enumerate(pairs):
-        tell(0.1 * i / len(pairs), "reading")
+    for i, (name, path, specimen) in enumerate(study.tests):
+        tell(0.1 * i / len(study.tests), "reading")
         try:
             test = read_test(path, specimen, study.cycle, cycles=study.cycles)
             if test.priors:

@@ -8,7 +8,7 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from foamfit.data.toml_file import check_keys, is_range, load_toml
+from foamfit.data.toml_file import COUNT, FLAG, RANGE, Rule, check_keys, load_toml
 from foamfit.errors import InputError
 from foamfit.fitting.curves import DRIVES
 from foamfit.fitting.links import KINDS
@@ -19,19 +19,29 @@ from foamfit.study.test_files import find_tests
 
 # The kind of a parameter for which evidence chooses one of `KINDS`.
 AUTO = "auto"
-_EXAMPLES = {
-    "tests": 'tests = ["runs/*.csv"]',
-    "model": 'model = "microscale"',
-    "name": 'name = "new heel"',
-    "specimen": 'specimen = "foam.toml"',
+_EXAMPLES = {"tests": 'tests = ["runs/*.csv"]', "model": 'model = "microscale"'}
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip())
+
+
+_RULES = {
+    "name": Rule(_is_text, 'text, like name = "new heel"'),
+    "specimen": Rule(_is_text, 'text, like specimen = "foam.toml"'),
+    "seed": Rule(lambda v: type(v) is int and v >= 0, "a whole number from 0 up"),
+    "cycle": COUNT,
+    "cycles": RANGE._replace(right=f"{RANGE.right}, without cycle"),
+    "starts": COUNT,
+    "drive": Rule(lambda v: v in DRIVES, f"one of {', '.join(DRIVES)}"),
+    **dict.fromkeys(OPTIONS, FLAG),
 }
-_LEAST = {"seed": 0, "cycle": 1, "starts": 1}  # of whole numbers
-_KEYS = (*_EXAMPLES, *_LEAST, "cycles", "relaxation", *OPTIONS, "drive", "specimens", "parameters")
+_KEYS = (*_RULES, "tests", "model", "relaxation", "specimens", "parameters")
 
 
 @dataclass(frozen=True)
 class Study:
-    """What a study says; `tests` are names and files, `specimens` the TOML of each (or None).
+    """What a study says; `tests` are names, files, and the TOML of each (None: beside it).
 
     `kinds` has the kind of each parameter that is named, one of `links.KINDS` or "auto"; `held`
     the values (SI) of those that are held.
@@ -39,8 +49,7 @@ class Study:
 
     path: Path
     name: str
-    tests: tuple[tuple[str, Path], ...]
-    specimens: tuple[Path | None, ...]
+    tests: tuple[tuple[str, Path, Path | None], ...]
     model: str
     relaxation: int
     drive: str | None
@@ -67,31 +76,17 @@ def _read(path: Path, content: Mapping[str, Any]) -> Study:
     for key in ("tests", "model"):
         if key not in content:
             raise InputError(f"{key} is missing; give it like {_EXAMPLES[key]}")
-    for key, value in content.items():
-        admissible, wanted = True, ""
-        if key in ("name", "specimen"):
-            admissible = isinstance(value, str) and bool(value.strip())
-            wanted = f"text, like {_EXAMPLES[key]}"
-        elif key in _LEAST:
-            admissible = type(value) is int and value >= _LEAST[key]
-            wanted = f"a whole number from {_LEAST[key]} up"
-        elif key == "drive":
-            admissible, wanted = value in DRIVES, f"one of {', '.join(DRIVES)}"
-        elif key in OPTIONS:
-            admissible, wanted = isinstance(value, bool), "true or false"
-        elif key == "cycles":
-            admissible = is_range(value) and "cycle" not in content
-            wanted = "the numbers of the first and the last one, like [1, 3], without cycle"
-        if not admissible:
-            raise InputError(f"{key} = {value!r} must be {wanted}")
+    for key, rule in _RULES.items():
+        both = key == "cycles" and "cycle" in content
+        if key in content and (both or not rule.valid(content[key])):
+            raise InputError(f"{key} = {content[key]!r} must be {rule.right}")
     model = Model.of_result(content)
-    tests = _tests(path, content["tests"])
+    tests = _tests(path, content)
     kinds, held = _parameters(content.get("parameters", {}), model)
     return Study(
         path=path,
         name=content.get("name") or path.stem,
         tests=tests,
-        specimens=_specimens(path, content, [name for name, _ in tests]),
         model=model.name,
         relaxation=model.relaxation,
         drive=content.get("drive"),
@@ -104,7 +99,9 @@ def _read(path: Path, content: Mapping[str, Any]) -> Study:
     )
 
 
-def _tests(path: Path, patterns: Any) -> tuple[tuple[str, Path], ...]:
+def _tests(path: Path, content: Mapping[str, Any]) -> tuple[tuple[str, Path, Path | None], ...]:
+    """Tests, and the TOML of each: its own in [specimens], else that of all."""
+    patterns = content["tests"]
     patterns = [patterns] if isinstance(patterns, str) else patterns
     if not isinstance(patterns, list) or not all(isinstance(p, str) for p in patterns):
         raise InputError(f"tests must be a list like {_EXAMPLES['tests']}")
@@ -116,20 +113,16 @@ def _tests(path: Path, patterns: Any) -> tuple[tuple[str, Path], ...]:
         raise InputError(
             f"tests names {'one test' if found else 'none'}; a joint fit needs at least two"
         )
-    return tuple(found)
-
-
-def _specimens(path: Path, content: Mapping[str, Any], names: list[str]) -> tuple[Path | None, ...]:
-    """The TOML of each test: its own in [specimens], else that of all; None = beside the test."""
-    own = content.get("specimens", {})
+    own, names = content.get("specimens", {}), [name for name, _ in found]
     if not isinstance(own, dict):
         raise InputError(f'specimens must be a table of tests, like {names[0]} = "a.toml"')
     check_keys("[specimens]", own, names)
     for name, value in own.items():
         if not isinstance(value, str):
             raise InputError(f"[specimens] {name} = {value!r} must be the name of a TOML")
-    given = [own.get(name, content.get("specimen")) for name in names]
-    return tuple(None if one is None else path.parent / one for one in given)
+    tomls = (own.get(name, content.get("specimen")) for name in names)
+    places = (None if toml is None else path.parent / toml for toml in tomls)
+    return tuple((*test, place) for test, place in zip(found, places, strict=True))
 
 
 def _parameters(table: Any, model: Model) -> tuple[dict[str, str], dict[str, float]]:

@@ -33,11 +33,10 @@ _NUMBER = re.compile(
 
 @dataclass(frozen=True)
 class Text:
-    """The text of a file: its bytes without a mark, their encoding, and the digest of the file."""
+    """The text of a file, and the digest of its bytes."""
 
     path: Path
-    raw: bytes
-    encoding: str
+    content: str
     sha256: str
 
 
@@ -69,45 +68,39 @@ class Table(Text):
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield (row number in the file, cells) of the lines that are not blank."""
-        file = io.BytesIO(self.raw)
-        lines = io.TextIOWrapper(file, self.encoding, errors="replace", newline="")
-        for row, cells in _cells(lines, self.separator):
+        for row, cells in _cells(io.StringIO(self.content, newline=""), self.separator):
             if row > self.first_row and (len(cells) > 1 or "".join(cells).strip()):
                 yield row, cells
 
-    def body(self) -> bytes:
+    def body(self) -> str:
         """Return the rows below the header."""
-        return self.raw.split(b"\n", self.first_row)[-1] if self.first_row else self.raw
+        return self.content.split("\n", self.first_row)[-1] if self.first_row else self.content
 
 
 def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
     """Read a file as text; `wanted` says what the path must be, `sheet` which of a workbook."""
     raw = read_bytes(path, f"give {wanted}")
-    sha256, encoding = hashlib.sha256(raw).hexdigest(), "utf-8"
+    sha256 = hashlib.sha256(raw).hexdigest()
     with naming(path):
         raw = unpacked(raw, sheet)
         if not raw.strip():
             raise InputError("the file is empty; it must hold a header and rows of numbers.")
-        if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-            raw = raw.decode("utf-16", errors="replace").encode()
-        raw = raw.removeprefix(codecs.BOM_UTF8)
-        if b"\n" not in raw:
-            raw = raw.replace(b"\r", b"\n")
-        if b"\0" in raw:
+        try:
+            wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+            text = raw.decode("utf-16", "replace") if wide else raw.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = raw.removeprefix(codecs.BOM_UTF8).decode("latin-1")
+        if "\0" in text:
             raise InputError("is a binary file; it must be a text table (CSV) or .xlsx.")
-    try:
-        raw.decode()
-    except UnicodeDecodeError:
-        encoding = "latin-1"
-    return Text(path, raw, encoding, sha256)
+    return Text(path, text if "\n" in text else text.replace("\r", "\n"), sha256)
 
 
 def find_table(text: Text, names: set[str | int]) -> Table:
     """Find separator, header row and decimal sign; `names` are the columns given in the TOML."""
-    lines = io.TextIOWrapper(io.BytesIO(text.raw), text.encoding, newline=None)
+    lines = io.StringIO(text.content, newline=None)
     head = [line.rstrip("\r\n") for line, _ in zip(lines, range(_HEAD_ROWS), strict=False)]
     grids = {s: [[c.strip() for c in cells] for _, cells in _cells(head, s)] for s in _SEPARATORS}
-    whole = text.path, text.raw, text.encoding, text.sha256
+    whole = text.path, text.content, text.sha256
     scope = scope_of(grids[","])
     if scope is not None:
         headers, first = tuple(map(parse_header, scope.headers)), scope.rows
@@ -116,9 +109,9 @@ def find_table(text: Text, names: set[str | int]) -> Table:
     found = _header_row(grids, {n for n in names if isinstance(n, str)})
     if found is None or not any(map(_is_sample, grids[found[0]][found[1] :])):
         rows = (sum(map(_is_sample, grid)) > 2 for grid in grids.values())
-        tabbed = None if any(rows) else blanks_as_tabs(text.raw.decode(text.encoding))
+        tabbed = None if any(rows) else blanks_as_tabs(text.content)
         if tabbed is not None:
-            return find_table(replace(text, raw=tabbed.encode(), encoding="utf-8"), names)
+            return find_table(replace(text, content=tabbed), names)
     separator, i = found or _above_numbers(grids, names)
     grid = grids[separator]
     if i < 0:  # no header
@@ -272,38 +265,59 @@ def read_numbers(
 
     InputError names the first cell that is no number.
     """
-    count, places = len(table.headers), list(columns.values())
-    strict = table.decimal == "," or b"_" in table.body()  # what float does not refuse or know
-    numbers, rows, empty = array("d"), array("q"), array("q")
-    for row, cells in table.rows():
-        try:
-            values = [float(cells[k]) for k in places]
-        except (ValueError, IndexError):
-            values = []
-        if strict or not values or len(cells) > count or not math.isfinite(sum(values)):
-            cells = [cell.strip() for cell in cells] + [""] * (count - len(cells))
-            if tuple(cells) == table.header_cells:
-                again = f"row {row} repeats the header of row {table.header_row}"
-                raise InputError(f"{again}; a file must hold one table with one header.")
-            if any(cells[count:]):
-                many = f"row {row} has {len(cells)} cells, but the header has {count}"
-                raise InputError(f"{many}; every row must have as many as the header.")
-            texts = [cells[k] for k in places]
-            if not any(texts):
-                empty.append(row)
-                continue
-            for k, text in zip(places, texts, strict=True):
-                if wrong := _wrong(text, table.decimal):
-                    raise InputError(f"row {row}, column {table.headers[k].text!r} is {wrong}.")
-            values = [float(text.replace(",", ".")) for text in texts]
-        numbers.extend(values)
-        rows.append(row)
-    read = np.array(numbers).reshape(-1, len(places)).T.copy()
+    places, empty = list(columns.values()), list[int]()
+    read = _plain_numbers(table, places)
+    if read is None:
+        read, rows, empty = _checked_numbers(table, places)
+    else:
+        rows = np.arange(table.first_row + 1, table.first_row + 1 + read.shape[1])
     for k, one in zip(places, read, strict=True):
         _refuse_thousands(table, k, one)
         if table.clock is not None and k == 0:
             one[:] = table.clock[0] + table.clock[1] * one
-    return dict(zip(columns, read, strict=True)), np.array(rows), np.array(empty)
+    return dict(zip(columns, read, strict=True)), rows, np.array(empty, dtype=np.int64)
+
+
+def _plain_numbers(table: Table, places: list[int]) -> Array | None:
+    """Read the columns (k, n) at once; None unless each row has finite numbers in them."""
+    text = table.body().rstrip("\r\n")
+    comma = table.decimal == ","
+    if not text or (comma and ("." in text or table.separator == ",")):
+        return None
+    text = text.replace(",", ".") if comma else text
+    kinds = [(str(k), "f8" if k in places else "U1") for k in range(len(table.headers))]
+    try:
+        lines = io.StringIO(text, newline=None)
+        read = np.loadtxt(lines, kinds, None, table.separator, quotechar='"', ndmin=1)
+    except ValueError:
+        return None
+    numbers = np.array([read[str(k)] for k in places])
+    # A line that is blank, or a cell that spans several, would shift the numbers of the rows.
+    whole = read.size == text.count("\n") + 1 and np.isfinite(numbers).all()
+    return numbers if whole else None
+
+
+def _checked_numbers(table: Table, places: list[int]) -> tuple[Array, Integers, list[int]]:
+    """Read the columns (k, n) cell by cell, as `read_numbers`."""
+    numbers, rows, empty, count = array("d"), array("q"), list[int](), len(table.headers)
+    for row, cells in table.rows():
+        cells = [cell.strip() for cell in cells] + [""] * (count - len(cells))
+        if tuple(cells) == table.header_cells:
+            again = f"row {row} repeats the header of row {table.header_row}"
+            raise InputError(f"{again}; a file must hold one table with one header.")
+        if any(cells[count:]):
+            many = f"row {row} has {len(cells)} cells, but the header has {count}"
+            raise InputError(f"{many}; every row must have as many as the header.")
+        texts = [cells[k] for k in places]
+        if not any(texts):
+            empty.append(row)
+            continue
+        for k, text in zip(places, texts, strict=True):
+            if wrong := _wrong(text, table.decimal):
+                raise InputError(f"row {row}, column {table.headers[k].text!r} is {wrong}.")
+        numbers.extend(float(text.replace(",", ".")) for text in texts)
+        rows.append(row)
+    return np.array(numbers).reshape(-1, len(places)).T.copy(), np.array(rows), empty
 
 
 def _refuse_thousands(table: Table, column: int, values: Array) -> None:
@@ -328,11 +342,10 @@ def without_cut_row(table: Table) -> tuple[Table, list[Dropped]]:
     It has no line end, and fewer cells than the rows above, or a last number that ends in the
     decimal sign, or has fewer digits behind it where `_ABOVE` rows have equally many.
     """
-    above = table.body().rsplit(b"\n", _ABOVE)[1:]
-    if len(above) < MIN_ROWS or not above[-1].strip() or b'"' in above[-1]:
+    above = table.body().rsplit("\n", _ABOVE)[1:]
+    if len(above) < MIN_ROWS or not above[-1].strip() or '"' in above[-1]:
         return table, []
-    texts = (line.decode(table.encoding, "replace") for line in above)
-    *whole, last = ([c.strip() for c in text.split(table.separator)] for text in texts)
+    *whole, last = ([c.strip() for c in line.split(table.separator)] for line in above)
     (_, sign, end), *ends = (cells[-1].partition(table.decimal) for cells in (last, *whole))
     digits, counts = {len(digits) for *_, digits in ends}, {len(cells) for cells in whole}
     point = sign and not end and not any(sign and not digits for _, sign, digits in ends)
@@ -340,8 +353,9 @@ def without_cut_row(table: Table) -> tuple[Table, list[Dropped]]:
     cut = len(counts) == 1 and (point or fewer or len(last) < min(counts))
     if not cut or not all(map(_is_number, last)):
         return table, []
-    row, why = table.raw.count(b"\n") + 1, f"the file ends within it, at {last[-1]!r}"
-    return replace(table, raw=table.raw.removesuffix(above[-1])), [Dropped(1, row, row, why)]
+    row, why = table.content.count("\n") + 1, f"the file ends within it, at {last[-1]!r}"
+    shorter = replace(table, content=table.content.removesuffix(above[-1]))
+    return shorter, [Dropped(1, row, row, why)]
 
 
 def _wrong(cell: str, decimal: str) -> str:
