@@ -119,9 +119,9 @@ def fit(
         Whether what has snapped once softens and weakens: s1_softening, s1_weakening.
     intervals : str
         Method of the 95 % intervals: "auto" (local covariance, and profiles of the parameters
-        along which the cost is not parabolic), "local", "profile", "bootstrap" or "mcmc".
+        along which the cost is not parabolic), "local", "profile" or "mcmc".
     draws : int, optional
-        Refits of the bootstrap (by default 500) or steps of the Markov chain (2000).
+        Steps of the Markov chain, by default 2000.
     priors : mapping, optional
         What is known of parameters of the springs before the fit: mean and standard deviation of a
         normal distribution, (5.5e6, 1e5) in SI or "5.5 ± 0.1 MPa". Each counts as one residual.

@@ -49,8 +49,8 @@ Watch = Callable[[Problem, Array], None]
 # Descents of the search for each spring, for each of several hysteretic springs in series, and at
 # most in all.
 STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 48, 100_000
-# Refits of the bootstrap and steps of the Markov chain.
-DRAWS = {"bootstrap": 500, "mcmc": 2000}
+# Steps of a Markov chain.
+DRAWS = 2000
 # Evaluations that the default spends on profiles, and on ranges, over those of the search; and how
 # often it continues from a better point found on the way.
 PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
@@ -150,7 +150,7 @@ class Options:
     @property
     def choice(self) -> Choice:
         """Which intervals are wanted."""
-        draws = DRAWS.get(self.intervals, 0) if self.draws is None else self.draws
+        draws = DRAWS if self.draws is None else self.draws
         return Choice(self.intervals, draws, self.seed)
 
     @property

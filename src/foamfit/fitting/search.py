@@ -97,9 +97,9 @@ class Tracker:
     looked: Callable[[Array], None] | None = None
     ends: list[Array] = field(default_factory=list)
 
-    def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
-        """Residual less a shift; raises SearchStoppedError once the time is up."""
-        residual = self.consider(values, shift)
+    def residual(self, values: Array) -> Array:
+        """Residual of the objective; raises SearchStoppedError once the time is up."""
+        residual = self.consider(values)
         if self.pulse is not None and self.objective.evaluations % PULSE == 0:
             self.pulse()
         if self.deadline is not None and time.monotonic() > self.deadline:
@@ -117,12 +117,10 @@ class Tracker:
         if best is not None:
             self.consider(best)
 
-    def consider(self, values: Array, shift: Array | float = 0.0) -> Array:
-        """Residual of the objective, whatever the time; with a shift, that of other data."""
+    def consider(self, values: Array) -> Array:
+        """Residual of the objective, whatever the time."""
         failures = self.objective.failures
         residual = self.objective.residual(values)
-        if np.any(shift):
-            return residual - shift
         cost = float(residual @ residual)
         if cost < self.best_cost and self.objective.failures == failures:
             self.best_cost, self.best_values = cost, values.copy()

@@ -43,8 +43,6 @@ class Refit:
 
     best: BestPoint
     tracker: Tracker  # Simulates, counts and ends all at its deadline
-    # Taken off the residual: data (and means of priors) that differ from those that were fitted.
-    shift: Array | float = 0.0
 
     def __post_init__(self) -> None:
         """Find the box of the parameters and the gain at which a refit ends."""
@@ -55,12 +53,12 @@ class Refit:
 
     def start(self) -> Iterate:
         """The best point itself."""
-        return Iterate(self.best.values, self.best.residual - self.shift, self.best.scaled)
+        return Iterate(self.best.values, self.best.residual, self.best.scaled)
 
     def residual(self, point: Array) -> Array | None:
         """Residual of a point that can be simulated, else None."""
         objective = self.tracker.objective
-        failures, residual = objective.failures, self.tracker.residual(point, self.shift)
+        failures, residual = objective.failures, self.tracker.residual(point)
         return residual if objective.failures == failures else None
 
     def rise(self, point: Array) -> float:
@@ -98,7 +96,7 @@ class Refit:
         def residual(scaled: Array) -> Array:
             if scaled is begin:
                 return np.asarray(root * first)
-            return np.asarray(root * self.tracker.residual(self.point(scaled, box), self.shift))
+            return np.asarray(root * self.tracker.residual(self.point(scaled, box)))
 
         def jacobian(scaled: Array) -> Array:
             slopes = best.problem.slopes(self.point(scaled, box), best.names)
