@@ -156,39 +156,26 @@ def fit(
         raise InputError("params must be lmfit.Parameters, as foamfit.make_params returns them")
     chosen = Options.of("fit", options)
     progress, tell = progress or (lambda *_: None), tell or (lambda _: None)
-    if model != "auto":
+    if model == "auto":
+        chosen.check_auto(params=params is not None, priors=measurement.priors)
+    else:
         Model.parse(model, chosen.relaxation)
     with at_first_use(model, chosen.relaxation) as compile_rest:
 
-        def shown(share: float, what: str) -> None:
-            compile_rest()  # before the first trial, after what is wrong in the call was refused
-            progress(share, what)
+        def part(begin: float, end: float) -> Progress:
+            """Progress of a part of the work, between these shares of the whole."""
 
-        return _fit(measurement, model, params, chosen, shown, tell)
+            def shown(share: float, what: str) -> None:
+                compile_rest()  # before the first trial, after what is wrong was refused
+                progress(begin + (end - begin) * share, what)
 
+            return shown
 
-def _fit(
-    measurement: Measurement,
-    model: str,
-    params: lmfit.Parameters | None,
-    chosen: Options,
-    progress: Progress,
-    tell: Announce,
-) -> FitResult:
-    """Identify as `fit` does, which see."""
-    if model != "auto":
+        if model == "auto":
+            from foamfit.auto import compare_models
 
-        def search(share: float, what: str) -> None:
-            progress(SEARCHED * share, what)
-
-        def assess(share: float, what: str) -> None:
-            progress(SEARCHED + (1.0 - SEARCHED) * share, what)
-
-        searched = identify(measurement, model, params, chosen, search)
-        found, _ = judge(searched, chosen.choice, tell, assess)
+            return FitResult(**vars(compare_models(measurement, chosen, part(0.0, 1.0), tell)))
+        searched = identify(measurement, model, params, chosen, part(0.0, SEARCHED))
+        found, _ = judge(searched, chosen.choice, tell, part(SEARCHED, 1.0))
         progress(1.0, "done")
         return FitResult(**vars(found))
-    chosen.check_auto(params=params is not None, priors=measurement.priors)
-    from foamfit.auto import compare_models
-
-    return FitResult(**vars(compare_models(measurement, chosen, progress, tell)))

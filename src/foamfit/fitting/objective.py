@@ -181,11 +181,10 @@ class Objective:
         uncertain = self.by_motion(values)
         if uncertain is None:
             return False
-        plain = np.abs(self._moved_by(0.0).residual(values)[: self.n_data])
-        parts = np.split(plain, np.cumsum(self.sizes)[:-1])
+        plain = np.abs(self._moved_by(0.0).residual(values))
         levels = [
             max(NORMAL * float(np.median(part)), self.noise(name).sigma * self.factor(name), 1e-9)
-            for name, part in zip(self.counted, parts, strict=True)
+            for name, part in self.by_curve(plain).items()
         ]
         self.weighing = Weighing.of(uncertain, np.repeat(levels, self.sizes))
         return True
@@ -412,7 +411,6 @@ class Objective:
         along = motion if self._driven else None
         if along is None and (everything or "stress_strain" in self.counted) and self._along:
             along = run(self._followed(self._along[damped], at), False)
-
         by_site = np.flatnonzero(places == values.size - 1)
         parts = {"stress_time": _with_slopes(motion), "displacement_time": _with_slopes(shown, -1)}
         if everywhere:
@@ -422,14 +420,14 @@ class Objective:
         if self.accelerated:
             parts[ACCELERATION] = self._acceleration(shown, drag, at, by_site)
         curves, slopes = dict[str, Array](), dict[str, Array]()
-        for name, rows in parts.items():
+        for name, simulated in parts.items():
             if name in self._absent:
                 continue
-            rows, zero = self._late(name, self._sampled(rows), late), self._zero_of.get(name)
-            curves[name], slopes[name] = rows[0] + at[zero] if zero else rows[0], rows[1:]
+            seen, zero = self._late(name, self._sampled(simulated), late), self._zero_of.get(name)
+            curves[name], slopes[name] = seen[0] + at[zero] if zero else seen[0], seen[1:]
             slopes[name][by_site] /= height  # site_eta acts through η_site/H
-        seen = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
-        return Simulated(curves, seen, slopes if len(wanted) else None)
+        averaged = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
+        return Simulated(curves, averaged, slopes if len(wanted) else None)
 
     # ------------------------------------------------------------------ where and when
 
@@ -593,12 +591,16 @@ class Objective:
         taken = self.measurement.sampled.get(self.channel(name))
         return self.time.size if taken is None else int(np.count_nonzero(taken))
 
+    def by_curve(self, residual: Array) -> dict[str, Array]:
+        """Return the part of each counted curve in a residual, or in rows like it."""
+        parts = np.split(residual[: self.n_data], np.cumsum(self.sizes)[:-1])
+        return dict(zip(self.counted, parts, strict=True))
+
     def rms(self, residual: Array) -> dict[str, float]:
         """RMS of each counted curve in its unit, from residuals."""
-        parts = np.split(residual[: self.n_data], np.cumsum(self.sizes)[:-1])
         return {
             name: float(np.sqrt(np.mean(part**2))) / self.factor(name)
-            for name, part in zip(self.counted, parts, strict=True)
+            for name, part in self.by_curve(residual).items()
         }
 
     def misfit(self, curves: Simulated) -> dict[str, float | None]:
