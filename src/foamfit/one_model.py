@@ -397,5 +397,6 @@ def weigh_motion(problem: Problem, tracker: Tracker) -> None:
         best = tracker.best_values
         if best is None or not problem.objective.weigh_motion(best):
             return
-        tracker.restart()
+        tracker.best_values, tracker.best_cost = None, math.inf  # costs count by other weights now
+        tracker.consider(best)
         _refine(problem, tracker)

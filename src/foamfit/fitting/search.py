@@ -111,12 +111,6 @@ class Tracker:
         if self.looked is not None and self.best_values is not None:
             self.looked(self.best_values)
 
-    def restart(self) -> None:
-        """Go on from the best point with an objective that has changed."""
-        best, self.best_values, self.best_cost = self.best_values, None, np.inf
-        if best is not None:
-            self.consider(best)
-
     def consider(self, values: Array) -> Array:
         """Residual of the objective, whatever the time."""
         failures = self.objective.failures

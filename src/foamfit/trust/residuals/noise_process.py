@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import toeplitz
+from scipy.linalg import orth, toeplitz
 
 from foamfit.arrays import Array
 
@@ -212,8 +212,7 @@ def basis_of(jacobian: Array) -> Array:
     if not jacobian.shape[1]:
         return jacobian
     scale = np.linalg.norm(jacobian, axis=0)
-    left, singular, _ = np.linalg.svd(jacobian / np.where(scale > 0, scale, 1), full_matrices=False)
-    return left[:, singular > 1e-10 * max(float(singular[0]), 1e-300)]
+    return np.asarray(orth(jacobian / np.where(scale > 0.0, scale, 1.0), rcond=1e-10))
 
 
 def autocorrelation_time(residual: Array) -> float:
