@@ -136,13 +136,11 @@ class Options:
         limit = self.max_time
         if limit is not None and not (isinstance(limit, Real) and float(limit) > 0):
             raise InputError(f"max_time = {limit!r} is not admissible; it must be positive, in s")
-        for name, what in (
-            ("weights", "curves to numbers, like {'stress_time': 1}"),
-            (
-                "priors",
-                "parameters to mean and standard deviation, like {'s1_k0': '5.5 ± 0.1 MPa'}",
-            ),
-        ):
+        mappings = {
+            "weights": "curves to numbers, like {'stress_time': 1}",
+            "priors": "parameters to mean and standard deviation, like {'s1_k0': '5.5 ± 0.1 MPa'}",
+        }
+        for name, what in mappings.items():
             if not isinstance(getattr(self, name) or {}, Mapping):
                 raise InputError(f"{name} must be a mapping of {what}")
         _ = self.choice

@@ -117,24 +117,22 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
     A value much farther off, at a minimum that is hardly worse than the best, is named beside them.
     """
     ends, methods, elsewhere = dict(made.ends), dict(made.methods), dict[str, float]()
-    known = [(column, best.names[column]) for column in map(best.names.index, best.known)]
-
-    def interval(column: int, name: str) -> tuple[float, float]:
-        value, half = float(best.values[best.index[name]]), float(best.halves[column])
-        return ends.get(name, (value - half, value + half))
-
+    values, known = best.values[best.places], {name: best.names.index(name) for name in best.known}
+    local = np.stack([values - best.halves, values + best.halves], axis=1)
+    intervals = {name: ends.get(name, tuple(local[at].tolist())) for name, at in known.items()}
     for point, residual in minima:
         halves = _halves(best, point, residual)
-        for column, name in known:
+        for name, column in known.items():
             if math.isfinite(half := float(halves[column])):
-                there, (low, high) = float(point[best.index[name]]), interval(column, name)
+                there, (low, high) = float(point[best.index[name]]), intervals[name]
                 wider = min(low, there - half), max(high, there + half)
                 if wider[1] - wider[0] > (1.0 + PLACED) * (high - low):
-                    ends[name], methods[name] = wider, "other minima"
+                    intervals[name] = ends[name] = wider
+                    methods[name] = "other minima"
     for point, residual in () if best.misfits else minima:
         near = best.rises(residual) <= (HARDLY_WORSE * best.quantiles) ** 2
-        for column, name in known:
-            there, (low, high) = float(point[best.index[name]]), interval(column, name)
+        for name, column in known.items():
+            there, (low, high) = float(point[best.index[name]]), intervals[name]
             if near[column] and max(low - there, there - high) > high - low:
                 elsewhere.setdefault(name, there)
     return replace(made, ends=ends, methods=methods, elsewhere=elsewhere)
