@@ -6,6 +6,7 @@ stiff it is not: it is flat along ε_a, with several shallow minima. There the c
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ from foamfit.fitting.search import Tracker
 from foamfit.results import Intervals
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.markov_chain import check_emcee, mcmc, walkers
+from foamfit.trust.markov_chain import mcmc, walkers
 from foamfit.trust.profile import PLACED, Tracing, departures
 from foamfit.trust.residuals.noise_process import parts
 
@@ -61,8 +62,10 @@ class Choice:
                 f"{self.draws} draws are too {wrong} for intervals by {self.method}; "
                 f"it must be at {f'least {least}' if wrong == 'few' else f'most {MOST_DRAWS}'}"
             )
-        if self.method == "mcmc":
-            check_emcee()
+        if self.method == "mcmc" and importlib.util.find_spec("emcee") is None:
+            raise InputError(
+                'Markov chains need emcee, which is not installed; pip install "foamfit[mcmc]"'
+            )
 
 
 def assess(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.errors import InputError
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
@@ -45,14 +43,6 @@ class MarkovChain:
     def sentence(self, lost: Sequence[str] = (), few: bool = False) -> str:
         """What the autocorrelation says of the chain; of what is `lost` there are no intervals."""
         return say("interval", "chain", chain=self, lost=lost, few=few)
-
-
-def check_emcee() -> None:
-    """Raise InputError if emcee is not there."""
-    if importlib.util.find_spec("emcee") is None:
-        raise InputError(
-            'Markov chains need emcee, which is not installed; pip install "foamfit[mcmc]"'
-        )
 
 
 def walkers(best: BestPoint) -> int:
