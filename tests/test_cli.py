@@ -556,7 +556,7 @@ def test_init_needs_a_table(here: Path) -> None:
         (["--starts", "1000000000"], ("starts = 1000000000", "from 1 to 100000")),
         (["--relaxation", "999"], ("relaxation = 999", "from 0 (none) to 10")),
         (["--model", "+".join(["linear"] * 99)], ("99 springs", "20 at most")),
-        (["--bootstrap", "1000000000"], ("too many", "most 100000")),
+        (["--mcmc", "1000000000"], ("too many", "most 100000")),
         (["--cycle", "1,99"], ("no cycle 99", "1 to 1")),
         (["--seed", "-1"], ("'--seed'", "x>=0")),
         (["--max-time", "-1"], ("max_time", "positive")),

@@ -133,9 +133,9 @@ def fit(
         Whether what has snapped once softens and weakens: s1_softening, s1_weakening.
     intervals : str
         Method of the 95 % intervals: "auto" (local covariance, and profiles of the parameters
-        along which the cost is not parabolic), "local", "profile", "bootstrap" or "mcmc".
+        along which the cost is not parabolic), "local", "profile" or "mcmc".
     draws : int, optional
-        Refits of the bootstrap (by default 500) or steps of the Markov chain (2000).
+        Steps of the Markov chain, by default 2000.
     priors : mapping, optional
         What is known of parameters of the springs before the fit: mean and standard deviation of a
         normal distribution, (5.5e6, 1e5) in SI or "5.5 ± 0.1 MPa". Each counts as one residual.
@@ -170,39 +170,26 @@ def fit(
         raise InputError("params must be lmfit.Parameters, as foamfit.make_params returns them")
     chosen = Options.of("fit", options)
     progress, tell = progress or (lambda *_: None), tell or (lambda _: None)
-    if model != "auto":
+    if model == "auto":
+        chosen.check_auto(params=params is not None, priors=measurement.priors)
+    else:
         Model.parse(model, chosen.relaxation)
     with at_first_use(model, chosen.relaxation) as compile_rest:
 
-        def shown(share: float, what: str) -> None:
-            compile_rest()  # before the first trial, after what is wrong in the call was refused
-            progress(share, what)
+        def part(begin: float, end: float) -> Progress:
+            """Progress of a part of the work, between these shares of the whole."""
 
-        return _fit(measurement, model, params, chosen, shown, tell)
+            def shown(share: float, what: str) -> None:
+                compile_rest()  # before the first trial, after what is wrong was refused
+                progress(begin + (end - begin) * share, what)
 
+            return shown
 
-def _fit(
-    measurement: Measurement,
-    model: str,
-    params: lmfit.Parameters | None,
-    chosen: Options,
-    progress: Progress,
-    tell: Announce,
-) -> FitResult:
-    """Identify as `fit` does, which see."""
-    if model != "auto":
+        if model == "auto":
+            from foamfit.auto import compare_models
 
-        def search(share: float, what: str) -> None:
-            progress(SEARCHED * share, what)
-
-        def assess(share: float, what: str) -> None:
-            progress(SEARCHED + (1.0 - SEARCHED) * share, what)
-
-        searched = identify(measurement, model, params, chosen, search)
-        found, _ = judge(searched, chosen.choice, tell, assess)
+            return FitResult(**vars(compare_models(measurement, chosen, part(0.0, 1.0), tell)))
+        searched = identify(measurement, model, params, chosen, part(0.0, SEARCHED))
+        found, _ = judge(searched, chosen.choice, tell, part(SEARCHED, 1.0))
         progress(1.0, "done")
         return FitResult(**vars(found))
-    chosen.check_auto(params=params is not None, priors=measurement.priors)
-    from foamfit.auto import compare_models
-
-    return FitResult(**vars(compare_models(measurement, chosen, progress, tell)))

@@ -289,7 +289,7 @@ class _Comparison:
         """End the fit of a chain whose first descents are far worse than the best of one spring."""
         alone = [one for one in self.tried if len(Model.parse(one.result.model).kinds) == 1]
         objective = problem.objective
-        found = misfit_of(objective, objective.residual(values)[: objective.n_data])
+        found = misfit_of(objective, objective.residual(values))
         best = min(alone, key=lambda one: one.misfit, default=None)
         if best is not None and found > UNPROMISING * best.misfit:
             raise _UnpromisingError(

@@ -49,8 +49,8 @@ Watch = Callable[[Problem, Array], None]
 # Descents of the search for each spring, for each of several hysteretic springs in series, and at
 # most in all.
 STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 48, 100_000
-# Refits of the bootstrap and steps of the Markov chain.
-DRAWS = {"bootstrap": 500, "mcmc": 2000}
+# Steps of a Markov chain.
+DRAWS = 2000
 # Evaluations that the default spends on profiles, and on ranges, over those of the search; and how
 # often it continues from a better point found on the way.
 PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
@@ -136,13 +136,11 @@ class Options:
         limit = self.max_time
         if limit is not None and not (isinstance(limit, Real) and float(limit) > 0):
             raise InputError(f"max_time = {limit!r} is not admissible; it must be positive, in s")
-        for name, what in (
-            ("weights", "curves to numbers, like {'stress_time': 1}"),
-            (
-                "priors",
-                "parameters to mean and standard deviation, like {'s1_k0': '5.5 ± 0.1 MPa'}",
-            ),
-        ):
+        mappings = {
+            "weights": "curves to numbers, like {'stress_time': 1}",
+            "priors": "parameters to mean and standard deviation, like {'s1_k0': '5.5 ± 0.1 MPa'}",
+        }
+        for name, what in mappings.items():
             if not isinstance(getattr(self, name) or {}, Mapping):
                 raise InputError(f"{name} must be a mapping of {what}")
         _ = self.choice
@@ -150,7 +148,7 @@ class Options:
     @property
     def choice(self) -> Choice:
         """Which intervals are wanted."""
-        draws = DRAWS.get(self.intervals, 0) if self.draws is None else self.draws
+        draws = DRAWS if self.draws is None else self.draws
         return Choice(self.intervals, draws, self.seed)
 
     @property
@@ -397,5 +395,6 @@ def weigh_motion(problem: Problem, tracker: Tracker) -> None:
         best = tracker.best_values
         if best is None or not problem.objective.weigh_motion(best):
             return
-        tracker.restart()
+        tracker.best_values, tracker.best_cost = None, math.inf  # costs count by other weights now
+        tracker.consider(best)
         _refine(problem, tracker)

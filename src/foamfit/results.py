@@ -38,11 +38,11 @@ class ParameterEstimate:
     `stderr` and `ci95` are None where the test does not determine it; `state` is "determined",
     "weak", "not determined" or "fixed" (fixed by the user or the model), and `why` says so in a
     sentence. `ci95_method` is the source of the interval: "local covariance", "profile likelihood",
-    "block bootstrap", "MCMC" or "other minima" (of the search, which noise could have made the
-    best). `range` includes model error: the values that fit almost equally well; None where the
-    residuals are noise. `systematic` is one standard deviation from the ± of height, area, mass and
-    calibration in the TOML; it is not in `stderr` and `ci95`, and is 0 where no ± is stated or the
-    test does not determine the parameter.
+    "MCMC" or "other minima" (of the search, which noise could have made the best). `range` includes
+    model error: the values that fit almost equally well; None where the residuals are noise.
+    `systematic` is one standard deviation from the ± of height, area, mass and calibration in the
+    TOML; it is not in `stderr` and `ci95`, and is 0 where no ± is stated or the test does not
+    determine the parameter.
     """
 
     value: float

@@ -1,4 +1,4 @@
-"""Profiles, bootstrap and Markov chains against closed forms, each other and independent refits."""
+"""Profiles and Markov chains against closed forms, each other and independent refits."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from foamfit.fitting.search import SearchRecord, Tracker
 from foamfit.one_model import Found, judge
 from foamfit.report.result_figures import plot_profiles
 from foamfit.results import Profile
-from foamfit.trust import intervals, resample
+from foamfit.trust import intervals, markov_chain
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.intervals import Choice, assess
+from foamfit.trust.markov_chain import mcmc
 from foamfit.trust.profile import Refit, Tracing, departures
 from foamfit.trust.ranges import Open
-from foamfit.trust.resample import block_length, bootstrap, mcmc
 from foamfit.trust.residuals.noise_process import NoiseProcess, noise_processes
 
 sys.path.insert(0, str(EXPERIMENTS / "recovery"))
@@ -318,11 +318,11 @@ class _Interrupting(Tracker):
 
     left = 60
 
-    def residual(self, values: np.ndarray, shift: np.ndarray | float = 0.0) -> np.ndarray:
+    def residual(self, values: np.ndarray) -> np.ndarray:
         self.left -= 1
         if self.left < 0:
             raise KeyboardInterrupt
-        return super().residual(values, shift)
+        return super().residual(values)
 
 
 def test_an_interrupted_profile_keeps_what_was_done(impact, monkeypatch):
@@ -355,31 +355,7 @@ def test_a_better_point_is_told(impact):
     assert residual @ residual < off.cost
 
 
-# ---------------------------------------------------------------- bootstrap and Markov chains
-
-
-@pytest.mark.parametrize("rho", [0.0, 0.7])
-def test_the_bootstrap_agrees_with_the_local_errors(rho):
-    """Standard deviations of 600 draws scatter by 1/√1200 = 3 %, and by the blocks."""
-    around = curve(rho=rho)
-    drawn = bootstrap(around, 600, seed=3)[0]
-    assert drawn.std(axis=0) == pytest.approx(around.spread.stderr, rel=0.15 if rho else 0.08)
-    assert np.array_equal(drawn[:20], bootstrap(around, 20, seed=3)[0])
-    assert not np.array_equal(drawn[:20], bootstrap(around, 20, seed=4)[0])
-
-
-def test_the_bootstrap_of_an_impact_agrees_with_the_local_errors(impact):
-    drawn = bootstrap(impact, 60, seed=1)[0]
-    ratio = drawn.std(axis=0) / impact.spread.stderr
-    # 60 draws scatter by 9 %; three of these, and ε_a and Δσ are not quite parabolic.
-    assert np.all((ratio > 0.7) & (ratio < 1.4))
-
-
-def test_blocks_are_as_long_as_the_correlation_asks():
-    assert block_length(NoiseProcess(np.empty(0), 1.0), 1000) == 1
-    lengths = [block_length(NoiseProcess(np.array([r]), 1.0), 1000) for r in (0.3, 0.6, 0.9)]
-    assert lengths == sorted(lengths)
-    assert lengths[0] > 1
+# ---------------------------------------------------------------- Markov chains
 
 
 def test_a_markov_chain_agrees_with_the_local_errors():
@@ -447,7 +423,7 @@ def test_a_chain_runs_over_what_is_not_determined_within_its_limits():
     assert "does not determine a, c" in told
 
 
-@pytest.mark.parametrize("method", ["profile", "bootstrap", "mcmc"])
+@pytest.mark.parametrize("method", ["profile", "mcmc"])
 def test_nothing_is_drawn_where_nothing_is_determined(method):
     around = levels(names=("a", "c"))
     assert around.known == []
@@ -474,47 +450,49 @@ def test_where_nothing_can_be_simulated_a_chain_gives_up():
     chain = mcmc(around, 100, seed=0)
     assert len(chain.samples) == 0
     assert "nothing can be simulated" in chain.sentence()
-    assert around.problem.objective.evaluations - before <= 3 * resample.walkers(around)
+    assert around.problem.objective.evaluations - before <= 3 * markov_chain.walkers(around)
 
 
-@pytest.mark.parametrize("method", ["bootstrap", "mcmc"])
-def test_a_time_that_is_up_keeps_the_fit(method):
+def test_a_time_that_is_up_keeps_the_fit():
     around = levels()
-    found = assess(around, Choice(method, 200), Tracker(around.problem.objective, 0.0))
+    found = assess(around, Choice("mcmc", 200), Tracker(around.problem.objective, 0.0))
     assert found.ends == {}
     (told,) = found.warnings
     assert "stopped by the time limit" in told
     assert "the intervals are local" in told.lower()
 
 
-@pytest.mark.parametrize(("method", "after"), [("bootstrap", 900), ("mcmc", 5), ("mcmc", 900)])
-def test_ctrl_c_keeps_what_was_drawn(method, after, monkeypatch, capsys):
+@pytest.mark.parametrize("after", [5, 900])
+def test_ctrl_c_keeps_what_was_drawn(after, monkeypatch, capsys):
     """Also within the first draws, and without what emcee prints of it."""
     monkeypatch.setattr(_Interrupting, "left", after)
     monkeypatch.setattr(intervals, "Tracker", _Interrupting)
-    found = assess(levels(), Choice(method, 5000))
+    found = assess(levels(), Choice("mcmc", 5000))
     assert set(found.ends) == ({"b"} if after > 5 else set())
     assert found.notes == ()
     assert "stopped by Ctrl-C" in found.warnings[0]
-    assert "of 5000 refits" in found.warnings[0] or method == "mcmc"
     assert capsys.readouterr() == ("", "")
 
 
-def test_fewer_refits_than_asked_for_are_a_no_of_the_checklist(impact, monkeypatch):
+def test_a_shorter_chain_than_asked_for_is_a_no_of_the_checklist(impact, monkeypatch):
     monkeypatch.setattr(_Interrupting, "left", 600)
     monkeypatch.setattr(intervals, "Tracker", _Interrupting)
-    found = assess(impact, Choice("bootstrap", 5000))
+    found = assess(impact, Choice("mcmc", 5000))
     assert found.ends
     result = conclude(impact, SearchRecord(0, 8, 0.0, ((1.0, 8),)), found)
     (check,) = [check for check in result.checklist if check.key == "intervals"]
     assert check.answer is False
     assert result.status == "warnings"
-    assert any("of 5000 refits" in warning for warning in result.warnings)
+    assert any("stopped by Ctrl-C" in warning for warning in result.warnings)
 
 
 @pytest.mark.parametrize(
     ("method", "draws", "word"),
-    [("guess", 0, "unknown"), ("bootstrap", 3, "too few"), ("mcmc", 5, "too few")],
+    [
+        ("guess", 0, "unknown"),
+        ("bootstrap", 500, "must be one of auto, local, profile, mcmc"),
+        ("mcmc", 5, "too few"),
+    ],
 )
 def test_refuses_what_cannot_be_done(method, draws, word):
     with pytest.raises(InputError, match=word):
@@ -563,16 +541,16 @@ def test_local_intervals_are_told_apart():
 def test_the_command_makes_intervals_one_way_and_tells_the_cost(tmp_path: Path):
     test = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
     call = ["fit", str(test), "--starts", "2", "--out", str(tmp_path / "out")]
-    refused = CliRunner().invoke(main, [*call, "--profile", "--bootstrap", "50"])
+    refused = CliRunner().invoke(main, [*call, "--profile", "--mcmc", "200"])
     assert refused.exit_code == 1
-    assert "--profile and --bootstrap exclude each other" in refused.stderr
+    assert "--profile and --mcmc exclude each other" in refused.stderr
     assert not (tmp_path / "out").exists()
-    done = CliRunner().invoke(main, [*call, "--bootstrap", "40", "--json"])
+    done = CliRunner().invoke(main, [*call, "--mcmc", "100", "--json"])
     assert done.exit_code == 0
-    assert "intervals by bootstrap: 240 simulations, about" in done.stderr
+    assert "intervals by mcmc: 2626 simulations, about" in done.stderr
     content = json.loads(done.stdout)
-    assert content["parameters"]["s1_kc"]["ci95_method"] == "block bootstrap"
-    assert any("40 of 40 refits" in note for note in content["notes"])
+    assert content["parameters"]["s1_kc"]["ci95_method"] == "MCMC"
+    assert any("Markov chain of 26 walkers and 100 steps" in note for note in content["warnings"])
 
 
 PROFILE = "profile likelihood"
@@ -580,7 +558,7 @@ AGREED = SearchRecord(0, 8, 0.0, ((1.0, 8),))
 
 
 @pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("method", ["profile likelihood", "block bootstrap", "MCMC", "none"])
+@pytest.mark.parametrize("method", ["profile likelihood", "MCMC", "none"])
 def test_an_interval_is_in_order_and_holds_its_value(impact, method, seed):
     """Whatever the draws were: to one side of the value, the wrong way round, past the limits."""
     rng = np.random.default_rng(seed)

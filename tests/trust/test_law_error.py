@@ -37,7 +37,6 @@ from foamfit.trust.covariance import (
 from foamfit.trust.intervals import Choice
 from foamfit.trust.profile import Refit
 from foamfit.trust.ranges import ALIKE, alike, left_open, tolerance
-from foamfit.trust.resample import bootstrap
 from foamfit.trust.residuals.law_error import curve_errors
 from foamfit.trust.residuals.noise_process import NoiseProcess
 
@@ -328,19 +327,6 @@ def test_there_is_no_range_where_the_law_follows_the_curves():
     assert result.noise["stress_strain"]["law_error"] is None
     report = readable("s1_kc", result.parameters["s1_kc"])
     assert report.range == ""
-
-
-def test_the_bootstrap_adds_noise_to_the_curve_and_keeps_the_error_of_the_law():
-    """Refits scatter about the best point as its covariance says, where there is one minimum."""
-    best = fitted(0)[1]
-    chosen = ("s1_k0", "s1_kc", "s1_kh_plus")
-    around = BestPoint(best.problem, best.values, chosen)
-    drawn = bootstrap(around, 40, seed=2)[0]
-    assert drawn.mean(axis=0) == pytest.approx(
-        around.values[[around.index[n] for n in chosen]], abs=float("inf"), rel=0.01
-    )
-    ratio = drawn.std(axis=0) / around.spread.stderr
-    assert np.all((ratio > 0.5) & (ratio < 1.6))
 
 
 def test_a_loop_has_two_branches_c():

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from foamfit.report.studies.cycles import CycleFits
 
 # Options that `foamfit.fit` does not take as keywords, and those that become its `intervals`.
-NO_KEYWORDS, WAYS = ("cycle", "cycles", "model"), ("profile", "bootstrap", "mcmc")
+NO_KEYWORDS, WAYS = ("cycle", "cycles", "model"), ("profile", "mcmc")
 
 
 def _fixes(
@@ -63,9 +63,6 @@ fit_options = options.together(
     options.RELAXATION,
     *options.MORE,
     option("--profile", "95 % intervals by profile likelihood."),
-    option(
-        "--bootstrap", "95 % intervals by N >= 40 refits to resampled blocks.", int, metavar="N"
-    ),
     option("--mcmc", "95 % intervals by N steps of emcee.", int, metavar="N"),
 )
 

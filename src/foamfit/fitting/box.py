@@ -141,20 +141,32 @@ COMMON_ORDER = ("g", "tau", "eta", "height")
 class Coordinate(NamedTuple):
     """One coordinate: the place of its parameter in the vector, and how they depend on each other.
 
-    `param` is the record, None of a nuisance parameter or an absolute one; `unit` is its scale, SI,
-    0 of a nuisance parameter; `of` has the places of the parameters that it is relative to.
+    The logarithm of the parameter over the second of its `ends` (SI), or the way from one end to
+    the other, 0 to 1; the ends may depend on the parameters at the places `of`.
     """
 
     place: int
     short: str
-    param: Param | None
-    unit: float
-    of: tuple[int, ...]
+    param: Param | None  # None of a nuisance parameter or an absolute one
+    limits: tuple[float, float]
+    ends: tuple[float, float] | Between
+    of: tuple[int, ...] = ()
 
     @property
     def is_logarithmic(self) -> bool:
         """Whether it is the logarithm of the parameter."""
         return self.param is not None and self.param.is_logarithmic
+
+    def ends_at(self, values: Array) -> tuple[float, float]:
+        """Values of the parameter at the coordinates 0 and 1, unless its logarithm is one."""
+        if isinstance(self.ends, Between):
+            return self.ends.ends(*(float(values[place]) for place in self.of))
+        return self.ends
+
+    def value(self, u: float, values: Array) -> float:
+        """Parameter of a coordinate, whatever its limits; what it needs of `values` is there."""
+        first, last = self.ends_at(values)
+        return float(np.exp(u)) * last if self.is_logarithmic else first + u * (last - first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,14 +192,19 @@ class Space:
         """The parameters that vary, each after those that it is relative to."""
         out, index = [], {name: i for i, name in enumerate(self.names)}
         for name in sorted(self.free, key=self._rank):
-            if name in NUISANCE or name in self.absolute:
-                unit = 1.0 if name in self.absolute else 0.0
-                out.append(Coordinate(index[name], name, None, unit, ()))
-                continue
-            param, prefix = self.model.param(name), name.partition("_")[0]
-            of = tuple(index[f"{prefix}_{short}"] for short in param.of)
-            unit = self.scales.unit(param.scale)
-            out.append(Coordinate(index[name], split_name(name)[1], param, unit, of))
+            at = index[name]
+            low, high = float(self.low[at]), float(self.high[at])
+            if name in self.absolute:
+                out.append(Coordinate(at, name, None, (low, high), (0.0, 1.0)))
+            elif name in NUISANCE:
+                out.append(Coordinate(at, name, None, NUISANCE_BOX, (0.5 * (low + high), high)))
+            else:
+                param, prefix = self.model.param(name), name.partition("_")[0]
+                of = tuple(index[f"{prefix}_{short}"] for short in param.of)
+                ends = 0.0, self.scales.unit(param.scale)
+                between = param.coordinate if isinstance(param.coordinate, Between) else ends
+                short = split_name(name)[1]
+                out.append(Coordinate(at, short, param, param.limits, between, of))
         return out
 
     def _rank(self, name: str) -> int:
@@ -202,33 +219,18 @@ class Space:
     @cached_property
     def box(self) -> tuple[Array, Array]:
         """Lowest and highest coordinates, (n_free,) each."""
-        limits = [
-            one.param.limits
-            if one.param is not None
-            else (self.low[one.place], self.high[one.place])
-            if one.unit
-            else NUISANCE_BOX
-            for one in self.coordinates
-        ]
-        low, high = np.reshape(np.array(limits, dtype=float), (-1, 2)).T.copy()
+        limits = np.array([one.limits for one in self.coordinates])
+        low, high = np.reshape(limits, (-1, 2)).T.copy()
         return low, high
-
-    def _ends(self, one: Coordinate, values: Array) -> tuple[float, float]:
-        """Values of a parameter at the coordinates 0 and 1, unless its logarithm is one."""
-        if one.param is not None and isinstance(one.param.coordinate, Between):
-            return one.param.coordinate.ends(*(float(values[place]) for place in one.of))
-        if one.unit:
-            return 0.0, one.unit
-        return 0.5 * (self.low[one.place] + self.high[one.place]), self.high[one.place]
 
     def encode(self, values: Array) -> Array:
         """Coordinates of a vector of parameters, moved into the box."""
         out = np.empty(len(self.coordinates))
         for j, one in enumerate(self.coordinates):
+            first, last = one.ends_at(values)
             if one.is_logarithmic:
-                out[j] = np.log(max(values[one.place], 1e-300) / one.unit)
+                out[j] = np.log(max(values[one.place], 1e-300) / last)
             else:
-                first, last = self._ends(one, values)
                 out[j] = (values[one.place] - first) / (last - first)
         low, high = self.box
         margin = 1e-9 * (high - low)
@@ -238,7 +240,7 @@ class Space:
         """Vector of parameters (SI) at a point of the box."""
         values = self.values.copy()
         for u, one in zip(point, self.coordinates, strict=True):
-            value = self._value(u, one, values)
+            value = one.value(u, values)
             values[one.place] = min(max(value, self.low[one.place]), self.high[one.place])
         return self.complete(values)
 
@@ -248,23 +250,14 @@ class Space:
         What stands at the places `held` stays.
         """
         for one in self.coordinates:
-            param = one.param
-            if param is not None and param.of and one.place not in held:
-                first, last = self._ends(one, values)
-                ends = [first + u * (last - first) for u in param.limits]
+            if one.of and one.place not in held:
+                ends = [one.value(u, values) for u in one.limits]
                 values[one.place] = np.clip(values[one.place], min(ends), max(ends))
         return self.complete(values)
 
     def complete(self, values: Array) -> Array:
         """Complete a vector by what hangs on others."""
         return values if self.tied is None else self.tied(values)
-
-    def _value(self, u: float, one: Coordinate, values: Array) -> float:
-        """Parameter of a coordinate, whatever its limits; what it needs of `values` is there."""
-        if one.is_logarithmic:
-            return float(np.exp(u)) * one.unit
-        first, last = self._ends(one, values)
-        return first + u * (last - first)
 
     def slopes(self, point: Array, values: Array) -> Array:
         """Derivative of the parameters by the coordinates at a point, (n_values, n_free).
@@ -273,16 +266,13 @@ class Space:
         """
         moves = np.zeros((values.size, point.size))
         for j, one in enumerate(self.coordinates):
-            if one.param is not None and isinstance(one.param.coordinate, Between):
-                by = one.param.coordinate.slopes(*(float(values[place]) for place in one.of))
+            if isinstance(one.ends, Between):
+                by = one.ends.slopes(*(float(values[place]) for place in one.of))
                 for place, (first, last) in zip(one.of, by, strict=True):
                     moves[one.place] += (first + point[j] * (last - first)) * moves[place]
-            if one.is_logarithmic:
-                moves[one.place, j] = values[one.place]
-            else:
-                first, last = self._ends(one, values)
-                moves[one.place, j] = last - first
-            value = self._value(point[j], one, values)
+            first, last = one.ends_at(values)
+            moves[one.place, j] = values[one.place] if one.is_logarithmic else last - first
+            value = one.value(point[j], values)
             if not self.low[one.place] <= value <= self.high[one.place]:
                 moves[one.place] = 0.0
         return self.follow(values, moves, np.full(point.size, 1e-5))

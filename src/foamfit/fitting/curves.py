@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from numbers import Real
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 from scipy.linalg import lstsq
 from scipy.ndimage import convolve1d
 
@@ -218,13 +219,7 @@ def without_tension(motion: Motion) -> Motion:
 
 def later(time: Array, curves: Array, late: float) -> Array:
     """Curves (…, n) seen `late` seconds later, at the samples; straight past their ends."""
-    when = time - late
-    ahead, after = np.minimum(when - time[0], 0.0), np.maximum(when - time[-1], 0.0)
-    first = (curves[..., 1] - curves[..., 0]) / (time[1] - time[0])
-    last = (curves[..., -1] - curves[..., -2]) / (time[-1] - time[-2])
-    rows = [np.interp(when, time, row) for row in np.atleast_2d(curves)]
-    inside = np.reshape(rows, curves.shape)
-    return np.asarray(inside + first[..., None] * ahead + last[..., None] * after)
+    return np.asarray(make_interp_spline(time, curves, k=1, axis=-1)(time - late))
 
 
 def instants(time: Array, fine: int) -> Array:

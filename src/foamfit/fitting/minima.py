@@ -95,7 +95,10 @@ def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
     objective, costs = tracker.objective, list[tuple[float, int]]()
     met, open_ends = [], [(tracker.best_cost, tracker.best_values)]
     for _ in range(EXCHANGES):
-        open_ends = [end for end in open_ends if _leads_on(end[0], tracker)]
+        best = tracker.best_cost
+        # Where it misses more than noise the true springs, if there are any, are not yet found.
+        detour = DETOUR * best if best > MISSING * objective.floor else 0.0
+        open_ends = [end for end in open_ends if end[0] <= best + max(_near(objective), detour)]
         if not open_ends:
             break
         at = min(range(len(open_ends)), key=lambda i: open_ends[i][0])
@@ -145,13 +148,6 @@ def settle_ends(tracker: Tracker, space: Space) -> None:
 def _near(objective: Objective) -> float:
     """Rise of the cost that other noise could make up for, with a wide margin."""
     return NEAR * objective.floor / objective.n_data
-
-
-def _leads_on(cost: float, tracker: Tracker) -> bool:
-    """Whether exchanges from an end of this cost may lead to a better minimum than the best."""
-    best, floor = tracker.best_cost, tracker.objective.floor
-    misses = best > MISSING * floor  # the true springs, if there are any, are not yet found
-    return cost <= best + max(_near(tracker.objective), DETOUR * best if misses else 0.0)
 
 
 def _among(points: list[Array], point: Array) -> bool:

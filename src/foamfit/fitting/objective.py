@@ -70,6 +70,18 @@ class Simulated:
     slopes: dict[str, Array] | None = None  # (p, n) each
 
 
+def _with_slopes(motion: Motion, node: int | None = None) -> Array:
+    """The base stress of a run, or the displacement of a node, and below it its derivatives."""
+
+    def of(base_stress: Array, displacement: Array) -> Array:
+        return base_stress if node is None else displacement[..., node, :]
+
+    rows = of(motion.base_stress, motion.displacement)[None]
+    if (slopes := motion.slopes) is None:
+        return rows
+    return np.concatenate([rows, of(slopes.base_stress, slopes.displacement)])
+
+
 @dataclass(eq=False)
 class Objective:
     """Residuals of a model under a drive against a measurement.
@@ -169,11 +181,10 @@ class Objective:
         uncertain = self.by_motion(values)
         if uncertain is None:
             return False
-        plain = np.abs(self._moved_by(0.0).residual(values)[: self.n_data])
-        parts = np.split(plain, np.cumsum(self.sizes)[:-1])
+        plain = np.abs(self._moved_by(0.0).residual(values))
         levels = [
             max(NORMAL * float(np.median(part)), self.noise(name).sigma * self.factor(name), 1e-9)
-            for name, part in zip(self.counted, parts, strict=True)
+            for name, part in self.by_curve(plain).items()
         ]
         self.weighing = Weighing.of(uncertain, np.repeat(levels, self.sizes))
         return True
@@ -277,13 +288,12 @@ class Objective:
         assert level is not None  # completed by with_noise
         return level
 
-    def _fitted(self, name: str) -> slice | NDArray[np.bool_]:
+    def _fitted(self, name: str) -> NDArray[np.intp]:
         """Samples of a curve that count: those that its channel measured, but no outliers."""
-        outliers = self.measurement.outliers.get(self.channel(name))
-        taken = self.measurement.sampled.get(self.channel(name), slice(None))
-        if outliers is None:
-            return taken
-        return ~outliers.left_out if isinstance(taken, slice) else taken & ~outliers.left_out
+        channel = self.channel(name)
+        counts = self.measurement.sampled.get(channel, np.ones(self.time.size, dtype=bool))
+        outliers = self.measurement.outliers.get(channel)
+        return np.flatnonzero(counts if outliers is None else counts & ~outliers.left_out)
 
     # ------------------------------------------------------------------ simulation and residual
 
@@ -316,24 +326,21 @@ class Objective:
         own = places < values.size
         if own.all():
             return self._curves(values, nuisance, everything, places)
-        named = {int(p): self.nuisance[p - values.size] for p in places[~own]}
-        zero = next((p for p, name in named.items() if name == "displacement_zero"), None)
+        zero, named = "displacement_zero", [self.nuisance[p - values.size] for p in places[~own]]
         still = not self._is_damped(values, places[own])
-        moved = zero is not None and still and self._plans[False].moves_one
+        moved = zero in named and still and self._plans[False].moves_one
         curves = self._curves(values, nuisance, everything, places[own], moved=moved)
-        carried = curves.slopes or {}
-        by = {
-            int(place): {name: rows[i] for name, rows in carried.items()}
-            for i, place in enumerate(places[own])
-        }
-        for place, name in named.items():
-            if moved and place == zero:  # the motion goes back by as much
-                by[place] = {curve: -rows[-1] for curve, rows in carried.items()}
+        carried, n = curves.slopes or {}, self.time.size
+        slopes = {name: np.empty((places.size, n)) for name in curves.curves}
+        for curve, rows in carried.items():
+            slopes[curve][own] = rows[: np.count_nonzero(own)]
+        for at, name in zip(np.flatnonzero(~own), named, strict=True):
+            if moved and name == zero:  # the motion goes back by as much
+                by = {curve: -rows[-1] for curve, rows in carried.items()}
             else:
-                by[place] = self._nuisance_slope(values, nuisance, name)
-        slopes = {
-            name: np.array([by[place][name] for place in places.tolist()]) for name in curves.curves
-        }
+                by = self._nuisance_slope(values, nuisance, name)
+            for curve, rows in slopes.items():
+                rows[at] = by[curve]
         return replace(curves, slopes=slopes)
 
     def _is_damped(self, values: Array, places: NDArray[np.int64]) -> bool:
@@ -404,33 +411,23 @@ class Objective:
         along = motion if self._driven else None
         if along is None and (everything or "stress_strain" in self.counted) and self._along:
             along = run(self._followed(self._along[damped], at), False)
-
-        def of(run: Motion, node: int) -> tuple[Array, Array | None]:
-            return run.displacement[node], run.slopes and run.slopes.displacement[:, node]
-
-        parts = {
-            "stress_time": (motion.base_stress, motion.slopes and motion.slopes.base_stress),
-            "displacement_time": of(shown, -1),
-        }
-        if everywhere:
-            parts |= {name: of(shown, node - 1) for name, node in self.interior.items()}
-        if along is not None:
-            parts["stress_strain"] = along.base_stress, along.slopes and along.slopes.base_stress
         by_site = np.flatnonzero(places == values.size - 1)
+        parts = {"stress_time": _with_slopes(motion), "displacement_time": _with_slopes(shown, -1)}
+        if everywhere:
+            parts |= {name: _with_slopes(shown, node - 1) for name, node in self.interior.items()}
+        if along is not None:
+            parts["stress_strain"] = _with_slopes(along)
         if self.accelerated:
             parts[ACCELERATION] = self._acceleration(shown, drag, at, by_site)
         curves, slopes = dict[str, Array](), dict[str, Array]()
-        for name, (curve, slope) in parts.items():
+        for name, simulated in parts.items():
             if name in self._absent:
                 continue
-            curve, zero = self._sampled(curve), self._zero_of.get(name)
-            curves[name] = self._late(name, curve + at[zero] if zero else curve, late)
-            if slope is not None:
-                sampled = self._sampled(slope)
-                sampled[by_site] /= height  # site_eta acts through η_site/H
-                slopes[name] = self._late(name, sampled, late)
-        seen = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
-        return Simulated(curves, seen, slopes if len(wanted) else None)
+            seen, zero = self._late(name, self._sampled(simulated), late), self._zero_of.get(name)
+            curves[name], slopes[name] = seen[0] + at[zero] if zero else seen[0], seen[1:]
+            slopes[name][by_site] /= height  # site_eta acts through η_site/H
+        averaged = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
+        return Simulated(curves, averaged, slopes if len(wanted) else None)
 
     # ------------------------------------------------------------------ where and when
 
@@ -496,29 +493,22 @@ class Objective:
 
     def _acceleration(
         self, motion: Motion, drag: float, at: dict[str, float], by_site: NDArray[np.intp]
-    ) -> tuple[Array, Array | None]:
+    ) -> Array:
         """Deceleration of the striker, m/s², and its derivatives: eq. of motion of the top mass.
 
         A (Σ_N + η_site/H dw/dt)/m; with masses inside the second derivative of the motion itself.
         A sensor on the striker does not feel gravity, nor does its zero before contact show it.
         """
+        speed = np.gradient(_with_slopes(motion, -1), self._clock, axis=-1)
+        if self.interior_mass:
+            felt = -np.gradient(speed, self._clock, axis=-1)
+            felt[0] += self._gravity
+            return felt
         per_mass = self.measurement.specimen.area / at[nuisances.STRIKER_MASS]
-        flying = self._clock < at[nuisances.CONTACT_TIME]
-
-        def of(stress: Array, top: Array) -> tuple[Array, Array]:
-            speed = np.gradient(top, self._clock, axis=-1)
-            if self.interior_mass:
-                felt = 0.0 if top.ndim > 1 else self._gravity
-                return felt - np.gradient(speed, self._clock, axis=-1), np.zeros_like(speed)
-            braked = np.where(flying, 0.0, speed)
-            return per_mass * (stress + drag * braked), per_mass * braked
-
-        push, by_drag = of(motion.base_stress, motion.displacement[-1])
-        if motion.slopes is None:
-            return push, None
-        slopes = of(motion.slopes.base_stress, motion.slopes.displacement[:, -1])[0]
-        slopes[by_site] += by_drag
-        return push, slopes
+        braked = np.where(self._clock < at[nuisances.CONTACT_TIME], 0.0, speed)
+        pushed: Array = per_mass * (_with_slopes(motion) + drag * braked)
+        pushed[1:][by_site] += per_mass * braked[0]
+        return pushed
 
     # ------------------------------------------------------------------ residual
 
@@ -594,19 +584,23 @@ class Objective:
 
     def kept(self, name: str) -> NDArray[np.intp]:
         """Samples of a curve that stand in the residual, in their order."""
-        return np.arange(self.time.size)[self._kept[name]]
+        return self._kept[name]
 
     def n_measured(self, name: str) -> int:
         """Count the samples that the channel of a curve measured, outliers included."""
         taken = self.measurement.sampled.get(self.channel(name))
         return self.time.size if taken is None else int(np.count_nonzero(taken))
 
+    def by_curve(self, residual: Array) -> dict[str, Array]:
+        """Return the part of each counted curve in a residual, or in rows like it."""
+        parts = np.split(residual[: self.n_data], np.cumsum(self.sizes)[:-1])
+        return dict(zip(self.counted, parts, strict=True))
+
     def rms(self, residual: Array) -> dict[str, float]:
         """RMS of each counted curve in its unit, from residuals."""
-        parts = np.split(residual[: self.n_data], np.cumsum(self.sizes)[:-1])
         return {
             name: float(np.sqrt(np.mean(part**2))) / self.factor(name)
-            for name, part in zip(self.counted, parts, strict=True)
+            for name, part in self.by_curve(residual).items()
         }
 
     def misfit(self, curves: Simulated) -> dict[str, float | None]:

@@ -97,9 +97,9 @@ class Tracker:
     looked: Callable[[Array], None] | None = None
     ends: list[Array] = field(default_factory=list)
 
-    def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
-        """Residual less a shift; raises SearchStoppedError once the time is up."""
-        residual = self.consider(values, shift)
+    def residual(self, values: Array) -> Array:
+        """Residual of the objective; raises SearchStoppedError once the time is up."""
+        residual = self.consider(values)
         if self.pulse is not None and self.objective.evaluations % PULSE == 0:
             self.pulse()
         if self.deadline is not None and time.monotonic() > self.deadline:
@@ -111,18 +111,10 @@ class Tracker:
         if self.looked is not None and self.best_values is not None:
             self.looked(self.best_values)
 
-    def restart(self) -> None:
-        """Go on from the best point with an objective that has changed."""
-        best, self.best_values, self.best_cost = self.best_values, None, np.inf
-        if best is not None:
-            self.consider(best)
-
-    def consider(self, values: Array, shift: Array | float = 0.0) -> Array:
-        """Residual of the objective, whatever the time; with a shift, that of other data."""
+    def consider(self, values: Array) -> Array:
+        """Residual of the objective, whatever the time."""
         failures = self.objective.failures
         residual = self.objective.residual(values)
-        if np.any(shift):
-            return residual - shift
         cost = float(residual @ residual)
         if cost < self.best_cost and self.objective.failures == failures:
             self.best_cost, self.best_values = cost, values.copy()

@@ -70,6 +70,7 @@ class Term:
 
     objective: Objective
     space: Space
+    names: tuple[str, ...]  # Of the coordinates
     places: NDArray[np.intp]
     rates: tuple[Rate, ...]
     pulls: tuple[Pull, ...]
@@ -250,8 +251,8 @@ def effective_samples(problem: Problem, values: Array) -> int:
     What the own fit leaves is mostly an error of the law, which is no noise: one stretch on one
     side, whatever its samples, says one thing. Counted over `BLOCKS` means of each curve.
     """
-    residual, count = problem.objective.residual(values)[: problem.objective.n_data], 0
-    for part in np.split(residual, np.cumsum(problem.objective.sizes)[:-1]):
+    objective, count = problem.objective, 0
+    for part in objective.by_curve(objective.residual(values)).values():
         blocks = np.array_split(part, min(BLOCKS, part.size))
         signs = np.sign([float(np.mean(block)) for block in blocks])
         count += 1 + int(np.count_nonzero(np.diff(signs)))
@@ -330,13 +331,10 @@ class _Layout:
             zip(problems, _spaces(problems, absolute), strict=True)
         ):
             at, rates = list[int](), list[Rate]()
-            for j, one in enumerate(space.coordinates):
-                name = problem.names[one.place]
-                if name in own:
-                    at.append(count)
-                    count += 1
-                    continue
-                at.append(places[name])
+            coordinates = {problem.names[one.place]: one for one in space.coordinates}
+            for j, (name, one) in enumerate(coordinates.items()):
+                at.append(count if name in own else places[name])
+                count += name in own
                 if kinds[name] in RATES:
                     rates.append(Rate(j, kinds[name], links.x(t), one.is_logarithmic))
             pulls = tuple(
@@ -344,8 +342,8 @@ class _Layout:
                 for name, pull in links.pulls.items()
                 if name in places and name in problem.free() and pull[t]
             )
-            at_all = np.array(at, np.intp)
-            terms.append(Term(problem.objective, space, at_all, tuple(rates), pulls))
+            named, at_all = tuple(coordinates), np.array(at, np.intp)
+            terms.append(Term(problem.objective, space, named, at_all, tuple(rates), pulls))
         box = np.full(count, -_FAR), np.full(count, _FAR)
         for term in terms:
             for side, ends, steepest in zip(
@@ -371,31 +369,25 @@ class _Layout:
 
     def start(self, vectors: Sequence[Array]) -> Array:
         """The point that has the own parameters of these vectors, and what is nearest in common."""
-        point = np.zeros(self.box[0].size)
-        there = dict[int, list[tuple[float, Rate | None]]]()
-        for term, vector in zip(self.terms, vectors, strict=True):
-            found = term.space.encode(vector)
-            point[term.places] = found
-            rates = {rate.at: rate for rate in term.rates}
-            for j, place in enumerate(term.places.tolist()):
-                there.setdefault(place, []).append((found[j], rates.get(j)))
+        point, links = np.zeros(self.box[0].size), self.links
+        found = [term.space.encode(own) for term, own in zip(self.terms, vectors, strict=True)]
+        for term, own in zip(self.terms, found, strict=True):
+            point[term.places] = own
         for name, place in self.common_places.items():
+            free = [t for t, problem in enumerate(self.problems) if name in problem.free()]
             if name in self.own:
-                logs = [
-                    _logarithm(vector[problem.index[name]])
-                    for problem, vector in zip(self.problems, vectors, strict=True)
-                    if name in problem.free()
-                ]
-                point[place] = np.median(logs)
+                values = (vectors[t][self.problems[t].index[name]] for t in free)
+                point[place] = np.median([_logarithm(value) for value in values])
                 continue
-            own, rates_ = zip(*there[place], strict=True)
-            rate = rates_[0]
-            if rate is None:
+            columns = [self.terms[t].names.index(name) for t in free]
+            own = np.array([found[t][j] for t, j in zip(free, columns, strict=True)])
+            if (kind := links.kind(name)) not in RATES:
                 point[place] = np.median(own)
                 continue
-            values = np.exp(own) if rate.logarithmic else np.array(own)
-            v, b = start_of(rate.kind, values, np.array([one.x for one in rates_]))
-            point[place : place + 2] = np.log(v) if rate.logarithmic else v, b
+            logarithmic = self.terms[free[0]].space.coordinates[columns[0]].is_logarithmic
+            x = np.array([links.x(t) for t in free])
+            v, b = start_of(kind, np.exp(own) if logarithmic else own, x)
+            point[place : place + 2] = np.log(v) if logarithmic else v, b
         return np.clip(point, *self.box)
 
     def common(self, point: Array, values: Sequence[Array]) -> dict[str, tuple[float, ...]]:

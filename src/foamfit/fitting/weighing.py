@@ -31,7 +31,5 @@ class Weighing:
 
     def __call__(self, rows: Array) -> Array:
         """Weigh residuals (n,), or columns of their derivatives (n, k)."""
-        levels, less = self.levels, self.less
-        if rows.ndim == 2:
-            levels, less = levels[:, None], less[:, None]
-        return np.asarray(rows - levels * (self.axes @ (less * (self.axes.T @ (rows / levels)))))
+        along = (rows.T / self.levels) @ self.axes * self.less
+        return np.asarray(rows - (self.levels * (along @ self.axes.T)).T)

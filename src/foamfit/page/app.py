@@ -37,7 +37,7 @@ SHOWN = ("model", "drive", "relaxation", *CYCLES)
 FOLDED = (
     *laws.OPTIONS,
     *("starts", "max_time", "seed", "interior_mass", "time_shift"),
-    *("profile", "bootstrap", "mcmc"),
+    *("profile", "mcmc"),
 )
 # Options on which the curves of a model depend.
 OF_CURVES = ("drive", "relaxation", "interior_mass", "time_shift", *laws.OPTIONS)

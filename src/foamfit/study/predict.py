@@ -320,9 +320,8 @@ def _by_motion(problem: Problem, point: Array) -> dict[str, Array]:
         return out
     apart = np.linalg.norm(objective.motion.modes(objective.time), axis=1)
     share = np.minimum(1.0, level.sigma / np.maximum(apart, 1e-300))
-    parts = np.split(np.linalg.norm(changes, axis=1), np.cumsum(objective.sizes)[:-1])
     samples = np.arange(objective.time.size)
-    for name, part in zip(objective.counted, parts, strict=True):
+    for name, part in objective.by_curve(np.linalg.norm(changes, axis=1)).items():
         size = np.interp(samples, objective.kept(name), part / objective.factor(name))
         out[name] = NORMAL * share * size
     return out

@@ -3,7 +3,7 @@
 `best_point` holds what was computed at the best point, `covariance` and `intervals` give numbers,
 `checklist` asks what a good fit must pass, `conclude` gives each parameter its state; `residuals`
 tells noise from an error of the law, `ranges` what the latter leaves open, and `sentences.toml` has
-the words for all of it. A newcomer may skip `profile`, `resample` and `evidence`.
+the words for all of it. A newcomer may skip `profile`, `markov_chain` and `evidence`.
 """
 
 from __future__ import annotations

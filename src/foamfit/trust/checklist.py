@@ -246,9 +246,15 @@ def _of_test(best: BestPoint, balance: EnergyAudit) -> Iterator[Check]:
 
 
 def _damping(best: BestPoint, known: Sequence[str]) -> Check:
-    if best.problem.objective.drive != "displacement" or not best.names:
+    """Whether a driven single spring plainly lacks the damping (Pa·s) that was left out."""
+    problem, name = best.problem, "s1_eta"
+    if problem.objective.drive != "displacement" or not best.names:
         return _check("damping", None)
-    eta = _damping_hint(best, known) or 0.0
+    held, alone, eta = problem.params[name], len(problem.model.kinds) == 1, 0.0
+    if alone and problem.measurement.time is not None and not held.vary and held.value == 0.0:
+        column = problem.slopes(best.values, (name,))[:, 0]
+        size = float(problem.sizes((name,), best.values)[0])
+        eta = max(_one_step(best, known, column, size) or 0.0, 0.0)
     return _check("damping", eta == 0.0, eta=eta)
 
 
@@ -286,19 +292,6 @@ def _shift_hint(best: BestPoint, determined: Sequence[str]) -> float | None:
     if found is not None and abs(found) > 0.25 * gap:
         return found
     return _shift_of_motion(best.problem)
-
-
-def _damping_hint(best: BestPoint, determined: Sequence[str]) -> float | None:
-    """Damping (Pa·s) that a single spring lacks under a driven motion, where it is plain."""
-    problem, name = best.problem, "s1_eta"
-    held = problem.params[name]
-    alone = problem.objective.drive == "displacement" and len(problem.model.kinds) == 1
-    if not alone or problem.measurement.time is None or held.vary or held.value != 0.0:
-        return None
-    column = problem.slopes(best.values, (name,))[:, 0]
-    size = float(problem.sizes((name,), best.values)[0])
-    eta = _one_step(best, determined, column, size)
-    return eta if eta is not None and eta > 0.0 else None
 
 
 def _one_step(

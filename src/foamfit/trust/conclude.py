@@ -33,6 +33,7 @@ from foamfit.trust.checklist import (
     status_of,
     warnings_of,
 )
+from foamfit.trust.covariance import Ends
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
 
@@ -239,7 +240,7 @@ def _varied(
     span = intervals.ranges.get(name)
     if span is not None:  # it may be that of the point before the last improvement
         span = min(span[0], value), max(span[1], value)
-    state, why = state_of(name, value, ends, insight, (low, high), span)
+    state, why = _state_of(best, name, ends, insight, span)
     objective, there = problem.objective, intervals.elsewhere.get(name)
     off, curve = max((objective.off(best.simulated, one) or 0.0, one) for one in objective.counted)
     if state == "determined" and (objective.interior_mass or there is not None or off > POOR):
@@ -255,21 +256,16 @@ def _varied(
     return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method, span)
 
 
-def state_of(
-    name: str,
-    value: float,
-    ends: tuple[float, float],
-    insight: Insight,
-    limits: tuple[float, float],
-    span: tuple[float, float] | None = None,
+def _state_of(
+    best: BestPoint, name: str, ends: Ends, insight: Insight, span: Ends | None
 ) -> tuple[str, str]:
     """State of a parameter that varies and whose branch is reached, and the reason in one sentence.
 
-    `ends` are those of its 95 % interval, not cut at its `limits`; NaN or infinite where the data
+    `ends` are those of its 95 % interval, not cut at its limits; NaN or infinite where the data
     fix only a combination. `span` is its range, if there is one; the wider of the two counts.
     """
-    ends, what = covariance.wider(ends, span)
-    size, unit = float(insight.sizes[insight.names.index(name)]), unit_of(name)
+    (ends, what), limits, unit = covariance.wider(ends, span), best.limits(name), unit_of(name)
+    value, size = float(best.values[best.index[name]]), float(best.sizes[best.names.index(name)])
     state, why = covariance.state(name, value, (ends, what), size, limits)
     if state == "not determined":
         reason = why if math.isfinite(ends[1] - ends[0]) else say("why", "independent")

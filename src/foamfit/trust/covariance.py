@@ -68,6 +68,13 @@ class Covariance:
         return self.matrix / np.outer(scale, scale)
 
 
+def _directions(rows: Array) -> tuple[Array, Array, Array]:
+    """Singular value decomposition of some rows, without the directions that they do not show."""
+    left, singular, vt = np.linalg.svd(rows, full_matrices=False)
+    seen = singular > SINGULAR * max(float(singular.max(initial=0.0)), 1e-300)
+    return left[:, seen], singular[seen], vt[seen]
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """One test in a covariance; everything is scaled, so that directions compare.
@@ -91,9 +98,8 @@ class Block:
     @cached_property
     def axes(self) -> tuple[Array, Array]:
         """Orthonormal columns (n, r), and what leads from parameters to them (r, k): J is both."""
-        left, singular, vt = np.linalg.svd(self.jacobian, full_matrices=False)
-        seen = singular > SINGULAR * max(float(singular.max(initial=0.0)), 1e-300)
-        return left[:, seen], singular[seen, None] * vt[seen]
+        left, singular, vt = _directions(self.jacobian)
+        return left, singular[:, None] * vt
 
     @cached_property
     def steps(self) -> Array:
@@ -183,9 +189,8 @@ class Uncertainty:
     def _solved(self) -> tuple[Array, Array]:
         rows = [block.axes[1] @ block.through for block in self.blocks]
         rows += [] if self.drawn is None else [self.drawn[0]]
-        left, singular, vt = np.linalg.svd(np.concatenate(rows), full_matrices=False)
-        seen = singular > SINGULAR * max(float(singular.max(initial=0.0)), 1e-300)
-        return left[:, seen], vt[seen].T / singular[seen]
+        left, singular, vt = _directions(np.concatenate(rows))
+        return left, vt.T / singular
 
     @property
     def root(self) -> Array:

@@ -30,7 +30,7 @@ from foamfit.fitting.search import Tracker, squares
 from foamfit.results import Fit, rung_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
-from foamfit.trust.residuals.noise_process import autocorrelation_time, parts
+from foamfit.trust.residuals.noise_process import autocorrelation_time
 from foamfit.trust.residuals.residual_tests import neighbours_test, runs_test
 
 # Residuals are random where neither test of their order rejects it at the first level. Below the
@@ -59,7 +59,7 @@ STEPS, ENOUGH = 20, 1e-3
 def misfit_of(objective: Objective, residual: Array) -> float:
     """RMS over the measured ranges of all counted curves, of a residual as the objective has it."""
     spans = np.repeat([objective.span(name) for name in objective.counted], objective.sizes)
-    return math.sqrt(float(np.mean((residual / spans) ** 2)))
+    return math.sqrt(float(np.mean((residual[: spans.size] / spans) ** 2)))
 
 
 def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
@@ -80,7 +80,7 @@ def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
         end = levenberg.descend(*functions, start, space.box, STEPS, enough=ENOUGH)
         there = objective.residual(space.decode(end.point))
         predicted[~rest] = there[~rest]
-    return misfit_of(objective, predicted[: objective.n_data])
+    return misfit_of(objective, predicted)
 
 
 @dataclass(eq=False)
@@ -106,10 +106,10 @@ class Tried:
         self.varied = sum(item.vary for item in self.result.parameters.values())
         self.counted, self.sizes = objective.counted, objective.sizes
         self.spans = [objective.span(name) for name in self.counted]  # in the unit of the residual
-        residual, slices = best.residual[: objective.n_data], parts(self.sizes)
-        self.curves = [residual[part] for part in slices]
+        residual = best.residual[: objective.n_data]
+        self.curves = list(objective.by_curve(residual).values())
         self.taus = [autocorrelation_time(curve) for curve in self.curves]
-        self.grams = np.array([best.scaled[part].T @ best.scaled[part] for part in slices])
+        self.grams = np.array([one.T @ one for one in objective.by_curve(best.scaled).values()])
         floor = sum(n * (EXACT * s) ** 2 for n, s in zip(self.sizes, self.spans, strict=True))
         self.chisqr = max(float(residual @ residual), floor)
         self.misfit = max(misfit_of(objective, residual), EXACT)

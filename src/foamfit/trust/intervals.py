@@ -6,6 +6,7 @@ stiff it is not: it is flat along ε_a, with several shallow minima. There the c
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -19,18 +20,19 @@ from foamfit.fitting.search import Tracker
 from foamfit.results import Intervals
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
+from foamfit.trust.markov_chain import mcmc, walkers
 from foamfit.trust.profile import PLACED, Tracing, departures
-from foamfit.trust.resample import bootstrap, check_emcee, mcmc, walkers
 from foamfit.trust.residuals.noise_process import parts
 
 # The default profiles a parameter if the root of the cost departs from a straight line by this
 # share at the end of its local interval.
 BENT = 0.15
-METHODS = ("auto", "local", "profile", "bootstrap", "mcmc")
-# Refits of an average profile, for the announcement; draws that percentiles need, and at most.
-REFITS, ENOUGH_DRAWS, MOST_DRAWS = 9, 40, 100_000
-# Evaluations of a refit; there is a set of slopes to ten of them.
-EVALUATIONS = 6.0
+METHODS = ("auto", "local", "profile", "mcmc")
+# Refits of an average profile, for the announcement, and evaluations of a refit; there is a set of
+# slopes to ten of them.
+REFITS, EVALUATIONS = 9, 6.0
+# Samples of a Markov chain that percentiles need; its steps at least and at most.
+ENOUGH_DRAWS, LEAST_DRAWS, MOST_DRAWS = 40, 100, 100_000
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
 # noise makes that much difference in one test of ten thousand, but there are many minima.
 HARDLY_WORSE = 2.0
@@ -43,7 +45,7 @@ class Choice:
     """Which intervals are wanted."""
 
     method: str = "auto"  # One of `METHODS`; see `foamfit.fit`
-    draws: int = 0  # Refits of the bootstrap, or steps of the Markov chain
+    draws: int = 0  # Steps of the Markov chain
     seed: int = 0  # Source of all chance
     ranges: bool = True  # Whether ranges are made where the law has an error
 
@@ -53,15 +55,17 @@ class Choice:
             raise InputError(
                 f"intervals '{self.method}' is unknown; it must be one of {', '.join(METHODS)}"
             )
-        least = {"bootstrap": 40, "mcmc": 100}.get(self.method, 0)
+        least = LEAST_DRAWS if self.method == "mcmc" else 0
         if not least <= self.draws <= MOST_DRAWS:
             wrong = "few" if self.draws < least else "many"
             raise InputError(
                 f"{self.draws} draws are too {wrong} for intervals by {self.method}; "
                 f"it must be at {f'least {least}' if wrong == 'few' else f'most {MOST_DRAWS}'}"
             )
-        if self.method == "mcmc":
-            check_emcee()
+        if self.method == "mcmc" and importlib.util.find_spec("emcee") is None:
+            raise InputError(
+                'Markov chains need emcee, which is not installed; pip install "foamfit[mcmc]"'
+            )
 
 
 def assess(
@@ -89,8 +93,6 @@ def assess(
     if method != "auto":
         count = evaluations_of(best, choice)
         announce(say("interval", "cost", by=method, count=count, seconds=_seconds(best, count)))
-    if method == "bootstrap":
-        return _by_bootstrap(best, choice, tracker)
     if method == "mcmc":
         return _by_mcmc(best, choice, tracker)
     if method == "profile":
@@ -109,8 +111,6 @@ def evaluations_of(best: BestPoint, choice: Choice) -> float:
     """Evaluations that intervals which were asked for are expected to take; 0 by default."""
     if choice.method == "mcmc":
         return float((choice.draws + 1) * walkers(best))
-    if choice.method == "bootstrap":
-        return EVALUATIONS * choice.draws
     return EVALUATIONS * REFITS * len(best.known) if choice.method == "profile" else 0.0
 
 
@@ -120,24 +120,22 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
     A value much farther off, at a minimum that is hardly worse than the best, is named beside them.
     """
     ends, methods, elsewhere = dict(made.ends), dict(made.methods), dict[str, float]()
-    known = [(column, best.names[column]) for column in map(best.names.index, best.known)]
-
-    def interval(column: int, name: str) -> tuple[float, float]:
-        value, half = float(best.values[best.index[name]]), float(best.halves[column])
-        return ends.get(name, (value - half, value + half))
-
+    values, known = best.values[best.places], {name: best.names.index(name) for name in best.known}
+    local = np.stack([values - best.halves, values + best.halves], axis=1)
+    intervals = {name: ends.get(name, tuple(local[at].tolist())) for name, at in known.items()}
     for point, residual in minima:
         halves = _halves(best, point, residual)
-        for column, name in known:
+        for name, column in known.items():
             if math.isfinite(half := float(halves[column])):
-                there, (low, high) = float(point[best.index[name]]), interval(column, name)
+                there, (low, high) = float(point[best.index[name]]), intervals[name]
                 wider = min(low, there - half), max(high, there + half)
                 if wider[1] - wider[0] > (1.0 + PLACED) * (high - low):
-                    ends[name], methods[name] = wider, "other minima"
+                    intervals[name] = ends[name] = wider
+                    methods[name] = "other minima"
     for point, residual in () if best.misfits else minima:
         near = best.rises(residual) <= (HARDLY_WORSE * best.quantiles) ** 2
-        for column, name in known:
-            there, (low, high) = float(point[best.index[name]]), interval(column, name)
+        for name, column in known.items():
+            there, (low, high) = float(point[best.index[name]]), intervals[name]
             if near[column] and max(low - there, there - high) > high - low:
                 elsewhere.setdefault(name, there)
     return replace(made, ends=ends, methods=methods, elsewhere=elsewhere)
@@ -212,36 +210,28 @@ def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]
     return [points[0], points[-1]] if points else []
 
 
-def _by_bootstrap(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
-    drawn, stopped = bootstrap(best, choice.draws, choice.seed, tracker)
-    few = len(drawn) < ENOUGH_DRAWS
-    facts = {"done": len(drawn), "count": choice.draws, "stopped": stopped, "few": few}
-    note = say("interval", "bootstrap", **facts)
-    return _percentiles(best, drawn, "block bootstrap", note, stopped is None)
-
-
 def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
-    chain = mcmc(best, choice.draws, choice.seed, tracker)
-    lost = [name for name in best.names if name not in best.known]
-    few = len(chain.samples) < ENOUGH_DRAWS
-    note = chain.sentence(lost, few)
-    fine = chain.converged and chain.stopped is None
-    made = _percentiles(best, chain.samples, "MCMC", note, fine)
-    columns = chain.samples.reshape(-1, chain.walkers, len(best.names)).T  # (k, walkers, steps)
-    return made if few else replace(made, draws=dict(zip(best.names, columns, strict=True)))
+    """Intervals between the 2.5th and the 97.5th percentile of a Markov chain.
 
-
-def _percentiles(best: BestPoint, drawn: Array, method: str, note: str, fine: bool) -> Intervals:
-    """Intervals between the 2.5th and the 97.5th percentile of what was drawn.
-
-    What is said of them is a warning if they are not what was asked for; too few give none.
+    What is said of it is a warning if it is too short or was stopped; too few samples give none.
     """
-    if len(drawn) < ENOUGH_DRAWS:
+    chain = mcmc(best, choice.draws, choice.seed, tracker)
+    few = len(chain.samples) < ENOUGH_DRAWS
+    note = chain.sentence([name for name in best.names if name not in best.known], few)
+    if few:
         return Intervals(warnings=(note,))
-    columns = dict(zip(best.names, np.percentile(drawn, [2.5, 97.5], axis=0).T, strict=True))
-    ends = {name: (float(columns[name][0]), float(columns[name][1])) for name in best.known}
-    notes, warnings = ((note,), ()) if fine else ((), (note,))
-    return Intervals(ends, dict.fromkeys(ends, method), notes=notes, warnings=warnings)
+    low, high = np.percentile(chain.samples, [2.5, 97.5], axis=0).tolist()
+    pairs = dict(zip(best.names, zip(low, high, strict=True), strict=True))
+    ends = {name: pairs[name] for name in best.known}
+    fine = chain.converged and chain.stopped is None
+    samples = chain.samples.reshape(-1, chain.walkers, len(best.names)).T  # (k, walkers, steps)
+    return Intervals(
+        ends,
+        dict.fromkeys(ends, "MCMC"),
+        notes=(note,) if fine else (),
+        warnings=() if fine else (note,),
+        draws=dict(zip(best.names, samples, strict=True)),
+    )
 
 
 def _seconds(best: BestPoint, evaluations: float) -> float:

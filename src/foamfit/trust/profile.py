@@ -43,8 +43,6 @@ class Refit:
 
     best: BestPoint
     tracker: Tracker  # Simulates, counts and ends all at its deadline
-    # Taken off the residual: data (and means of priors) that differ from those that were fitted.
-    shift: Array | float = 0.0
 
     def __post_init__(self) -> None:
         """Find the box of the parameters and the gain at which a refit ends."""
@@ -55,12 +53,12 @@ class Refit:
 
     def start(self) -> Iterate:
         """The best point itself."""
-        return Iterate(self.best.values, self.best.residual - self.shift, self.best.scaled)
+        return Iterate(self.best.values, self.best.residual, self.best.scaled)
 
     def residual(self, point: Array) -> Array | None:
         """Residual of a point that can be simulated, else None."""
         objective = self.tracker.objective
-        failures, residual = objective.failures, self.tracker.residual(point, self.shift)
+        failures, residual = objective.failures, self.tracker.residual(point)
         return residual if objective.failures == failures else None
 
     def rise(self, point: Array) -> float:
@@ -98,7 +96,7 @@ class Refit:
         def residual(scaled: Array) -> Array:
             if scaled is begin:
                 return np.asarray(root * first)
-            return np.asarray(root * self.tracker.residual(self.point(scaled, box), self.shift))
+            return np.asarray(root * self.tracker.residual(self.point(scaled, box)))
 
         def jacobian(scaled: Array) -> Array:
             slopes = best.problem.slopes(self.point(scaled, box), best.names)
@@ -309,13 +307,12 @@ def departures(best: BestPoint) -> Array:
     the best point, infinite where nothing can be simulated.
     """
     refit, k = Refit(best, Tracker(best.problem.objective)), len(best.names)
-    start, out = refit.start(), np.zeros((k, 2))
-    normal = start.jacobian.T @ start.jacobian
+    out, normal = np.zeros((k, 2)), best.scaled.T @ best.scaled
 
     def least(residual: Array, others: NDArray[np.intp]) -> float:
         """Sum of squares after one linear step of the other parameters."""
         inverse = np.linalg.pinv(normal[np.ix_(others, others)], rcond=1e-10, hermitian=True)
-        slope = start.jacobian[:, others].T @ residual
+        slope = best.scaled[:, others].T @ residual
         return float(residual @ residual - slope @ inverse @ slope)
 
     for i, (value, limits) in enumerate(zip(best.values[best.places], best.box.T, strict=True)):
@@ -330,9 +327,9 @@ def departures(best: BestPoint) -> Array:
             out[i, side] = np.inf
             for share in (1.0, 0.5, 0.25):
                 shift = min(share * half, to_limit)
-                residual = refit.residual(refit.moved(start.point, sign * shift * along))
+                residual = refit.residual(refit.moved(best.values, sign * shift * along))
                 if residual is not None:
-                    rise = least(residual, others) - least(start.residual, others)
+                    rise = least(residual, others) - least(best.residual, others)
                     root = math.sqrt(max(rise / best.spread.inflation[i], 0.0))
                     out[i, side] = root * stderr / shift - 1.0
                     break

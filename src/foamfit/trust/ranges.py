@@ -50,8 +50,7 @@ def alike(
     most, refit = tolerance(best), Refit(best, tracker)
     refit.enough, allowed = 0.01 * most, tracker.objective.evaluations + budget
     out = [best.values, *(point for point in minima if refit.rise(point) <= most)]
-    jacobian = refit.start().jacobian
-    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-12, hermitian=True)
+    inverse = np.linalg.pinv(best.scaled.T @ best.scaled, rcond=1e-12, hermitian=True)
     for column, row in enumerate(inverse):
         for limit, sign in zip(best.box[:, column], (-1.0, 1.0), strict=True):
             if tracker.objective.evaluations < allowed:
@@ -116,8 +115,7 @@ def _towards(refit: Refit, weights: Array, most: float) -> list[Array]:
     """Refit with other weights, moved towards the best point until it follows the curves."""
     best, share = refit.best, 1.0
     found = refit.run(best.values, weights=weights, iterations=ITERATIONS)
-    if found is None:
-        return []
+    assert found is not None  # the best point can be simulated
     step = (found.point - best.values)[best.places] / best.sizes
     for _ in range(TRIALS):
         point = refit.moved(best.values, share * step)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import toeplitz
+from scipy.linalg import orth, toeplitz
 
 from foamfit.arrays import Array
 
@@ -57,24 +57,18 @@ class NoiseProcess:
             return 1.0
         return max(self.white / (1.0 - float(self.coefficients.sum())) ** 2, 1.0)
 
-    def _circulant(self, n: int) -> Array:
-        """Eigenvalues of the circulant matrix that has the covariance of n samples in a corner."""
-        lags = self.autocovariance(n)
-        return np.asarray(np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]])))
-
     def times(self, columns: Array) -> Array:
         """Covariance matrix of n samples times the columns of an (n, k) array."""
         if not self.coefficients.size:
             return self.variance * columns
         n = len(columns)
-        spectrum = np.fft.rfft(columns, 2 * n, axis=0) * self._circulant(n)[:, None]
-        product: Array = np.fft.irfft(spectrum, axis=0)[:n]
-        return product
-
-    def draw(self, n: int, rng: np.random.Generator) -> Array:
-        """So many samples of normal noise, (n,)."""
-        root = np.sqrt(np.maximum(self._circulant(n).real, 0.0))
-        return np.asarray(np.fft.irfft(root * np.fft.rfft(rng.standard_normal(2 * n)))[:n])
+        lags = self.autocovariance(n)
+        # A circulant matrix that has the covariance in a corner: the transform makes it diagonal.
+        circulant = np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]]))
+        product: Array = np.fft.irfft(
+            np.fft.rfft(columns, 2 * n, axis=0) * circulant[:, None], axis=0
+        )
+        return product[:n]
 
     def forms(self, columns: Array, mix: Array | None = None) -> Array:
         """Variance lᵀΣl of the noise times each column l of an (n, m) product, (m,).
@@ -218,8 +212,7 @@ def basis_of(jacobian: Array) -> Array:
     if not jacobian.shape[1]:
         return jacobian
     scale = np.linalg.norm(jacobian, axis=0)
-    left, singular, _ = np.linalg.svd(jacobian / np.where(scale > 0, scale, 1), full_matrices=False)
-    return left[:, singular > 1e-10 * max(float(singular[0]), 1e-300)]
+    return np.asarray(orth(jacobian / np.where(scale > 0.0, scale, 1.0), rcond=1e-10))
 
 
 def autocorrelation_time(residual: Array) -> float:

@@ -1,95 +1,22 @@
-"""Intervals by resampling: the block bootstrap and Markov chains. Both are made only on demand."""
+"""Markov chains of the parameters, which are made only on demand."""
 
 from __future__ import annotations
 
-import importlib.util
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.errors import InputError
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import Refit
-from foamfit.trust.residuals.noise_process import NoiseProcess, parts
 
 # Farthest that a walker of a Markov chain begins from the best point along a direction that the
 # test does not fix, over the scales of the parameters.
 FARTHEST = 0.1
-
-
-def block_length(process: NoiseProcess, n: int) -> int:
-    """Length of the blocks of a bootstrap of n samples of a noise.
-
-    The one that makes the error of a variance least if the noise is autoregressive of first order
-    with the same autocorrelation time (Politis & White 2004, Econometric Reviews 23, 53):
-    (3/8 n ((τ²-1)/τ)²)^(1/3), one for white noise.
-    """
-    tau = process.tau
-    length = (0.375 * n * ((tau * tau - 1.0) / tau) ** 2) ** (1.0 / 3.0)
-    return int(min(max(round(length), 1), max(n // 4, 1)))
-
-
-def _source(
-    residual: Array, process: NoiseProcess, law: bool
-) -> Callable[[np.random.Generator], Array]:
-    """What draws the noise of one curve: its process beside an error of the law, else its residual.
-
-    From the residual, circular blocks with random starts (Politis & Romano 1992). A factor corrects
-    that residuals are smaller than the noise was, and that blocks break correlation at their ends:
-    sums over the curve vary as those of its noise.
-    """
-    n, length = residual.size, block_length(process, residual.size)
-    lags = process.autocovariance(length) / process.variance
-    within = 1.0 + 2.0 * float((1.0 - np.arange(1, length) / length) @ lags[1:])
-    power = max(float(np.var(residual)), 1e-300)
-    factor = process.variance / power * max(process.tau / within, 1.0)
-    scaled = (residual - residual.mean()) * math.sqrt(factor)
-
-    def blocks(rng: np.random.Generator) -> Array:
-        starts = rng.integers(0, n, -(-n // length))
-        return np.asarray(scaled[((starts[:, None] + np.arange(length)) % n).ravel()[:n]])
-
-    return partial(process.draw, n) if law else blocks
-
-
-def bootstrap(
-    best: BestPoint, draws: int, seed: int, tracker: Tracker | None = None
-) -> tuple[Array, str | None]:
-    """Refit data remade from the fitted curves and blocks of the residuals.
-
-    Returned are the parameters of each, (m, k), SI, and what ended the refits early. Where a
-    residual holds an error of the law, that stays, and noise of the kind that is in it is added to
-    the measured curve. Each refit descends from the best point; other minima are not searched.
-    """
-    objective = best.problem.objective
-    tracker = Tracker(objective) if tracker is None else tracker
-    rng = np.random.default_rng([seed, 1])
-    priors = len(objective.priors)
-    sources, fitted = [], best.residual[: objective.n_data].copy()
-    for part, process, error in zip(
-        parts(objective.sizes), best.spread.noise, best.errors, strict=True
-    ):
-        sources.append(_source(best.residual[part], process, error.found))
-        if error.found:
-            fitted[part] = 0.0
-    out: list[Array] = []
-    stopped = None
-    try:
-        for _ in range(draws):
-            left = fitted - np.concatenate([draw(rng) for draw in sources])
-            refit = Refit(best, tracker, np.append(left, rng.standard_normal(priors)))
-            end = refit.run(best.values)
-            assert end is not None  # the best point can be simulated
-            out.append(end.point[best.places])
-    except STOPPING as error:
-        stopped = what_stopped(error)
-    return np.array(out).reshape(-1, len(best.names)), stopped
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,14 +43,6 @@ class MarkovChain:
     def sentence(self, lost: Sequence[str] = (), few: bool = False) -> str:
         """What the autocorrelation says of the chain; of what is `lost` there are no intervals."""
         return say("interval", "chain", chain=self, lost=lost, few=few)
-
-
-def check_emcee() -> None:
-    """Raise InputError if emcee is not there."""
-    if importlib.util.find_spec("emcee") is None:
-        raise InputError(
-            'Markov chains need emcee, which is not installed; pip install "foamfit[mcmc]"'
-        )
 
 
 def walkers(best: BestPoint) -> int:
