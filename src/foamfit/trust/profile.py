@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.fitting.levenberg import Iterate, damped_step, descend
+from foamfit.fitting.levenberg import Iterate, descend, following
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
 from foamfit.results import Profile
 from foamfit.trust.best_point import BestPoint
@@ -31,8 +31,6 @@ OUTWARD, INWARD = 14, 6
 PLACED = 0.02
 # Two values are nearly the same if they differ by this share of their distance from the best.
 NEARLY = 0.01
-# Damping of the first step of the other parameters, more until it lowers the cost.
-FOLLOWING = (1e-9, 1e-6, 1e-3)
 # A profile that falls below the best point by this share of the cut has found a better minimum.
 BETTER = 0.01
 
@@ -224,16 +222,14 @@ class _Side:
     def _hold(self, value: float, near: Iterate) -> Iterate | None:
         """Refit with the parameter held, starting from a refit near by; None if nothing is found.
 
-        The others follow to first order as far as that lowers the cost: where the test hardly fixes
-        them, the whole step may lead far off.
+        The others follow as far as that lowers the cost.
         """
         shift = np.zeros(len(self.refit.best.names))
         shift[self.column] = (value - self.value(near)) / self.refit.best.sizes[self.column]
-        ahead, held = near.gradient + near.normal @ shift, np.arange(shift.size) == self.column
-        start = self.refit.moved(near.point, shift)
+        alone, *together = following(near, shift, np.arange(shift.size) == self.column)
+        start = self.refit.moved(near.point, alone)
         least = self.refit.rise(start)
-        for damping in FOLLOWING:
-            step = shift + damped_step(ahead, near.normal, damping, held)
+        for step in together:
             trial = self.refit.moved(near.point, step)
             if self.refit.rise(trial) < least:
                 start = trial
