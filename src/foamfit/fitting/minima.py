@@ -31,8 +31,8 @@ NEAR, MINIMA, SAME = 40.0, 24, 0.02
 # Steps of a scan: the first and the least as a share of the box, and the most to each side, half as
 # many where the curves miss more than noise: minima so near are equally good there. Rise of the
 # cost, in variances of what is left of the curves, above which a step is halved; its change below
-# which the next one is doubled.
-STEP, SHORTEST, STEPS, TOO_HIGH, FLAT = 0.04, 0.015, 12, 300.0, 4.0
+# which the next one is doubled, until one was halved; and below which the scan ends.
+STEP, SHORTEST, STEPS, TOO_HIGH, FLAT, NOTHING = 0.04, 0.015, 12, 300.0, 4.0, 0.05
 
 
 def scan_places(tracker: Tracker, space: Space) -> bool:
@@ -48,7 +48,7 @@ def scan_places(tracker: Tracker, space: Space) -> bool:
     scanned = {law.scanned for law in space.model.laws}
     for column, one in enumerate(space.coordinates):
         for sign in (1.0, -1.0) if one.short in scanned else ():
-            values, step, before = best, sign * STEP, cost
+            values, step, growth, before = best, sign * STEP, 2.0, cost
             for _ in range(STEPS if cost <= tracker.objective.floor else STEPS // 2):
                 point = _moved(tracker, space, space.encode(values), column, step)
                 if point is None:
@@ -57,12 +57,14 @@ def scan_places(tracker: Tracker, space: Space) -> bool:
                 fixed = replace(space, values=space.decode(point), free=free)
                 now, point = descend(tracker, fixed, fixed.encode(fixed.values), 30, enough=1e-4)
                 if now > cost + TOO_HIGH * left:
-                    step *= 0.5
+                    step, growth = 0.5 * step, 1.0
                     if abs(step) < SHORTEST:
                         break
                     continue
-                step *= 2.0 if abs(now - before) < FLAT * left else 1.0
-                values, before = fixed.decode(point), now
+                change, values, before = abs(now - before), fixed.decode(point), now
+                if change < NOTHING * left:
+                    break
+                step *= growth if change < FLAT * left else 1.0
                 end = descend(tracker, space, space.encode(values), 60)[1]
                 if not _among(met, end):
                     met.append(end)
