@@ -341,7 +341,8 @@ def _search(
         progress(REFINED, "refinement")
         _refine(problem, tracker)
         weigh_motion(problem, tracker)
-        if exchange_springs(tracker, problem.space()) or scan_places(tracker, problem.space()):
+        moved = bool(exchange_springs(tracker, problem.space()))
+        if scan_places(tracker, problem.space()) or moved:
             _refine(problem, tracker)
             weigh_motion(problem, tracker)
         settle_ends(tracker, problem.space())

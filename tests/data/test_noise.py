@@ -294,3 +294,13 @@ def test_outliers_are_bridged_named_and_kept_for_the_eye():
     assert note.startswith("Check: 3 samples of the stress")
     assert "100 MPa" in note
     assert set(done.outliers) == {"stress"}
+
+
+def test_a_steep_short_peak_is_no_gap() -> None:
+    """Four samples of branch c between a slow rise and a fall as steep as they are."""
+    peak = [250.8, 277.2, 303.9, 292.1, 265.7]
+    rise, fall, rest = np.linspace(0.0, 246.4, 149), np.arange(239.6, 10.0, -26.2), np.zeros(140)
+    force = np.array([*rise, *peak, *fall, *rest])
+    assert not find_outliers(force).any()
+    force[40:44] = 0.0  # a true gap in the same record
+    assert np.flatnonzero(find_outliers(force)).tolist() == [40, 41, 42, 43]

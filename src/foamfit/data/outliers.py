@@ -52,11 +52,11 @@ _FOLLOWS, _SURE, _AROUND = 0.5, 3.0, 3.0
 def find_outliers(values: Array, time: Array | None = None) -> Mask:
     """Isolated samples that cannot belong to a smooth signal with this noise: spikes and gaps.
 
-    Gaps are up to five samples between two opposite jumps of ten times the median jump nearby. A
-    spike is off the cubic through its eight neighbours by four standard deviations, while these
-    agree among themselves and the lines from either side do not lead to it. Samples across a pause
-    are not judged, and of a held channel only gaps are found. If more than 2 % stand out, none is
-    an outlier.
+    Gaps are up to five samples between two opposite jumps of ten times the median jump nearby,
+    before and after which the signal changes by less than half as much. A spike is off the cubic
+    through its eight neighbours by four standard deviations, while these agree among themselves and
+    the lines from either side do not lead to it. Samples across a pause are not judged, and of a
+    held channel only gaps are found. If more than 2 % stand out, none is an outlier.
     """
     n = values.size
     if n < 30:
@@ -99,8 +99,10 @@ def _gaps(values: Array, time: Array) -> Mask:
     high = np.flatnonzero(usual > _JUMP * np.maximum(median_filter(usual, _NEARBY), floor))
     for start, end in ((i, j) for i in high for j in high[(high > i) & (high <= i + _MAX_RUN)]):
         there, back = jump[start], jump[end]
-        left = abs(values[end + 1] - values[start])  # what the signal itself has changed
-        if there * back < 0.0 and left < 0.5 * min(abs(there), abs(back)):
+        # What the signal itself changes, also just before and after: a steep peak is no gap.
+        beside = *jump[start - 1 : start], *jump[end + 1 : end + 2]
+        most = max(np.abs([values[end + 1] - values[start], *beside]))
+        if there * back < 0.0 and most < 0.5 * min(abs(there), abs(back)):
             out[start + 1 : end + 1] = True
     return out
 

@@ -38,10 +38,9 @@ STEP, SHORTEST, STEPS, TOO_HIGH, FLAT, NOTHING = 0.04, 0.015, 12, 300.0, 4.0, 0.
 def scan_places(tracker: Tracker, space: Space) -> bool:
     """Descend from points whose ε_a or ε_* is moved step by step; say whether one is better.
 
-    At each step the other parameters follow, then all are free. Springs in series are left to
-    `exchange_springs`.
+    At each step the other parameters follow, then all are free.
     """
-    if tracker.best_values is None or has_several(space.model):
+    if tracker.best_values is None:
         return False
     best, cost, met = tracker.best_values, tracker.best_cost, [space.encode(tracker.best_values)]
     left = max(cost, tracker.objective.floor) / tracker.objective.n_data
