@@ -185,14 +185,14 @@ def test_failing_at_the_swap_puts_the_older_result_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = fabricated.result(seed=1).save(tmp_path / "r")
-    rename = Path.rename
+    swap = Path.replace
 
     def fail_for_the_new(self: Path, target: Path) -> Path:
         if self.name.endswith(".new"):
             raise OSError(28, "No space left on device")
-        return rename(self, target)
+        return swap(self, target)
 
-    monkeypatch.setattr(Path, "rename", fail_for_the_new)
+    monkeypatch.setattr(Path, "replace", fail_for_the_new)
     with pytest.raises(InputError, match="No space left on device"):
         fabricated.result(seed=2).save(folder)
     assert load_result(folder)["seed"] == 1

@@ -266,7 +266,6 @@ def test_a_fit_of_a_record_from_before_contact_is_drawn_on_the_page(fitted):
     turning = Turning(fitted.measurement, "bistable", told)
     assert not {row.name for row in turning.rows} & NUISANCE.keys()  # they are not turned by hand
     drawn = turning.turn({})
-    assert drawn.values["contact_time"] == pytest.approx(told["contact_time"])
     _, stress = drawn.curves["stress_time"]
     np.testing.assert_allclose(stress, fitted.curves.stress, atol=1e-6 * np.ptp(stress))
     assert drawn.misfit["stress_time"] == pytest.approx(fitted.misfit["stress_time"], rel=1e-3)

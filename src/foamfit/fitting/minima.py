@@ -38,17 +38,19 @@ STEP, SHORTEST, STEPS, TOO_HIGH, FLAT, NOTHING = 0.04, 0.015, 12, 300.0, 4.0, 0.
 def scan_places(tracker: Tracker, space: Space) -> bool:
     """Descend from points whose ε_a or ε_* is moved step by step; say whether one is better.
 
-    At each step the other parameters follow, then all are free.
+    At each step the other parameters follow, then all are free. Where the curves miss more than
+    noise only better ends are kept.
     """
     if tracker.best_values is None:
         return False
     best, cost, met = tracker.best_values, tracker.best_cost, [space.encode(tracker.best_values)]
     left = max(cost, tracker.objective.floor) / tracker.objective.n_data
+    at_noise = cost <= tracker.objective.floor
     scanned = {law.scanned for law in space.model.laws}
     for column, one in enumerate(space.coordinates):
         for sign in (1.0, -1.0) if one.short in scanned else ():
             values, step, growth, before = best, sign * STEP, 2.0, cost
-            for _ in range(STEPS if cost <= tracker.objective.floor else STEPS // 2):
+            for _ in range(STEPS if at_noise else STEPS // 2):
                 point = _moved(tracker, space, space.encode(values), column, step)
                 if point is None:
                     break
@@ -64,8 +66,8 @@ def scan_places(tracker: Tracker, space: Space) -> bool:
                 if change < NOTHING * left:
                     break
                 step *= growth if change < FLAT * left else 1.0
-                end = descend(tracker, space, space.encode(values), 60)[1]
-                if not _among(met, end):
+                now, end = descend(tracker, space, space.encode(values), 60)
+                if not _among(met, end) and (at_noise or now < cost):
                     met.append(end)
                     tracker.ends.append(space.decode(end))
     return tracker.best_cost < cost
