@@ -20,7 +20,6 @@ from foamfit.solve.plan import (
     NO_DIRECTIONS,
     RADAU,
     SECOND_ORDER,
-    TAYLOR,
     Directions,
     Motion,
     Plan,
@@ -84,13 +83,11 @@ def _verified(
     """
     rows, heights = arrays.rows, arrays.heights
     motion = scene.run(rows, heights, rtol, directions=directions)
-    brief = scene.plain and motion.steps <= FEW_STEPS and motion.method == TAYLOR
-    if brief and not _hard(scene, arrays):
-        return motion
-    inside = len(scene.ends) > 2
-    if len(scene.ends) == 2:  # the base stress depends on the velocity of the mass above
+    groups = len(scene.ends)
+    inside = groups > 2
+    if groups == 2:  # the base stress depends on the velocity of the mass above
         inside = bool((rows[: scene.ends[0], kernels.ETA] > 0.0).any())
-    long = _is_long(scene, motion, FEW_STEPS) or inside or motion.method == RADAU
+    long = inside or motion.method == RADAU or _is_long(scene, motion, FEW_STEPS)
     if scene.speed > 0.0 and not long and not _hard(scene, arrays):
         return motion
 

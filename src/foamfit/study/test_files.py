@@ -25,11 +25,11 @@ def find_tests(
 ) -> list[tuple[str, Path]]:
     """Find the tests that files, folders and globs ("**" goes into folders) name, from `base`.
 
-    Of a folder, and of what a glob matches, tables are taken (`ENDINGS`) that are no list of
-    specimens, no motion that a TOML beside them names as that of another test, and no result of
-    foamfit. A file that is named itself is taken unless it is a TOML. Returned are names and files
-    in the order of the files, each file once. A name is the stem of its file; where two have the
-    same, parent folders stand before it, joined by "-".
+    From a folder, and from what a glob matches, it takes the tables (`ENDINGS`), but no list of
+    specimens, no motion file that the TOML of another test names, and no result of foamfit. A file
+    that is named itself is taken unless it is a TOML. Returned are names and files in the order of
+    the files, each file once. The name is the stem of the file; where two are the same, the parent
+    folders are put before it, joined by "-".
 
     Raises
     ------
