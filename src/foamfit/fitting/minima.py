@@ -14,6 +14,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.fitting.box import Space
 from foamfit.fitting.levenberg import Iterate, following
+from foamfit.fitting.nuisance import CONTACT_TIME
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import MISSING, Tracker, descend, has_several, rank, squares
 from foamfit.springs.laws.record import Law
@@ -38,6 +39,7 @@ STEP, SHORTEST, STEPS, TOO_HIGH, FLAT, NOTHING = 0.04, 0.015, 12, 300.0, 4.0, 0.
 def scan_places(tracker: Tracker, space: Space) -> bool:
     """Descend from points whose ε_a or ε_* is moved step by step; say whether one is better.
 
+    So is the contact time of an impact whose motion is not measured: a dashpot can imitate another.
     At each step the other parameters follow, then all are free. Where the curves miss more than
     noise only better ends are kept.
     """
@@ -47,6 +49,8 @@ def scan_places(tracker: Tracker, space: Space) -> bool:
     left = max(cost, tracker.objective.floor) / tracker.objective.n_data
     at_noise = cost <= tracker.objective.floor
     scanned = {law.scanned for law in space.model.laws}
+    if "displacement_time" not in tracker.objective.counted:
+        scanned.add(CONTACT_TIME)
     for column, one in enumerate(space.coordinates):
         for sign in (1.0, -1.0) if one.short in scanned else ():
             values, step, growth, before = best, sign * STEP, 2.0, cost
