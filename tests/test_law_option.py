@@ -62,14 +62,21 @@ COMMANDS = ("batch", "check", "compare", "fit", "init", "joint", "page", "predic
 TRUE = {"s1_k": 2e5, "s1_q": 1e6}
 
 
+@pytest.fixture(scope="module")
+def cubic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The law file: in one place, it is compiled once."""
+    path = tmp_path_factory.mktemp("law") / "cubic.py"
+    path.write_text(LAW)
+    return path
+
+
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a law and two tests of it; what is registered goes with the test."""
+    """A folder with two tests of the law; what is registered goes with the test."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(laws, "_LAWS", dict(laws._LAWS))
     monkeypatch.setattr(laws, "_TEXTS", dict(laws._TEXTS))
     without_pictures(monkeypatch)
-    (tmp_path / "cubic.py").write_text(LAW)
     strain = 0.5 * np.sin(np.linspace(0.0, np.pi, 61))
     stress = TRUE["s1_k"] * strain + TRUE["s1_q"] * strain**3
     for seed in (1, 2):
@@ -100,23 +107,23 @@ def test_every_command_takes_laws(command: str) -> None:
     assert "--law FILE.py" in run(command, "--help").stdout
 
 
-def test_a_law_of_a_file_simulates(here: Path) -> None:
+def test_a_law_of_a_file_simulates(here: Path, cubic: Path) -> None:
     (here / "drive.csv").write_text("time (s),displacement (mm)\n0,0\n1,2\n2,4\n3,0\n")
     (here / "scene.toml").write_text(
         '[chain]\narea = "1 cm^2"\n[[chain.springs]]\nkind = "cubic"\nheight = "10 mm"\n'
         'k = "0.2 MPa"\nq = "1 MPa"\n[drive]\nkind = "displacement"\nfile = "drive.csv"\n'
     )
     assert "kind = 'cubic'" in refused("simulate", "scene.toml")
-    assert run("simulate", "scene.toml", "--law", "cubic.py").exit_code == 0
+    assert run("simulate", "scene.toml", "--law", cubic).exit_code == 0
     stress, strain = np.loadtxt(here / "scene.csv", delimiter=",", skiprows=1).T[1:3]
     np.testing.assert_allclose(strain, [0.0, 0.2, 0.4, 0.0], atol=1e-12)
     np.testing.assert_allclose(stress, 2e5 * strain + 1e6 * strain**3, rtol=1e-9, atol=1e-6)
 
 
 def test_a_law_of_a_file_is_fitted_and_predicts(
-    here: Path, monkeypatch: pytest.MonkeyPatch
+    here: Path, cubic: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = ("--model", "cubic", "--law", "cubic.py", "--starts", 2, "--out", "r", "--json")
+    asked = ("--model", "cubic", "--law", cubic, "--starts", 2, "--out", "r", "--json")
     told = run("fit", "t1.csv", *asked)
     assert told.exit_code == 0, told.output
     found = json.loads(told.stdout)["parameters"]
@@ -125,13 +132,14 @@ def test_a_law_of_a_file_is_fitted_and_predicts(
         assert found[name]["value"] == pytest.approx(true, rel=0.02)
     monkeypatch.setattr(laws, "_LAWS", {k: v for k, v in laws._LAWS.items() if k != "cubic"})
     assert "'cubic' is not a spring" in refused("predict", "r", "t2.csv")
-    told = run("predict", "r", "t2.csv", "--law", "cubic.py", "--json", "--no-report")
+    told = run("predict", "r", "t2.csv", "--law", cubic, "--json", "--no-report")
     assert told.exit_code == 0, told.output
     assert json.loads(told.stdout)["misfit"]["stress_strain"] < 0.01
 
 
 def test_processes_of_a_batch_know_the_law_as_it_is_now(here: Path) -> None:
     """With another text of the law what is done is fitted again."""
+    (here / "cubic.py").write_text(LAW)
     asked = ("t1.csv", "--model", "cubic", "--law", "cubic.py", "--starts", 1, "--jobs", 1)
     told = run("batch", *asked, "--json", "--no-report", "--out", "b")
     assert told.exit_code == 0, told.output
@@ -143,12 +151,12 @@ def test_processes_of_a_batch_know_the_law_as_it_is_now(here: Path) -> None:
     assert second["s1_q"] != pytest.approx(first["s1_q"], rel=0.1)
 
 
-def test_the_process_of_the_page_knows_the_law(here: Path) -> None:
+def test_the_process_of_the_page_knows_the_law(here: Path, cubic: Path) -> None:
     import time
 
     from foamfit.page.desk import Desk
 
-    laws.load_file(here / "cubic.py")
+    laws.load_file(cubic)
     desk = Desk(here / "window")
     desk.take(here / "t1.csv")
     assert desk.check(*desk.dropped_toml())  # an error is raised

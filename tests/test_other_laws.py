@@ -210,7 +210,8 @@ def test_a_law_that_depends_on_time_needs_one(tmp_path):
         ff.fit(ff.read_test(path), model="fractional")
 
 
-def test_a_law_file_may_import_what_stands_beside_it(tmp_path):
+def test_a_law_file_may_import_what_stands_beside_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(laws, "_TEXTS", {})
     example = FOLDER.parent.parent / "notebooks" / "bouc_wen.py"
     (tmp_path / "stands_beside.py").write_text(example.read_text())
     path = tmp_path / "imports.py"

@@ -29,6 +29,7 @@ def bouc_wen() -> Iterator[Law]:
     yield law
     laws._LAWS.clear()
     laws._LAWS.update(before)
+    laws._TEXTS.clear()  # each new process would compile them
 
 
 def chain_of(spring: ff.springs.spring.Spring, **more: float) -> ff.Chain:

@@ -355,7 +355,7 @@ def test_twins_get_the_same_states(thin_foams, tmp_path):
     states, values = {}, {}
     for foam in ("turbo-comp", "leap-comp", "worn-heel-comp"):
         for test in real_foams.first_cycles(thin_foams, tmp_path, (foam,)):
-            for name, item in real_foams.varied(ff.fit(test, starts=4)).items():
+            for name, item in real_foams.varied(ff.fit(test, starts=2)).items():
                 states.setdefault((foam, name), []).append(item.state)
                 values.setdefault((foam, name), []).append(item.value)
     scatter = {key: np.std(own, ddof=1) / abs(np.mean(own)) for key, own in values.items()}

@@ -83,16 +83,22 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
 
 
 @cache
-def driven(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
-    """Loop along a prescribed stress or motion, for springs of these laws."""
+def driven(laws: tuple[Law, ...], top: int) -> Callable[..., tuple[float, bool]]:
+    """Loop along a prescribed stress (Pa) or motion (m), for springs of these laws."""
     begin, stretch, elongate, note = in_series(laws)
 
     @compiled
+    def press(springs: Springs, sigma: float, value: float, h: float) -> float:
+        return value if math.isfinite(stretch(springs, value, h)) else math.nan
+
+    follow = press if top == STRESS else elongate  # the other one is not compiled
+
+    @compiled
     def drive(
-        springs: Springs, top: int, t: Array, values: Array, parts: int,
+        springs: Springs, t: Array, values: Array, parts: int,
         nodes: Array, stress: Array, branches: NDArray[np.int64],
     ) -> tuple[float, bool]:  # fmt: skip
-        """Follow a prescribed stress (Pa) or motion (m), in so many parts from sample to sample."""
+        """Follow a drive in so many parts from sample to sample."""
         sigma = 0.0
         begin(springs)
         for j in range(t.size):
@@ -101,10 +107,7 @@ def driven(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
                 before = values[j - 1] if j else 0.0
                 value = before + part * (values[j] - before)
                 h = (t[j] - t[j - 1]) / parts if j else 0.0
-                if top == STRESS:
-                    sigma = value if math.isfinite(stretch(springs, value, h)) else math.nan
-                else:
-                    sigma = elongate(springs, sigma, value, h)
+                sigma = follow(springs, sigma, value, h)
             if not math.isfinite(sigma):
                 return math.nan, False
             stress[j] = sigma
@@ -243,7 +246,8 @@ class AnyLawPlan(NamedTuple):
             striker = self.mass[-1], drag, self.speed, self.values[0] / self.mass[-1]
             end, fine = struck(self.laws)(springs, *striker, self.time, *filled)
         else:
-            end, fine = driven(self.laws)(springs, self.top, self.time, self.values, *filled)
+            loop = driven(self.laws, self.top)
+            end, fine = loop(springs, self.time, self.values, *filled)
         if not fine:
             raise SimulationError(
                 "a stress or strain is no longer finite: the drive goes past what the law can bear"

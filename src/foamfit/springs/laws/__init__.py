@@ -30,6 +30,7 @@ _OPTIONAL = (microscale.STIFFENING_LAW, microscale.MULLINS_LAW, microscale.MEMOR
 _LAWS = {law.kind: law for law in (*_PAPER, *_OPTIONAL)}
 PAPER = tuple(_LAWS)  # laws that the kernels know
 _TEXTS: dict[str, str] = {}  # of the law files that were loaded, by path
+_FOUND: dict[tuple[str, str], tuple[Law, ...]] = {}  # their laws, by path and text
 _asked_packages: list[bool] = []
 
 
@@ -151,15 +152,21 @@ def load_texts(given: Mapping[str, str]) -> None:
 
 
 def _run(path: str, text: str) -> tuple[Law, ...]:
-    """Run the text of a law file and register its laws, all or none."""
-    before = dict(_LAWS)
+    """Run the text of a law file and register its laws, all or none.
+
+    Loaded again, a text has the laws that it had: what was compiled of them stays.
+    """
+    before, place = dict(_LAWS), str(Path(path).resolve())
+    if (place, text) in _FOUND:
+        _LAWS.update({one.kind: one for one in _FOUND[place, text]})
+        return _FOUND[place, text]
     name = f"foamfit_law_{Path(path).stem}"
     spec = importlib.util.spec_from_loader(name, loader=None, origin=path)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     module.__file__ = path
     sys.modules[name] = module
-    folder = str(Path(path).resolve().parent)  # it may import what stands beside it
+    folder = str(Path(place).parent)  # it may import what stands beside it
     sys.path.insert(0, folder)
     try:
         exec(compile(text, path, "exec"), module.__dict__)
@@ -177,6 +184,7 @@ def _run(path: str, text: str) -> tuple[Law, ...]:
         sys.path.remove(folder)
     if not found:
         raise InputError(f"{path}: the file defines no law; make a foamfit.Law at its top level")
+    _FOUND[place, text] = found
     return found
 
 
