@@ -742,7 +742,7 @@ def test_no_acceptable_rung_is_exit_code_two(loop_file, tmp_path):
     for i in range(1, len(rows)):
         rows[i] = f"{noise[i]:.6g},{rows[i].split(',')[1]}"
     loop_file.write_text("\n".join(rows) + "\n")
-    done = run("fit", loop_file, "--model", "auto", "--starts", 2)
+    done = run("fit", loop_file, "--model", "auto", "--starts", 2, "--no-report")
     assert done.exit_code == 2
     assert "no acceptable fit" in done.stderr
     assert (tmp_path / "fits" / "loop" / "auto" / "ladder.csv").is_file()

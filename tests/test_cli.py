@@ -165,7 +165,8 @@ def test_fit_writes_beneath_the_current_directory(fitted: tuple[Path, Result]) -
 
 
 def test_json_is_all_there_is_and_the_seed_repeats(here: Path, fitted: tuple[Path, Result]) -> None:
-    result = accepted("fit", RECONSTRUCTION, "--seed", 1, "--json", "--out", "a/b")
+    args = ("--seed", 1, "--json", "--out", "a/b", "--no-report")
+    result = accepted("fit", RECONSTRUCTION, *args)
     content = json.loads(result.stdout)
     assert content == json.loads((here / "a/b/fit.json").read_text())
     before = json.loads(next(fitted[0].rglob("fit.json")).read_text())
@@ -193,7 +194,7 @@ def test_an_older_result_is_replaced_and_quiet_is_quiet(
 
 @pytest.mark.usefixtures("fitted")  # it has the solver compiled
 def test_the_time_limit_gives_the_best_so_far(here: Path) -> None:
-    args = ("--model", " bistable ", "--starts", 9000, "--max-time", 1.5, "--json")
+    args = ("--model", " bistable ", "--starts", 9000, "--max-time", 1.5, "--json", "--no-report")
     result = run("fit", RECONSTRUCTION, *args)
     content = json.loads(result.stdout)
     assert result.exit_code == (2 if content["status"] == "failed" else 0)
@@ -715,7 +716,8 @@ def process(*args: object) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_process_keeps_stdout_and_stderr_apart(here: Path) -> None:
-    good = process("fit", RECONSTRUCTION, "--json", "--starts", 1, "--max-time", 5)
+    short = ("--json", "--starts", 1, "--max-time", 5, "--no-report")
+    good = process("fit", RECONSTRUCTION, *short)
     assert (good.returncode, good.stderr) == (0, "")
     assert json.loads(good.stdout)["test"].endswith("(reconstruction)")
     bad = process("fit", write(here, rows=["x"]), "--out", "no")
