@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import re
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from conftest import EXPERIMENTS
 from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit
 from foamfit.data.measurement import Record, Specimen, Striker
 from foamfit.data.noise import with_noise
 from foamfit.data.prepare import condition
 from foamfit.errors import InputError
+
+sys.path.insert(0, str(EXPERIMENTS / "recovery"))
+import rig
 
 HEIGHT, AREA, MASS, VELOCITY = 10e-3, 1e-4, 0.5, 2.0
 DURATION = 4e-3
@@ -360,3 +365,10 @@ def test_a_gauge_that_rests_again_does_not_stop_the_striker(channels):
     assert found.rebound_velocity == pytest.approx(2 * BRAKED / OMEGA - VELOCITY, rel=0.12)
     assert found.impulse_ratio == pytest.approx(1.0, abs=0.06)
     assert found.absorbed_over_striker == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_rest_in_correlated_noise_is_found(tmp_path):
+    """Its slope is hardly known; begun at the first sample, a fit does not get to the contact."""
+    made = rig.impact(rig.Impact(tau=8.0), 6062)
+    found = read_test(rig.write(made, tmp_path)).origins["contact_time"]
+    assert found == pytest.approx(made.truth["contact_time"], abs=2e-4)

@@ -12,14 +12,17 @@ from foamfit.data.noise import MIN_REST, level_on_line
 
 # A signal rests where its slope is less than this share of the slope that follows: the branches of
 # a foam differ less on loading (6 times in the published sets), so that a soft start is no rest.
-# For an impact, whose fit refines the start, and for a motion a larger share will do.
+# For an impact, whose fit refines the start, and for a motion a larger share will do. Standard
+# errors of the slope that are added to it; fewer where a motion away from its zero shows that the
+# record began before contact.
 STILL, _STILL_IMPACT, STILL_MOTION = 0.15, 0.3, 0.5
+_ERRORS, _ERRORS_AWAY = 2.0, 1.0
 _APPROACH = 0.02  # share of its travel beyond which a machine without a stress is not in contact
 _BRAKED = 0.02  # share of the peak of a derived stress at which contact starts
 # Shares of the peak up to which a rise is taken for straight: the least that is so many standard
 # deviations of the noise, or else the largest.
 _SHARES, _CLEAR, _LARGEST = (0.025, 0.05, 0.1, 0.2), 8.0, 0.5
-_ERRORS, ELSEWHERE = 2.0, 5.0  # standard errors: of a slope; of a motion whose zero lies elsewhere
+ELSEWHERE = 5.0  # standard errors of a motion whose zero lies elsewhere
 
 Levels = dict[str, NoiseLevel]
 Kink = tuple[float, float]  # where a signal starts to rise: time and standard error, s
@@ -105,7 +108,12 @@ def _onset(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
 
 
 def leave_rest(
-    time: Array, values: Array, noise: NoiseLevel, still: float = STILL, drift: float = np.inf
+    time: Array,
+    values: Array,
+    noise: NoiseLevel,
+    still: float = STILL,
+    drift: float = np.inf,
+    errors: float = _ERRORS,
 ) -> Kink | None:
     """Where a signal leaves its rest, or None if the record shows no rest before the rise.
 
@@ -121,11 +129,12 @@ def leave_rest(
             return None
         own = n >= MIN_REST * noise.time  # else they do not show their own noise
         slope = level_on_line(t[:n], y[:n], at, replace(noise, sigma=0.0) if own else noise)
-        size, error, rest = abs(slope[1].value), _ERRORS * slope[1].error, float(y[:n].mean())
+        size, error, rest = abs(slope[1].value), slope[1].error, float(y[:n].mean())
         high = _reached(y, 0.15)[0]
         high = high if t[high] > at else int(np.argmax(y))
         after = float(y[high : high + 3].mean() - rest) / (t[high] - at)
-        if size + error < still * after and (size - error) * (t[n - 1] - t[0]) <= drift:
+        changed = (size - _ERRORS * error) * (t[n - 1] - t[0])
+        if size + errors * error < still * after and changed <= drift:
             return found
         rows = n
     return None
@@ -158,8 +167,8 @@ def start_of_impact(record: Record, levels: Levels) -> Start:
         elsewhere = _first_motion(time, w, levels["displacement"])[1]
         drift = np.inf if elsewhere else 0.002
     if "stress" not in record.derived:
-        least = drift * float(np.ptp(stress))
-        at = leave_rest(time, stress, levels["stress"], _STILL_IMPACT, least)
+        least, errors = drift * float(np.ptp(stress)), _ERRORS_AWAY if elsewhere else _ERRORS
+        at = leave_rest(time, stress, levels["stress"], _STILL_IMPACT, least, errors)
     start = _at_kink("stress", time, at, "stress") if at else _first_sample(record, levels)
     if w is None:
         return start
