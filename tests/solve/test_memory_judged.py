@@ -36,7 +36,7 @@ FRESH = {
     "relaxation": (0, 1, 2, 11),
     "microscale+relaxation": (0, 1, 2, 11),
     "mixed": (0, 3, 4, 11),
-    "motion": (8, 9, 14),
+    "motion": (5, 6, 8, 9, 14),
     "motion+relaxation": (8, 10, 11, 31, 35),
     "worn": (82, 172, 194, 263, 499),
     "worn+relaxation": (41, 336, 412),

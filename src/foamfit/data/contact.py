@@ -13,8 +13,8 @@ from foamfit.data.noise import MIN_REST, level_on_line
 # A signal rests where its slope is less than this share of the slope that follows: the branches of
 # a foam differ less on loading (6 times in the published sets), so that a soft start is no rest.
 # For an impact, whose fit refines the start, and for a motion a larger share will do. Standard
-# errors of the slope that are added to it; fewer where a motion away from its zero shows that the
-# record began before contact.
+# errors of the slope that are added to it; fewer for an impact whose motion does not begin at zero,
+# as it may begin before contact.
 STILL, _STILL_IMPACT, STILL_MOTION = 0.15, 0.3, 0.5
 _ERRORS, _ERRORS_AWAY = 2.0, 1.0
 _APPROACH = 0.02  # share of its travel beyond which a machine without a stress is not in contact

@@ -39,7 +39,8 @@ STEP, SHORTEST, STEPS, TOO_HIGH, FLAT, NOTHING = 0.04, 0.015, 12, 300.0, 4.0, 0.
 def scan_places(tracker: Tracker, space: Space) -> bool:
     """Descend from points whose ε_a or ε_* is moved step by step; say whether one is better.
 
-    So is the contact time of an impact whose motion is not measured: a dashpot can imitate another.
+    So is the contact time of an impact whose motion is not measured: with a dashpot, a wrong one
+    may fit almost as well.
     At each step the other parameters follow, then all are free. Where the curves miss more than
     noise only better ends are kept.
     """

@@ -10,6 +10,7 @@ import importlib.util
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -30,7 +31,6 @@ _OPTIONAL = (microscale.STIFFENING_LAW, microscale.MULLINS_LAW, microscale.MEMOR
 _LAWS = {law.kind: law for law in (*_PAPER, *_OPTIONAL)}
 PAPER = tuple(_LAWS)  # laws that the kernels know
 _TEXTS: dict[str, str] = {}  # of the law files that were loaded, by path
-_FOUND: dict[tuple[str, str], tuple[Law, ...]] = {}  # their laws, by path and text
 _asked_packages: list[bool] = []
 
 
@@ -133,9 +133,7 @@ def load_file(path: str | Path) -> tuple[Law, ...]:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: the file cannot be read ({error})") from None
-    found = _run(str(path), text)
-    _TEXTS[str(path)] = text
-    return found
+    return _load(str(path), text)
 
 
 def texts() -> dict[str, str]:
@@ -147,27 +145,28 @@ def load_texts(given: Mapping[str, str]) -> None:
     """Make the laws known that another process has loaded from files; see `load_file`."""
     for path, text in given.items():
         if _TEXTS.get(path) != text:
-            _run(path, text)
-            _TEXTS[path] = text
+            _load(path, text)
 
 
-def _run(path: str, text: str) -> tuple[Law, ...]:
-    """Run the text of a law file and register its laws, all or none.
+def _load(path: str, text: str) -> tuple[Law, ...]:
+    """Register the laws of a text; those that it has had in this process stay compiled."""
+    found = _run(path, str(Path(path).resolve().parent), text)
+    _LAWS.update({one.kind: one for one in found})
+    _TEXTS[path] = text
+    return found
 
-    Loaded again, a text has the laws that it had: what was compiled of them stays.
-    """
-    before, place = dict(_LAWS), str(Path(path).resolve())
-    if (place, text) in _FOUND:
-        _LAWS.update({one.kind: one for one in _FOUND[place, text]})
-        return _FOUND[place, text]
+
+@cache
+def _run(path: str, folder: str, text: str) -> tuple[Law, ...]:
+    """Run the text of a law file and register its laws, all or none."""
+    before = dict(_LAWS)
     name = f"foamfit_law_{Path(path).stem}"
     spec = importlib.util.spec_from_loader(name, loader=None, origin=path)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     module.__file__ = path
     sys.modules[name] = module
-    folder = str(Path(place).parent)  # it may import what stands beside it
-    sys.path.insert(0, folder)
+    sys.path.insert(0, folder)  # it may import what stands beside it
     try:
         exec(compile(text, path, "exec"), module.__dict__)
         given = [one for one in vars(module).values() if isinstance(one, Law)]
@@ -184,7 +183,6 @@ def _run(path: str, text: str) -> tuple[Law, ...]:
         sys.path.remove(folder)
     if not found:
         raise InputError(f"{path}: the file defines no law; make a foamfit.Law at its top level")
-    _FOUND[place, text] = found
     return found
 
 
