@@ -14,9 +14,11 @@ from foamfit.data.noise import MIN_REST, level_on_line
 # a foam differ less on loading (6 times in the published sets), so that a soft start is no rest.
 # For an impact, whose fit refines the start, and for a motion a larger share will do. Standard
 # errors of the slope that are added to it; fewer for an impact whose motion does not begin at zero,
-# as it may begin before contact.
+# as it may begin before contact. Share of the peak by which the rest of an impact may drift: less
+# where the motion begins at zero, as a stress that rises then is no rest; in between without one.
 STILL, _STILL_IMPACT, STILL_MOTION = 0.15, 0.3, 0.5
 _ERRORS, _ERRORS_AWAY = 2.0, 1.0
+_DRIFT, _DRIFT_AT_ZERO, _DRIFT_AWAY = 0.01, 0.002, 0.06
 _APPROACH = 0.02  # share of its travel beyond which a machine without a stress is not in contact
 _BRAKED = 0.02  # share of the peak of a derived stress at which contact starts
 # Shares of the peak up to which a rise is taken for straight: the least that is so many standard
@@ -162,10 +164,10 @@ def start_of_impact(record: Record, levels: Levels) -> Start:
     step or two after the file's time zero.
     """
     time, stress, w = record.instants, record.stress, record.displacement
-    drift, at, elsewhere = 0.01, None, False
-    if w is not None:  # where the motion starts at its zero, no stress that rises is at rest
+    drift, at, elsewhere = _DRIFT, None, False
+    if w is not None:
         elsewhere = _first_motion(time, w, levels["displacement"])[1]
-        drift = np.inf if elsewhere else 0.002
+        drift = _DRIFT_AWAY if elsewhere else _DRIFT_AT_ZERO
     if "stress" not in record.derived:
         least, errors = drift * float(np.ptp(stress)), _ERRORS_AWAY if elsewhere else _ERRORS
         at = leave_rest(time, stress, levels["stress"], _STILL_IMPACT, least, errors)

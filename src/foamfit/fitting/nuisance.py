@@ -34,6 +34,7 @@ UNDER_DRIVE = {
 REACH = 6.0
 # Largest contact time and time shift, over the time under load; largest zeros, over the range.
 LARGEST_CONTACT, LARGEST_SHIFT, LARGEST_ZERO = 0.15, 0.1, 0.5
+_LOW = 0.1  # share of the peak stress up to which a contact may be missed
 
 
 @dataclass(frozen=True)
@@ -114,4 +115,16 @@ def limits_of(
         reach = 0.0 if values is None else LARGEST_ZERO * float(np.ptp(values))
     else:
         reach = (LARGEST_CONTACT if name == CONTACT_TIME else LARGEST_SHIFT) * duration
-    return middle - reach, middle + reach
+    latest = _latest_contact(measurement) if name == CONTACT_TIME else 0.0
+    return middle - reach, middle + max(reach, latest)
+
+
+def _latest_contact(measurement: Measurement) -> float:
+    """Latest contact where no rest was found and the motion begins elsewhere than at zero.
+
+    Such a record may begin before the contact, which is then anywhere while the stress is low.
+    """
+    if measurement.contact != "file" or not measurement.origins.get("displacement_zero"):
+        return 0.0
+    high = measurement.stress > _LOW * measurement.stress.max()
+    return float(measurement.time[np.argmax(high)])
