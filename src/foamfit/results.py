@@ -147,7 +147,7 @@ class Intervals:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()  # Why they differ from what was asked for
     better: Array | None = None  # A point of lower cost from which the fit should continue
-    # Values, far outside the interval, at minima almost as good as the best
+    # Values, far outside the interval, with which the curves fit almost as well
     elsewhere: dict[str, float] = field(default_factory=dict)
     # Ends of the ranges that include the error of the law, where there is one
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)

@@ -16,12 +16,14 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
-from foamfit.fitting.search import Tracker
+from foamfit.fitting.search import STOPPING, Tracker, what_stopped
 from foamfit.results import Intervals
+from foamfit.springs.parameters import NUISANCE
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
+from foamfit.trust.covariance import WEAK
 from foamfit.trust.markov_chain import mcmc, walkers
-from foamfit.trust.profile import PLACED, Tracing, departures
+from foamfit.trust.profile import BETTER, PLACED, STEPS, Refit, Tracing, departures
 from foamfit.trust.residuals.noise_process import parts
 
 # The default profiles a parameter if the root of the cost departs from a straight line by this
@@ -36,6 +38,9 @@ ENOUGH_DRAWS, LEAST_DRAWS, MOST_DRAWS = 40, 100, 100_000
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
 # noise makes that much difference in one test of ten thousand, but there are many minima.
 HARDLY_WORSE = 2.0
+# Iterations of a refit that looks how much worse the fit is far outside of an interval, more where
+# a local interval stands though the cost is no parabola.
+ITERATIONS = 10
 Announce = Callable[[str], None]
 Minima = Sequence[tuple[Array, Array]]  # points at which descents ended, and their residuals
 
@@ -104,7 +109,8 @@ def assess(
         far[(best.rises(residual) < best.quantiles**2) & (apart > best.quantiles)] = np.inf
     order = sorted(known, key=lambda name: -far[best.names.index(name)])
     bent = [name for name in order if far[best.names.index(name)] > BENT]
-    return _with_minima(best, _by_profiles(best, bent, minima, tracker, budget), others)
+    made = _with_minima(best, _by_profiles(best, bent, minima, tracker, budget), others)
+    return made if best.misfits or made.better is not None else _with_far(best, made, tracker)
 
 
 def evaluations_of(best: BestPoint, choice: Choice) -> float:
@@ -139,6 +145,36 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
             if near[column] and max(low - there, there - high) > high - low:
                 elsewhere.setdefault(name, there)
     return replace(made, ends=ends, methods=methods, elsewhere=elsewhere)
+
+
+def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
+    """Name values a whole width outside of an interval at which the curves fit hardly worse.
+
+    There a parabola has nine times the cut of the interval. The other parameters are refitted.
+    """
+    refit, elsewhere = Refit(best, tracker), dict(made.elsewhere)
+    try:
+        for name in best.known:
+            column, value = best.names.index(name), float(best.values[best.index[name]])
+            half, (least, most) = float(best.halves[column]), best.limits(name)
+            low, high = made.ends.get(name, (value - half, value + half))
+            if name in NUISANCE or high - low > 2.0 * WEAK * best.sizes[column]:
+                continue
+            cut = best.quantiles[column] ** 2 * best.spread.inflation[column]
+            iterations = STEPS if name in made.doubtful else ITERATIONS
+            for there in (2.0 * low - high, 2.0 * high - low):
+                if name in elsewhere or not least <= there <= most:
+                    continue
+                start = refit.along(column, there - value)
+                found = refit.run(start, (column, there), iterations=iterations)
+                if found and found.cost - best.cost < -BETTER * cut:
+                    return replace(made, better=found.point)
+                if found and found.cost - best.cost <= HARDLY_WORSE**2 * cut:
+                    elsewhere[name] = there
+    except STOPPING as error:
+        late = say("interval", "far", by=what_stopped(error))
+        return replace(made, elsewhere=elsewhere, warnings=(*made.warnings, late))
+    return replace(made, elsewhere=elsewhere)
 
 
 def _halves(best: BestPoint, point: Array, residual: Array) -> Array:

@@ -74,6 +74,12 @@ class Refit:
         """Point that is off another by a scaled step, within the limits."""
         return self.point(at[self.best.places] / self.best.sizes + step, self.best.box)
 
+    def along(self, column: int, shift: float) -> Array:
+        """Point with one parameter moved (SI), the others following their correlation."""
+        covariance = self.best.spread.matrix[:, column]
+        along = np.nan_to_num(covariance / covariance[column]) / self.best.sizes
+        return self.moved(self.best.values, shift * along)
+
     def run(
         self,
         start: Array,
@@ -314,8 +320,6 @@ def departures(best: BestPoint) -> Array:
     for i, (value, limits) in enumerate(zip(best.values[best.places], best.box.T, strict=True)):
         others = np.delete(np.arange(k), i)
         stderr, half = float(best.spread.stderr[i]), float(best.halves[i])
-        column = best.spread.matrix[:, i]
-        along = np.nan_to_num(column / column[i]) / best.sizes
         for side, sign in enumerate((-1.0, 1.0)):
             to_limit = abs(limits[side] - value)
             if not to_limit > 0.05 * half:
@@ -323,7 +327,7 @@ def departures(best: BestPoint) -> Array:
             out[i, side] = np.inf
             for share in (1.0, 0.5, 0.25):
                 shift = min(share * half, to_limit)
-                residual = refit.residual(refit.moved(best.values, sign * shift * along))
+                residual = refit.residual(refit.along(i, sign * shift))
                 if residual is not None:
                     rise = least(residual, others) - least(best.residual, others)
                     root = math.sqrt(max(rise / best.spread.inflation[i], 0.0))
