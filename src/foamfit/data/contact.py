@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from foamfit.data.noise import MIN_REST, level_on_line
 # errors of the slope that are added to it; fewer for an impact whose motion does not begin at zero,
 # as it may begin before contact. Share of the peak by which the rest of an impact may drift: less
 # where the motion begins at zero, as a stress that rises then is no rest; in between without one.
+# Where the motion begins elsewhere, a rest that drifts more is taken if there is no other.
 STILL, _STILL_IMPACT, STILL_MOTION = 0.15, 0.3, 0.5
 _ERRORS, _ERRORS_AWAY = 2.0, 1.0
 _DRIFT, _DRIFT_AT_ZERO, _DRIFT_AWAY = 0.01, 0.002, 0.06
@@ -169,8 +171,9 @@ def start_of_impact(record: Record, levels: Levels) -> Start:
         elsewhere = _first_motion(time, w, levels["displacement"])[1]
         drift = _DRIFT_AWAY if elsewhere else _DRIFT_AT_ZERO
     if "stress" not in record.derived:
-        least, errors = drift * float(np.ptp(stress)), _ERRORS_AWAY if elsewhere else _ERRORS
-        at = leave_rest(time, stress, levels["stress"], _STILL_IMPACT, least, errors)
+        errors = _ERRORS_AWAY if elsewhere else _ERRORS
+        leaves = partial(leave_rest, time, stress, levels["stress"], _STILL_IMPACT, errors=errors)
+        at = leaves(drift * float(np.ptp(stress))) or (leaves() if elsewhere else None)
     start = _at_kink("stress", time, at, "stress") if at else _first_sample(record, levels)
     if w is None:
         return start
