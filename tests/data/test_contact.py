@@ -17,6 +17,7 @@ from foamfit.data.measurement import Record, Specimen, Striker
 from foamfit.data.noise import with_noise
 from foamfit.data.prepare import condition
 from foamfit.errors import InputError
+from foamfit.fitting.problem import make_params
 
 sys.path.insert(0, str(EXPERIMENTS / "recovery"))
 import rig
@@ -372,3 +373,19 @@ def test_a_rest_in_correlated_noise_is_found(tmp_path):
     made = rig.impact(rig.Impact(tau=8.0), 6062)
     found = read_test(rig.write(made, tmp_path)).origins["contact_time"]
     assert found == pytest.approx(made.truth["contact_time"], abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("given", "seed"),
+    [
+        (rig.Impact(tau=8.0), 6008),
+        (rig.Impact(tau=8.0), 6018),
+        (rig.Impact(samples=150), 6007),
+        (rig.Impact(noise=0.02), 6007),
+    ],
+)
+def test_a_fit_can_reach_the_contact_of_a_record_whose_rest_is_hard_to_see(given, seed, tmp_path):
+    """Correlated noise, few samples, a soft start before a steep peak."""
+    made = rig.impact(given, seed)
+    contact = make_params(read_test(rig.write(made, tmp_path)))["contact_time"]
+    assert contact.min < made.truth["contact_time"] < contact.max
