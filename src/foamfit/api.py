@@ -133,7 +133,8 @@ def fit(
         Whether what has snapped once softens and weakens: s1_softening, s1_weakening.
     intervals : str
         Method of the 95 % intervals: "auto" (local covariance, and profiles of the parameters
-        along which the cost is not parabolic), "local", "profile" or "mcmc".
+        along which the cost is not parabolic and whose range is not wider), "local", "profile" or
+        "mcmc".
     draws : int, optional
         Steps of the Markov chain, by default 2000.
     priors : mapping, optional

@@ -317,7 +317,7 @@ def _assess(
             made = Intervals(better=better)
             if better is None:
                 minima = [*tracker.ends, *left.minima]
-                made = assess(best, choice, tracker, minima, budget, announce)
+                made = assess(best, choice, tracker, minima, budget, announce, left.ranges)
             if made.better is None:
                 return best, record, replace(made, ranges=left.ranges)
             tracker.consider(made.better)

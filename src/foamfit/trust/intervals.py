@@ -9,8 +9,9 @@ from __future__ import annotations
 import importlib.util
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -80,11 +81,13 @@ def assess(
     minima: Sequence[Array] = (),
     budget: float = math.inf,
     announce: Announce = lambda _: None,
+    ranges: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> Intervals:
     """Make the intervals that were chosen.
 
     `minima` are points at which the descents of the search ended. It ends at the deadline of what
-    has `searched` with what was done; after `budget` evaluations "auto" begins no further profile.
+    has `searched` with what was done; after `budget` evaluations "auto" begins no further profile,
+    and none of a parameter whose range (`ranges`) is wider than its local interval.
     `announce` is called with the expected run time before it is spent.
     """
     method, known = choice.method, best.known
@@ -109,8 +112,16 @@ def assess(
         far[(best.rises(residual) < best.quantiles**2) & (apart > best.quantiles)] = np.inf
     order = sorted(known, key=lambda name: -far[best.names.index(name)])
     bent = [name for name in order if far[best.names.index(name)] > BENT]
-    made = _with_minima(best, _by_profiles(best, bent, minima, tracker, budget), others)
+    within = [name for name in bent if _is_wider(best, name, ranges.get(name))]
+    made = _by_profiles(best, [n for n in bent if n not in within], minima, tracker, budget)
+    made = _with_minima(best, replace(made, doubtful=(*made.doubtful, *within)), others)
     return made if best.misfits or made.better is not None else _with_far(best, made, tracker)
+
+
+def _is_wider(best: BestPoint, name: str, span: tuple[float, float] | None) -> bool:
+    """Whether a range is wider than the local interval: the error of the law counts, not noise."""
+    half = float(best.halves[best.names.index(name)])
+    return span is not None and span[1] - span[0] > 2.0 * half
 
 
 def evaluations_of(best: BestPoint, choice: Choice) -> float:
