@@ -129,7 +129,7 @@ def leave_rest(
     while rows >= 10 and (found := _onset(time[:rows], values[:rows], noise)):
         at, t, y = found[0], time[:rows], values[:rows]
         n = int(np.searchsorted(time, at))
-        if n < max(5 * noise.time, 3) or n >= rows:
+        if n < max(3 * noise.time, 5) or n >= rows:
             return None
         own = n >= MIN_REST * noise.time  # else they do not show their own noise
         slope = level_on_line(t[:n], y[:n], at, replace(noise, sigma=0.0) if own else noise)
