@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -217,6 +217,23 @@ class Space:
         return 1000 + rest.index(family(short))
 
     @cached_property
+    def _fixed_ends(self) -> tuple[Any, ...]:
+        """Coordinates with ends of their own: columns, places, both ends, which are logarithms."""
+        coordinates = enumerate(self.coordinates)
+        own = [(j, one) for j, one in coordinates if not isinstance(one.ends, Between)]
+        ends = np.array([one.ends for _, one in own])
+        columns = np.array([j for j, _ in own], dtype=np.intp)
+        places = np.array([one.place for _, one in own], dtype=np.intp)
+        by_log = np.flatnonzero([one.is_logarithmic for _, one in own])
+        return columns, places, *np.reshape(ends, (-1, 2)).T, by_log
+
+    @cached_property
+    def _between(self) -> list[tuple[int, Coordinate]]:
+        """The other coordinates, with their columns."""
+        coordinates = enumerate(self.coordinates)
+        return [(j, one) for j, one in coordinates if isinstance(one.ends, Between)]
+
+    @cached_property
     def box(self) -> tuple[Array, Array]:
         """Lowest and highest coordinates, (n_free,) each."""
         limits = np.array([one.limits for one in self.coordinates])
@@ -238,9 +255,13 @@ class Space:
 
     def decode(self, point: Array) -> Array:
         """Vector of parameters (SI) at a point of the box."""
-        values = self.values.copy()
-        for u, one in zip(point, self.coordinates, strict=True):
-            value = one.value(u, values)
+        values, (columns, places, first, last, by_log) = self.values.copy(), self._fixed_ends
+        u = point[columns]
+        found = first + u * (last - first)
+        found[by_log] = np.exp(u[by_log]) * last[by_log]
+        values[places] = np.minimum(np.maximum(found, self.low[places]), self.high[places])
+        for j, one in self._between:
+            value = one.value(point[j], values)
             values[one.place] = min(max(value, self.low[one.place]), self.high[one.place])
         return self.complete(values)
 

@@ -124,7 +124,8 @@ def _latest_contact(measurement: Measurement) -> float:
 
     Such a record may begin before the contact, which is then anywhere while the stress is low.
     """
-    if measurement.contact != "file" or not measurement.origins.get("displacement_zero"):
+    time, stress = measurement.time, measurement.stress
+    elsewhere = bool(measurement.origins.get("displacement_zero"))
+    if time is None or stress is None or measurement.contact != "file" or not elsewhere:
         return 0.0
-    high = measurement.stress > _LOW * measurement.stress.max()
-    return float(measurement.time[np.argmax(high)])
+    return float(time[np.argmax(stress > _LOW * stress.max())])

@@ -411,7 +411,7 @@ class Objective:
         along = motion if self._driven else None
         if along is None and (everything or "stress_strain" in self.counted) and self._along:
             along = run(self._followed(self._along[damped], at), False)
-        by_site = np.flatnonzero(places == values.size - 1)
+        by_site = np.flatnonzero(places == values.size - 1) if places.size else places
         parts = {"stress_time": _with_slopes(motion), "displacement_time": _with_slopes(shown, -1)}
         if everywhere:
             parts |= {name: _with_slopes(shown, node - 1) for name, node in self.interior.items()}
@@ -425,7 +425,8 @@ class Objective:
                 continue
             seen, zero = self._late(name, self._sampled(simulated), late), self._zero_of.get(name)
             curves[name], slopes[name] = seen[0] + at[zero] if zero else seen[0], seen[1:]
-            slopes[name][by_site] /= height  # site_eta acts through η_site/H
+            if by_site.size:
+                slopes[name][by_site] /= height  # site_eta acts through η_site/H
         averaged = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
         return Simulated(curves, averaged, slopes if len(wanted) else None)
 
@@ -538,7 +539,7 @@ class Objective:
             for name in self.counted
         ]
         # A stress near the pole of branch c is as bad as none.
-        bounded = np.clip(np.concatenate(parts), -self.penalty, self.penalty)
+        bounded = np.concatenate(parts).clip(-self.penalty, self.penalty)
         bounded = bounded if self.weighing is None else self.weighing(bounded)
         return np.append(bounded, self.off_priors(values)) if self.priors else bounded
 

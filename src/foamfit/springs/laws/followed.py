@@ -125,9 +125,8 @@ def solver_row(law: Law, values: Array, terms: ArrayLike, room: int) -> Array | 
     own[kernels.ETA] = values[-1]
     relaxing[1::2] = np.inf  # no term
     relaxing[: pairs.size] = pairs
-    g, tau = pairs[::2], pairs[1::2]
-    if fine and pairs.size:
-        fine = bool(np.all((g >= 0.0) & (g < np.inf) & (tau > 0.0) & (tau < np.inf)))
+    for g, tau in pairs.reshape(-1, 2).tolist():
+        fine = fine and 0.0 <= g < math.inf and 0.0 < tau < math.inf
     return row if fine else None
 
 
