@@ -21,7 +21,7 @@ from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import CURVE_STARTS, box_starts, curve_starts, smooth_loop
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import NUISANCE
+from foamfit.springs.parameters import NUISANCE, family, relaxation_names
 
 Progress = Callable[[float, str], None]
 
@@ -35,11 +35,15 @@ IN_SERIES = 3  # searches at least for several hysteretic springs
 LOST = 30.0  # times the noise floor of the cost, above which no agreement is believed at once
 NOISY = 0.005  # noise of a motion, over its range, that is much
 AROUND = 200  # points about the best one among which another search begins
-# Share of the box that counts as its edge, and where inside a descent begins again.
-EDGE, INSIDE = 0.02, (0.35, 0.5, 0.65)
-# Change of the logarithm of a parameter that leads out of a wrong minimum; it is tried if the cost
-# is above this share of the noise floor, which includes a margin.
-APART, MISSING = 1.2, 0.8
+# Share of the box that counts as its edge, more of it where the curves miss more than noise, and
+# where inside a descent begins again.
+EDGE, EDGE_MISSING, INSIDE = 0.02, 0.1, (0.35, 0.5, 0.65)
+# Changes of the logarithm of a parameter, and of a relaxation time, that lead out of a wrong
+# minimum; they are tried if the cost is above this share of the noise floor, which includes a
+# margin.
+APART, APART_IN_TIME, MISSING = (1.2,), (1.2, 3.0, 4.8), 0.8
+# Strength of each relaxation term that begins anew, and scales of what is as stiff as before then.
+ANEW, STIFF = 0.3, ("stress", "slope")
 # Points off the best one are tried again where it costs less than before by this share.
 NEWS = 1e-5
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
@@ -259,7 +263,9 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
     low, high = space.box
     best = space.encode(tracker.best_values) if tracker.best_values is not None else low
     span = high - low
-    edges = (best - low < EDGE * span) | (high - best < EDGE * span)
+    missing = tracker.best_cost >= MISSING * tracker.objective.floor
+    margin = (EDGE_MISSING if missing else EDGE) * span
+    edges = (best - low < margin) | (high - best < margin)
     edges |= len(space.model.kinds) > 1 and tracker.best_cost > tracker.objective.floor
     starts = []
     for at in np.flatnonzero(edges & [one.is_logarithmic for one in space.coordinates]):
@@ -269,6 +275,7 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
             starts.append(start)
     if tracker.best_cost > tracker.objective.floor:
         starts += _neighbours(space, space.decode(best))
+        starts += _relaxing_anew(space, space.decode(best))
     return _descended(tracker, space, starts)
 
 
@@ -291,11 +298,33 @@ def _apart(tracker: Tracker, space: Space) -> Iterator[Array]:
         return
     (low, high), best = space.box, space.encode(tracker.best_values)
     for at, one in enumerate(space.coordinates):
-        for step in (APART, -APART) if one.is_logarithmic else ():
+        steps = APART_IN_TIME if family(one.short) == "tau" else APART
+        for step in (*steps, *(-step for step in steps)) if one.is_logarithmic else ():
             if low[at] < best[at] + step < high[at]:
                 start = best.copy()
                 start[at] += step
                 yield start
+
+
+def _relaxing_anew(space: Space, values: Array) -> Iterator[Array]:
+    """Point whose relaxation begins anew, a decade or two below the time under load.
+
+    The springs are as stiff as they were at once, k (1 + Σ g). Long times with large strengths are
+    a wide wrong minimum.
+    """
+    model, moved, count = space.model, values.copy(), space.model.relaxation
+    times = space.scales.duration * 10.0 ** ((np.arange(count) + 0.5) / max(count, 1) - 2.0)
+    for spring, law in enumerate(model.laws if count else ()):
+        names = [f"s{spring + 1}_{short}" for short in relaxation_names(count)]
+        stiff = [f"s{spring + 1}_{one.name}" for one in law.params if one.scale in STIFF]
+        if not law.hysteretic or not set(space.free).issuperset(names + stiff):
+            continue
+        places = [model.index[name] for name in names]
+        before = 1.0 + float(values[places[::2]].sum())
+        moved[places] = np.ravel(np.column_stack([np.full(count, ANEW), times]))
+        moved[[model.index[name] for name in stiff]] *= before / (1.0 + ANEW * count)
+    if np.any(moved != values):
+        yield space.encode(moved)
 
 
 def _neighbours(space: Space, values: Array) -> Iterator[Array]:
