@@ -372,3 +372,23 @@ def test_a_striker_on_cartilage_is_fitted_and_its_impulse_doubted(
     assert result.energy["impulse_ratio"] == pytest.approx(ratio, abs=0.01)
     assert any("momentum" in warning for warning in result.warnings)
     assert result.misfit["stress_time"] < 0.2
+
+
+@pytest.mark.parametrize(
+    ("given", "seed"),
+    [
+        (rig.Slow(relaxation=1, dashpot=True, noise=1e-3), 6077),
+        (rig.Slow(relaxation=1, dashpot=True, noise=1e-3), 6148),
+        (rig.Slow("bistable", noise=1e-3, early=True, zero=True), 6097),
+    ],
+)
+def test_a_wrong_minimum_is_left_where_more_than_noise_is_missed(given, seed, tmp_path):
+    """Long relaxation times of soft springs, and a branch of few samples without stiffness."""
+    test = ff.read_test(rig.write(made := rig.slow(given, seed), tmp_path))
+    params = ff.make_params(test, made.model, "displacement", relaxation=given.relaxation)
+    params["s1_eta"].vary = given.dashpot
+    options = {"relaxation": given.relaxation, "intervals": "local"}
+    result = ff.fit(test, model=made.model, params=params, **options)
+    assert result.noise["stress_strain"]["residual_over_noise"] < 1.1
+    for name in ("s1_k0", "s1_kc", "s1_eta"):
+        assert result.parameters[name].value == pytest.approx(made.truth[name], rel=0.1)
