@@ -292,7 +292,8 @@ def _descended(tracker: Tracker, space: Space, starts: Iterable[Array]) -> list[
 def _apart(tracker: Tracker, space: Space) -> Iterator[Array]:
     """Points with one positive parameter of the best changed by a factor, larger and smaller.
 
-    Relaxation times, along which the cost is flat far off, are changed by more of them. All descents may end in the same wrong minimum. There are none where only noise is left.
+    All descents may end in the same wrong minimum. Relaxation times are changed by more, as the
+    cost is flat along them far off. There are no points where only noise is left.
     """
     if tracker.best_values is None or tracker.best_cost < MISSING * tracker.objective.floor:
         return
