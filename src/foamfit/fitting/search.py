@@ -35,13 +35,13 @@ IN_SERIES = 3  # searches at least for several hysteretic springs
 LOST = 30.0  # times the noise floor of the cost, above which no agreement is believed at once
 NOISY = 0.005  # noise of a motion, over its range, that is much
 AROUND = 200  # points about the best one among which another search begins
-# Share of the box that counts as its edge, more of it where the curves miss more than noise, and
-# where inside a descent begins again.
+# Share of the box that counts as its edge, that of what is moved where the curves miss more than
+# noise, and where inside a descent begins again.
 EDGE, EDGE_MISSING, INSIDE = 0.02, 0.1, (0.35, 0.5, 0.65)
-# Changes of the logarithm of a parameter, and of a relaxation time, that lead out of a wrong
-# minimum; they are tried if the cost is above this share of the noise floor, which includes a
-# margin.
-APART, APART_IN_TIME, MISSING = (1.2,), (1.2, 3.0, 4.8), 0.8
+# Change of the logarithm of a parameter, and further ones of a relaxation time, that lead out of a
+# wrong minimum; they are tried if the cost is above this share of the noise floor, which includes
+# a margin.
+APART, APART_IN_TIME, MISSING = 1.2, (3.0, -3.0, 4.8, -4.8), 0.8
 # Strength of each relaxation term that begins anew, and scales of what is as stiff as before then.
 ANEW, STIFF = 0.3, ("stress", "slope")
 # Points off the best one are tried again where it costs less than before by this share.
@@ -228,6 +228,10 @@ def search(
             edges = _off_edges(tracker, space)
             apart = _descended(tracker, space, _apart(tracker, space))
             out += [(cost, 1) for cost in edges + apart]
+            reached = tracker.best_cost
+            _descended(tracker, space, _far_off(tracker, space))
+            if tracker.best_cost < reached:  # those that lead to one end do not agree by chance
+                out.append((tracker.best_cost, 1))
             left = tracker.best_cost
         least = IN_SERIES if several else max(attempts // 2, 2 if edges else 1)
         if attempt + 1 == attempts or _settled(tracker, out, attempt, least):
@@ -263,9 +267,7 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
     low, high = space.box
     best = space.encode(tracker.best_values) if tracker.best_values is not None else low
     span = high - low
-    missing = tracker.best_cost >= MISSING * tracker.objective.floor
-    margin = (EDGE_MISSING if missing else EDGE) * span
-    edges = (best - low < margin) | (high - best < margin)
+    edges = (best - low < EDGE * span) | (high - best < EDGE * span)
     edges |= len(space.model.kinds) > 1 and tracker.best_cost > tracker.objective.floor
     starts = []
     for at in np.flatnonzero(edges & [one.is_logarithmic for one in space.coordinates]):
@@ -275,7 +277,6 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
             starts.append(start)
     if tracker.best_cost > tracker.objective.floor:
         starts += _neighbours(space, space.decode(best))
-        starts += _relaxing_anew(space, space.decode(best))
     return _descended(tracker, space, starts)
 
 
@@ -292,19 +293,41 @@ def _descended(tracker: Tracker, space: Space, starts: Iterable[Array]) -> list[
 def _apart(tracker: Tracker, space: Space) -> Iterator[Array]:
     """Points with one positive parameter of the best changed by a factor, larger and smaller.
 
-    All descents may end in the same wrong minimum. Relaxation times are changed by more, as the
-    cost is flat along them far off. There are no points where only noise is left.
+    All descents may end in the same wrong minimum. There are none where only noise is left.
     """
     if tracker.best_values is None or tracker.best_cost < MISSING * tracker.objective.floor:
         return
     (low, high), best = space.box, space.encode(tracker.best_values)
     for at, one in enumerate(space.coordinates):
-        steps = APART_IN_TIME if family(one.short) == "tau" else APART
-        for step in (*steps, *(-step for step in steps)) if one.is_logarithmic else ():
+        for step in (APART, -APART) if one.is_logarithmic else ():
             if low[at] < best[at] + step < high[at]:
                 start = best.copy()
                 start[at] += step
                 yield start
+
+
+def _far_off(tracker: Tracker, space: Space) -> Iterator[Array]:
+    """Points farther from the best than those of `_off_edges` and `_apart`, if more is missed.
+
+    Other relaxation times, along which the cost is flat far off, a relaxation begun anew, and
+    what lies in the outer tenth of the box moved inside.
+    """
+    if tracker.best_values is None or tracker.best_cost < MISSING * tracker.objective.floor:
+        return
+    (low, high), best = space.box, space.encode(tracker.best_values)
+    for at, one in enumerate(space.coordinates):
+        off, span = min(best[at] - low[at], high[at] - best[at]), high[at] - low[at]
+        places: list[float] = []
+        if family(one.short) == "tau":
+            places = [best[at] + step for step in APART_IN_TIME]
+        if one.is_logarithmic and EDGE * span <= off < EDGE_MISSING * span:
+            places += [low[at] + share * span for share in INSIDE]
+        for place in places:
+            if low[at] < place < high[at]:
+                start = best.copy()
+                start[at] = place
+                yield start
+    yield from _relaxing_anew(space, space.decode(best))
 
 
 def _relaxing_anew(space: Space, values: Array) -> Iterator[Array]:
