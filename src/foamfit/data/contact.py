@@ -13,13 +13,14 @@ from foamfit.data.noise import MIN_REST, level_on_line
 
 # A signal rests where its slope is less than this share of the slope that follows: the branches of
 # a foam differ less on loading (6 times in the published sets), so that a soft start is no rest.
-# For an impact, whose fit refines the start, and for a motion a larger share will do. Standard
-# errors of the slope that are added to it; fewer for an impact whose motion does not begin at zero,
-# as it may begin before contact. Share of the peak by which the rest of an impact may drift: less
-# where the motion begins at zero, as a stress that rises then is no rest; in between without one.
-# Where the motion begins elsewhere, a rest that drifts more is taken if there is no other.
+# For an impact, whose fit refines the start, and for a motion a larger share will do.
 STILL, _STILL_IMPACT, STILL_MOTION = 0.15, 0.3, 0.5
+# Standard errors that are added to the slope of a rest; fewer where the motion of an impact begins
+# elsewhere than at zero, so that the record may begin before contact.
 _ERRORS, _ERRORS_AWAY = 2.0, 1.0
+# Share of the peak by which the rest of an impact may drift: without a motion, where the motion
+# begins at its zero (a stress that rises then is no rest), and where it begins elsewhere. There a
+# rest that drifts more is taken if there is no other.
 _DRIFT, _DRIFT_AT_ZERO, _DRIFT_AWAY = 0.01, 0.002, 0.06
 _APPROACH = 0.02  # share of its travel beyond which a machine without a stress is not in contact
 _BRAKED = 0.02  # share of the peak of a derived stress at which contact starts

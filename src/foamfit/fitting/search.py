@@ -230,7 +230,7 @@ def search(
             out += [(cost, 1) for cost in edges + apart]
             reached = tracker.best_cost
             _descended(tracker, space, _far_off(tracker, space))
-            if tracker.best_cost < reached:  # those that lead to one end do not agree by chance
+            if tracker.best_cost < reached:  # that several of them lead there is no agreement
                 out.append((tracker.best_cost, 1))
             left = tracker.best_cost
         least = IN_SERIES if several else max(attempts // 2, 2 if edges else 1)
@@ -331,9 +331,9 @@ def _far_off(tracker: Tracker, space: Space) -> Iterator[Array]:
 
 
 def _relaxing_anew(space: Space, values: Array) -> Iterator[Array]:
-    """Point whose relaxation begins anew, a decade or two below the time under load.
+    """Point with new relaxation terms, their times a tenth to a hundredth of the time under load.
 
-    The springs are as stiff as they were at once, k (1 + Σ g). Long times with large strengths are
+    The springs keep their instantaneous stiffness k (1 + Σ g). Large strengths with long times are
     a wide wrong minimum.
     """
     model, moved, count = space.model, values.copy(), space.model.relaxation

@@ -39,8 +39,8 @@ ENOUGH_DRAWS, LEAST_DRAWS, MOST_DRAWS = 40, 100, 100_000
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
 # noise makes that much difference in one test of ten thousand, but there are many minima.
 HARDLY_WORSE = 2.0
-# Iterations of a refit that looks how much worse the fit is far outside of an interval, more where
-# a local interval stands though the cost is no parabola.
+# Iterations of a refit one width outside of an interval; as many as for a profile where the
+# interval is local though the cost is not a parabola.
 ITERATIONS = 10
 Announce = Callable[[str], None]
 Minima = Sequence[tuple[Array, Array]]  # points at which descents ended, and their residuals
