@@ -315,30 +315,35 @@ def test_what_one_profile_meets_counts_for_the_others():
 
 @pytest.mark.parametrize("far", [True, False])
 def test_a_value_far_outside_that_fits_almost_as_well_is_named(far):
-    """The residual of b is a line to 1.2 half widths; beyond it goes on, or rises no more."""
+    """The residual of b is a line to 1.2 half widths; beyond it goes on, or rises no more.
+
+    Beyond, the best a follows b to where a refit with a held does not find b.
+    """
     noise = np.random.default_rng(2).standard_normal(400)
     noise[:2] = 0.0
 
     class Shelf(Curve):
         def residual(self, values: np.ndarray) -> np.ndarray:
             out = self.data.copy()
-            out[0] += 30.0 * values[0]
-            out[1] += 30.0 * (min(values[1], 0.08) if far else values[1])
+            beyond = max(values[1] - 0.08, 0.0) if far else 0.0
+            out[0] += 30.0 * (values[0] - 10.0 * beyond)
+            out[1] += 30.0 * (values[1] - beyond)
             return out
 
     class ShelfBench(Bench):
         def slopes(self, values: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
             out = np.zeros((400, 2))
-            out[0, 0] = 30.0
-            out[1, 1] = 0.0 if far and values[1] > 0.08 else 30.0
+            beyond = far and values[1] > 0.08
+            out[0] = 30.0, -300.0 * beyond
+            out[1, 1] = 30.0 * (not beyond)
             return out
 
     bench = ShelfBench(Shelf(np.arange(400.0), noise))
     found = assess(BestPoint(bench, np.zeros(2), ("a", "b")), Choice())  # type: ignore[arg-type]
     half = 1.966 / 30.0
     assert found.ends == {}
-    assert list(found.elsewhere) == (["b"] if far else [])
-    assert found.elsewhere.get("b", 3.0 * half) == pytest.approx(3.0 * half, rel=0.1)
+    there = {"a": 10.0 * (3.0 * half - 0.08), "b": 3.0 * half} if far else {}
+    assert found.elsewhere == pytest.approx(there, rel=0.1)
 
 
 class _Interrupting(Tracker):

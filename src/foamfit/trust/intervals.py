@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -39,6 +39,7 @@ ENOUGH_DRAWS, LEAST_DRAWS, MOST_DRAWS = 40, 100, 100_000
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
 # noise makes that much difference in one test of ten thousand, but there are many minima.
 HARDLY_WORSE = 2.0
+WIDTH = 1.0 - 1e-9  # the widths of an interval that are far outside of it, with rounding
 # Iterations of a refit one width outside of an interval; as many as for a profile where the
 # interval is local though the cost is not a parabola.
 ITERATIONS = 10
@@ -136,52 +137,67 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
 
     A value much farther off, at a minimum that is hardly worse than the best, is named beside them.
     """
-    ends, methods, elsewhere = dict(made.ends), dict(made.methods), dict[str, float]()
-    values, known = best.values[best.places], {name: best.names.index(name) for name in best.known}
-    local = np.stack([values - best.halves, values + best.halves], axis=1)
-    intervals = {name: ends.get(name, tuple(local[at].tolist())) for name, at in known.items()}
+    ends, methods = dict(made.ends), dict(made.methods)
+    intervals = {name: _interval(best, made, name) for name in best.known}
     for point, residual in minima:
         halves = _halves(best, point, residual)
-        for name, column in known.items():
-            if math.isfinite(half := float(halves[column])):
-                there, (low, high) = float(point[best.index[name]]), intervals[name]
+        for name, (low, high) in intervals.items():
+            if math.isfinite(half := float(halves[best.names.index(name)])):
+                there = float(point[best.index[name]])
                 wider = min(low, there - half), max(high, there + half)
                 if wider[1] - wider[0] > (1.0 + PLACED) * (high - low):
                     intervals[name] = ends[name] = wider
                     methods[name] = "other minima"
+    made, elsewhere = replace(made, ends=ends, methods=methods), dict[str, float]()
     for point, residual in () if best.misfits else minima:
-        near = best.rises(residual) <= (HARDLY_WORSE * best.quantiles) ** 2
-        for name, column in known.items():
-            there, (low, high) = float(point[best.index[name]]), intervals[name]
-            if near[column] and max(low - there, there - high) > high - low:
-                elsewhere.setdefault(name, there)
-    return replace(made, ends=ends, methods=methods, elsewhere=elsewhere)
+        elsewhere = dict(_far_values(best, made, point, float(residual @ residual))) | elsewhere
+    return replace(made, elsewhere=elsewhere)
+
+
+def _interval(best: BestPoint, made: Intervals, name: str) -> tuple[float, float]:
+    """The interval of a parameter, the local one where no other was made."""
+    value, half = float(best.values[best.index[name]]), best.halves[best.names.index(name)]
+    return made.ends.get(name, (value - half, value + half))
+
+
+def _far_values(
+    best: BestPoint, made: Intervals, point: Array, cost: float
+) -> Iterator[tuple[str, float]]:
+    """Values of a point that lie a width outside of their intervals, if it fits hardly worse."""
+    cuts = best.quantiles**2 * best.spread.inflation
+    for name in best.known:
+        there, (low, high) = float(point[best.index[name]]), _interval(best, made, name)
+        near = cost - best.cost <= HARDLY_WORSE**2 * cuts[best.names.index(name)]
+        if near and max(low - there, there - high) > WIDTH * (high - low):
+            yield name, there
 
 
 def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
     """Name values a whole width outside of an interval at which the curves fit hardly worse.
 
-    There a parabola has nine times the cut of the interval. The other parameters are refitted.
+    There a parabola has nine times the cut of the interval. The other parameters are refitted, and
+    those of them that come to lie as far outside of theirs are named too.
     """
     refit, elsewhere = Refit(best, tracker), dict(made.elsewhere)
     try:
         for name in best.known:
             column, value = best.names.index(name), float(best.values[best.index[name]])
-            half, (least, most) = float(best.halves[column]), best.limits(name)
-            low, high = made.ends.get(name, (value - half, value + half))
+            low, high = _interval(best, made, name)
             if name in NUISANCE or high - low > 2.0 * WEAK * best.sizes[column]:
                 continue
-            cut = best.quantiles[column] ** 2 * best.spread.inflation[column]
+            least, most = best.limits(name)
             iterations = STEPS if name in made.doubtful else ITERATIONS
             for there in (2.0 * low - high, 2.0 * high - low):
                 if name in elsewhere or not least <= there <= most:
                     continue
                 start = refit.along(column, there - value)
                 found = refit.run(start, (column, there), iterations=iterations)
-                if found and found.cost - best.cost < -BETTER * cut:
+                if found is None:
+                    continue
+                cut = best.quantiles[column] ** 2 * best.spread.inflation[column]
+                if found.cost - best.cost < -BETTER * cut:
                     return replace(made, better=found.point)
-                if found and found.cost - best.cost <= HARDLY_WORSE**2 * cut:
-                    elsewhere[name] = there
+                elsewhere = dict(_far_values(best, made, found.point, found.cost)) | elsewhere
     except STOPPING as error:
         late = say("interval", "far", by=what_stopped(error))
         return replace(made, elsewhere=elsewhere, warnings=(*made.warnings, late))
