@@ -64,9 +64,10 @@ class Simulated:
     """The curves of one set of parameters, the run itself, and derivatives if they were wanted."""
 
     # By their names in `Objective.curves`, absent where the drive prescribes or the test lacks
-    # them; stress_strain is the stress (Pa) along the measured displacement.
+    # them, or where they are not counted; stress_strain is the stress (Pa) along the measured
+    # displacement.
     curves: dict[str, Array]
-    motion: Motion
+    motion: Motion  # on the clock of the samples where everything was asked for
     slopes: dict[str, Array] | None = None  # (p, n) each
 
 
@@ -412,23 +413,22 @@ class Objective:
         if along is None and (everything or "stress_strain" in self.counted) and self._along:
             along = run(self._followed(self._along[damped], at), False)
         by_site = np.flatnonzero(places == values.size - 1) if places.size else places
-        parts = {"stress_time": _with_slopes(motion), "displacement_time": _with_slopes(shown, -1)}
-        if everywhere:
-            parts |= {name: _with_slopes(shown, node - 1) for name, node in self.interior.items()}
-        if along is not None:
-            parts["stress_strain"] = _with_slopes(along)
-        if self.accelerated:
+        of = {"stress_time": (motion, None), "displacement_time": (shown, -1)}
+        of |= {name: (shown, node - 1) for name, node in self.interior.items()}
+        of |= {} if along is None else {"stress_strain": (along, None)}
+        asked = set(self.curves).difference(self._absent) if everything else self.counted
+        parts = {name: _with_slopes(*of[name]) for name in of if name in asked}
+        if ACCELERATION in asked:
             parts[ACCELERATION] = self._acceleration(shown, drag, at, by_site)
         curves, slopes = dict[str, Array](), dict[str, Array]()
         for name, simulated in parts.items():
-            if name in self._absent:
-                continue
             seen, zero = self._late(name, self._sampled(simulated), late), self._zero_of.get(name)
             curves[name], slopes[name] = seen[0] + at[zero] if zero else seen[0], seen[1:]
             if by_site.size:
                 slopes[name][by_site] /= height  # site_eta acts through η_site/H
-        averaged = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
-        return Simulated(curves, averaged, slopes if len(wanted) else None)
+        if everything:
+            motion = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
+        return Simulated(curves, motion, slopes if len(wanted) else None)
 
     # ------------------------------------------------------------------ where and when
 

@@ -160,7 +160,8 @@ def _masses(best: BestPoint) -> dict[str, Any] | None:
     if mass is None:
         return {"changes": [], "ended": None}
     try:
-        other = replace(objective, interior_mass=True).simulate(best.values).curves
+        massive = replace(objective, interior_mass=True)
+        other = massive.simulate(best.values, everything=True).curves
     except SimulationError as error:
         return {"changes": [], "ended": error}
     spoken, changes = {"stress_time": "base stress", "displacement_time": "displacement"}, []
