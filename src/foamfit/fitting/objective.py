@@ -122,8 +122,8 @@ class Objective:
         self.accelerated = self.drive == "impact" and self.measurement.acceleration is not None
         self.curves = (*CURVES, *((ACCELERATION,) if self.accelerated else ()), *self.interior)
         self.weights = checked_weights(self.weights, self.curves)
-        self._dashpots = np.array([name.endswith("eta") for name in self.model.names])
-        self._dashpots[-1] = False  # the onsite damper is none of a spring
+        dashpots = [name.endswith("eta") for name in self.model.names[:-1]]  # of springs
+        self._dashpots = np.flatnonzero(dashpots)
         time = self.measurement.time
         self.time = np.arange(self.stress.size, dtype=float) if time is None else time
         self._fine = min(self.measurement.block, FINEST) if self.drive != "stress" else 1
@@ -347,7 +347,7 @@ class Objective:
     def _is_damped(self, values: Array, places: NDArray[np.int64]) -> bool:
         """Whether a spring has a dashpot, or a derivative by one is wanted."""
         eta = self._dashpots
-        return bool(values[: eta.size][eta].any() or eta[places].any())
+        return bool(values[eta].any() or (places.size and np.isin(places, eta).any()))
 
     def _nuisance_slope(self, values: Array, nuisance: Array, name: str) -> dict[str, Array]:
         """Derivative of the curves by one nuisance parameter.
@@ -389,7 +389,7 @@ class Objective:
         """
         height, rows = self.measurement.specimen.height, self.model.rows(values)
         heights = np.ascontiguousarray(self.model.heights(values, height))
-        if rows is None or not (np.all(heights > 0.0) and values[-1] >= 0.0):
+        if rows is None or not (heights.min() > 0.0 and values[-1] >= 0.0):
             raise SimulationError("the parameters are not admissible")
         damped = self._is_damped(values, places)  # a dashpot at zero is left out
         drag, everywhere = float(values[-1]) / height, everything or self._inside
@@ -539,7 +539,7 @@ class Objective:
             for name in self.counted
         ]
         # A stress near the pole of branch c is as bad as none.
-        bounded = np.concatenate(parts).clip(-self.penalty, self.penalty)
+        bounded = np.minimum(np.maximum(np.concatenate(parts), -self.penalty), self.penalty)
         bounded = bounded if self.weighing is None else self.weighing(bounded)
         return np.append(bounded, self.off_priors(values)) if self.priors else bounded
 
