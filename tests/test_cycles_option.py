@@ -131,7 +131,7 @@ def test_a_batch_and_a_toml_take_several_cycles(record: Path, tmp_path: Path) ->
     out = tmp_path / "runs"
     rows = ff.batch(
         [record], out=out, model="microscale", mullins=True, cycles=(1, 2), starts=2, jobs=1,
-        report=False, max_time=20.0,
+        report=False, max_time=20.0, intervals="local",
     )  # fmt: skip
     assert rows["status"].tolist() != ["refused"], rows["error"].tolist()
     content = json.loads((out / "foam" / "fit.json").read_text())

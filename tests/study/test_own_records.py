@@ -119,13 +119,13 @@ def test_intervals_of_shared_values_hold_the_truth(together, tmp_path):
     assert max(off) < 4.0
 
 
-def test_a_value_that_the_study_holds_is_that_of_each_file(tmp_path):
-    write_impacts(tmp_path, 0)
-    (tmp_path / "study.toml").write_text(
+def test_a_value_that_the_study_holds_is_that_of_each_file(together):
+    study = together[0] / "held.toml"
+    study.write_text(
         'tests = ["t0.csv", "t1.csv"]\nmodel = "bistable"\nstarts = 2\n'
         "[parameters]\nstress_zero = 0\n"
     )
-    found = ff.joint(tmp_path / "study.toml", jobs=1)
+    found = ff.joint(study, jobs=1)
     held = found.parameters["stress_zero"]
     assert (held.kind, held.value) == ("fixed", 0.0)
     assert found.estimates(0)["stress_zero"].value == 0.0  # though rows before contact show another
