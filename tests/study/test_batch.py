@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -42,6 +42,7 @@ from foamfit.study import batch_work, processes
 from foamfit.study.batch_work import work
 from foamfit.study.processes import ATTEMPTS, EndedError, Processes
 from foamfit.terminal import TerminatedError
+from inline import Inline
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 QUICK = {"starts": 2, "intervals": "local"}  # after a single start a search looks around longer
@@ -69,18 +70,6 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "tests" / "bad.csv").write_text("x,y\n1,2\n")
     (tmp_path / "foam.toml").write_text(TOML)
     return tmp_path
-
-
-class Inline(Executor):
-    """Calls at once, in this process."""
-
-    def submit(self, fn, /, *args, **kwargs):
-        future = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from foamfit.fitting.nuisance import names_of
 from foamfit.fitting.problem import make_problem
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.identified import read_source
+from inline import Inline
 
 sys.path.insert(0, str(EXPERIMENTS / "recovery"))
 import rig
@@ -232,7 +233,7 @@ def test_profiles_agree_with_the_local_intervals(together, tmp_path):
 
 def test_a_batch_fixes_and_varies_what_a_record_does_not_say(together, tmp_path):
     folder, _, _ = together
-    quick = {"starts": 2, "intervals": "local", "report": False, "jobs": 1}
+    quick = {"starts": 2, "intervals": "local", "report": False, "executor": Inline()}
     fixed = {"stress_zero": 0.0}
     frame = ff.batch(
         [folder / "t1.csv", folder / "t2.csv"], out=tmp_path / "out", fix=fixed,
