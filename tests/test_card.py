@@ -196,7 +196,8 @@ def test_on_real_foam_three_parameters_lose_little_and_two_more(tmp_path: Path) 
     toml = tmp_path / "foam.toml"
     toml.write_text('[specimen]\nheight = "10.53 mm"\ndiameter = "7.63 mm"\n')
     file = thinned(DATA / "shoe-foam" / "turbo-comp-1_cycle1.csv", tmp_path, 4)
-    fit = ff.fit(ff.read_test(file, toml), model="microscale", relaxation=1, starts=3)
+    test, law = ff.read_test(file, toml), {"model": "microscale", "relaxation": 1}
+    fit = ff.fit(test, **law, starts=3, intervals="local")
     three, two = (ff.card(fit, format=style) for style in ("mat083", "mat057"))
     assert fit.misfit["stress_strain"] < 0.007
     assert three.misfit["card"] < 0.012

@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 
 import fabricated
 import foamfit as ff
-from conftest import EXPERIMENTS
+from conftest import EXPERIMENTS, small_pictures
 from foamfit.cli import main
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
@@ -175,8 +175,9 @@ def test_json_is_all_there_is_and_the_seed_repeats(here: Path, fitted: tuple[Pat
 
 
 def test_an_older_result_is_replaced_and_quiet_is_quiet(
-    here: Path, fitted: tuple[Path, Result]
+    here: Path, fitted: tuple[Path, Result], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    small_pictures(monkeypatch)
     shutil.copytree(next(fitted[0].rglob("fit.json")).parent, "old")
     (here / "old" / "ladder.csv").write_text("x")
     args = ("--drive", "displacement", "--fix", "s1_k0=5.5e6", "--vary", "s1_eta", "--starts", 3)
@@ -194,7 +195,7 @@ def test_an_older_result_is_replaced_and_quiet_is_quiet(
 
 @pytest.mark.usefixtures("fitted")  # it has the solver compiled
 def test_the_time_limit_gives_the_best_so_far(here: Path) -> None:
-    args = ("--model", " bistable ", "--starts", 9000, "--max-time", 1.5, "--json", "--no-report")
+    args = ("--model", " bistable ", "--starts", 9000, "--max-time", 0.5, "--json", "--no-report")
     result = run("fit", RECONSTRUCTION, *args)
     content = json.loads(result.stdout)
     assert result.exit_code == (2 if content["status"] == "failed" else 0)
@@ -716,7 +717,7 @@ def process(*args: object) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_process_keeps_stdout_and_stderr_apart(here: Path) -> None:
-    short = ("--json", "--starts", 1, "--max-time", 5, "--no-report")
+    short = ("--json", "--starts", 2, "--max-time", 5, "--no-report")
     good = process("fit", RECONSTRUCTION, *short)
     assert (good.returncode, good.stderr) == (0, "")
     assert json.loads(good.stdout)["test"].endswith("(reconstruction)")

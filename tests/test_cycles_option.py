@@ -18,6 +18,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.fitting.curves import default_weights
 from foamfit.fitting.objective import Objective
 from foamfit.springs.model import Model
+from inline import Inline
 
 TRUTH = ff.MicroscaleSpring(
     5e5, 3e5, 0.25, 1.2e5, 0.4, 5.5e4, 0.6, stiffening=1.8, softening=0.7, weakening=0.4
@@ -130,8 +131,8 @@ def test_a_scene_file_may_name_what_a_spring_remembers(tmp_path: Path) -> None:
 def test_a_batch_and_a_toml_take_several_cycles(record: Path, tmp_path: Path) -> None:
     out = tmp_path / "runs"
     rows = ff.batch(
-        [record], out=out, model="microscale", mullins=True, cycles=(1, 2), starts=2, jobs=1,
-        report=False, max_time=20.0,
+        [record], out=out, model="microscale", mullins=True, cycles=(1, 2), starts=2,
+        report=False, max_time=20.0, intervals="local", executor=Inline(),
     )  # fmt: skip
     assert rows["status"].tolist() != ["refused"], rows["error"].tolist()
     content = json.loads((out / "foam" / "fit.json").read_text())

@@ -225,7 +225,7 @@ def test_only_frames_are_fitted_and_the_others_are_no_outliers(tmp_path):
 
 def test_the_result_says_which_samples_were_measured(tmp_path, monkeypatch):
     test = impact(tmp_path)
-    result = ff.fit(test, model="linear", starts=1)
+    result = ff.fit(test, model="linear", starts=2, intervals="local")
     assert result.statistics["n_left_out"] == 0
     assert not any("outlier" in note for note in result.notes)
     without_pictures(monkeypatch)
@@ -256,7 +256,14 @@ def test_a_task_takes_both_files_to_another_machine(tmp_path, file):
     content = tuple(one.read_bytes() for one in (path, toml, camera))
     for one in (path, toml, camera):
         one.unlink()
-    task = Task("test", path, toml, Recipe("linear", {"starts": 1}), "", content=content)
+    task = Task(
+        "test",
+        path,
+        toml,
+        Recipe("linear", {"starts": 2, "intervals": "local"}),
+        "",
+        content=content,
+    )
     [row], _ = work(task)
     assert row.status in ("ok", "warnings")
 

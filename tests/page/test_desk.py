@@ -179,7 +179,7 @@ def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkey
     desk.take(record)
     desk.check(*desk.dropped_toml(), ["--cycle", "3,2"])
     assert (desk.measurement.cycle, desk.measurement.cycles) == (3, (1, 2, 3))
-    asked = ["--cycle", "3,2", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "1"]
+    asked = ["--cycle", "3,2", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "2"]
     wait(desk.fit(asked))
     assert desk.ending() == ""
     assert desk.command == f"foamfit fit synthetic.csv {' '.join(asked)}"
@@ -209,7 +209,7 @@ def test_several_cycles_are_one_history(desk, tmp_path):
     assert (record.cycle, record.last_cycle) == (1, 3)
     assert desk.measured(1, 3) is record
     assert desk.measured(2, 3).last_cycle == 3
-    wait(desk.fit(["--cycles", "1-3", "--starts", "1", "--max-time", "2"]))
+    wait(desk.fit(["--cycles", "1-3", "--starts", "2", "--max-time", "2"]))
     assert desk.ending() == ""
     assert (desk.worker.news.cycle, desk.worker.news.last_cycle) == (1, 3)
     assert [*desk.fits] == [0]

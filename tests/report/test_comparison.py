@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 import fabricated
 import foamfit as ff
-from conftest import synthetic_impact
+from conftest import synthetic_impact, without_pictures
 from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.errors import InputError
@@ -335,7 +335,8 @@ def test_a_result_with_nothing_to_compare_has_an_empty_row() -> None:
     assert [text.get_text() for text in alone.texts] == ["no parameter to compare"]
 
 
-def test_a_real_fit_recovers_its_spring(tmp_path: Path) -> None:
+def test_a_real_fit_recovers_its_spring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    without_pictures(monkeypatch)
     result = ff.fit(synthetic_impact()[1], starts=4)
     folder = result.save(tmp_path / "fit")
     section = only(compare([folder], published="foam-1/model-1"))

@@ -76,7 +76,7 @@ def test_text_from_files_is_escaped() -> None:
     whole = page(**changed)
     assert "script" not in whole.tags
     assert whole.text.count(evil) >= 8
-    assert evil not in render_report(fabricated.result(**changed))
+    assert evil not in render_report(fabricated.result(**changed), fabricated.no_figures())
 
 
 def test_misfit_figure_parameters_and_warnings_come_first_and_the_rest_is_folded() -> None:
@@ -155,7 +155,7 @@ def test_the_statistics_and_the_energy_are_labelled() -> None:
 def test_branches_are_told_per_spring() -> None:
     words = page(visited={"s1": ("a", "d")}).words
     assert "d · snap-buckling c · densified, not reached e · snap-back, not reached" in words
-    whole = Page(render_report(fabricated.chain_result())).words
+    whole = Page(render_report(fabricated.chain_result(), fabricated.no_figures())).words
     assert "s1 linear, has no branches s2 a · elastic" in whole
 
 
@@ -270,7 +270,7 @@ def test_the_terminal_says_why_a_parameter_is_not_determined() -> None:
 
 
 def test_what_a_microscale_spring_snapped_and_relaxes_is_told() -> None:
-    words = Page(render_report(fabricated.microscale_result())).words
+    words = Page(render_report(fabricated.microscale_result(), fabricated.no_figures())).words
     assert "microscale model with 1 relaxation term, displacement drive" in words
     snapped = "96 % of the micro-springs snap in this test, at 230.8 kPa and a strain of 0.6000"
     assert snapped in words

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -42,9 +42,10 @@ from foamfit.study import batch_work, processes
 from foamfit.study.batch_work import work
 from foamfit.study.processes import ATTEMPTS, EndedError, Processes
 from foamfit.terminal import TerminatedError
+from inline import Inline
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-QUICK = {"starts": 1, "intervals": "local"}
+QUICK = {"starts": 2, "intervals": "local"}  # after a single start a search looks around longer
 TOML = (
     f'[specimen]\nheight = "{1e3 * HEIGHT} mm"\narea = "19.635 mm^2"\n'
     '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
@@ -52,7 +53,7 @@ TOML = (
 
 
 def write(folder: Path, name: str, seed: int) -> None:
-    _, test = synthetic_impact(seed=seed, samples=101)
+    _, test = synthetic_impact(noise=0.003, seed=seed, samples=101)
     columns = (1e3 * test.time, 1e-6 * test.stress, 1e3 * test.displacement)
     lines = [",".join(f"{x:.6f}" for x in row) for row in zip(*columns, strict=True)]
     header = "time (ms),stress (MPa),displacement (mm)"
@@ -69,18 +70,6 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "tests" / "bad.csv").write_text("x,y\n1,2\n")
     (tmp_path / "foam.toml").write_text(TOML)
     return tmp_path
-
-
-class Inline(Executor):
-    """Calls at once, in this process."""
-
-    def submit(self, fn, /, *args, **kwargs):
-        future = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
 
 
 @pytest.fixture
@@ -125,27 +114,27 @@ def stamps(out):
 
 def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
     again(out="one", executor=None, jobs=1, **QUICK)
-    frame = again(out="three", executor=None, jobs=3, **QUICK)
+    frame = again(out="two", executor=None, jobs=2, **QUICK)
     again(out="inline", **QUICK)
     made = numbers("one")
     assert list(made) == ["a", "b", "c"]
-    assert made == numbers("three") == numbers("inline")
+    assert made == numbers("two") == numbers("inline")
     alone = ff.fit(ff.read_test("tests/b.csv", "foam.toml"), **QUICK)
     row = frame.set_index("test").loc
     assert row["b", "s1_k0"] == alone.params["s1_k0"].value
-    assert names("three") == ["a", "b", "bad", "c", "summary.csv", "summary.html", "summary.tex"]
-    assert names("three/a") == [
+    assert names("two") == ["a", "b", "bad", "c", "summary.csv", "summary.html", "summary.tex"]
+    assert names("two/a") == [
         "batch.json", "curves.csv", "fit.json", "parameters.csv", "table.tex",
     ]  # fmt: skip
     assert row["bad", "status"] == "refused"
     assert row["bad", "error"].startswith("tests/bad.csv: ")
-    with open("three/summary.csv", newline="") as file:
+    with open("two/summary.csv", newline="") as file:
         head = next(csv.reader(file))
     curves = [f"misfit_{c}" for c in ("stress_time", "displacement_time", "stress_strain")]
     assert head[:8] == ["test", "file", "status", "error", *curves, "runtime_s"]
     parts = [f"s1_k0{part}" for part in ("", "_stderr", "_lo", "_hi", "_state")]
     assert head[8:13] == parts
-    pd.testing.assert_frame_equal(frame, pd.read_csv("three/summary.csv"), check_dtype=False)
+    pd.testing.assert_frame_equal(frame, pd.read_csv("two/summary.csv"), check_dtype=False)
 
 
 @pytest.fixture
@@ -494,14 +483,23 @@ def test_a_folder_with_files_of_others_is_refused(here, tried, place):
 # ------------------------------------------------------------------------- the command
 
 
+def alive(process):
+    """Whether a process runs; one that has ended may be a zombie, if nobody waits for it."""
+    import psutil
+
+    try:
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
 @posix
 def test_killed_and_called_again_nothing_is_lost_or_done_twice(here):
     """The process of the command is killed: the others end, and the next call goes on."""
     import psutil
 
-    for seed in range(3, 5):
-        write(here / "tests", f"t{seed}", seed)
-    words = ["batch", "tests", "--specimen", "foam.toml", "--starts", "1", "--jobs", "2"]
+    write(here / "tests", "t3", 3)
+    words = ["batch", "tests", "--specimen", "foam.toml", "--starts", "2", "--jobs", "2"]
     words += ["--no-report", "--quiet", "--out", "out"]
     with subprocess.Popen([sys.executable, "-m", "foamfit", *words]) as process:
         deadline = time.monotonic() + 60
@@ -510,17 +508,19 @@ def test_killed_and_called_again_nothing_is_lost_or_done_twice(here):
         others = psutil.Process(process.pid).children(recursive=True)
         process.kill()
     done = stamps("out")
-    assert len(done) < 6
+    assert len(done) < 5
     assert len(others) >= 3
-    _, alive = psutil.wait_procs(others, timeout=20)
-    assert not [one for one in alive if one.is_running() and one.status() != psutil.STATUS_ZOMBIE]
+    deadline = time.monotonic() + 20
+    while any(map(alive, others)):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
     done = stamps("out")
-    result = run(*words)
+    result = run(*words, "--jobs", "1")
     assert result.exit_code == 2  # bad.csv
-    assert "1 of 6 tests has no acceptable fit" in result.stderr
+    assert "1 of 5 tests has no acceptable fit" in result.stderr
     after = stamps("out")
     assert {name: after[name] for name in done} == done
-    assert len(after) == 6
+    assert len(after) == 5
     assert not [name for name in names("out") if name.startswith(".")]
 
 
@@ -617,7 +617,7 @@ def test_a_dask_cluster_loses_a_worker_and_no_test(here):
             time.sleep(0.05)
         address = json.loads(file.read_text())["address"]
         killer.start()
-        words = ["batch", "tests", "--specimen", "foam.toml", "--starts", "1", "--no-report"]
+        words = ["batch", "tests", "--specimen", "foam.toml", "--starts", "2", "--no-report"]
         result = run(*words, "--scheduler", address, "--out", "out", "--quiet")
         assert result.exit_code == 0, result.output
         assert processes[1].wait(10) == -signal.SIGKILL
@@ -625,7 +625,7 @@ def test_a_dask_cluster_loses_a_worker_and_no_test(here):
         for process in reversed(processes):
             process.kill()
             process.wait()
-    again(starts=1, out="local")
+    again(starts=2, out="local")
     assert len(numbers("out")) == 4
     assert numbers("out") == numbers("local")
 

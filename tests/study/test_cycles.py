@@ -70,7 +70,7 @@ def test_ctrl_c_keeps_what_was_found(record, monkeypatch, at):
         return real(*words, **options)
 
     monkeypatch.setattr(cycles, "fit", fit)
-    kept = ff.fit_cycles(record, starts=1, intervals="local")
+    kept = ff.fit_cycles(record, starts=2, intervals="local")
     assert list(kept.results) == {"reading": [1], "fit": [1, 2]}[at]
     assert all("Ctrl-C" in why for why in kept.refused.values())
     assert len(kept.results) + len(kept.refused) == 3
@@ -181,7 +181,7 @@ def test_json_holds_every_cycle(record, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
     monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
-    words = ("--starts", 1, "--json", "--out", tmp_path / "out")
+    words = ("--starts", 2, "--json", "--out", tmp_path / "out")
     result = run("fit", record, "--cycle", "1,2", *words)
     assert result.exit_code == 0
     content = json.loads(result.stdout)

@@ -19,6 +19,7 @@ from foamfit.fitting.nuisance import names_of
 from foamfit.fitting.problem import make_problem
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.identified import read_source
+from inline import Inline
 
 sys.path.insert(0, str(EXPERIMENTS / "recovery"))
 import rig
@@ -119,13 +120,13 @@ def test_intervals_of_shared_values_hold_the_truth(together, tmp_path):
     assert max(off) < 4.0
 
 
-def test_a_value_that_the_study_holds_is_that_of_each_file(tmp_path):
-    write_impacts(tmp_path, 0)
-    (tmp_path / "study.toml").write_text(
+def test_a_value_that_the_study_holds_is_that_of_each_file(together):
+    study = together[0] / "held.toml"
+    study.write_text(
         'tests = ["t0.csv", "t1.csv"]\nmodel = "bistable"\nstarts = 2\n'
         "[parameters]\nstress_zero = 0\n"
     )
-    found = ff.joint(tmp_path / "study.toml", jobs=1)
+    found = ff.joint(study, jobs=1)
     held = found.parameters["stress_zero"]
     assert (held.kind, held.value) == ("fixed", 0.0)
     assert found.estimates(0)["stress_zero"].value == 0.0  # though rows before contact show another
@@ -232,7 +233,7 @@ def test_profiles_agree_with_the_local_intervals(together, tmp_path):
 
 def test_a_batch_fixes_and_varies_what_a_record_does_not_say(together, tmp_path):
     folder, _, _ = together
-    quick = {"starts": 2, "intervals": "local", "report": False, "jobs": 1}
+    quick = {"starts": 2, "intervals": "local", "report": False, "executor": Inline()}
     fixed = {"stress_zero": 0.0}
     frame = ff.batch(
         [folder / "t1.csv", folder / "t2.csv"], out=tmp_path / "out", fix=fixed,
