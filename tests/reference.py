@@ -337,6 +337,8 @@ class _System:
         self.loaded_top = light_top and self.site == 0.0
         ends = sorted({0, *self.heavy, n})
         self.groups = [_Group(list(range(b, t)), b, t) for b, t in pairwise(ends)]
+        self.free = [[i for i in one.springs if self.eta[i] == 0.0] for one in self.groups]
+        self.damped = [[i for i in one.springs if self.eta[i] > 0.0] for one in self.groups]
         self.at_strain = {i: k for k, i in enumerate(self.dashed)}
         k = len(self.dashed)
         self.at_node = {node: k + 2 * j for j, node in enumerate(self.heavy)}
@@ -353,11 +355,11 @@ class _System:
 
     def series(self, springs: Sequence[int], length: float, guess: float) -> float:
         """Stress at which springs without dashpots, in series, shorten by `length` together."""
-        if any(self.branch[i] == "off" for i in springs):
-            return 0.0
         if len(springs) == 1:
             i = springs[0]
             return float(self.laws[i].sigma(self.branch[i], length / self.h[i]))
+        if any(self.branch[i] == "off" for i in springs):
+            return 0.0
 
         def gap(s: float) -> float:
             inv = (self.h[i] * self.laws[i].inverse(self.branch[i], s) for i in springs)
@@ -404,8 +406,7 @@ class _System:
             place[self.n] = y[self.at_top]
         stress = []
         for g, group in enumerate(self.groups):
-            free = [i for i in group.springs if self.eta[i] == 0.0]
-            dashed = [i for i in group.springs if self.eta[i] > 0.0]
+            free, dashed = self.free[g], self.damped[g]
             sigma = {i: self.laws[i].sigma(self.branch[i], strain[i]) for i in dashed}
             loaded = group.top == self.n and self.loaded_top
             if loaded:
