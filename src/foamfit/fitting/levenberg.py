@@ -94,9 +94,10 @@ def damped_step(gradient: Array, normal: Array, damping: float, held: NDArray[np
     moving = np.flatnonzero(~held)
     step = np.zeros(gradient.size)
     if moving.size:
-        own = normal[np.ix_(moving, moving)]
-        scale = np.maximum(np.diag(own), 1e-12 * max(float(np.trace(own)), 1e-300))
-        step[moving] = np.linalg.solve(own + damping * np.diag(scale), -gradient[moving])
+        own = normal[np.ix_(moving, moving)]  # a copy
+        diagonal = np.einsum("ii->i", own)  # a view
+        diagonal += damping * np.maximum(diagonal, 1e-12 * max(float(diagonal.sum()), 1e-300))
+        step[moving] = np.linalg.solve(own, -gradient[moving])
     return step
 
 

@@ -122,8 +122,9 @@ class Objective:
         self.accelerated = self.drive == "impact" and self.measurement.acceleration is not None
         self.curves = (*CURVES, *((ACCELERATION,) if self.accelerated else ()), *self.interior)
         self.weights = checked_weights(self.weights, self.curves)
-        dashpots = [name.endswith("eta") for name in self.model.names[:-1]]  # of springs
-        self._dashpots = np.flatnonzero(dashpots)
+        self._is_dashpot = np.array([name.endswith("eta") for name in self.model.names])
+        self._is_dashpot[-1] = False  # the onsite damper is none of a spring
+        self._dashpots = np.flatnonzero(self._is_dashpot)
         time = self.measurement.time
         self.time = np.arange(self.stress.size, dtype=float) if time is None else time
         self._fine = min(self.measurement.block, FINEST) if self.drive != "stress" else 1
@@ -346,8 +347,7 @@ class Objective:
 
     def _is_damped(self, values: Array, places: NDArray[np.int64]) -> bool:
         """Whether a spring has a dashpot, or a derivative by one is wanted."""
-        eta = self._dashpots
-        return bool(values[eta].any() or (places.size and np.isin(places, eta).any()))
+        return bool(values[self._dashpots].any() or self._is_dashpot[places].any())
 
     def _nuisance_slope(self, values: Array, nuisance: Array, name: str) -> dict[str, Array]:
         """Derivative of the curves by one nuisance parameter.
