@@ -5,7 +5,7 @@ stands, and with what it does not say exactly taken for exact (contact time and 
 motion as it was sampled). The time of a fit over that of the other is the price of what the record
 leaves open. The numbers of the second kind are wrong: it is there for its time alone.
 
-Answer. 0.26 to 1.5 times the other's time: see unknowns.md.
+Answer. 0.28 to 1.7 times the other's time: see unknowns.md.
 
     python experiments/error_vs_runtime/unknowns.py        # prints and writes unknowns.md
 """

@@ -8,7 +8,7 @@ springs' parameters are counted, those of contact time, zero, velocity and mass 
 far if it is called determined and its interval misses the truth by more than its own width. The
 search has missed the minimum of a slow test where the true springs follow its stress better.
 
-Answer. They hold in 94.9 % of impacts, 94.5 % of slow tests of one spring, 95.5 % of two: README.md.
+Answer. 94.9 % hold of impacts, 94.5 % of slow tests of one spring, 95.5 % of two: see README.md.
 
 With `--invariance` each impact is written several ways: with another zero of the motion, another
 clock, fewer rows before contact. The moves of its parameters are counted in standard errors.

@@ -6,7 +6,7 @@ is compiled (an empty NUMBA_CACHE_DIR). The parts are those of one more process,
 what the command calls; in the last part, figures are drawn in other processes where there are two
 cores, as by the command.
 
-Answer. 600 rows: 2.3 s once compiled, 11.4 s at first use; README.md says where the time goes. A
+Answer. 600 rows: 5.4 s once compiled, 18 s at first use; README.md says where the time goes. A
 million rows: 6.2 s, 384 MiB.
 
     python experiments/start_up/start_up.py                            # the table of README.md
