@@ -418,7 +418,7 @@ def _search_loop(
         for i, point in enumerate(spread_out(own, points, starts)):
             progress(DESCENTS + (ON_CURVES - DESCENTS) * i / starts, "loop")
             if 2 * i == starts and objective.drive != "impact" and inner.best_values is not None:
-                tracker.consider(inner.best_values)
+                tracker.consider(inner.best_values)  # half of them show whether more are worth it
                 tracker.look()
             cost, end = descend(inner, own, point, 40)
             ends.append((cost, space.encode(own.decode(end))))
