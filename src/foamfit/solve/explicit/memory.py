@@ -80,7 +80,7 @@ PLACE, SCALE, FRACTION, LEFT, GAIN, PER_GAIN, GIVE, PER_GIVE, SOFT, BASE = range
 PER_A, PER_C, PER_S, RATE_A, RATE_C, RATE_U, GAP = range(10, 17)
 STIFF, K_MAIN, UNSNAPPED, PER_FRESH, RATE_FRESH, N_NOW = range(17, 23)
 # A held spring is past where it turned if its strain is, by so much of itself.
-MARGIN = 1e-13
+MARGIN = 1e-14
 # A strain that changes in a step by so little of itself stands still.
 STILL = 1e-14
 # A spring that turns within so small a part of a step turns at its start.
