@@ -696,8 +696,9 @@ def lines_of(
 
 def finest_of(spec: Spec) -> float:
     """What brute force can tell of strains: it follows stresses, a digit of which is many ranks."""
-    spreads = [spring.get(f"spread_{side}", 1.0) for spring in spec["springs"] for side in SIDES]
-    return OF_STRESSES / min(spreads)
+    springs = spec.get("springs", [])
+    spreads = [spring.get(f"spread_{side}", 1.0) for spring in springs for side in SIDES]
+    return OF_STRESSES / min(spreads, default=1.0)
 
 
 def judged(
