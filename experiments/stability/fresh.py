@@ -657,7 +657,7 @@ def slope_error(spec: Spec, scene: Scene, rtol: float, most: int, known: dict[st
 
 
 SIDES = "plus", "minus"
-OF_STRESSES = 1e-14  # rounding of the logarithm of a stress, by some switches
+OF_STRESSES = 1e-14  # rounding error of the logarithm of a stress after a few switches
 REASONS = {
     "step underflow": "shrank to nothing",
     "vibration": "masses vibrate too fast",
@@ -695,7 +695,7 @@ def lines_of(
 
 
 def finest_of(spec: Spec) -> float:
-    """What brute force can tell of strains: it follows stresses, a digit of which is many ranks."""
+    """Smallest error of a strain that brute force, which follows rounded stresses, can see."""
     springs = spec.get("springs", [])
     spreads = [spring.get(f"spread_{side}", 1.0) for spring in springs for side in SIDES]
     return OF_STRESSES / min(spreads, default=1.0)

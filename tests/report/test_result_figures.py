@@ -53,7 +53,7 @@ def test_all_figures_of_the_report_are_pdf_where_that_is_asked_for(tmp_path: Pat
     "error", [EndedError("its process ended 2 times"), ImportError("no functioning sem_open")]
 )
 def test_where_processes_end_this_one_draws(
-    monkeypatch: pytest.MonkeyPatch, error: Exception
+    drawn_here: dict[str, Images | None], monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     def ended(*_: Any) -> Future[Any]:
         told: Future[Any] = Future()
@@ -64,7 +64,7 @@ def test_where_processes_end_this_one_draws(
     monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
     with closing(Drawers()) as drawers:
         drawers.begin()
-        assert list(drawers.map(str.upper, ["fit", "shown"])) == ["FIT", "SHOWN"]
+        assert dict(draw_all(fabricated.result(), mapped=drawers.map)) == drawn_here
 
 
 def test_where_no_process_can_be_had_this_one_draws(monkeypatch: pytest.MonkeyPatch) -> None:

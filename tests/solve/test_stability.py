@@ -61,15 +61,15 @@ def difference(one: ff.Response | Motion, other: ff.Response | Motion) -> float:
     )
 
 
-def judge(point: Point, answer: ff.Response, most: int) -> None:
-    """Hold an answer to shorter steps, and to brute force where `most` steps do."""
+def judge(point: Point, answer: ff.Response) -> None:
+    """Hold an answer to shorter steps, and to brute force where that is affordable."""
     if answer.steps:
         finer = (  # the second only if the first does not tell
             bare(point, fine * RTOL, implicit=answer.method == "Radau IIA") for fine in (1e-2, 1e-4)
         )
         resolved = (motion for motion in finer if motion.unresolved <= RTOL)
         assert any(difference(answer, motion) <= RTOL for motion in resolved), point
-    truth = independent.judge(*scene_of(point), most)
+    truth = independent.judge(*scene_of(point), 300_000)
     if not truth.why and truth.unsure <= 0.1 * RTOL:
         assert difference(answer, truth) <= RTOL, point
 
@@ -136,7 +136,7 @@ def test_designed_scenes(part: int) -> None:
         answer, why = ended(point)
         assert (answer is None) == bool(why)
         if answer is not None and answer.steps < 5000:
-            judge(point, answer, 200_000)
+            judge(point, answer)
             answered += 1
     assert answered >= 0.8 * len(points)
 
@@ -153,7 +153,7 @@ def test_to_the_end_of_an_axis(axis: str) -> None:
     for point in ends:
         answer, _ = ended(point)
         if answer is not None and answer.steps < 3000:
-            judge(point, answer, 100_000)
+            judge(point, answer)
 
 
 # ----------------------------------------------------------------------------------- the refusals

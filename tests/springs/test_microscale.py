@@ -202,7 +202,7 @@ def test_the_fraction_that_has_snapped_follows_its_two_laws() -> None:
 
 @pytest.mark.parametrize("spread", [1e-6, 1e-5])
 def test_a_narrow_snap_goes_on_at_the_stress_at_which_it_turned(spread: float) -> None:
-    """A digit of the stress is many ranks of it: what has snapped is known from the strain."""
+    """The last digit of the stress covers many ranks; the strain shows what has snapped."""
     spring = ff.MicroscaleSpring(2.5e6, 2.1e8, 1.09, 7.5e4, spread, 7.2e3, 0.46)
     for turn in np.linspace(0.1, 1.0, 50):
         there, _, again = spring.stress(np.array([turn, 0.99 * turn, turn]))

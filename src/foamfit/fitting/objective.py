@@ -122,9 +122,8 @@ class Objective:
         self.accelerated = self.drive == "impact" and self.measurement.acceleration is not None
         self.curves = (*CURVES, *((ACCELERATION,) if self.accelerated else ()), *self.interior)
         self.weights = checked_weights(self.weights, self.curves)
-        self._is_dashpot = np.array([name.endswith("eta") for name in self.model.names])
-        self._is_dashpot[-1] = False  # the onsite damper is none of a spring
-        self._dashpots = np.flatnonzero(self._is_dashpot)
+        self._dashpots = np.array([name.endswith("eta") for name in self.model.names])
+        self._dashpots[-1] = False  # site_eta belongs to no spring
         time = self.measurement.time
         self.time = np.arange(self.stress.size, dtype=float) if time is None else time
         self._fine = min(self.measurement.block, FINEST) if self.drive != "stress" else 1
@@ -347,7 +346,8 @@ class Objective:
 
     def _is_damped(self, values: Array, places: NDArray[np.int64]) -> bool:
         """Whether a spring has a dashpot, or a derivative by one is wanted."""
-        return bool(values[self._dashpots].any() or self._is_dashpot[places].any())
+        eta = self._dashpots
+        return bool(values[: eta.size][eta].any() or eta[places].any())
 
     def _nuisance_slope(self, values: Array, nuisance: Array, name: str) -> dict[str, Array]:
         """Derivative of the curves by one nuisance parameter.
@@ -413,11 +413,12 @@ class Objective:
         if along is None and (everything or "stress_strain" in self.counted) and self._along:
             along = run(self._followed(self._along[damped], at), False)
         by_site = np.flatnonzero(places == values.size - 1) if places.size else places
-        of = {"stress_time": (motion, None), "displacement_time": (shown, -1)}
-        of |= {name: (shown, node - 1) for name, node in self.interior.items()}
-        of |= {} if along is None else {"stress_strain": (along, None)}
+        runs = {"stress_time": (motion, None), "displacement_time": (shown, -1)}
+        runs |= {name: (shown, node - 1) for name, node in self.interior.items()}
+        if along is not None:
+            runs["stress_strain"] = along, None
         asked = set(self.curves).difference(self._absent) if everything else self.counted
-        parts = {name: _with_slopes(*of[name]) for name in of if name in asked}
+        parts = {name: _with_slopes(*runs[name]) for name in runs if name in asked}
         if ACCELERATION in asked:
             parts[ACCELERATION] = self._acceleration(shown, drag, at, by_site)
         curves, slopes = dict[str, Array](), dict[str, Array]()

@@ -39,8 +39,6 @@ def _listed(values: Any, name: str, wanted: str) -> tuple[Any, ...]:
 
 def padded(rows: Sequence[Array]) -> Array:
     """Rows of several lengths as one array, filled up with zeros."""
-    if len(rows) == 1:
-        return rows[0][None]
     out = np.zeros((len(rows), max(row.size for row in rows)))
     for line, row in zip(out, rows, strict=True):
         line[: row.size] = row

@@ -62,7 +62,7 @@ OF_STRAIN, OF_STIFFENING, OF_SOFTENING, OF_WEAKENING, CARRIED, PLAIN_CARRIED = 7
 # A step of Halley's method so small, in widths over which the law bends, is the last: what it
 # leaves is about its cube.
 NEAR = 3e-6
-ROUNDED = 1e-8  # Share of micro-springs that a digit of the stress may hide, at most.
+ROUNDED = 1e-8  # Largest such correction of a share, which rounding alone can explain.
 # The least stress that is sought: the least normal number.
 LEAST = 2.0**-1022
 _ROOT_HALF, _ROOT_TURN = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
@@ -373,7 +373,8 @@ def _enter(row: Row, state: Array, branch: int) -> None:
 def _hold(row: Row, state: Array, rank: float) -> None:
     """Hold a rank that has been reached.
 
-    A digit of the stress is many ranks of a narrow snap: the strain tells what has snapped.
+    In a narrow snap the last digit of the stress covers many ranks, so the share that has snapped
+    is corrected to agree with the strain.
     """
     (p, rest), sigma, never = shares(rank), state[SIGMA], state[NEVER]
     eps, _, _, on_main, _ = mixture(row, HELD, p, rest, never, sigma)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -39,7 +39,8 @@ ENOUGH_DRAWS, LEAST_DRAWS, MOST_DRAWS = 40, 100, 100_000
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
 # noise makes that much difference in one test of ten thousand, but there are many minima.
 HARDLY_WORSE = 2.0
-WIDTH = 1.0 - 1e-9  # the widths of an interval that are far outside of it, with rounding
+# A value is far if it lies so many widths of its interval outside of it: one, less rounding.
+FAR = 1.0 - 1e-9
 # Iterations of a refit one width outside of an interval; as many as for a profile where the
 # interval is local though the cost is not a parabola.
 ITERATIONS = 10
@@ -150,7 +151,7 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
                     methods[name] = "other minima"
     made, elsewhere = replace(made, ends=ends, methods=methods), dict[str, float]()
     for point, residual in () if best.misfits else minima:
-        elsewhere = dict(_far_values(best, made, point, float(residual @ residual))) | elsewhere
+        elsewhere = _far_values(best, made, point, residual) | elsewhere
     return replace(made, elsewhere=elsewhere)
 
 
@@ -161,22 +162,23 @@ def _interval(best: BestPoint, made: Intervals, name: str) -> tuple[float, float
 
 
 def _far_values(
-    best: BestPoint, made: Intervals, point: Array, cost: float
-) -> Iterator[tuple[str, float]]:
-    """Values of a point that lie a width outside of their intervals, if it fits hardly worse."""
-    cuts = best.quantiles**2 * best.spread.inflation
+    best: BestPoint, made: Intervals, point: Array, residual: Array
+) -> dict[str, float]:
+    """Return the values of a point that are far outside of their intervals, if it fits well."""
+    near, far = best.rises(residual) <= (HARDLY_WORSE * best.quantiles) ** 2, dict[str, float]()
     for name in best.known:
         there, (low, high) = float(point[best.index[name]]), _interval(best, made, name)
-        near = cost - best.cost <= HARDLY_WORSE**2 * cuts[best.names.index(name)]
-        if near and max(low - there, there - high) > WIDTH * (high - low):
-            yield name, there
+        outside = max(low - there, there - high)
+        if near[best.names.index(name)] and outside > FAR * (high - low):
+            far[name] = there
+    return far
 
 
 def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
     """Name values a whole width outside of an interval at which the curves fit hardly worse.
 
-    There a parabola has nine times the cut of the interval. The other parameters are refitted, and
-    those of them that come to lie as far outside of theirs are named too.
+    There a parabola has nine times the cut of the interval. The other parameters are refitted;
+    those that the refit moves as far outside of their own intervals are named too.
     """
     refit, elsewhere = Refit(best, tracker), dict(made.elsewhere)
     try:
@@ -194,10 +196,9 @@ def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
                 found = refit.run(start, (column, there), iterations=iterations)
                 if found is None:
                     continue
-                cut = best.quantiles[column] ** 2 * best.spread.inflation[column]
-                if found.cost - best.cost < -BETTER * cut:
+                if best.rises(found.residual)[column] < -BETTER * best.quantiles[column] ** 2:
                     return replace(made, better=found.point)
-                elsewhere = dict(_far_values(best, made, found.point, found.cost)) | elsewhere
+                elsewhere = _far_values(best, made, found.point, found.residual) | elsewhere
     except STOPPING as error:
         late = say("interval", "far", by=what_stopped(error))
         return replace(made, elsewhere=elsewhere, warnings=(*made.warnings, late))
