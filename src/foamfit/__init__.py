@@ -1,6 +1,6 @@
 """foamfit: identify the parameters of hysteretic bistable springs from impact tests on foams.
 
-Names are loaded when they are first used, so that the command starts fast.
+Each name is imported when it is first used, so that the command starts quickly.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The public fit: of one model, or of the simplest that follows the curves."""
+"""`foamfit.fit`: fit one model, or find the simplest model that describes the curves."""
 
 from __future__ import annotations
 
@@ -34,32 +34,32 @@ if TYPE_CHECKING:
 
 
 class FitResult(Shown, Fit):
-    """The result of a fit: parameters, intervals, curves and verdict."""
+    """Result of a fit: parameters, intervals, curves, status and warnings."""
 
     def plot(self, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
-        """Draw a panel, measured and fitted, into axes or into those of a new figure.
+        """Plot one panel, measured and fitted, into `ax` or into a new figure.
 
         `what` is "stress-strain", "stress-time" or "displacement-time". Returns the axes.
         """
         return draw_panel(self, ax, what)
 
     def table(self) -> pd.DataFrame:
-        """Return a row for each parameter, SI; the LaTeX of its `to_latex` compiles."""
+        """Return one row per parameter, in SI units; the output of its `to_latex` compiles."""
         return frame(self.parameters)
 
     @property
     def samples(self) -> xarray.Dataset | None:
-        """Samples of `intervals="mcmc"` as ArviZ takes them, SI; None if no chain was made.
+        """Samples of `intervals="mcmc"` in ArviZ's layout, SI units; None without a chain.
 
-        InputError if xarray is not installed.
+        Raises InputError if xarray is not installed.
         """
         about = {"test": self.measurement.name, "model": self.words}
         return dataset(self.draws, **about) if self.draws else None
 
     def _shown(self, *, html: bool = False) -> str:
         """Return status, model, misfit and parameters."""
-        told = ", ".join(f"{name} {percent(off)}" for name, off in compared(self).items())
-        line = f"{self.law}, {self.drive} drive · status {self.status} · misfit: {told or '–'}"
+        misfits = ", ".join(f"{name} {percent(misfit)}" for name, misfit in compared(self).items())
+        line = f"{self.law}, {self.drive} drive · status {self.status} · misfit: {misfits or '–'}"
         rows = [readable(name, p) for name, p in self.parameters.items() if p.state != "fixed"]
         return brief(self.measurement.name, line, rows, html)
 
@@ -71,14 +71,14 @@ class FitResult(Shown, Fit):
         figure_width: str = TWO,
         mapped: Mapped = map,
     ) -> Path:
-        """Write the result folder whole, replacing an older one at the end; returns it.
+        """Write the result folder and return its path; an older folder is replaced at the end.
 
-        Without `report` it has neither report.html nor figures. Its figure is "one" or "two"
-        columns wide, or as wide as a length ("85 mm"); with ", pdf" behind that all figures of the
-        report are written as PDF too, with ", untitled" they have no title. `mapped` draws the
-        figures, as the `map` of an executor does.
+        Without `report`, neither report.html nor figures are written. `figure_width` is "one" or
+        "two" columns, or a length ("85 mm"). Add ", pdf" to write every figure of the report as
+        PDF as well, and ", untitled" to omit the titles. `mapped` draws the figures; give the `map`
+        of an executor to draw them in parallel.
         """
-        inches(figure_width)  # refuses what is no width
+        inches(figure_width)  # rejects an invalid width
         drawn: Any = {"pages": report, "width": figure_width, "mapped": mapped}
         return save_whole(folder, partial(write_result, self, **drawn))
 
@@ -100,59 +100,60 @@ def fit(
     measurement : Measurement
         The test; see `foamfit.read_test`.
     model : str
-        Springs from the base up, joined by "+"; "auto" compares models and takes the simplest
-        that holds.
+        Springs from the base up, joined by "+"; "auto" compares models and selects the simplest
+        one that describes the curves.
     params : lmfit.Parameters, optional
         Values, bounds, fixed values and expressions; see `make_params`.
     progress : callable, optional
-        Called with the fraction done and the current step.
+        Called with the completed fraction and the name of the current step.
     tell : callable, optional
         Called with the expected run time of the intervals before they are computed.
     drive : str, optional
-        "impact", "stress" or "displacement"; by default what the test allows, in this order:
-        impact, displacement.
+        "impact", "stress" or "displacement"; by default "impact" if the test allows it, otherwise
+        "displacement".
     seed : int
-        Same test and seed give the same numbers.
+        The same test and seed give the same numbers.
     starts : int, optional
-        Descents of the search; by default 16 for each spring, 48 if several are hysteretic.
+        Number of start points of the search; by default 16 per spring, or 48 per spring if several
+        are hysteretic.
     max_time : float, optional
-        Seconds after which the best point so far is the result.
+        Time limit, s; when it is reached, the best point so far is returned.
     weights : mapping, optional
         Weight of each curve, by its name in `FitResult.misfit`.
     interior_mass : bool
-        Whether the specimen's mass is placed between the springs of a chain, in equal parts. By
-        default it is neglected, and the notes of the result say what it would change.
+        Whether to distribute the mass of the specimen equally between the springs of a chain. By
+        default it is neglected, and the notes of the result state its effect.
     time_shift : bool
-        Whether to fit how late the motion is against the force, as the parameter time_shift (s).
+        Whether to fit the delay of the motion relative to the force, time_shift (s).
     relaxation : int
-        Relaxation terms of every bistable and microscale spring: s1_g1, s1_tau1, …; model="auto"
-        tries one term by itself and refuses this.
+        Number of relaxation terms of every bistable and microscale spring: s1_g1, s1_tau1, ….
+        Not allowed with model="auto", which tries one term by itself.
     stiffening : bool
-        Whether branch a of every microscale spring stiffens as the test says: s1_stiffening.
+        Whether to fit the stiffening of branch a of every microscale spring: s1_stiffening.
     mullins : bool
-        Whether what has snapped once softens and weakens: s1_softening, s1_weakening.
+        Whether to fit softening and weakening after the first snap: s1_softening, s1_weakening.
     intervals : str
         Method of the 95 % intervals: "auto" (local covariance, and profiles of the parameters
         along which the cost is not parabolic and whose range is not wider), "local", "profile" or
         "mcmc".
     draws : int, optional
-        Steps of the Markov chain, by default 2000.
+        Number of steps of the Markov chain, by default 2000.
     priors : mapping, optional
-        What is known of parameters of the springs before the fit: mean and standard deviation of a
-        normal distribution, (5.5e6, 1e5) in SI or "5.5 ± 0.1 MPa". Each counts as one residual.
-        [priors] of the TOML are used too.
+        Normal prior distributions of spring parameters, as mean and standard deviation:
+        (5.5e6, 1e5) in SI units or "5.5 ± 0.1 MPa". Each counts as one residual. They are added to
+        [priors] of the TOML.
     watch : callable, optional
-        Called with the problem and the best parameters so far whenever these improve; it must be
-        quick.
+        Called with the problem and the best parameters whenever these improve; it must return
+        quickly.
     fix : mapping, optional
-        Parameters to hold at a value (SI), where `params` is not given.
+        Parameters to fix at a value (SI); not together with `params`.
     vary : sequence of str
-        Names of parameters to vary though they are held by default.
+        Names of parameters to vary that are fixed by default.
 
     Returns
     -------
     FitResult
-        If Ctrl-C or `max_time` ended the search, that of the best point found.
+        The best point found so far if Ctrl-C or `max_time` ended the search.
 
     Raises
     ------
@@ -161,7 +162,7 @@ def fit(
     InputError
         If the test cannot feed the drive or a parameter is unknown; the message names it.
     SimulationError
-        If no trial could be simulated.
+        If none of the trial parameters could be simulated.
     """
     if not isinstance(measurement, Measurement):
         raise InputError(
@@ -178,10 +179,10 @@ def fit(
     with at_first_use(model, chosen.relaxation) as compile_rest:
 
         def part(begin: float, end: float) -> Progress:
-            """Progress of a part of the work, between these shares of the whole."""
+            """Report the progress of a part of the work between two fractions of the whole."""
 
             def shown(share: float, what: str) -> None:
-                compile_rest()  # before the first trial, after what is wrong was refused
+                compile_rest()  # before the first simulation, after the arguments were checked
                 progress(begin + (end - begin) * share, what)
 
             return shown

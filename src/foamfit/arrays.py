@@ -1,4 +1,4 @@
-"""Types and means of arrays, and the threads of linear algebra."""
+"""Array types, means of parts of a signal, and the number of threads of linear algebra."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ _Result = TypeVar("_Result")
 
 
 def means(values: Array, starts: Integers) -> Array:
-    """Means of the parts of a signal that begin at `starts`."""
+    """Return the mean of each part of a signal; the parts begin at the indices `starts`."""
     return np.asarray(np.add.reduceat(values, starts) / np.diff(np.append(starts, len(values))))
 
 
 def single_threaded(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
-    """Make a function that runs linear algebra in one thread.
+    """Decorate a function so that its linear algebra runs in one thread.
 
-    The matrices are small: several threads wait for each other most of the time, on a busy machine
-    forty times as long as the work takes, and rounding depends on how many there are.
+    The matrices are small: several threads mostly wait for each other (forty times longer than
+    they work, on a busy machine), and the rounding depends on the number of threads.
     """
 
     @wraps(function)

@@ -1,9 +1,9 @@
-"""The simplest model that follows the curves, and the evidence for each that was tried.
+"""Model selection: find the simplest model that describes the curves.
 
-Models are fitted from the simplest up, each without damping and then with it. If one of them
-reaches the noise, AICc and BIC compare them, with the effective numbers of samples and parameters;
-otherwise their predictions of samples that were held back do (`trust.evidence`). The comparison
-ends where the residuals are random, or where two groups of models in a row bring no gain.
+Models are fitted from the simplest up, each without damping and then with damping. If a model
+reaches the noise floor, AICc and BIC compare the models, with effective numbers of samples and
+parameters; otherwise predictions of held-out samples compare them (`trust.evidence`). The
+comparison ends when the residuals are random, or after two groups of models without a gain.
 """
 
 from __future__ import annotations
@@ -39,10 +39,11 @@ from foamfit.trust.evidence import BLOCKS, MARGIN, SHARE, Tried, misfit_of, pred
 from foamfit.trust.intervals import Announce, Choice
 from foamfit.trust.residuals.residual_tests import BENT, find_structure, neighbours_test, runs_test
 
-# From the simplest up, in groups: one spring; a linear spring below it, or its relaxation (which
-# comes first but in an impact, where it takes longer); one that softens where it has snapped;
-# two springs; three; two that relax. More springs have more parameters (23 and more) than a loop
-# has features. Springs that remember take too long in three, others gain nothing in the last group.
+# Groups of models, from the simplest up: one spring; a linear spring below it, or relaxation (tried
+# first except in impacts, where it is slower); one spring that softens after snapping; two springs;
+# three springs; two springs with relaxation. Longer chains have more parameters (at least 23) than
+# a loop has features. Microscale springs are too slow in chains of three, and bistable springs gain
+# nothing in the last group.
 _OWN = [law.kind for law in map(laws.law, laws.PAPER) if law.hysteretic and not law.word]
 _SLOW = [kind for kind in _OWN if laws.law(kind).remembers]
 _QUICK = [kind for kind in _OWN if kind not in _SLOW]
@@ -58,7 +59,7 @@ LADDER = tuple(
         [(f"{kind}+{kind}", 1) for kind in _SLOW],
     )
 )
-# The same for several cycles as one history, of which a spring that forgets describes each alone.
+# Several cycles as one history: only springs with memory, as others repeat the same loop.
 HISTORY = (
     *((Model.parse(kind, 1),) for kind in _SLOW),
     *(
@@ -68,38 +69,38 @@ HISTORY = (
         if laws.law(kind).options
     ),
 )
-# The comparison ends after so many groups in a row without a gain.
+# Number of consecutive groups without a gain after which the comparison ends.
 WITHOUT_GAIN = 2
-# Chains with springs that remember, which take minutes in an impact, are not tried where one such
-# spring misses the curves by so many times more than one spring that does not.
+# Chains of springs with memory take minutes in an impact. They are skipped if the misfit of one
+# such spring exceeds the misfit of one spring without memory by more than this factor.
 HOPELESS = 1.1
-# Two of them take a minute even under a known motion: they are not tried where one, perhaps with
-# relaxation, misses the curves by no more than this share of the range.
+# Two of them take a minute even under a prescribed motion. They are skipped if the misfit of one,
+# with or without relaxation, is at most this fraction of the range.
 CLOSE = 0.01
-# Springs in series are not searched further where the first descents miss the curves by so many
-# times more than one spring: what follows them gains a fifth at most.
+# The search for springs in series stops if the misfit after the first descents exceeds the misfit
+# of one spring by more than this factor: later descents reduce it by at most a fifth.
 UNPROMISING = 1.5
-# Share of the time of a comparison after which only the chosen model is left to be judged.
+# Fraction of the run time that the comparison takes; the rest is for the selected model.
 CHOSEN = 0.9
-# While models are compared: only the chosen one gets ranges and better intervals, which cost as
-# much as a search.
+# Intervals while models are compared. Only the selected model gets ranges and better intervals,
+# which take as long as a search.
 COMPARED = Choice("local", ranges=False)
 
 
 class _UnpromisingError(Exception):
-    """Why a chain is not searched further."""
+    """The search for a chain was stopped early; the message says why."""
 
 
 def _dampers(params: lmfit.Parameters) -> list[str]:
-    """Return the names of the dampers that vary."""
+    """Return the names of the damping parameters that vary."""
     return [name for name in params if split_name(name)[1] == "eta" and params[name].vary]
 
 
 def _carry(params: lmfit.Parameters, model: Model, tried: Sequence[Tried]) -> None:
-    """Start from the best fit of a model that is contained in this one, top spring first; in place.
+    """Set the start values to the best fit of a model that this one contains; in place.
 
-    A new linear spring starts short and stiff and new relaxation with a share of zero, so that the
-    chain starts with the curves of that fit.
+    Springs are matched from the top. A new linear spring starts short and stiff, and a new
+    relaxation term with g = 0, so that the curves start as those of that fit.
     """
     inside = [
         one
@@ -135,11 +136,11 @@ def _carry(params: lmfit.Parameters, model: Model, tried: Sequence[Tried]) -> No
 def compare_models(
     measurement: Measurement, options: Options, progress: Progress, announce: Announce
 ) -> Fit:
-    """Fit ever richer models until one holds; this is `foamfit.fit` with model="auto".
+    """Fit richer and richer models until one describes the curves: `foamfit.fit`, model="auto".
 
-    The time limit is that of all models together; it and Ctrl-C keep what is done. All models have
-    local intervals, and states by these alone; only the chosen one has ranges and the intervals
-    that were asked for.
+    The time limit applies to all models together; after it, or after Ctrl-C, the finished fits are
+    compared. All models have local intervals and states derived from them; only the selected model
+    has ranges and the requested intervals.
     """
     state = _Comparison(measurement, options, progress)
     tried = state.tried
@@ -150,8 +151,8 @@ def compare_models(
             raise
         state.stopped = what_stopped(error)
     if not tried:
-        told = "; ".join(state.skipped)
-        raise SimulationError(f"{measurement.name}: no model could be tried: {told}")
+        reasons = "; ".join(state.skipped)
+        raise SimulationError(f"{measurement.name}: no model could be tried: {reasons}")
     best = evidence.choose(tried).best
     wanted = options.choice.method != "local" or tried[best].best.misfits
     if state.stopped is None and wanted:
@@ -161,33 +162,33 @@ def compare_models(
             progress(done, f"model chosen, {tried[best].name}: {what}")
 
         result, point = one_model.judge(state.fits[best], options.choice, announce, tell)
-        tried[best] = replace(tried[best], result=result, best=point)  # it may be a better point
+        tried[best] = replace(tried[best], result=result, best=point)  # it may have improved
     progress(1.0, "done")
     return _conclude(state)
 
 
 class _Comparison:
-    """The test and options of all models, what was tried, and what stopped the comparison."""
+    """State of a comparison: the models tried so far, those skipped, and why it ended."""
 
     def __init__(self, measurement: Measurement, options: Options, progress: Progress) -> None:
         self.measurement, self.progress = measurement, progress
         self.options = replace(options, drive=options.drive or choose_drive(measurement))
         self.began, limit = time.perf_counter(), options.max_time
         self.deadline = None if limit is None else time.monotonic() + limit
-        self.skipped: list[str] = []  # models that are not tried, and why
-        self.unpromising: list[Model] = []  # those of them whose first descents were poor
+        self.skipped: list[str] = []  # each skipped model with the reason
+        self.unpromising: list[Model] = []  # skipped because of poor first descents
         self.groups = self._models()
-        self.of, self.number = sum(map(len, self.groups)), 0  # models in all, and the present one
+        self.of, self.number = sum(map(len, self.groups)), 0  # number of models; current model
         self.tried: list[Tried] = []
-        self.fits: list[Found] = []  # of what was tried, in its order
+        self.fits: list[Found] = []  # same order as `tried`
         self.stopped: str | None = None
         self.ended = "there are no richer ones left to try"
 
     def _models(self) -> list[list[Model]]:
-        """Return the models that the test allows, in their groups.
+        """Return the groups of models that the test allows.
 
-        They have as many springs as heights are given, or one, and every mass whose motion was
-        measured; relaxation needs the time.
+        A model has one spring or as many as there are heights, and contains every mass whose motion
+        was measured; relaxation needs a time column.
         """
         test, groups = self.measurement, []
         heights, inside = test.specimen.heights, max(test.interior, default=0)
@@ -206,19 +207,19 @@ class _Comparison:
                 self._skip(model, why)
             groups += [allowed] if allowed else []
         if not groups:
-            told = "; ".join(self.skipped)
-            raise InputError(f"{test.name}: no model of the ladder fits this test: {told}")
+            reasons = "; ".join(self.skipped)
+            raise InputError(f"{test.name}: no model of the ladder fits this test: {reasons}")
         return groups
 
     def _skip(self, model: Model, why: str) -> bool:
-        """Note why a model is not tried, if there is a reason."""
+        """Record the reason why a model is skipped, if there is one; return whether there is."""
         if why:
             named = rung_name(model.name, "none", model.relaxation)
             self.skipped.append(f"{named}: {why}")
         return bool(why)
 
     def climb(self) -> None:
-        """Fit group after group until one model holds, two groups gain nothing, or time is up."""
+        """Fit the groups in turn until residuals are random, nothing is gained, or time is up."""
         idle = 0
         for group in self.groups:
             below = len(self.tried)
@@ -238,7 +239,7 @@ class _Comparison:
                 return
 
     def _family(self, model: Model) -> None:
-        """Fit one model without damping and, unless that is enough, with it."""
+        """Fit one model without damping and, unless its residuals are random, with damping."""
         dampings = ("without", "with") if _dampers(self._params(model)) else ("none",)
         for i, damping in enumerate(dampings):
             left = None if self.deadline is None else max(self.deadline - time.monotonic(), 1e-6)
@@ -247,7 +248,7 @@ class _Comparison:
                 return
             try:
                 one = self._fit(model, damping, left, i / len(dampings), 1.0 / len(dampings))
-            except (_UnpromisingError, SimulationError) as error:  # a dashpot would not help
+            except (_UnpromisingError, SimulationError) as error:  # damping would not help
                 self.unpromising += [model] if isinstance(error, _UnpromisingError) else []
                 self._skip(model, str(error).removeprefix(f"{self.measurement.name}: "))
                 return
@@ -263,7 +264,11 @@ class _Comparison:
     def _fit(
         self, model: Model, damping: str, left: float | None, before: float, part: float
     ) -> Tried:
-        """Fit one model with or without damping; `before` and `part` are shares of its work."""
+        """Fit one model with or without damping.
+
+        `before` and `part` are the fractions of the work for this model done before, and by, this
+        fit.
+        """
         began, params = time.perf_counter(), self._params(model)
         _carry(params, model, self.tried)
         if damping == "without":
@@ -286,7 +291,7 @@ class _Comparison:
         return Tried(result, damping, best, time.perf_counter() - began, predicted)
 
     def _look(self, problem: Problem, values: Array) -> None:
-        """End the fit of a chain whose first descents are far worse than the best of one spring."""
+        """Stop the fit of a chain if its first descents are far worse than one spring."""
         alone = [one for one in self.tried if len(Model.parse(one.result.model).kinds) == 1]
         objective = problem.objective
         found = misfit_of(objective, objective.residual(values))
@@ -299,10 +304,10 @@ class _Comparison:
 
 
 def _hopeless(model: Model, tried: Sequence[Tried], unpromising: Sequence[Model] = ()) -> str:
-    """Say why a model that takes long cannot win; "" where it may, and of others."""
+    """Return why a slow model need not be tried, or "" if it is to be tried."""
 
     def least(kinds: Sequence[str], most: float = math.inf) -> tuple[float, str]:
-        """Misfit of one spring of these kinds with no more relaxation terms, in words too."""
+        """Return the least misfit of one spring of these kinds, also as a sentence."""
         alone = (t for t in tried if t.result.model in kinds and t.result.relaxation <= most)
         found = min(alone, key=lambda one: one.misfit, default=None)
         if found is None:
@@ -330,7 +335,7 @@ def _hopeless(model: Model, tried: Sequence[Tried], unpromising: Sequence[Model]
 
 
 def _has_gained(tried: Sequence[Tried], below: int) -> bool:
-    """Whether one of the last models is chosen, or AICc or BIC strongly prefers one."""
+    """Return whether a model from index `below` on is selected or strongly preferred."""
     if below == 0:
         return True
     decision = evidence.choose(tried)
@@ -342,11 +347,11 @@ def _has_gained(tried: Sequence[Tried], below: int) -> bool:
     )
 
 
-# ---------------------------------------------------------------- what it says
+# ---------------------------------------------------------------- the result
 
 
 def _conclude(state: _Comparison) -> Fit:
-    """Return the result of the chosen model with the whole comparison."""
+    """Return the result of the selected model, with the comparison as its `ladder`."""
     tried, stopped = state.tried, state.stopped
     decision = evidence.choose(tried)
     best, criteria = tried[decision.best], decision.criteria
@@ -396,7 +401,7 @@ def _conclude(state: _Comparison) -> Fit:
 
 
 def _rung(i: int, tried: Sequence[Tried], decision: evidence.Decision) -> Rung:
-    """Return what was found of the `i`-th model, and why it was chosen or not."""
+    """Return the row of model `i` in the comparison, with the reason for its rank."""
     one, best, result = tried[i], tried[decision.best], tried[i].result
     found, chosen = decision.criteria[i], decision.criteria[decision.best]
     before, ruler = (
@@ -435,5 +440,5 @@ def _rung(i: int, tried: Sequence[Tried], decision: evidence.Decision) -> Rung:
 
 
 def _signed(value: float) -> str:
-    """Write a difference of AICc or BIC; AICc is not defined with too few effective samples."""
+    """Format a difference of AICc or BIC; AICc is undefined with too few effective samples."""
     return text.signed(value, 1) if math.isfinite(value) else "not defined"

@@ -1,6 +1,6 @@
-"""Results as plain types and back: by the fields and types of their dataclasses.
+"""Convert results to plain JSON types and back, by the fields and types of their dataclasses.
 
-An array that is a column of a table beside the JSON is a reference to it, `{"column": name}`.
+An array that is also a column of the CSV file is stored as a reference, `{"column": name}`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 @contextmanager
 def reading(what: str) -> Iterator[None]:
-    """Say in one sentence what is wrong with a result that is read in the body, as InputError."""
+    """Turn errors of reading a result in the body into an InputError of one sentence."""
     try:
         yield
         return
@@ -40,9 +40,9 @@ def reading(what: str) -> Iterator[None]:
 
 
 def encode(value: Any, columns: Columns | None = None) -> Any:
-    """Return a value in the types of JSON, dataclasses as objects of their fields.
+    """Return a value in JSON types; a dataclass becomes an object of its fields.
 
-    A number that is not finite is its name, or None where there are no columns.
+    A number that is not finite becomes its name, or None without `columns`.
     """
     if hasattr(value, "valuesdict"):  # lmfit's parameters, whose own writer pickles functions
         every = {
@@ -71,7 +71,7 @@ def encode(value: Any, columns: Columns | None = None) -> Any:
 
 
 def decode(hint: Any, value: Any, columns: Columns) -> Any:
-    """Return what `encode` has made of a value of a type; `build` says what is raised."""
+    """Invert `encode` for a value of type `hint`; raises the errors of `build`."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         arms = [arm for arm in inner if arm is not type(None)]
@@ -104,10 +104,10 @@ def decode(hint: Any, value: Any, columns: Columns) -> Any:
 
 
 def build(made: type, content: Mapping[str, Any], columns: Columns, **names: Any) -> Any:
-    """Make a dataclass of its encoded fields; one that has a default may be missing.
+    """Make a dataclass from its encoded fields; fields with a default may be missing.
 
-    `names` are those in its annotations that its module imports for typing alone. What is missing
-    or not as the dataclass says raises KeyError, TypeError, ValueError or AttributeError.
+    `names` are the names in its annotations that its module imports for typing only. Raises
+    KeyError, TypeError, ValueError or AttributeError if a field is missing or invalid.
     """
     hints = get_type_hints(made, localns=names)
     given = {}
@@ -129,7 +129,7 @@ def _parameters(params: Any, content: Mapping[str, Any]) -> Any:
 
 
 def _finite_or_not(value: Any) -> Any:
-    """Return plain types with numbers in place of their names."""
+    """Replace the names of numbers that are not finite by the numbers."""
     if isinstance(value, Mapping):
         return {key: _finite_or_not(item) for key, item in value.items()}
     if isinstance(value, list):

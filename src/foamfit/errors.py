@@ -7,10 +7,10 @@ from contextlib import contextmanager
 
 
 class InputError(ValueError):
-    """A file, key, column, option or argument is wrong; the message says what would be right.
+    """A file, key, column, option or argument is wrong; the message says how to correct it.
 
-    Any other ValueError (numpy's LinAlgError, say) is a defect of foamfit. The command prints
-    `lines`, which a user may copy into a file, below the message.
+    Any other ValueError (such as numpy's LinAlgError) is a defect of foamfit. The command prints
+    `lines` below the message, for the user to copy into a file.
     """
 
     def __init__(self, message: str = "", lines: Sequence[str] = ()) -> None:
@@ -20,7 +20,7 @@ class InputError(ValueError):
 
 @contextmanager
 def naming(path: object) -> Iterator[None]:
-    """Name the file that is wrong at the beginning of an InputError of the body."""
+    """Put the path of the file in front of an InputError raised by the body."""
     try:
         yield
     except InputError as error:
@@ -28,14 +28,14 @@ def naming(path: object) -> Iterator[None]:
 
 
 class SimulationError(RuntimeError):
-    """A simulation cannot go on; the message says why. A simulation never returns NaN instead."""
+    """A simulation cannot continue; the message says why. Simulations never return NaN."""
 
 
 @contextmanager
 def as_signalled() -> Iterator[None]:
-    """Raise Ctrl-C, or the end by a signal, as itself.
+    """Raise KeyboardInterrupt where Python has turned it into a SystemError.
 
-    Python turns it into a SystemError if it comes while a compiled loop returns its result.
+    This happens if Ctrl-C or a signal arrives while a compiled loop returns its result.
     """
     try:
         yield

@@ -1,7 +1,7 @@
-"""Write a whole file or a whole folder, or nothing.
+"""Write files and folders atomically.
 
-Each is written under a temporary name beside its place, which names the process, and moved there at
-the end. What a killed process leaves is removed by the next one that writes to the same place.
+Each is written under a temporary name, which contains the process, and renamed at the end. Files
+left by a killed process are removed by the next process that writes to the same path.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from uuid import uuid4
 from foamfit.errors import InputError
 
 _HOST = re.sub(r"[^\w-]", "-", platform.node())[:40] or "host"
-# Marks this process; another one may have its number later, or in another container.
+# Identifies this process: its number may be used again later, or in another container.
 _TOKEN = uuid4().hex[:8]
-# Age, s, at which a temporary file of a process that cannot be checked counts as abandoned.
+# Age, s, after which a temporary file counts as abandoned if its process cannot be checked.
 _ABANDONED = 86400.0
-_LARGEST = 2**30  # bytes of a file that is read whole
+_LARGEST = 2**30  # bytes of the largest file that is read
 
 
 def check_file(path: Path) -> None:
-    """Raise InputError if a file could not be written."""
+    """Raise InputError if a file cannot be written."""
     try:
         if path.is_dir():
             raise InputError(f"{path} is a folder; name a file")
@@ -47,7 +47,7 @@ def check_file(path: Path) -> None:
 
 
 def read_whole(path: Path, most: int | None = None) -> bytes:
-    """Read a file or a pipe, or its first bytes; OSError for a device, which may have no end."""
+    """Read a file or a pipe, or its first `most` bytes; OSError for a device (may be endless)."""
     with path.open("rb") as file:
         mode = os.fstat(file.fileno()).st_mode
         if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
@@ -59,7 +59,7 @@ def read_whole(path: Path, most: int | None = None) -> bytes:
 
 
 def write_file(path: str | Path, content: bytes) -> None:
-    """Write a whole file; InputError if that fails, and an older file stays."""
+    """Write a file; if that fails, raise InputError and keep the older file."""
     path = Path(path)
     try:
         if path.exists() and not path.is_file():  # a device or a pipe
@@ -75,7 +75,7 @@ def write_file(path: str | Path, content: bytes) -> None:
 
 
 def csv_bytes(rows: Iterable[Iterable[object]]) -> bytes:
-    """Return rows of cells as CSV; an apostrophe keeps a spreadsheet from running a formula."""
+    """Return rows of cells as CSV, with an apostrophe before text that looks like a formula."""
     text = io.StringIO(newline="")
     csv.writer(text, lineterminator="\n").writerows(map(_harmless, row) for row in rows)
     # A non-UTF-8 name keeps its bytes as an escape.
@@ -94,11 +94,11 @@ def _harmless(cell: object) -> object:
 
 @contextmanager
 def replacing(target: Path, *, folder: bool = True, swept: bool = False) -> Iterator[Path]:
-    """Give a path beside `target` (resolved) to write to, which replaces it at the end.
+    """Give the body a temporary path that replaces `target` (a resolved path) at the end.
 
-    It is an empty `folder`, or else a file that the body makes. A caller that writes many folders
-    into one has it `swept` once: sweeping for each would take a time that grows with the square of
-    their number.
+    The path is an empty `folder`, or else a file that the body creates. A caller that writes many
+    folders into one calls `sweep` once and passes `swept`: the time to sweep for each folder would
+    grow with the square of their number.
     """
     made = [parent for parent in target.parents if not parent.exists()]
     fresh, old = _beside(target, "new"), _beside(target, "old")
@@ -111,7 +111,7 @@ def replacing(target: Path, *, folder: bool = True, swept: bool = False) -> Iter
         if folder and target.exists():
             target.rename(old)
         fresh.replace(target)
-    except BaseException:  # KeyboardInterrupt too must leave everything as it was
+    except BaseException:  # also after KeyboardInterrupt the old content must stay
         if old.exists() and not target.exists():
             old.rename(target)
         _remove(fresh)
@@ -120,12 +120,12 @@ def replacing(target: Path, *, folder: bool = True, swept: bool = False) -> Iter
                 parent.rmdir()
         raise
     finally:
-        if target.exists():  # else the old one is the last copy
+        if target.exists():  # otherwise the old content is the only copy
             _remove(old)
 
 
 def _remove(path: Path) -> None:
-    """Remove a file or a folder as far as the system allows."""
+    """Remove a file or a folder, ignoring errors."""
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -134,18 +134,18 @@ def _remove(path: Path) -> None:
 
 
 def reason(error: BaseException) -> str:
-    """Return why a file could not be read or written, in the system's words."""
+    """Return the operating system's message for a failed access to a file."""
     return getattr(error, "strerror", None) or str(error)
 
 
 def _beside(path: Path, ending: str) -> Path:
-    """Return a temporary name beside a path."""
+    """Return a temporary path in the same folder."""
     owner = f"{_HOST}.{os.getpid()}.{_TOKEN}{uuid4().hex[:8]}"
     return path.with_name(f".{_short(path.name)}.{owner}.{ending}")
 
 
 def _short(name: str) -> str:
-    """Return a name to which an ending can be added: its own if that is short enough."""
+    """Return the name, shortened if the file system may not accept it with a suffix."""
     raw = os.fsencode(name)
     return name if len(raw) <= 100 else f"{name[:20]}~{hashlib.sha256(raw).hexdigest()[:12]}"
 
@@ -158,14 +158,14 @@ _LEFT = re.compile(
 
 
 def is_left(name: str) -> bool:
-    """Whether a name is a temporary one of foamfit."""
+    """Return whether a name is a temporary name of foamfit."""
     return _LEFT.fullmatch(name) is not None
 
 
 def sweep(folder: Path, names: Iterable[str]) -> None:
-    """Remove what ended processes left of these files and folders in a folder.
+    """Remove temporary versions of these files and folders that ended processes have left.
 
-    An older result that one of them had moved aside goes back if nothing is in its place.
+    An older result that had been renamed is restored if nothing has taken its place.
     """
     if not folder.is_dir():
         return
@@ -183,9 +183,9 @@ def sweep(folder: Path, names: Iterable[str]) -> None:
 
 
 def _lives(found: re.Match[str], left: Path) -> bool:
-    """Whether the process that made a temporary file may still run."""
+    """Return whether the process that made a temporary file may still be running."""
     process = int(found["process"])
-    # A process of another machine cannot be asked, nor one of a system without POSIX signals.
+    # Processes of another machine, or on a system without POSIX signals, cannot be checked.
     if found["host"] != _HOST or os.name != "posix":
         with suppress(OSError):
             return time.time() - left.stat().st_mtime < _ABANDONED
@@ -196,6 +196,6 @@ def _lives(found: re.Match[str], left: Path) -> bool:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except OSError:  # another user's
+    except OSError:  # it belongs to another user
         pass
     return True

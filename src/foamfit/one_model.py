@@ -1,4 +1,4 @@
-"""The fit of one model: search, refinement by lmfit, intervals, and the best point ever seen."""
+"""The fit of one model: search, refinement by lmfit, intervals and result."""
 
 from __future__ import annotations
 
@@ -42,30 +42,26 @@ from foamfit.trust.intervals import Announce, Choice, assess, evaluations_of
 from foamfit.trust.ranges import Open, left_open
 
 Progress = Callable[[float, str], None]
-# Called with the problem and the best point so far, many times a second, so it must be quick; or
-# with that of the first descents: what it then raises ends the fit.
+# Called with the problem and the best point, many times a second, so it must be quick. `look` of
+# `identify` has the same type; it is called once, after the first descents, and may raise.
 Watch = Callable[[Problem, Array], None]
 
-# Descents of the search for each spring, for each of several hysteretic springs in series, and at
-# most in all.
+# Start points per spring, per spring if several are hysteretic, and the largest number in all.
 STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 48, 100_000
-# Steps of a Markov chain.
-DRAWS = 2000
-# Evaluations that the default spends on profiles, and on ranges, over those of the search; and how
-# often it continues from a better point found on the way.
+DRAWS = 2000  # default number of steps of a Markov chain
+# Budget of the profiles, and of the ranges, as a multiple of the evaluations of the search, and the
+# largest number of restarts from a better point found by either.
 PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
-# Beyond this share of the search's evaluations the fit does not continue from a better point,
-# unless intervals were asked for.
+# Such a restart must begin within this multiple of the evaluations of the search, unless the user
+# has chosen a method for the intervals.
 TOGETHER = 0.8
-# Ranges are made again from a better point whose cost is below this share of the one before.
+# Ranges are computed again if a better point has less than this fraction of the cost.
 MOVED = 0.999
-# Measured evaluations of ranges and profiles over those of the search: with an error of the law,
-# and at the noise.
+# Evaluations that ranges and profiles usually need, as a multiple of those of the search: with an
+# error of the law, and at the noise floor.
 JUDGED, JUDGED_NOISE = 2.0, 0.15
-# How often the covariance of a driving motion is computed.
-WEIGHED = 2
-# Share of the time of a fit that the search takes.
-SEARCHED = 0.5
+WEIGHED = 2  # number of times that the covariance of a driving motion is computed
+SEARCHED = 0.5  # fraction of the run time that the search takes
 
 
 class Keywords(TypedDict, total=False):
@@ -91,9 +87,9 @@ class Keywords(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Options:
-    """How a test is fitted, whatever the model; see `foamfit.fit` for each.
+    """Options of a fit that do not depend on the model; `foamfit.fit` describes each of them.
 
-    Raises InputError if one is not admissible; the message names it.
+    Raises InputError for an inadmissible value; the message names the option.
     """
 
     drive: str | None = None
@@ -115,7 +111,7 @@ class Options:
 
     @classmethod
     def of(cls, function: str, given: Mapping[str, Any]) -> Options:
-        """Take the keywords of a function; TypeError names it and one that it does not have."""
+        """Make options from the keyword arguments of `function`; TypeError for an unknown one."""
         for name in given.keys() - cls.__dataclass_fields__.keys():
             near = difflib.get_close_matches(name, cls.__dataclass_fields__, 1)
             meant = f"; did you mean {near[0]!r}?" if near else ""
@@ -123,7 +119,7 @@ class Options:
         return cls(**given)
 
     def __post_init__(self) -> None:
-        """Refuse inadmissible values."""
+        """Reject inadmissible values."""
         for name, least, most in (("seed", 0, math.inf), ("starts", 1, MOST_STARTS)):
             value = getattr(self, name)
             whole = isinstance(value, Integral) and least <= int(value) <= most
@@ -147,17 +143,17 @@ class Options:
 
     @property
     def choice(self) -> Choice:
-        """Which intervals are wanted."""
+        """The method of the intervals."""
         draws = DRAWS if self.draws is None else self.draws
         return Choice(self.intervals, draws, self.seed)
 
     @property
     def of_springs(self) -> dict[str, bool]:
-        """Options that free more parameters of some springs."""
+        """The options that free further parameters of some springs."""
         return {name: getattr(self, name) for name in OPTIONS}
 
     def check(self, measurement: Measurement, model: str) -> None:
-        """Refuse what the test or the model does not allow, before anything is simulated."""
+        """Reject options that the test or the model does not allow, before any simulation."""
         if self.time_shift:
             check_time_shift(measurement, self.drive or choose_drive(measurement))
         if model == "auto":
@@ -166,7 +162,7 @@ class Options:
             self.params(measurement, model)
 
     def check_auto(self, **given: object) -> None:
-        """Refuse what belongs to one model where models are compared; `given` may be that too."""
+        """Reject options of a single model, and those in `given`, if models are to be compared."""
         own = ("priors", self.priors), ("fix and vary", self.fix or self.vary)
         for name, value in (*given.items(), *own):
             if value:
@@ -179,7 +175,7 @@ class Options:
         with_options("auto", **self.of_springs)
 
     def params(self, measurement: Measurement, model: str) -> lmfit.Parameters | None:
-        """Return the parameters as `fix` and `vary` want them; None where nothing is asked."""
+        """Return the parameters with `fix` and `vary` applied; None without either."""
         if not (self.fix or self.vary):
             return None
         more: dict[str, Any] = {"time_shift": self.time_shift, "relaxation": self.relaxation}
@@ -189,7 +185,7 @@ class Options:
     def problem(
         self, measurement: Measurement, model: str, params: lmfit.Parameters | None = None
     ) -> Problem:
-        """Set up the fit of one model."""
+        """Return the problem of fitting one model."""
         params = self.params(measurement, model) if params is None else params
         model = with_options(model, **self.of_springs)
         return make_problem(
@@ -207,14 +203,17 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a search has found: the problem, its best point (in the tracker), and how it went."""
+    """Outcome of a search: the problem, the tracker with the best point, and the record."""
 
     problem: Problem
     tracker: Tracker
     record: SearchRecord
 
     def best(self) -> BestPoint:
-        """Return the best point, springs in order, parameters within rounding of a limit on it."""
+        """Return the best point, with its springs in order.
+
+        Parameters within rounding of a limit are moved onto it.
+        """
         problem, space, cost = self.problem, self.problem.space(), self.tracker.best_cost
         assert self.tracker.best_values is not None  # checked by identify
         values = in_order(space, problem.objective, self.tracker.best_values) + 0.0  # no -0
@@ -228,9 +227,9 @@ class Found:
         best = BestPoint(problem, values)
         if np.array_equal(moved, values):
             return best
-        there = BestPoint(problem, moved)
+        at_limits = BestPoint(problem, moved)
         try:
-            return there if there.cost <= cost + 1e-6 * (1.0 + cost) else best
+            return at_limits if at_limits.cost <= cost + 1e-6 * (1.0 + cost) else best
         except SimulationError:
             return best
 
@@ -243,7 +242,7 @@ def identify(
     progress: Progress,
     look: Watch | None = None,
 ) -> Found:
-    """Search and refine; see `foamfit.fit` for the arguments and the errors."""
+    """Search for the best point and refine it; `foamfit.fit` describes arguments and errors."""
     began = time.perf_counter()
     problem = options.problem(measurement, model, params)
     each = STARTS_IN_SERIES if has_several(problem.model) else STARTS
@@ -270,7 +269,7 @@ def identify(
 def judge(
     found: Found, choice: Choice, announce: Announce, progress: Progress = lambda *_: None
 ) -> tuple[Fit, BestPoint]:
-    """Compute the chosen intervals (and ranges), and the result of the best point."""
+    """Compute intervals, ranges and result of the best point."""
     try:
         with as_signalled():
             best, record, intervals = found.best(), found.record, Intervals()
@@ -279,14 +278,14 @@ def judge(
                 best, record, intervals = _assess(found, best, choice, announce)
             found.problem.put(best.values)
             return conclude(best, record, intervals), best
-    except KeyboardInterrupt as error:  # a late Ctrl-C keeps what was found
+    except KeyboardInterrupt as error:  # a late Ctrl-C keeps the best point
         best = found.best()
         found.problem.put(best.values)
         return conclude(best, replace(found.record, stopped=what_stopped(error))), best
 
 
 def _pulse(found: Found, best: BestPoint, choice: Choice, progress: Progress) -> Callable[[], None]:
-    """Report the evaluations done over those that ranges and intervals are expected to take."""
+    """Return a function that reports the progress of ranges and intervals by evaluations."""
     objective, spent = found.problem.objective, found.problem.objective.evaluations
     share = JUDGED if choice.ranges and best.misfits else JUDGED_NOISE
     expected = max(share * spent, 1.0) + evaluations_of(best, choice)
@@ -297,23 +296,23 @@ def _pulse(found: Found, best: BestPoint, choice: Choice, progress: Progress) ->
 def _assess(
     found: Found, best: BestPoint, choice: Choice, announce: Announce
 ) -> tuple[BestPoint, SearchRecord, Intervals]:
-    """Compute the intervals; where these find a better point, continue from there."""
+    """Compute ranges and intervals; if they find a better point, start again from it."""
     problem, tracker, record = found.problem, found.tracker, found.record
     budget = PROFILE_SHARE * problem.objective.evaluations
     enough = (1.0 + TOGETHER) * problem.objective.evaluations
     enough = enough if choice.method in ("auto", "local") else math.inf
-    left, there = Open(), math.inf
+    left, cost_of_ranges = Open(), math.inf
     for _ in range(IMPROVEMENTS + 1):
         if not best.names or problem.objective.evaluations > enough:
             break
         before = tracker.best_cost
         try:
             better = None
-            # The ranges of the point before do not hold here.
-            if choice.ranges and best.cost < MOVED * there:
-                other = choice.method != "local"  # local intervals are those of this minimum
+            # Ranges of the previous point are not valid here.
+            if choice.ranges and best.cost < MOVED * cost_of_ranges:
+                other = choice.method != "local"  # local intervals belong to this minimum
                 left = left_open(best, tracker.ends, tracker, budget, other)
-                better, there = left.better if other else None, best.cost
+                better, cost_of_ranges = left.better if other else None, best.cost
             made = Intervals(better=better)
             if better is None:
                 minima = [*tracker.ends, *left.minima]
@@ -333,7 +332,7 @@ def _assess(
 def _search(
     problem: Problem, tracker: Tracker, record: SearchRecord, progress: Progress
 ) -> SearchRecord:
-    """Search, then refine by lmfit; returns the record with its costs and what stopped it."""
+    """Search, then refine by lmfit; return the record with the costs and the reason of a stop."""
     rng = np.random.default_rng(record.seed)
     try:
         costs = search(tracker, problem.space(), starts=record.starts, rng=rng, progress=progress)
@@ -356,8 +355,7 @@ def _search(
 def _refine(problem: Problem, tracker: Tracker) -> None:
     """Refine the best point by lmfit's least_squares in the physical parameters.
 
-    Parameters on branches that the best point never reaches do not change the curves; they are held
-    for the refinement.
+    Parameters of branches that the best point never reaches do not change the curves and are fixed.
     """
     if tracker.best_values is None:
         return
@@ -380,7 +378,7 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
     def jacobian(p: lmfit.Parameters) -> Array:
         return problem.slopes(problem.vector(p), names)
 
-    with warnings.catch_warnings():  # of its covariance, which is not used
+    with warnings.catch_warnings():  # about lmfit's covariance, which is not used
         warnings.simplefilter("ignore", RuntimeWarning)
         ends = {"ftol": 1e-10, "xtol": 1e-10, "gtol": 1e-12, "max_nfev": 60}
         more = {"jac": jacobian, "x_scale": best.sizes} | ends
@@ -390,12 +388,12 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
 def weigh_motion(problem: Problem, tracker: Tracker) -> None:
     """Weight the residual by the covariance due to the motion's own uncertainty, and refine.
 
-    The covariance depends on the best point, so this is done twice.
+    The covariance depends on the best point, so this is repeated.
     """
     for _ in range(WEIGHED):
         best = tracker.best_values
         if best is None or not problem.objective.weigh_motion(best):
             return
-        tracker.best_values, tracker.best_cost = None, math.inf  # costs count by other weights now
+        tracker.best_values, tracker.best_cost = None, math.inf  # the weights have changed
         tracker.consider(best)
         _refine(problem, tracker)

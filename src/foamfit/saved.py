@@ -1,4 +1,4 @@
-"""A result folder read back: what `foamfit.load` returns."""
+"""`foamfit.load`: read a result folder."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
 
 
 def load(folder: str | Path) -> FitResult | SavedJoint | CycleFits | pd.DataFrame:
-    """Return what was saved in the folder of a fit, of a joint fit, of cycles or of a batch.
+    """Return the result in the folder of a fit, a joint fit, several cycles or a batch.
 
-    It is the same as was saved, and is saved again to the same; of a batch its summary, as
-    `foamfit.batch` returns it.
+    It equals the result that was saved, and saving it again writes the same files. For a batch it
+    is the summary that `foamfit.batch` returns.
 
     Raises
     ------
     InputError
-        If there is no result of this version's format, or a file of it is damaged.
+        If there is no result in the format of this version, or one of its files is damaged.
     """
     place = Path(folder)
     if not place.is_dir():
@@ -73,7 +73,7 @@ def _fit(folder: Path) -> FitResult:
 
 
 def _columns(path: Path, samples: object) -> dict[str, Array]:
-    """Read curves.csv, which must have so many rows."""
+    """Read curves.csv, which must have `samples` rows."""
     try:
         head, *lines = read_whole(path).decode(errors="replace").splitlines() or [""]
     except OSError as error:
@@ -90,7 +90,7 @@ def _columns(path: Path, samples: object) -> dict[str, Array]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SavedJoint(JointViews):
-    """A joint fit read back; its fields are as joint.json has them."""
+    """A joint fit read from its folder; the fields are those of joint.json."""
 
     name: str
     model: str
@@ -99,14 +99,14 @@ class SavedJoint(JointViews):
     sentences: tuple[str, ...]
     tests: tuple[str, ...]
     rates: tuple[float | None, ...]  #: Mean strain rate on loading of each test, 1/s
-    rate0: float | None  #: That of the median test
-    parameters: dict[str, JointParameter]  #: SI; values by test are in `tests` of each
-    results: dict[str, FitResult]  #: Of each test at the joint fit
+    rate0: float | None  #: Rate of the median test, 1/s
+    parameters: dict[str, JointParameter]  #: SI; `tests` of each has its values by test
+    results: dict[str, FitResult]  #: Result of each test at the joint fit
     content: dict[str, Any]  #: All of joint.json
 
     @property
     def loops(self) -> tuple[Loop, ...]:
-        """The loop of each test, measured and fitted."""
+        """The measured and fitted loop of each test."""
         found = ((name, one.loop) for name, one in self.results.items())
         return tuple(loop._replace(name=name) for name, loop in found if loop is not None)
 
@@ -117,7 +117,7 @@ class SavedJoint(JointViews):
         return self.content
 
     def test_fits(self) -> Iterator[FitResult]:
-        """Give the result of each test, in the order of `tests`."""
+        """Iterate over the results of the tests, in the order of `tests`."""
         return map(self.results.__getitem__, self.tests)
 
 

@@ -1,4 +1,4 @@
-"""A scene file: any chain under any drive, for the forward run of the command."""
+"""Scene files: a chain and a drive, read for `foamfit simulate`, and the CSV of the response."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from foamfit.springs.spring import Spring
 
 Made = TypeVar("Made")
 
-_UNITS = {  # key: SI unit and an example, of what is no parameter of a spring
+_UNITS = {  # SI unit and example of each key that is not a parameter of a spring
     "mass": ("kg", "7 g"),
     "velocity": ("m/s", "1.75 m/s"),
     "gravity": ("m/s**2", "9.81 m/s^2"),
@@ -35,24 +35,24 @@ _UNITS = {  # key: SI unit and an example, of what is no parameter of a spring
     "end": ("s", "1 ms"),
 }
 _MOST_SAMPLES = 1_000_000
-# The table of a response begins with these columns.
+# First columns of the CSV of a response.
 RESPONSE = "time (s),base stress (Pa),strain"
 
 
 @dataclass(frozen=True)
 class _Part:
-    """A table of the scene, and where it stands."""
+    """A table of the scene file, and its place for messages."""
 
     where: str
     table: dict[str, Any]
 
     def only(self, *keys: str) -> _Part:
-        """Refuse other keys."""
+        """Reject all other keys."""
         check_keys(self.where, self.table, list(keys))
         return self
 
     def number(self, key: str, param: Param | None = None, default: float | None = None) -> float:
-        """Read a quantity, SI; InputError if it is missing and has no default."""
+        """Return a quantity in SI units; InputError if it is missing and has no default."""
         if key not in self.table and default is not None:
             return default
         if param is None:
@@ -68,14 +68,14 @@ class _Part:
         return parse_quantity(value, unit, f"{self.where} {key}", example)
 
     def made(self, make: Callable[..., Made], *given: Any, **named: Any) -> Made:
-        """Make a part of the scene; a refusal names where its numbers stand."""
+        """Call `make`; an InputError names the place in the file."""
         try:
             return make(*given, **named)
         except InputError as error:
             raise InputError(f"{self.where} {error}.") from None
 
     def parts(self, key: str, name: str, wrong: str) -> list[_Part]:
-        """Return the tables of a list, numbered from 1; raise InputError if it is not a list."""
+        """Return the tables of a list, numbered from 1; InputError if it is not a list."""
         given = self.table.get(key, [])
         if not isinstance(given, list) or not all(isinstance(one, dict) for one in given):
             raise InputError(f"{self.where} {wrong}.")
@@ -83,14 +83,14 @@ class _Part:
 
 
 def read_scene(path: Path) -> tuple[Chain, Drive, Array]:
-    """Read chain, drive and samples (s) of a scene; see `foamfit simulate --help` for the keys."""
+    """Read chain, drive and sample times (s); `foamfit simulate --help` lists the keys."""
     document = load_toml(path, "give the TOML file of a scene")
     check_keys(f"{path}:", document, ["chain", "drive", "time"])
     return _chain(_table(path, document, "chain")), *_drive(path, document)
 
 
 def files_of_scene(path: Path) -> tuple[Path, ...]:
-    """Return the files that a scene is read from: itself and that of its drive, if it has one."""
+    """Return the path of the scene file and, if it names one, of the file of its drive."""
     drive = load_toml(path, "give the TOML file of a scene").get("drive")
     file = drive.get("file") if isinstance(drive, dict) else None
     return (path, path.parent / file) if isinstance(file, str) else (path,)
@@ -133,7 +133,7 @@ def _spring(given: _Part) -> Spring:
     if kind not in known:
         raise InputError(f"{given.where} kind = {kind!r}; it must be one of {', '.join(known)}.")
     law = laws.law(kind)
-    extra = max(law.options, key=len, default=())  # all parameters that options would free
+    extra = max(law.options, key=len, default=())  # all parameters that options can free
     wide = laws.law(laws.with_options(kind, extra))
     law = wide if set(wide.own) - set(law.own) & set(given.table) else law
     terms = ["relaxation"] if law.hysteretic else []
@@ -158,8 +158,8 @@ def _drive(path: Path, document: dict[str, Any]) -> tuple[Drive, Array]:
         impact = given.made(Impact, given.number("mass"), given.number("velocity"), gravity)
         return impact, _samples(_table(path, document, "time"))
     if kind not in ("stress", "displacement"):
-        told = f"kind = {kind!r}; it must be impact, stress or displacement"
-        raise InputError(f"{given.where} {told}.")
+        choice = "it must be impact, stress or displacement"
+        raise InputError(f"{given.where} kind = {kind!r}; {choice}.")
     given.only("kind", "file")
     if not isinstance(file, str):
         raise InputError(f'{given.where} file is missing; give a CSV like file = "drive.csv".')
@@ -174,21 +174,19 @@ def _samples(given: _Part) -> Array:
     if not 0.0 < end < math.inf:
         raise InputError(f"{given.where} end = {given.table['end']!r} must be positive.")
     if type(samples) is not int or not 2 <= samples <= _MOST_SAMPLES:
-        told = f"must be a whole number from 2 to {_MOST_SAMPLES}"
-        raise InputError(f"{given.where} samples = {samples!r} {told}.")
+        limits = f"a whole number from 2 to {_MOST_SAMPLES}"
+        raise InputError(f"{given.where} samples = {samples!r} must be {limits}.")
     return np.linspace(0.0, end, samples)
 
 
 def check_target(path: Path) -> None:
-    """Refuse to replace a file that is not the response of an earlier run."""
+    """Raise InputError if the path is a file other than the response of an earlier run."""
     if path.is_file() and not read_whole(path, len(RESPONSE)).startswith(RESPONSE.encode()):
-        raise InputError(
-            f"{path} stands where the response is to go, and is not one; choose another name"
-        )
+        raise InputError(f"{path} exists and is not a response of foamfit; choose another name")
 
 
 def write_response(response: Response, path: Path) -> None:
-    """Write a response as CSV, SI, one row per sample; an older file stays if that fails."""
+    """Write a response as CSV in SI units, one row per sample; an older file stays on failure."""
     nodes = range(1, len(response.displacement) + 1)
     header = [*RESPONSE.split(","), *(f"displacement_{i} (m)" for i in nodes)]
     columns = [response.time, response.base_stress, response.strain, *response.displacement]

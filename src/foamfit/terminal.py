@@ -1,4 +1,4 @@
-"""The terminal: text that it can show, and signals."""
+"""Output to the terminal, and signals."""
 
 from __future__ import annotations
 
@@ -17,22 +17,21 @@ from typing import Any, TextIO
 
 from foamfit.errors import InputError
 
-# Control characters but tab and new line, and those that reverse the direction of writing: in a
-# name they could move the cursor, colour the terminal or hide text. And surrogates, which stand for
-# bytes that are not UTF-8.
+# Control characters except tab and new line, and characters that reverse the direction of writing:
+# in a file name they could move the cursor or hide text. Also surrogates (non-UTF-8 bytes).
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-# What replaces a character that an encoding does not have; Greek letters are named.
+# Replacements of characters that an encoding lacks; Greek letters are spelled out.
 _PAIRS = "−- –- ±+/- ·* …... →-> √sqrt µu ²^2 ³^3 ⁻^- ¹1 ∂d"
 _INSTEAD = {pair[0]: pair[1:] for pair in _PAIRS.split()}
 
 
 def printable(text: str) -> str:
-    r"""Return a text with its control characters escaped, as in "\x1b"; lines stay lines."""
+    r"""Escape control characters, as in "\x1b", but not new lines."""
     return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
 
 
 def _instead(error: UnicodeError) -> tuple[str, int]:
-    """Replace characters that an encoding lacks by ASCII: an error handler of `codecs`."""
+    """Replace characters that an encoding lacks by ASCII; an error handler for `codecs`."""
     assert isinstance(error, UnicodeEncodeError)
     told = ""
     for character in error.object[error.start : error.end]:
@@ -50,16 +49,16 @@ codecs.register_error("foamfit.instead", _instead)
 
 
 def show_all() -> None:
-    """Let stdout and stderr replace characters that their encoding lacks, instead of failing."""
+    """Make stdout and stderr replace characters that their encoding lacks instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper) and stream.errors != "foamfit.instead":
             stream.reconfigure(errors="foamfit.instead")
 
 
 def say(text: str, *, err: bool = False, newline: bool = True) -> None:
-    """Print a text on stdout or stderr; InputError if stdout cannot be written (a full disk).
+    """Print a text on stdout or stderr; InputError if stdout cannot be written (disk full).
 
-    A reader that closes the pipe, as `head` does, is no error; the rest is not printed.
+    If the reader closes the pipe, as `head` does, the rest is discarded without an error.
     """
     stream: TextIO | None = sys.stderr if err else sys.stdout
     if stream is None:  # closed by the parent process
@@ -70,7 +69,7 @@ def say(text: str, *, err: bool = False, newline: bool = True) -> None:
     except OSError as error:
         if err:
             return
-        nowhere = os.open(os.devnull, os.O_WRONLY)  # for what stdout holds, and all further output
+        nowhere = os.open(os.devnull, os.O_WRONLY)  # for buffered and all further output
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
         if not isinstance(error, BrokenPipeError):
@@ -81,9 +80,9 @@ def say(text: str, *, err: bool = False, newline: bool = True) -> None:
 
 
 class TerminatedError(KeyboardInterrupt):
-    """The signal `number` asks the process to end: SIGTERM, or SIGHUP of a closed terminal.
+    """Raised on SIGTERM, or SIGHUP of a closed terminal; the message is the name of the signal.
 
-    Like Ctrl-C it keeps what was found. Its text is the name of the signal.
+    Like Ctrl-C it keeps the best point found so far.
     """
 
     def __init__(self, number: int) -> None:
@@ -96,16 +95,16 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def _handles_signals() -> bool:
-    """Whether this thread may install signal handlers."""
+    """Return whether this thread may install signal handlers."""
     return threading.current_thread() is threading.main_thread()
 
 
 @contextmanager
 def ending_cleanly() -> Iterator[None]:
-    """Turn SIGTERM and SIGHUP into an exception, so that nothing half-written stays behind.
+    """Turn SIGTERM and SIGHUP into an exception, so that no partial file stays behind.
 
-    Neither these nor Ctrl-C get lost in code that cannot raise, such as the callbacks by which
-    numba loads compiled code.
+    Neither these nor Ctrl-C are lost in code that cannot raise, such as numba's callbacks when it
+    loads compiled code.
     """
     if not _handles_signals():
         yield
@@ -124,7 +123,7 @@ def ending_cleanly() -> Iterator[None]:
 
 
 def _raise_again(lost: Any) -> None:
-    """Send a signal again whose exception was ignored: a hook of `sys`."""
+    """Send a signal again if Python has ignored its exception; a hook of `sys`."""
     if isinstance(lost.exc_value, TerminatedError):
         number = lost.exc_value.number
     elif isinstance(lost.exc_value, KeyboardInterrupt):
@@ -139,7 +138,7 @@ def _raise_again(lost: Any) -> None:
 
 @contextmanager
 def without_ctrl_c() -> Iterator[None]:
-    """Ignore Ctrl-C in the body, where it could only lose results."""
+    """Ignore Ctrl-C in the body, where it would only lose results."""
     if not _handles_signals():
         yield
         return

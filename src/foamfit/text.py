@@ -1,4 +1,4 @@
-"""Numbers and sentences for people: the one home of their formatting."""
+"""Formatting of numbers and sentences for all output that people read."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import shutil
 import textwrap
 from collections.abc import Iterable, Sequence
 
-# Characters of a line: those of the terminal, but not more or fewer than these.
+# Line length, characters: that of the terminal, within these limits.
 WIDTH, NARROWEST = 100, 40
-COLUMN = 10  # where a text behind its label begins
-_NO_BREAK = "\u00a0"  # a space at which no line ends
+COLUMN = 10  # column in which the text after a label begins
+_NO_BREAK = "\u00a0"  # no-break space
 _PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n"}
 
 
@@ -23,14 +23,14 @@ def engineering(value: float, unit: str) -> str:
 
 
 def quantity(value: float, unit: str | None) -> str:
-    """Write a value with its unit and four digits; a pure number has none."""
+    """Write a value with four digits and its unit, if it has one."""
     return engineering(value, unit) if unit else f"{value:.4g}"
 
 
 def number(value: float | None) -> str:
-    """Write a number with four digits and a minus sign, an integer with all its digits.
+    """Write a number with four digits and a true minus sign, an integer with all its digits.
 
-    "–" stands for None and for one that is not finite.
+    None and numbers that are not finite become "–".
     """
     if value is None or not math.isfinite(value):
         return "–"
@@ -43,7 +43,7 @@ def number(value: float | None) -> str:
 
 
 def significant(value: float, digits: int = 2) -> str:
-    """Write a few significant digits, never an exponent: 138.4, 2 gives "140"."""
+    """Write a number with a few significant digits and no exponent: 138.4, 2 gives "140"."""
     if value == 0 or not math.isfinite(value):
         return f"{value:.0f}"
     rounded = float(f"{value:.{digits}g}")
@@ -53,20 +53,20 @@ def significant(value: float, digits: int = 2) -> str:
 
 
 def percent(share: float, digits: int = 2) -> str:
-    """Write a share with a few significant digits: 1.384 gives "140 %"."""
+    """Write a fraction as a percentage with a few significant digits: 1.384 gives "140 %"."""
     if 0.0 < abs(share) < 1e-5:
         return "less than 0.001 %"
     return f"{significant(100.0 * share, digits)} %"
 
 
 def signed(value: float, decimals: int) -> str:
-    """Write a difference with its sign and a minus, zero without: "+1.2", "−0.3", "0.0"."""
+    """Write a difference with its sign, and zero without one: "+1.2", "−0.3", "0.0"."""
     shown = f"{value:+.{decimals}f}"
     return shown[1:] if float(shown) == 0.0 else shown.replace("-", "−")
 
 
 def field(value: float | str, width: int = 10) -> str:
-    """Write a number right-aligned into a field of a fixed width, a blank before it."""
+    """Write a number right-aligned in a field of fixed width that begins with a blank."""
     for digits in range(9, 0, -1):
         text = value if isinstance(value, str) else f"{value:.{digits}G}"
         text += ".0" if isinstance(value, float) and text.lstrip("-").isdigit() else ""
@@ -87,14 +87,14 @@ def listed(items: Iterable[str]) -> str:
 
 
 def line_width() -> int:
-    """Characters of a line of the terminal, `WIDTH` at most and where there is no terminal."""
+    """Return the line length of the terminal; `WIDTH` at most, and without a terminal."""
     return max(min(shutil.get_terminal_size((WIDTH, 24)).columns, WIDTH), NARROWEST)
 
 
 def wrapped(text: str, indent: int = 2, width: int | None = None) -> list[str]:
-    """Break a paragraph into lines; all but the first are indented by so many spaces.
+    """Wrap a paragraph; all lines but the first are indented by `indent` spaces.
 
-    No line begins with the % of a number.
+    A line never begins with the % sign of a number.
     """
     width = width or line_width()
     whole = re.sub(r"(?<=\d) %", f"{_NO_BREAK}%", text)
@@ -103,11 +103,10 @@ def wrapped(text: str, indent: int = 2, width: int | None = None) -> list[str]:
 
 
 def aligned(rows: Sequence[Sequence[str]], gap: str = "  ", right: Iterable[int] = ()) -> list[str]:
-    """Make lines of equal columns from rows of cells.
+    """Align rows of cells as a table; the first row is the header.
 
-    The columns whose numbers are in `right` are aligned to the right, all others to the left. The
-    first row is the header. Columns that the line has no room for follow in a table of
-    their own below, which begins with the first column again.
+    Columns whose indices are in `right` are right-aligned, all others left-aligned. Columns that do
+    not fit on the line follow in a second table, which repeats the first column.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     right, blocks = set(right), [[0]]
@@ -126,7 +125,7 @@ def aligned(rows: Sequence[Sequence[str]], gap: str = "  ", right: Iterable[int]
 
 
 def labelled(items: Iterable[tuple[str, Iterable[str]]]) -> str:
-    """Set each label before its texts, which are wrapped from `COLUMN` on, no last newline."""
+    """Write each label followed by its texts, wrapped from `COLUMN` on; no final newline."""
     lines = list[str]()
     for label, texts in items:
         for i, text in enumerate(texts):
