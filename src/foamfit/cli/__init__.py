@@ -1,7 +1,7 @@
-"""The command line; its modules are imported here so that the group knows their commands.
+"""The command line. Importing its modules registers their commands with the group.
 
-Heavy modules are imported inside the commands that need them. A newcomer reads `fit`; `group` holds
-exit codes and errors, `options` what several commands share.
+Heavy modules are imported inside the commands that need them. Begin with `fit`; `group` has the
+exit codes and the handling of errors, `options` the options shared by several commands.
 """
 
 from foamfit.cli import fit, many, results, start  # noqa: F401

@@ -1,4 +1,4 @@
-"""`foamfit fit`: its options, which batch and page share, and the fit that they ask for."""
+"""`foamfit fit`; its options and the call of the fit are shared with batch and page."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from foamfit.api import FitResult
     from foamfit.report.studies.cycles import CycleFits
 
-# Options that `foamfit.fit` does not take as keywords, and those that become its `intervals`.
+# Options that are not keywords of `foamfit.fit`, and options that select its `intervals`.
 NO_KEYWORDS, WAYS = ("cycle", "cycles", "model"), ("profile", "mcmc")
 
 
@@ -45,21 +45,23 @@ def _fixes(
 fit_options = options.together(
     option(
         "--model",
-        "Springs from the base up; auto compares models and takes the simplest that holds.",
+        "Springs from the base up; auto selects the simplest model that describes the curves.",
         default="bistable",
     ),
     options.DRIVE,
     option("--seed", "The same test and seed give the same numbers.", options.WHOLE, default=0),
     option(
         "--starts",
-        "Descents of the search. Default: 16 per spring, 48 if several are hysteretic.",
+        "Start points of the search. Default: 16 per spring, 48 if several are hysteretic.",
         COUNT,
     ),
-    option("--max-time", "Then the best so far is taken.", float, metavar="SECONDS"),
-    option("--fix", "Hold a parameter (SI).", multiple=True, metavar="NAME=VALUE", callback=_fixes),
-    option("--vary", "Vary a parameter that is held by default.", multiple=True, metavar="NAME"),
-    option("--interior-mass", "Put the specimen's mass between the springs."),
-    option("--time-shift", "Fit the delay of the motion against the force."),
+    option(
+        "--max-time", "Time limit; the best point so far is returned.", float, metavar="SECONDS"
+    ),
+    option("--fix", "Fix a parameter (SI).", multiple=True, metavar="NAME=VALUE", callback=_fixes),
+    option("--vary", "Vary a parameter that is fixed by default.", multiple=True, metavar="NAME"),
+    option("--interior-mass", "Distribute the specimen's mass between the springs."),
+    option("--time-shift", "Fit the delay of the motion relative to the force."),
     options.RELAXATION,
     *options.MORE,
     option("--profile", "95 % intervals by profile likelihood."),
@@ -68,7 +70,7 @@ fit_options = options.together(
 
 
 def model_name(asked: Mapping[str, Any]) -> str:
-    """Return a model's name without spaces; InputError if there is no such model."""
+    """Return the name of the model without spaces; InputError for an unknown model."""
     from foamfit.springs.model import Model, with_options
 
     model = asked["model"].strip()
@@ -77,9 +79,9 @@ def model_name(asked: Mapping[str, Any]) -> str:
 
 
 def cycles_of(asked: Mapping[str, Any]) -> int | tuple[int, ...] | None:
-    """Read --cycle: the one cycle that is named, or the several that are ("all" names none).
+    """Return the value of --cycle: a number, several numbers, or () for "all".
 
-    InputError if it is wrong, or --cycles is given too.
+    Raises InputError if it is invalid, or if --cycles is given too.
     """
     text = asked["cycle"]
     if text is not None and asked["cycles"] is not None:
@@ -94,11 +96,11 @@ def cycles_of(asked: Mapping[str, Any]) -> int | tuple[int, ...] | None:
 
 
 def keywords_of(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keywords of `foamfit.fit` among the options of a command."""
+    """Return the options of a command as keywords of `foamfit.fit`."""
     given = {way: asked[way] for way in WAYS if asked[way] not in (None, False)}
     if len(given) > 1:
         names = " and ".join(f"--{way}" for way in given)
-        raise InputError(f"{names} exclude each other; choose one way to make the intervals")
+        raise InputError(f"{names} exclude each other; choose one method for the intervals")
     search = {name: one for name, one in asked.items() if name not in (*NO_KEYWORDS, *WAYS)}
     way, draws = next(iter(given.items()), ("auto", None))
     return search | {"intervals": way, "draws": None if draws is True else draws}
@@ -110,10 +112,10 @@ def fit_as_asked(
     asked: Mapping[str, Any],
     begin: Callable[[float | None], AbstractContextManager[Progress]],
 ) -> FitResult | CycleFits:
-    """Fit a test, or cycles of a record, as the options of the command say.
+    """Fit a test, or cycles of a record, with the options of the command.
 
-    `begin` is called when everything is read, before anything is simulated, with the time limit of
-    the whole (s) if there is one; the fit reports to the `Progress` that it gives.
+    `begin` is called after all files are read and before the first simulation, with the time limit
+    (s) of the fit if there is one; the fit reports its progress to the object that it returns.
     """
     from foamfit.data.csv_file import read_test
 
@@ -129,8 +131,8 @@ def fit_as_asked(
     from foamfit import api
     from foamfit.one_model import Options
 
-    Options(**search).check(measurement, model)  # before anything is compiled
-    with begin(search["max_time"] if several is None else None) as news:  # it limits each cycle
+    Options(**search).check(measurement, model)  # fail before anything is compiled
+    with begin(search["max_time"] if several is None else None) as news:  # else a limit per cycle
         search |= {"progress": news.progress, "watch": news.watch, "tell": news.tell}
         if several is None:
             return api.fit(measurement, model=model, **search)
@@ -146,7 +148,7 @@ def fit_as_asked(
 @options.CYCLES
 @fit_options
 @options.output("fits/<test>/<model>", "fit.json")
-@options.option("--verbose", "Print the checklist, reasons, notes and all models too.")
+@options.option("--verbose", "Also print the checklist, reasons, notes and all models.")
 def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **asked: Any) -> int:
     """Identify the parameters of TEST.csv and write a result folder.
 
@@ -154,8 +156,8 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
     cycles.json: the parameters by cycle.
 
     Exit code 0: a fit was made; 1: the input or the call is wrong; 2: no acceptable fit was found
-    (what was found is written); 70: a defect of foamfit; 130 and 143: ended by Ctrl-C or SIGTERM
-    before anything was found (else the best so far is the result).
+    (the best one is written); 70: a defect of foamfit; 130 and 143: ended by Ctrl-C or SIGTERM
+    before any result (later, the best point so far is the result).
 
     \b
     Examples:
@@ -203,6 +205,6 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
 
 
 def _content_of(found: CycleFits) -> dict[str, Any]:
-    """Return the fits of several cycles as JSON has them."""
+    """Return the fits of several cycles as content of a JSON file."""
     each = {n: one.to_json_dict() for n, one in sorted(found.results.items())}
     return found.to_json_dict() | {"cycles": each}

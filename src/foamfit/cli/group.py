@@ -1,4 +1,4 @@
-"""The command `foamfit` itself: its help, its exit codes, and how every refusal is one sentence."""
+"""The command `foamfit`: help, exit codes, and errors as one sentence."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.terminal import TerminatedError, ending_cleanly, say, show_all
 
 # Exit codes: the input or the call is wrong; no acceptable fit; a defect (EX_SOFTWARE of
-# sysexits.h). The number of a signal that ended the command is added to the last.
+# sysexits.h); ended by a signal, to which the number of the signal is added.
 WRONG, NOT_ACCEPTABLE, DEFECT, SIGNALLED = 1, 2, 70, 128
 
 
 def _load_laws(context: click.Context, option: click.Parameter, files: tuple[str, ...]) -> None:
-    """Make the laws in the user's files known before anything else is done."""
+    """Register the laws in the files of --law before anything else is done."""
     for file in files:
         from foamfit.springs import laws
 
@@ -30,7 +30,7 @@ def _load_laws(context: click.Context, option: click.Parameter, files: tuple[str
 
 
 class _Group(click.Group):
-    """A group whose commands all take --law, and whose every refusal is one sentence."""
+    """A group whose commands all have --law, and whose errors are one sentence."""
 
     def add_command(self, cmd: click.Command, name: str | None = None) -> None:
         cmd.params.append(
@@ -41,7 +41,7 @@ class _Group(click.Group):
                 is_eager=True,
                 expose_value=False,
                 callback=_load_laws,
-                help="Make the laws of springs in a Python file of yours known; it is run.",
+                help="Register the spring laws that a Python file defines; the file is executed.",
             )
         )
         super().add_command(cmd, name)
@@ -58,7 +58,7 @@ class _Group(click.Group):
             _leave(WRONG, _one_sentence(error))
         except (InputError, SimulationError) as error:
             _leave(WRONG, str(error), getattr(error, "lines", ()))
-        except (click.Abort, KeyboardInterrupt) as error:  # the first is what click makes of these
+        except (click.Abort, KeyboardInterrupt) as error:  # click turns the second into the first
             first = error.__cause__ or error
             if isinstance(first, TerminatedError):
                 _leave(SIGNALLED + first.number, f"ended by {first}")
@@ -66,30 +66,28 @@ class _Group(click.Group):
         except Exception as error:
             if os.environ.get("FOAMFIT_TRACEBACK"):
                 raise
-            told = f"{type(error).__name__}: {error}"
-            _leave(
-                DEFECT,
-                f"this is a defect of foamfit, please report it ({told}); FOAMFIT_TRACEBACK=1 "
-                "shows where it is",
+            defect = (
+                f"this is a defect of foamfit, please report it ({type(error).__name__}: {error})"
             )
+            _leave(DEFECT, f"{defect}; FOAMFIT_TRACEBACK=1 shows where it is")
         sys.exit(code if isinstance(code, int) else 0)
 
 
 @functools.cache
 def _spare_the_collector() -> None:
-    """Keep the garbage collector from the objects of imports: that took a quarter of a fit."""
+    """Make the garbage collector run less often: imported objects took it a quarter of a fit."""
     gc.set_threshold(100_000, 20, 10)
     atexit.register(gc.freeze)
 
 
 def _leave(code: int, message: str, lines: Sequence[str] = ()) -> NoReturn:
-    """Print one line on stderr, and what may be copied beneath it, and leave."""
+    """Print a line on stderr, below it lines that can be copied into a file, and exit."""
     say("\n    ".join([f"foamfit: {' '.join(message.split())}", *lines]), err=True)
     sys.exit(code)
 
 
 def _one_sentence(error: click.ClickException) -> str:
-    """Return what click refuses, and where the right call is told, where click does not tell it."""
+    """Return click's message as one sentence that refers to --help."""
     message = error.format_message()
     if isinstance(error, click.UsageError) and not isinstance(error, click.BadParameter):
         path = error.ctx.command_path if error.ctx else "foamfit"
@@ -110,7 +108,7 @@ def main(context: click.Context) -> None:
     """Identify the parameters of a foam from an impact or compression test.
 
     \b
-    Look at a test, then fit it (foamfit init TEST.csv writes the TOML that yours needs):
+    Check a test, then fit it (foamfit init TEST.csv writes the TOML for a test of yours):
         foamfit check experiments/foam-1/model-1-2.0mps-reconstruction.csv
         foamfit fit experiments/foam-1/model-1-2.0mps-reconstruction.csv
     Two springs, fixed seed, result as JSON:

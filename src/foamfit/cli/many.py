@@ -1,4 +1,4 @@
-"""`foamfit batch` and `joint`: many tests, each on its own or in one fit."""
+"""`foamfit batch` and `joint`: several tests, each on its own or in one fit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from foamfit.study.batch import Batch
 
-PATIENCE = 10  # s in which a scheduler must answer
+PATIENCE = 10  # s, time limit for the scheduler to answer
 
 
 @main.command()
@@ -55,12 +55,12 @@ def batch(
 ) -> int:
     """Fit every test on its own: a result folder for each, summary.csv and summary.html.
 
-    A test that cannot be read or fitted is a row of the summary with its sentence. Called again,
-    only what is missing or has changed is fitted: data, TOML, settings, width of the figures or
-    version. What is done stays, however the command ends.
+    A test that cannot be read or fitted is a row of the summary that says why. Called again, the
+    command fits only tests that are missing or whose data, TOML, settings, figure width or version
+    have changed. Finished tests are kept, however the command ends.
 
     Exit code 0: every test has a fit; 1: the call is wrong, or the results cannot be written; 2:
-    some tests have no fit; 70, 130 and 143 as of fit.
+    some tests have no fit; 70, 130 and 143 as for fit.
 
     \b
     Examples:
@@ -98,8 +98,8 @@ def batch(
 
         def tell(made: Batch) -> None:
             done, left = len(made.rows), len(made.tests) - len(made.rows)
-            told = f"{done} done, {made.wrong} without a fit, {left} left"
-            line.progress(made.fitted / max(made.fitted + left, 1), told)
+            state = f"{done} done, {made.wrong} without a fit, {left} left"
+            line.progress(made.fitted / max(made.fitted + left, 1), state)
 
         where: Any = {"out": output.out, "executor": executor, "jobs": jobs, "progress": tell}
         found = run(tests, recipe, fresh=fresh, specimen=specimen, **where)
@@ -110,33 +110,34 @@ def batch(
     wrong = sum(not row.has_fit for row in rows)
     if not wrong:
         return 0
-    told = f"{wrong} of {len(rows)} tests {'has' if wrong == 1 else 'have'} no acceptable fit"
-    say(f"foamfit: {told}; see {found.out / 'summary.csv'}", err=True)
+    have = "has" if wrong == 1 else "have"
+    summary = found.out / "summary.csv"
+    say(f"foamfit: {wrong} of {len(rows)} tests {have} no acceptable fit; see {summary}", err=True)
     return NOT_ACCEPTABLE
 
 
 @contextmanager
 def _cluster(address: str) -> Iterator[Executor]:
-    """Give the executor of a running Dask scheduler."""
+    """Yield the executor of a running Dask scheduler."""
     try:
         from dask.distributed import Client
     except ImportError:
         raise InputError(
             '--scheduler needs Dask, which is not installed: pip install "foamfit[dask]"'
         ) from None
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # a sentence says what matters
-    connect: Any = Client  # which has no types
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are reported below
+    connect: Any = Client  # it has no type annotations
     try:
         client = connect(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:  # also TimeoutError
-        told = " ".join(str(error).split())
+        reason = " ".join(str(error).split())
         raise InputError(
-            f"--scheduler {address}: no Dask scheduler answers ({told}); start one by 'dask "
+            f"--scheduler {address}: no Dask scheduler answers ({reason}); start one by 'dask "
             "scheduler' and name its address, as tcp://127.0.0.1:8786"
         ) from None
     with client:
         if not client.scheduler_info()["workers"]:
-            say("foamfit: the scheduler has no worker yet, the tests wait for one", err=True)
+            say("foamfit: the scheduler has no worker yet; the tests wait for one", err=True)
         yield client.get_executor(pure=False)
 
 
@@ -150,25 +151,25 @@ def _cluster(address: str) -> Iterator[Executor]:
 def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> int:
     """Fit the tests of STUDY.toml together: shared, own, scattering, rate-dependent parameters.
 
-    Writes joint.json, joint.html, pictures, table.tex and a result folder for each test. Exit codes
-    are those of foamfit fit; a test that cannot be read is left out with a warning.
+    Writes joint.json, joint.html, figures, table.tex and a result folder for each test. Exit codes
+    are those of foamfit fit. A test that cannot be read is omitted with a warning.
 
     \b
     STUDY.toml, for example:
         name = "shoe foam, new heel"
         tests = ["new-heel-comp-*_raw.txt"]     # files, folders, globs, relative to this file
-        specimen = "heel.toml"                  # of all tests; default: the TOML beside each
+        specimen = "heel.toml"                  # for all tests; default: the TOML beside each
         model = "microscale"
         relaxation = 1
-        drive = "displacement"                  # default: what each test allows
-        [parameters]                            # what is not named is "own"
+        drive = "displacement"                  # default: as for foamfit fit
+        [parameters]                            # parameters not listed are "own"
         s1_k0 = "shared"                        # one value for all tests
-        s1_kc = "own"                           # one value for each
-        s1_sigma_plus = "scatter"               # one for each, log-normal about a common value
+        s1_kc = "own"                           # one value for each test
+        s1_sigma_plus = "scatter"               # one for each test, log-normal about a common value
         s1_sigma_minus = "log rate"             # v (1 + b ln(rate/rate0)), rate0 of the median test
         s1_tau1 = "power rate"                  # v (rate/rate0)^b
-        s1_g1 = "auto"                          # shared, own or a law of rate, by evidence
-        s1_eps_star = 0.3                       # held at a number (SI)
+        s1_g1 = "auto"                          # shared, own or a rate law, by evidence
+        s1_eps_star = 0.3                       # fixed at a value (SI)
     Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
     """
     output.check(without_report=False)

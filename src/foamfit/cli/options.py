@@ -1,4 +1,4 @@
-"""The options of the commands, each declared once, and what several commands do with them."""
+"""Options shared by several commands, and the output of a command."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ Command = Callable[..., Any]
 FILE, WHOLE, COUNT = click.Path(path_type=Path), click.IntRange(min=0), click.IntRange(min=1)
 
 
-def option(flag: str, told: str, kind: Any = None, **more: Any) -> Callable[[Command], Command]:
-    """Declare an option with its help; one without a type or a name for its value is a flag."""
+def option(flag: str, text: str, kind: Any = None, **more: Any) -> Callable[[Command], Command]:
+    """Declare an option; without a type, a metavar or a default it is a flag."""
     if kind is None and not more.keys() & {"metavar", "default"}:
         more["is_flag"] = True
-    return click.option(*flag.split(), type=kind, help=told, **more)
+    return click.option(*flag.split(), type=kind, help=text, **more)
 
 
 def _width(context: click.Context, parameter: click.Parameter, value: str) -> str:
-    """Refuse an inadmissible width before anything is computed."""
+    """Reject an invalid width before anything is computed."""
     if value not in ("one", "two"):  # these need no import
         from foamfit.report.figures import inches
 
@@ -61,7 +61,7 @@ CYCLE = option(
 def _range(
     context: click.Context, parameter: click.Parameter, text: str | None
 ) -> tuple[int, int] | None:
-    """Read the first and the last number of several cycles."""
+    """Return the first and the last cycle of --cycles."""
     if text is None:
         return None
     first, dash, last = (part.strip() for part in text.partition("-"))
@@ -72,7 +72,7 @@ def _range(
 
 CYCLES = option(
     "--cycles",
-    "Several cycles of a slow record as one history, with one set of parameters.",
+    "Fit several cycles of a slow record as one history, with one set of parameters.",
     metavar="FIRST-LAST",
     callback=_range,
 )
@@ -83,7 +83,7 @@ DRIVE = option(
 )
 RELAXATION = option(
     "--relaxation",
-    "Relaxation terms of every hysteretic spring; auto tries one by itself.",
+    "Number of relaxation terms of every hysteretic spring; auto tries one by itself.",
     WHOLE,
     default=0,
     metavar="N",
@@ -92,8 +92,8 @@ MORE = tuple(option(f"--{name}", freed.told) for name, freed in OPTIONS.items())
 PLOT = option("--plot", "Also draw a PNG, PDF or SVG.", FILE)
 WIDTH = option(
     "--figure-width",
-    'Width of figures: one column (3.25 in), two (7 in), or a length as "85 mm". "two, untitled" '
-    'leaves titles out, "two, pdf" writes all figures of the report as PDF too.',
+    'Width of figures: one column (3.25 in), two (7 in), or a length like "85 mm". "two, untitled" '
+    'omits titles; "two, pdf" also writes every figure of the report as PDF.',
     default="two",
     metavar="one|two|LENGTH",
     callback=_width,
@@ -101,13 +101,13 @@ WIDTH = option(
 
 
 def together(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
-    """Make one decorator of several options; the help lists them in this order."""
+    """Combine options into one decorator; the help lists them in this order."""
     return lambda command: functools.reduce(lambda f, add: add(f), reversed(options), command)
 
 
 @dataclass(frozen=True)
 class Output:
-    """Where a command writes its folder, and what it prints of it."""
+    """Where a command writes its result folder, and what it prints."""
 
     out: Path | None
     no_report: bool
@@ -118,11 +118,11 @@ class Output:
 
     @property
     def silent(self) -> bool:
-        """Whether nothing is printed but a result as JSON and failures."""
+        """Whether only failures and a result as JSON are printed."""
         return self.quiet or self.as_json
 
     def check(self, *, without_report: bool = True) -> None:
-        """Refuse --open beside --json (a browser may print too), or where no page is made."""
+        """Reject --open with --json (a browser may print on stdout), or without a page to open."""
         pageless = self.no_report and not without_report
         if self.opening and (self.as_json or pageless):
             given = "json" if self.as_json else "no-report"
@@ -137,8 +137,7 @@ class Output:
         for path in inputs:
             if folder.is_dir() and folder.resolve() in path.resolve().parents:
                 raise InputError(
-                    f"{folder} holds {path.name} and would be replaced as a whole; choose another "
-                    "--out"
+                    f"{folder} contains {path.name} and would be replaced; choose another --out"
                 )
         return folder
 
@@ -150,7 +149,10 @@ class Output:
         text: Callable[[], str],
         **options: Any,
     ) -> None:
-        """Save a result in the folder of `page`; print it, even if that fails, and where it is."""
+        """Save a result in the folder of `page`, and print it and its place.
+
+        If saving fails, the result is printed all the same.
+        """
         from foamfit.report.folder import save_somewhere
 
         options |= {"report": not self.no_report, "figure_width": self.figure_width}
@@ -186,14 +188,14 @@ class Output:
 
 
 def output(folder: str, printed: str) -> Callable[[Command], Command]:
-    """Add the options of `Output` to a command; `folder` and `printed` are for its help."""
+    """Add the options of `Output` to a command; `folder` and `printed` complete its help."""
     options = together(
         option("--out", f"Result folder. Default: {folder}.", FILE),
-        option("--no-report", "Tables alone: no report and no figures of each fit."),
+        option("--no-report", "Write tables only: no reports and no figures."),
         WIDTH,
-        option("--open opening", "Open what was found in the browser; not together with --json."),
-        option("--json as_json", f"Print {printed} on stdout, nothing else."),
-        option("--quiet", "Print nothing but warnings of failure."),
+        option("--open opening", "Open the report in the browser; not together with --json."),
+        option("--json as_json", f"Print {printed} on stdout and nothing else."),
+        option("--quiet", "Print nothing but failures."),
     )
 
     def add(command: Command) -> Command:
@@ -208,7 +210,7 @@ def output(folder: str, printed: str) -> Callable[[Command], Command]:
 
 
 def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> None:
-    """Refuse files that cannot be written, or that are read too, before anything is computed."""
+    """Raise InputError if an output cannot be written or is also an input of the command."""
     given = [path for path in (table, plot) if path is not None]
     for path in given:
         check_file(path)
@@ -226,10 +228,13 @@ def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -
 def compiling(
     quiet: bool, model: str = "bistable", relaxation: int = 0
 ) -> Iterator[Callable[[], None]]:
-    """Compile at first use, beside the body, which calls what it is given before it simulates."""
+    """Compile at first use, in parallel to the body.
+
+    The body calls the function that it receives before it simulates.
+    """
     from foamfit.solve import cache, precompile
 
-    if quiet:  # the log announces what is compiled later
+    if quiet:  # the log would announce later compilations
         logging.getLogger("foamfit").setLevel(logging.ERROR)
 
     def tell() -> None:
@@ -241,7 +246,7 @@ def compiling(
 
 
 class Drawers:
-    """Two processes that draw figures, once begun; without a second core this process draws."""
+    """Two processes that draw figures; with a single core this process draws them."""
 
     _pool: Processes | None = None
 
@@ -254,7 +259,7 @@ class Drawers:
                 self._pool = processes.Processes(2, processes.DRAWING)
 
     def map(self, draw: Callable[[str], Any], names: Iterable[str]) -> Iterable[Any]:
-        """Begin to draw; each figure is waited for when it is asked for."""
+        """Start drawing all figures; iterating over the results waits for each."""
         if self._pool is None:
             return map(draw, names)
         begun = [(name, self._pool.submit(draw, name)) for name in names]
@@ -269,5 +274,5 @@ class Drawers:
 def _drawn(begun: Future[Any], draw: Callable[[str], Any], name: str) -> Any:
     try:
         return begun.result()
-    except Exception:  # drawing here says what is wrong with the figure, if that is why
+    except Exception:  # if the figure is at fault, drawing it here raises the error
         return draw(name)

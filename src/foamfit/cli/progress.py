@@ -1,4 +1,4 @@
-"""What a command is doing, on one line of its terminal: best misfit, time left, a bar, the step."""
+"""The progress line of a command: best misfit, time left, a bar and the current step."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from foamfit.fitting.problem import Problem
 
 REDRAWN = 0.2  # refresh interval, s
-# Simulations for the best misfit take at most this share of the time of a fit, and are at least so
-# many seconds apart.
+# Simulations for the best misfit: largest fraction of the run time, and least time between two, s.
 SHARE, APART = 0.02, 0.2
-# The time left is told after this share of the work; its pace is that of this share of the time.
+# The time left is shown after this fraction of the work, from the pace over this fraction of the
+# time so far.
 ENOUGH, RECENT = 0.03, 0.4
 
 
 class Progress:
-    """Takes what a fit reports and shows nothing: stderr is no terminal, or is to stay silent."""
+    """Receives the progress of a fit and shows nothing: for --quiet, or without a terminal."""
 
     watch: Callable[[Problem, Array], None] | None = None
 
@@ -35,22 +35,22 @@ class Progress:
         self.says = says
 
     def progress(self, fraction: float, what: str) -> None:
-        """Take the share of the work that is done, and the present step."""
+        """Receive the completed fraction of the work and the current step."""
 
-    def tell(self, told: str) -> None:
-        """Print a sentence on stderr, unless silence is asked for."""
+    def tell(self, text: str) -> None:
+        """Print a sentence on stderr, unless `says` is false."""
         if self.says:
-            say(f"foamfit: {told}", err=True)
+            say(f"foamfit: {text}", err=True)
 
 
 class Watcher(Progress):
-    """Looks at the best point so far a few times a second, for a small share of the time."""
+    """Simulates the best point so far a few times a second, in a small fraction of the time."""
 
     _best: tuple[Problem, Array] | None = None
     _next, _looked = 0.0, False
 
     def watch(self, problem: Problem, values: Array) -> None:
-        """Take the best point so far."""
+        """Receive the best point so far."""
         self._best = problem, values
         self.look()
 
@@ -61,18 +61,18 @@ class Watcher(Progress):
         (problem, values), self._best = self._best, None
         if (misfit := problem.objective.look(values)) is not None:
             self.seen(problem, values, misfit)
-        took = time.monotonic() - began if self._looked else 0.0  # the first one loads the solver
+        took = time.monotonic() - began if self._looked else 0.0  # the first run loads the solver
         self._next, self._looked = began + took + max(took / SHARE, APART), True
 
     def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
-        """Take the best point and its misfits, which count as no step of the fit."""
+        """Receive the best point and its misfits; this does not count as a step of the fit."""
 
 
 class ProgressLine(Watcher):
-    """Keeps one line of a terminal, which `name` begins, up to date from a thread.
+    """A line of the terminal, beginning with `name`, that a thread keeps up to date.
 
-    The work ends after `limit` seconds. The misfit is the RMS of all fitted curves over their
-    measured ranges.
+    `limit` is the time limit of the work, s. The misfit is the RMS of all fitted curves, each
+    divided by its measured range.
     """
 
     def __init__(self, stream: TextIO, name: str, limit: float | None = None) -> None:
@@ -92,10 +92,10 @@ class ProgressLine(Watcher):
         self._thread.start()
 
     def progress(self, fraction: float, what: str) -> None:
-        """Take the share of the work that is done, and the present step."""
+        """Receive the completed fraction of the work and the current step."""
         scope = what.rpartition(": ")[0]
         if scope != self.scope and not scope.startswith("model"):
-            self.misfit = self._best = None  # it was of another test
+            self.misfit = self._best = None  # they belong to another test
         self.what, self.scope = what, scope
         if fraction > self.fraction:
             self.fraction = fraction
@@ -103,19 +103,19 @@ class ProgressLine(Watcher):
         self.look()
 
     def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
-        """Take the misfit of all fitted curves together."""
+        """Receive the misfits; show that of all fitted curves together."""
         objective = problem.objective
         pairs = zip(objective.counted, objective.sizes, strict=True)
         squares = sum(size * (misfit[name] or 0.0) ** 2 for name, size in pairs)
         whole = math.sqrt(squares / objective.n_data)
         self.misfit = whole if self.misfit is None else min(self.misfit, whole)
 
-    def tell(self, told: str) -> None:
+    def tell(self, text: str) -> None:
         """Print a sentence above the line."""
-        self._bar.write(printable(f"foamfit: {told}"), file=self._bar.fp)
+        self._bar.write(printable(f"foamfit: {text}"), file=self._bar.fp)
 
     def left(self) -> str:
-        """Say how much time is left, by the recent pace and the limit; "" if neither tells."""
+        """Return the time left in words, from the recent pace and the limit; "" if unknown."""
         if self.fraction >= 1.0:
             return ""
         now, ahead = time.monotonic(), self._ahead()
@@ -125,7 +125,7 @@ class ProgressLine(Watcher):
         return f"about {duration(ahead)} left"
 
     def _ahead(self) -> float:
-        """Seconds left by the recent pace; infinite where it is not known yet."""
+        """Return the time left, s, at the recent pace; infinite if it is not known yet."""
         now, (at, done) = time.monotonic(), self.marks[-1]
         if self.fraction < ENOUGH:
             return math.inf
@@ -133,19 +133,19 @@ class ProgressLine(Watcher):
         before = [mark for mark in self.marks if mark[0] <= since] or [self.marks[0]]
         pace = (done - before[-1][1]) / max(at - before[-1][0], 1e-6)
         ahead = (1.0 - done) / pace
-        return max(ahead - (now - at), 0.5 * ahead)  # a late step makes the pace unknown
+        return max(ahead - (now - at), 0.5 * ahead)  # a slow step must not bring it to zero
 
     def draw(self) -> None:
-        """Show the line as it is now; a narrow terminal cuts its end."""
+        """Draw the line; a narrow terminal cuts off its end."""
         best = "" if self.misfit is None else f"best misfit {100.0 * self.misfit:.2g} %"
-        told = ", ".join(filter(None, [best, self.left()]))
+        state = ", ".join(filter(None, [best, self.left()]))
         what = printable(self.what).replace("{", "{{").replace("}", "}}")
-        self._bar.bar_format = f"{self.name}: {told and told + ' '}|{{bar}}| {what}"
+        self._bar.bar_format = f"{self.name}: {state and state + ' '}|{{bar}}| {what}"
         self._bar.n = min(self.fraction, 1.0)
         self._bar.refresh()
 
     def close(self) -> None:
-        """Take the line away."""
+        """Remove the line."""
         self._ended.set()
         self._thread.join()
         self._bar.close()
@@ -167,7 +167,7 @@ def duration(seconds: float) -> str:
 def progress_line(
     quiet: bool, name: str, limit: float | None = None, *, says: bool = True
 ) -> Iterator[Progress]:
-    """Give a line on stderr that shows progress; elsewhere than a terminal it only `says`."""
+    """Yield a progress line on stderr; without a terminal it only prints sentences."""
     if quiet or sys.stderr is None or not sys.stderr.isatty():
         yield Progress(says)
         return

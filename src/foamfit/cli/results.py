@@ -1,4 +1,4 @@
-"""`foamfit compare`, `published`, `predict` and `card`: what is done with results."""
+"""`foamfit compare`, `published`, `predict` and `card`: commands that use results."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from foamfit.terminal import say
 @click.argument("results", metavar="RESULT [RESULT …]", nargs=-1, required=True, type=options.FILE)
 @options.option(
     "--published name",
-    "The published set to compare with. Default: the one in the name of the test.",
+    "Published set to compare with. Default: the one in the name of the test.",
     str,
     metavar="NAME",
 )
@@ -32,7 +32,7 @@ def compare(
     plot: Path | None,
     figure_width: str,
 ) -> None:
-    """Put result folders beside the published parameters, or beside the first of them.
+    """Compare results with published parameters, or with the first of the results.
 
     \b
     Examples:
@@ -69,15 +69,15 @@ def published() -> None:
 @options.CYCLES
 @options.option(
     "--drive",
-    "Default: that of the result.",
+    "Default: the drive of the result.",
     click.Choice(["impact", "stress", "displacement"]),
 )
 @options.option(
-    "--extrapolate", "Also predict a rate outside the fitted ones by more than a factor of 1.25."
+    "--extrapolate", "Allow a rate outside the fitted rates by more than a factor of 1.25."
 )
 @options.option(
     "--draws",
-    "Draws of specimens for the band.",
+    "Number of random specimens for the band.",
     click.IntRange(40, 100_000),
     default=400,
     metavar="N",
@@ -97,10 +97,10 @@ def predict(
 ) -> None:
     """Predict TEST.csv from RESULT: the folder of a fit or of a joint fit, or its JSON.
 
-    TEST.csv was not fitted; its specimen, striker and motion are simulated with the parameters of
-    the result. The folder holds prediction.json, prediction.csv (per sample) and pictures: the
-    curve with its 95 % band and what makes the band, the parameters, the scatter between specimens,
-    the noise and what the law missed before.
+    TEST.csv was not fitted: its specimen, striker and motion are simulated with the parameters of
+    the result. The folder contains prediction.json, prediction.csv (per sample) and figures: the
+    curve with its 95 % band, and the parts of the band: parameters, scatter between specimens,
+    noise, and the error of the law in the fitted tests.
 
     \b
     Examples:
@@ -119,7 +119,7 @@ def predict(
     default = Path("predictions", toml.stem)
     check_target(output.out or default, of="prediction.json")
     folder = output.folder(default, (test, specimen or toml, result))
-    read_source(result)  # a wrong path is reported before anything is compiled
+    read_source(result)  # report a wrong path before anything is compiled
     with options.compiling(output.silent) as compile_rest:
         measurement = read_test(test, specimen, cycle, cycles=cycles)
         from foamfit.study import predict as study
@@ -134,7 +134,7 @@ def predict(
 @click.argument("result", metavar="RESULT", type=options.FILE)
 @options.option(
     "--format",
-    "LS-DYNA *MAT_083 or *MAT_057, Radioss LAW90, Abaqus low-density foam, or the curves alone.",
+    "LS-DYNA *MAT_083 or *MAT_057, Radioss LAW90, Abaqus low-density foam, or curves only.",
     metavar="mat083|mat057|law90|abaqus|csv",
     required=True,
 )
@@ -146,13 +146,18 @@ def predict(
     "Strain rates of the loading curves, 1/s. Default: those of the fitted tests.",
     metavar="RATE,RATE,…",
 )
-@options.option("--out", "The card. Default: cards/<test>-<format> and its ending.", options.FILE)
+@options.option(
+    "--out",
+    "Card file. Default: cards/<test>-<format> with the extension of the format.",
+    options.FILE,
+)
 def card(result: Path, format: str, units: str, rates: str | None, out: Path | None) -> None:
     """Write a material card of the law in RESULT: the folder of a fit or of a joint fit.
 
-    Beside FILE stand FILE.json (parameters, curves in SI, misfit of fit and card), FILE.png and
-    FILE.pdf: measured, fitted, card. A rate outside the fitted ones gets the curve of the nearest
-    fitted rate, with a warning; beyond the measured strain the law extrapolates.
+    FILE.json (parameters, curves in SI units, misfit of fit and card), FILE.png and FILE.pdf
+    (measured, fitted, card) are written next to FILE. A rate outside the fitted rates gets the
+    curve of the nearest fitted rate, with a warning; beyond the measured strain the law
+    extrapolates.
 
     \b
     Examples:
@@ -170,7 +175,7 @@ def card(result: Path, format: str, units: str, rates: str | None, out: Path | N
     folder = result if result.is_dir() else result.parent
     if folder.resolve() in file.resolve().parents:
         raise InputError(
-            f"{file} lies in a result, which is replaced as a whole; choose another --out"
+            f"{file} lies in a result folder, which may be replaced; choose another --out"
         )
     with options.compiling(False, source.model.name, source.model.relaxation) as compile_rest:
         compile_rest()

@@ -1,4 +1,4 @@
-"""`foamfit check`, `init`, `simulate` and `page`: what is no fit, and a fit in a browser."""
+"""`foamfit check`, `init`, `simulate` and `page`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from foamfit.terminal import say
 @options.TEST
 @options.SPECIMEN
 def check(test: Path, specimen: Path | None) -> None:
-    """Say what the loader understood of TEST.csv: columns, contact, specimen, energy.
+    """Print how TEST.csv is understood: columns, units, contact, specimen, energy audit.
 
     \b
     Example:
@@ -33,10 +33,10 @@ def check(test: Path, specimen: Path | None) -> None:
 @main.command()
 @options.TEST
 def init(test: Path) -> None:
-    """Write TEST.toml beside TEST.csv: what was understood, and questions for the rest.
+    """Write TEST.toml next to TEST.csv: what the headers say, and questions for the rest.
 
-    A question is a line behind "# " with its unit and an example: give your value and take the "# "
-    away. A TOML that is there is left as it is.
+    Each question is a line after "# " with a unit and an example: enter your value and remove the
+    "# ". An existing TOML is not changed.
 
     Example: foamfit init TEST.csv
     """
@@ -52,7 +52,7 @@ def init(test: Path) -> None:
             file.write(text)
     except FileExistsError:
         raise InputError(
-            f"{target} is there and is left as it is; foamfit check {test} says what it lacks"
+            f"{target} exists already and is not changed; foamfit check {test} says what it lacks"
         ) from None
     except OSError as error:
         raise InputError(f"{target} cannot be written: {reason(error)}") from None
@@ -62,16 +62,16 @@ def init(test: Path) -> None:
 
 @main.command()
 @click.argument("scene", metavar="SCENE.toml", type=options.FILE)
-@options.option("--out", "CSV. Default: SCENE.csv here.", options.FILE)
+@options.option("--out", "CSV of the response. Default: SCENE.csv in this folder.", options.FILE)
 @options.PLOT
 @options.WIDTH
 @options.option(
-    "--rtol", "Wanted error over the range.", click.FloatRange(1e-14, 0.1), default=1e-6
+    "--rtol", "Largest error, divided by the range.", click.FloatRange(1e-14, 0.1), default=1e-6
 )
 def simulate(
     scene: Path, out: Path | None, plot: Path | None, figure_width: str, rtol: float
 ) -> None:
-    """Run any chain under any drive forward and write its response as CSV.
+    """Simulate a chain under a drive and write the response as CSV.
 
     \b
     SCENE.toml, for example:
@@ -94,9 +94,9 @@ def simulate(
         [time]
         end = "1 ms"
         samples = 501
-    Instead of the springs, published = "foam-1/model-3" under [chain] takes a published set. A
-    microscale spring has k0, kc, eps_star, sigma_plus, spread_plus, sigma_minus and spread_minus;
-    it and the bistable one may relax: relaxation = [{ g = 0.5, tau = "0.2 s" }].
+    Instead of springs, published = "foam-1/model-3" under [chain] selects a published set. A
+    microscale spring has k0, kc, eps_star, sigma_plus, spread_plus, sigma_minus and spread_minus.
+    Both may have relaxation terms: relaxation = [{ g = 0.5, tau = "0.2 s" }].
     """
     from foamfit.scene_file import check_target, files_of_scene, read_scene, write_response
     from foamfit.solve.simulation import simulate as run
@@ -122,10 +122,10 @@ def simulate(
 @options.option("--port", "Port of 127.0.0.1. Default: a free one.", click.IntRange(1, 65535))
 @options.option("--no-browser", "Print the address only; open no browser.")
 def page(test: Path | None, port: int | None, no_browser: bool) -> None:
-    """Check, fit and turn the parameters of TEST.csv in a browser.
+    """Check and fit TEST.csv, and vary its parameters by hand, in a browser.
 
-    The page is served to this machine alone (127.0.0.1). Its address, with a random token without
-    which nothing is answered, is the first line of stdout; Ctrl-C ends it.
+    The page is served on this machine only (127.0.0.1). The first line of stdout is its address,
+    which contains a random access token. Ctrl-C ends the server.
 
     \b
     Examples:
