@@ -530,7 +530,7 @@ def test_init_asks_what_the_file_does_not_say(
     assert "height 10 mm" in understood
     for channel, unit in answers.items():
         assert re.search(rf"{channel} from '\w+' in {unit}", " ".join(understood.split()))
-    refused(here, "init", path, words=("test.toml is there", "left as it is", "foamfit check"))
+    refused(here, "init", path, words=("test.toml exists", "is not changed", "foamfit check"))
 
 
 def test_init_needs_a_table(here: Path) -> None:
