@@ -86,7 +86,7 @@ BAD = {
     "no-unit.csv": (rows().replace("force (N)", "force"), "'force'"),
     "constant.csv": (rows(lambda i, r: f"{i},5,{0.01 * i}"), "is constant"),
     "back.csv": (rows(lambda i, r: "3,2.0,0.2" if i == 20 else r), "time goes back"),
-    "picture.png": ("\x89PNG", "picture.png is no table"),
+    "picture.png": ("\x89PNG", "picture.png is not a table"),
 }
 
 

@@ -96,7 +96,7 @@ def test_what_is_too_large_or_no_table_is_refused(desk, monkeypatch):
     monkeypatch.setattr(desk_module, "LARGEST", 2**20)
     with pytest.raises(InputError, match=r"a\.csv is larger than 1 MB"):
         desk.receive("a.csv", bytes(2**20 + 1))
-    with pytest.raises(InputError, match=r"picture\.png is no table"):
+    with pytest.raises(InputError, match=r"picture\.png is not a table"):
         desk.receive("picture.png", b"\x89PNG")
     assert desk.csv is None
 
@@ -135,7 +135,7 @@ cycle = 2
 
 
 def test_a_quantity_that_is_given_twice_is_refused():
-    with pytest.raises(InputError, match=r"\[specimen\] height is filled in above, too"):
+    with pytest.raises(InputError, match=r"\[specimen\] height is also filled in above"):
         join_toml(GOOD, '[specimen]\nheight = "2 mm"')
 
 
@@ -263,8 +263,8 @@ def test_a_worker_that_dies_says_so(ready):
 @pytest.mark.parametrize(
     ("code", "errors", "told"),
     [
-        (-signal.SIGINT, "", "stopped before anything was found"),
-        (1, "Traceback …\nKeyboardInterrupt", "stopped before anything was found"),
+        (-signal.SIGINT, "", "stopped before it had a result"),
+        (1, "Traceback …\nKeyboardInterrupt", "stopped before it had a result"),
         (1, "Traceback …\nMemoryError", "has died with exit code 1 (MemoryError)"),
         (-signal.SIGKILL, "", "has died by SIGKILL"),
     ],

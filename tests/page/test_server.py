@@ -115,7 +115,7 @@ def test_a_file_for_no_window_is_refused(served, receive):
         assert ask(served, f"{path}/{window}?name=a.csv", "POST", b"1")[0] == 404
     status, text = ask(served, f"{receive}?name=picture.png", "POST", b"1")
     assert status == 400
-    assert "is no table" in text
+    assert "is not a table" in text
 
 
 def test_a_path_leads_to_no_file(served):

@@ -1,7 +1,7 @@
-"""The page in the browser: everything that `foamfit check` and `foamfit fit` do, on this machine.
+"""The page in the browser: `foamfit check` and `foamfit fit`, on this machine.
 
-`server` guards the address, `app` builds one window from `widgets` (its inputs) and `curves`
-(panels and sliders, which the notebook shows too), `desk` holds what a window works on, `worker`
-has the processes that fit and compile, `turning` the curves of parameters that are turned by hand.
-A newcomer reads `desk`.
+`server` controls access, `app` builds one window from `widgets` (inputs) and `curves` (panels and
+sliders, also used in a notebook), `desk` holds the files, the test and the fit of a window,
+`worker` runs the processes that fit and compile, and `turning` computes the curves for parameters
+set by hand. Begin with `desk`.
 """

@@ -1,7 +1,7 @@
-"""One window of the page: its inputs, its curves, and what happens when something is pressed.
+"""One window of the page: inputs, curves, and the actions of its buttons.
 
-`desk` and `turning` compute, as the commands do; here their results are asked for and shown. All
-that comes from a file is shown as text.
+`desk` and `turning` compute, as the commands do; this module calls them and shows the results.
+Content of files is always shown as escaped text.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ from foamfit.results import law_in_words
 from foamfit.springs import laws
 from foamfit.springs.model import Model
 
-# Where a checkout of the repository may be: the working directory, or around an editable install.
+# Possible places of the repository: the working directory, or that of an editable install.
 CHECKOUTS = (Path(), Path(__file__).parents[3])
-# Options that are shown, and those that are folded away; --fix and --vary have ticks.
-CYCLES = ("cycle", "cycles")  # shown where a record has several
+# Options shown at once, and options folded away; tick boxes stand for --fix and --vary.
+CYCLES = ("cycle", "cycles")  # shown if a record has several
 SHOWN = ("model", "drive", "relaxation", *CYCLES)
 FOLDED = (
     *laws.OPTIONS,
     *("starts", "max_time", "seed", "interior_mass", "time_shift"),
     *("profile", "mcmc"),
 )
-# Options on which the curves of a model depend.
+# Options that change the curves of a model.
 OF_CURVES = ("drive", "relaxation", "interior_mass", "time_shift", *laws.OPTIONS)
-POLL = 200  # ms
-# Over all windows, one test is read and the curves of one are prepared at a time.
+POLL = 200  # interval between two looks at a running fit, ms
+# Shared by all windows: one test is read, and one set of curves prepared, at a time.
 READING, PREPARING = (
     ThreadPoolExecutor(1, thread_name_prefix=f"foamfit-{name}") for name in ("reading", "preparing")
 )
 COMPILING = (
-    "The solver is being compiled, once after installation, in half a minute or, where the "
-    "machine is busy, a whole one. Meanwhile a test can be dropped and its specimen filled in."
+    "The solver is being compiled, once after installation. This takes half a minute, or a minute "
+    "on a busy machine. Meanwhile you can drop a test and fill in its specimen."
 )
 TEXT, FIELD = style("text"), style("field")
 WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: var(--bad); }"
@@ -60,7 +60,7 @@ STYLE: dict[str, Any] = {
 
 
 class Window:
-    """The page in one window of a browser; it shares nothing with another one."""
+    """The page in one browser window; windows share nothing."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class Window:
             self.template.add_panel(name, pn.Column(*widgets, **WIDE))
         self._allow()
         document = pn.state.curdoc
-        for part in first_use.parts:  # what waits for the solver to be compiled
+        for part in first_use.parts:  # enable the buttons when the solver is compiled
             if not part.done():
                 part.add_done_callback(lambda _: document.add_next_tick_callback(self._allow))
         self._poll = pn.state.add_periodic_callback(self._follow, POLL, start=False)
@@ -163,11 +163,11 @@ class Window:
         )
 
     def _report(self) -> str:
-        """Return the report of the fit, or of the chosen cycle."""
+        """Return the HTML report of the fit, or of the selected cycle."""
         return (self.desk.fits[self.report_of.value] / "report.html").read_text(encoding="utf-8")
 
     def _outputs(self) -> None:
-        """Make the places for text, which is put there already escaped."""
+        """Create the panes for text, which is escaped before it is put there."""
         style = {"stylesheets": [TEXT], "sizing_mode": "stretch_width", "margin": (4, 0)}
         places = [pn.pane.HTML("", **style) for _ in range(7)]
         self.problem, self.progress, self.compiling, self.understood = places[:4]
@@ -178,7 +178,7 @@ class Window:
     # ------------------------------------------------------------------------------- beside
 
     def _allow(self) -> None:
-        """Enable a fit where there is a test, the solver is compiled and no fit runs."""
+        """Enable the Fit button: there is a test, the solver is compiled, and no fit is running."""
         compiled = self.first_use.needed(self.model.value, self.relaxation.value).done()
         self.compiling.object = "" if compiled else piece("busy", COMPILING)
         ready = self.desk.measurement is not None and compiled
@@ -187,9 +187,9 @@ class Window:
     def _beside(
         self, pool: ThreadPoolExecutor, work: Callable[[], Any], then: Callable[[Any], None]
     ) -> None:
-        """Work in a thread, then show the result unless more was asked for since.
+        """Work in a thread, then show the result unless it is out of date.
 
-        Results are shown in a callback of the document, whose lock threads do not hold.
+        Results are shown in a callback of the document, because threads do not hold its lock.
         """
         self._asked[pool] += 1
         asked, document = self._asked[pool], pn.state.curdoc
@@ -202,7 +202,7 @@ class Window:
                 return
             try:
                 found = work()
-            except Exception as error:  # shown, not lost in a thread
+            except Exception as error:  # show it; a thread would lose it
                 found = error
             document.add_next_tick_callback(lambda: then(found) if last() else None)
 
@@ -216,7 +216,7 @@ class Window:
             self._read()
 
     def _choose(self, event: Any) -> None:
-        if event.new in self.reconstructions:  # no other path comes from a browser
+        if event.new in self.reconstructions:  # a browser must not name any other path
             self._take(self.reconstructions[event.new])
 
     def _take(self, path: Path) -> None:
@@ -228,17 +228,17 @@ class Window:
         self._read()
 
     def _read(self) -> None:
-        """Fill in a dropped TOML, or clear the fields for another file without one, and check.
+        """Fill in the values of a dropped TOML, and check the test.
 
-        What was filled in belongs to the specimen of the file before.
+        Without a TOML the fields are cleared, as they belong to the specimen of the previous file.
         """
         try:
             found = self.desk.dropped_toml()
         except InputError as error:
             self.problem.object = wrong(error)
             return
-        self._filling = True  # one check after all of them
-        if self.desk.worker is None:  # what is shown of a fit is of another test
+        self._filling = True  # check once, after all fields are filled in
+        if self.desk.worker is None:  # the displayed fit belongs to another test
             self._hide_result("There is no fit yet.")
             self.curves.held, self.curves.found = {}, {}
             for field in self.cycles:
@@ -256,11 +256,11 @@ class Window:
             self._check()
 
     def _check(self, event: Any = None) -> None:
-        """Check the test as it is filled in, and show what is understood or wrong."""
+        """Check the test with the values filled in, and show the outcome or the error."""
         given = {name: field.value or "" for name, field in self.quantities.items()}
         which = [argument for name in CYCLES for argument in self.options[name].arguments()]
         rest, self.run.disabled = self.rest.value or "", True
-        self._asked[PREPARING] += 1  # curves in preparation are of the old test
+        self._asked[PREPARING] += 1  # curves in preparation belong to the old test
         self._beside(READING, lambda: self.desk.check(given, rest, which), self._show_checked)
 
     def _show_checked(self, found: str | Exception) -> None:
@@ -270,20 +270,20 @@ class Window:
             field.stylesheets = [WRONG if name == wrong_quantity(str(error)) else FIELD]
         if str(error) == BUSY:
             return
-        told = "The test cannot be read yet: see what is wrong with it."
-        self.understood.object = soft(told) if error else piece("verbatim", found)
+        unread = "The test cannot be read yet; see the error message."
+        self.understood.object = soft(unread) if error else piece("verbatim", found)
         self._allow()
         if self.desk.measurement is not None:
-            there = len(self.desk.measurement.cycles)
+            count = len(self.desk.measurement.cycles)
             for field in self.cycles:
-                field.visible = there > 1
-            self.cycles[0].name = f"{self.options['cycle'].label} This record has {there}."
+                field.visible = count > 1
+            self.cycles[0].name = f"{self.options['cycle'].label} This record has {count}."
         self._model_chosen()
 
     # ------------------------------------------------------------------------------- the curves
 
     def _model_chosen(self, event: Any = None) -> None:
-        """Show the model over the test, with values read off its loop."""
+        """Show the curves of the model, with start values read off the measured loop."""
         auto = self.model.value == "auto"
         self._allow()
         self.relaxation.disabled, self.curves.sliders.ticks = auto, not auto
@@ -292,7 +292,7 @@ class Window:
             return
         try:
             asked = parsed(self._arguments(ticked=False))
-        except InputError:  # said when it is fitted
+        except InputError:  # reported when the fit is started
             asked = parsed([])
         model = models()[1] if auto else self.model.value
         self._turn_model(model, self.desk.measurement, **keywords(asked))
@@ -308,16 +308,16 @@ class Window:
         values: Mapping[str, float] | None = None,
         **options: Any,
     ) -> None:
-        """Show other sliders under the curves, at these values or at values read off the loop.
+        """Show the sliders of a model, at `values` or at values read off the measured loop.
 
-        The cycles are those of a test or of a report.
+        `of` gives the cycles: a test, or the report of a fit.
         """
 
         def make() -> Turning:
             self.first_use.needed(model, options["relaxation"]).result()
             test = self.desk.measured(of.cycle, of.last_cycle)
             made = Turning(test, model, values, **options)
-            made.turn({})  # loads the compiled code
+            made.turn({})  # load the compiled code
             return made
 
         what = f"Preparing the curves of {law_in_words(model, options['relaxation'])} …"
@@ -337,7 +337,7 @@ class Window:
     # ------------------------------------------------------------------------------- the fit
 
     def _arguments(self, ticked: bool = True) -> list[str]:
-        """Return the arguments of `foamfit fit` for what is filled in."""
+        """Return the arguments of `foamfit fit` for the values filled in."""
         auto = self.model.value == "auto"
         hidden = {"relaxation": auto} | dict.fromkeys(CYCLES, not self.cycles[0].visible)
         shown = (field for name, field in self.options.items() if not hidden.get(name))
@@ -358,7 +358,7 @@ class Window:
         self.run.disabled, self.stop.visible, self.stop.disabled = True, True, False
         self._hide_result("A fit is running.")
         self.curves.found = {}
-        for field in (*self.fields, self.chosen, self.check):  # nothing of the test may change
+        for field in (*self.fields, self.chosen, self.check):  # the test must not change
             field.disabled = True
         self._poll.start()
 
@@ -387,28 +387,28 @@ class Window:
             return
         self._shown = news
         share = round(100 * news.fraction)
-        what = "stopping; the best is kept" if worker.stopping else news.what
-        told = f"{what}, {share} %"
+        what = "stopping; the best point is kept" if worker.stopping else news.what
+        text = f"{what}, {share} %"
         if news.misfit:
-            told += f"; best misfit {misfits_text(news.misfit)}"
-        self.progress.object = piece("progress", share, told)
+            text += f"; best misfit {misfits_text(news.misfit)}"
+        self.progress.object = piece("progress", share, text)
         self._show_best(news)
 
     def _show_best(self, news: News) -> None:
-        """Draw the curves of the best point so far, and move the sliders there."""
+        """Draw the curves of the best point so far, and move the sliders to it."""
         if not news.values or self.desk.measurement is None:
             return
         now = self.curves.turning
         test = None if now is None else now.problem.measurement
-        there = now and test and (now.law, now.drive, test.cycle, test.last_cycle)
+        shown = now and test and (now.law, now.drive, test.cycle, test.last_cycle)
         law = law_in_words(news.model, news.relaxation)
-        if there != (law, news.drive, news.cycle, news.last_cycle):
+        if shown != (law, news.drive, news.cycle, news.last_cycle):
             self._turn_fitted(news)
         else:
             self.curves.put(news.values)
 
     def _turn_fitted(self, news: News) -> None:
-        """Show the curves of the last fit at the values of a report."""
+        """Show the curves of the last fit at the reported values."""
         assert self.desk.worker is not None
         options = keywords(parsed(self.desk.worker.job.arguments))
         options |= {"relaxation": news.relaxation, "drive": news.drive}
@@ -441,7 +441,7 @@ class Window:
         self._back()
 
     def _back(self, event: Any = None) -> None:
-        """Show the report of the fit, and move the sliders back to it."""
+        """Show the report of the fit, and move the sliders back to its values."""
         cycle = self.report_of.value
         if cycle not in self.desk.fits:
             return
@@ -455,12 +455,12 @@ class Window:
 
 
 def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options on which the curves of a model depend."""
+    """Return the options that change the curves of a model."""
     return {one: asked[one] for one in OF_CURVES}
 
 
 def models() -> list[str]:
-    """Return the models that are listed: each law alone, on a linear spring, and twice."""
+    """Return the models in the list: each law alone, on a linear spring, and twice."""
     alone = [kind for kind in laws.kinds() if laws.law(kind).hysteretic]
     return ["auto", *alone, *(f"linear+{one}" for one in alone), *(f"{one}+{one}" for one in alone)]
 
@@ -468,7 +468,7 @@ def models() -> list[str]:
 def send_at_once() -> None:
     """Send messages of this window without waiting for acknowledgements (40 ms each).
 
-    Bokeh has no public way to its sockets; if this fails, curves come late.
+    Bokeh gives no public access to its sockets; if this fails, curves are drawn late.
     """
     with suppress(AttributeError):
         for connection in pn.state.curdoc.session_context.session._subscribed_connections:
@@ -476,15 +476,15 @@ def send_at_once() -> None:
 
 
 def soft(text: str) -> str:
-    """Write a text as a soft paragraph."""
+    """Return a text as a paragraph in a muted colour."""
     return piece("paragraph", text, "soft")
 
 
 def wrong(error: object) -> str:
-    """Write an error as a paragraph, nothing for none; one of no input is a defect."""
-    told = str(error)
+    """Return an error as a paragraph, "" for none; unexpected errors are called defects."""
+    text = str(error)
     if isinstance(error, Exception) and not isinstance(
         error, InputError | SimulationError | OSError
     ):
-        told = f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."
-    return piece("paragraph", told, "error") if told else ""
+        text = f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."
+    return piece("paragraph", text, "error") if text else ""

@@ -1,4 +1,4 @@
-"""Measured curves, simulated ones over them, and a slider for each parameter.
+"""Panels with measured and simulated curves, and a slider for each parameter.
 
 The page and the notebook `turn_the_parameters` show the same panels.
 """
@@ -23,9 +23,9 @@ from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
 from foamfit.text import percent
 
-MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a simulated curve, and of a measured one
+MOST_DRAWN, MOST_MARKERS = 400, 150  # largest number of points of a simulated and a measured curve
 NOTHING = np.empty(0), np.empty(0)
-AXES = {  # of each panel: x and y, with the SI units of both
+AXES = {  # name and SI unit of x and y in each panel
     "stress_time": (("time", "s"), ("stress", "Pa")),
     "displacement_time": (("time", "s"), ("displacement", "m")),
     "stress_strain": (("strain", ""), ("stress", "Pa")),
@@ -33,40 +33,40 @@ AXES = {  # of each panel: x and y, with the SI units of both
 
 
 def grid(parts: list[Any], width: float) -> pn.Column:
-    """Put parts side by side, each at least so many rem wide; hidden at first.
+    """Arrange parts side by side, each at least `width` rem wide; initially hidden.
 
-    The column around them is what is hidden, as a grid itself would stay visible.
+    The outer column is hidden, because a grid itself would stay visible.
     """
     style = (
         ":host { display: grid; gap: .4rem; "
         f"grid-template-columns: repeat(auto-fit, minmax(min(100%, {width}rem), 1fr)); }} "
-        ".scroll-button { display: none; }"  # would take the place of a part
+        ".scroll-button { display: none; }"  # it would take the place of a part
     )
     return pn.Column(pn.Column(*parts, stylesheets=[style], **WIDE), visible=False, **WIDE)
 
 
 class Curves:
-    """Panels and sliders of one test; `view` is what is shown of them."""
+    """Panels and sliders of one test; `view` is the Panel object that contains them."""
 
     def __init__(self, turning: Turning | None = None) -> None:
         self.turning: Turning | None = None
-        self.held: dict[str, bool] = {}  # by parameter: whether the user's tick holds it in a fit
+        self.held: dict[str, bool] = {}  # by parameter: whether the user has fixed it
         self.found: dict[str, Any] = {}  # parameters of the fit, as in fit.json
         self._rows: dict[str, Row] = {}
         self._scales: dict[str, tuple[float, float]] = {}
         self._measured = {name: ColumnDataSource({"x": [], "y": []}) for name in PANELS}
-        # One source for all panels makes one message per move.
+        # With one source for all panels each move needs one message.
         self._turned = ColumnDataSource({f"{name}_{axis}": [] for name in PANELS for axis in "xy"})
         self._points = ColumnDataSource({"x": [], "y": [], "name": [], "aside": [], "up": []})
         self._figures = {name: self._figure(name) for name in PANELS}
         self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
-        # With the lock of the document, which not every message holds.
+        # Take the lock of the document, as not every message holds it.
         self.sliders.on_msg(lambda event: pn.state.execute(partial(self._moved, event), True))
         legend = pn.pane.HTML(piece("legend", GREY, VERMILION), **WIDE)
         loop_first = sorted(PANELS, key=lambda name: name != "stress_strain")
         self._panes = {n: pn.pane.Bokeh(self._figures[n], **WIDE) for n in loop_first}
         self._panels = grid([*self._panes.values()], 14.5)
-        self._panels.insert(0, legend)  # a figure's own would be redrawn each time
+        self._panels.insert(0, legend)  # the legend of a figure would be redrawn each time
         self.chain = Chain(visible=False, **WIDE)
         self.view = pn.Column(self._panels, self.sliders, self.chain, **WIDE)
         if turning is not None:
@@ -84,13 +84,13 @@ class Curves:
         self._draw({})
 
     def _spans(self, row: Row) -> dict[str, list[float]]:
-        """Return interval and range of the fit, where there are any, in the unit of a slider."""
+        """Return interval and range of the fit, if there are any, in the unit of the slider."""
         fit = self.found.get(row.name, {})
         given = {"interval": fit.get("ci95"), "range": fit.get("range")}
         return {name: [end / row.factor for end in ends] for name, ends in given.items() if ends}
 
     def put(self, values: Mapping[str, float]) -> None:
-        """Draw the springs at other values (SI), and move the sliders there."""
+        """Draw the curves at other values (SI), and move the sliders to them."""
         self._draw(values)
         rows = self._rows
         self.sliders.show({n: v / rows[n].factor for n, v in values.items() if n in rows})
@@ -102,9 +102,9 @@ class Curves:
         self._panels.visible = self.chain.visible = False
 
     def chosen(self) -> tuple[dict[str, float], list[str]]:
-        """Return what a fit is to hold, with values (SI), and what it is to vary.
+        """Return the parameters to fix in a fit, with values (SI), and those to vary.
 
-        Parameters that it holds at this value, or varies, by default are left out.
+        Parameters that are fixed at this value, or varied, by default are omitted.
         """
         held, varied = dict[str, float](), list[str]()
         if self.turning is None:
@@ -123,7 +123,7 @@ class Curves:
             height=270,
             sizing_mode="stretch_width",
             output_backend="canvas",
-            stylesheets=[":host { filter: var(--figure, none); }"],  # on dark screens
+            stylesheets=[":host { filter: var(--figure, none); }"],  # for the dark colour scheme
             tools="pan,box_zoom,reset",
             toolbar_location="right",
             x_range=Range1d(0.0, 1.0),
@@ -131,8 +131,8 @@ class Curves:
         )
         measured = {"source": self._measured[name], "line_color": GREY}
         made.scatter("x", "y", size=5, fill_color="white", **measured)
-        # Moving curves have a canvas of their own, so axes and measured curves are not redrawn.
-        # The frame clips annotations there, not glyphs; a band without width is a line.
+        # Simulated curves have their own canvas, so axes and measured curves are not redrawn. There
+        # the frame clips annotations but not glyphs, so a curve is drawn as a band of zero width.
         above = {"source": self._turned, "level": "overlay", "line_color": VERMILION}
         ends = {"base": f"{name}_x", "lower": f"{name}_y", "upper": f"{name}_y"}
         made.add_layout(Band(line_width=2, line_alpha=1.0, fill_alpha=0.0, **above, **ends))
@@ -149,20 +149,20 @@ class Curves:
     def _show_measured(self) -> None:
         assert self.turning is not None
         for name, made in self._figures.items():
-            there = self.turning.measured.get(name)
+            measured = self.turning.measured.get(name)
             if name == "displacement_time" and self.turning.drive == "displacement":
-                there = None  # the input
-            self._panes[name].visible = there is not None
-            if there is None:
+                measured = None  # it is the input
+            self._panes[name].visible = measured is not None
+            if measured is None:
                 continue
             (x_name, x_si), (y_name, y_si) = AXES[name]
-            fx, x_unit = readable_unit(float(abs(there[0]).max()), x_si)
-            fy, y_unit = readable_unit(float(abs(there[1]).max()), y_si)
+            fx, x_unit = readable_unit(float(abs(measured[0]).max()), x_si)
+            fy, y_unit = readable_unit(float(abs(measured[1]).max()), y_si)
             self._scales[name] = fx, fy
             made.xaxis.axis_label = f"{x_name} ({x_unit})" if x_unit else x_name
             made.yaxis.axis_label = f"{y_name} ({y_unit})"
-            some = self._some(there[0], MOST_MARKERS)
-            x, y = there[0] / fx, there[1] / fy
+            some = self._some(measured[0], MOST_MARKERS)
+            x, y = measured[0] / fx, measured[1] / fy
             self._measured[name].data = {"x": x[some], "y": y[some]}
             # The axes keep their ranges while parameters change.
             for limits, values, beyond in ((made.x_range, x, 0.04), (made.y_range, y, 0.15)):
@@ -172,15 +172,15 @@ class Curves:
         self._panels.visible = self.chain.visible = True
 
     def _some(self, samples: Array, most: int) -> slice:
-        """Return every sample, or so many that at most some are drawn of each cycle."""
+        """Return a slice with at most `most` samples of each cycle."""
         assert self.turning is not None
         return slice(None, None, -(-len(samples) // (most * self.turning.cycles)) or 1)
 
     def _moved(self, event: Any) -> None:
-        """Draw the curves for sliders that were moved; note ticks."""
-        told = message(event)
+        """Draw the curves for the sliders that were moved, and store the ticks."""
+        sent = message(event)
         moves, held = (
-            one if isinstance(one, dict) else {} for one in (told.get("moves"), told.get("held"))
+            one if isinstance(one, dict) else {} for one in (sent.get("moves"), sent.get("held"))
         )
         self.held |= {name: bool(value) for name, value in held.items() if name in self._rows}
         wanted = {
@@ -194,7 +194,7 @@ class Curves:
             self.sliders.drawn()
 
     def _draw(self, moves: Mapping[str, float]) -> None:
-        """Send only the arrays of the curves."""
+        """Simulate the curves, and send only their arrays."""
         assert self.turning is not None
         drawn = self.turning.turn(moves)
         data = dict[str, Any]()
@@ -203,7 +203,7 @@ class Curves:
             fx, fy = self._scales.get(name, (1.0, 1.0))
             some = self._some(x, MOST_DRAWN)
             data |= {f"{name}_x": x[some] / fx, f"{name}_y": y[some] / fy}
-        # A source needs arrays of one length; single precision resolves a pixel.
+        # A source needs arrays of equal length; single precision is finer than a pixel.
         sent = {name: np.full(max(map(len, data.values())), np.nan, np.float32) for name in data}
         for name, values in data.items():
             sent[name][: len(values)] = values
@@ -211,20 +211,20 @@ class Curves:
         self._draw_points(drawn)
         self._draw_chain(drawn.chain)
         test = self.turning.problem.measurement
-        told = f"{self.turning.law}, {self.turning.drive} drive"
+        text = f"{self.turning.law}, {self.turning.drive} drive"
         if test.last_cycle is not None:
-            told += f", cycles {test.cycle} to {test.last_cycle}"
+            text += f", cycles {test.cycle} to {test.last_cycle}"
         elif len(test.cycles) > 1:
-            told += f", cycle {test.cycle}"
-        told += f": misfit {misfits_text(drawn.misfit)}"
-        self.sliders.tell(drawn.error or told, wrong=bool(drawn.error))
+            text += f", cycle {test.cycle}"
+        text += f": misfit {misfits_text(drawn.misfit)}"
+        self.sliders.tell(drawn.error or text, wrong=bool(drawn.error))
 
     def _draw_points(self, drawn: Drawn) -> None:
         fx, fy = self._scales.get("stress_strain", (1.0, 1.0))
         x, y = np.array([*drawn.points.values()]).reshape(-1, 2).T
         if len(x) or len(self._points.data["x"]):
             names = [*drawn.points]
-            # In px, A1 and C1 above on the left, A2 and C2 below on the right: beside the curves.
+            # Offsets in px: A1 and C1 above on the left, A2 and C2 below on the right of the curve.
             beside = [(-8 - 7 * len(name), 2) if name[-1] == "1" else (6, -15) for name in names]
             aside, up = np.array(beside).reshape(-1, 2).T
             self._points.data = {"x": x / fx, "y": y / fy, "name": names, "aside": aside, "up": up}

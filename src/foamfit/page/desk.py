@@ -1,6 +1,6 @@
-"""The work of one window: its files, the test read from them, and its fit.
+"""The files, the test and the fit of one window.
 
-Everything lies in a folder of the window, which is removed with it. Windows share nothing.
+Each window has its own folder, which is removed with it. Windows share nothing.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ from foamfit.page.worker import Job, Worker, end_all, parsed
 from foamfit.springs import laws
 from foamfit.text import listed
 
-LARGEST = 64 * 1024 * 1024  # bytes of a file that is dropped
-LONGEST = 80  # characters of the name of a file
-BUSY = "A fit is running; stop it before anything of the test is changed."
+LARGEST = 64 * 1024 * 1024  # bytes of the largest file that can be dropped
+LONGEST = 80  # characters of the longest file name
+BUSY = "A fit is running; stop it before you change the test."
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
-# Quantities to fill in, by their names in messages: label and example. The first are shown at once.
+# Label and example of each quantity to fill in, by its name in messages. The first `FIRST` are
+# always shown, the others folded away.
 FIRST = 4
 QUANTITIES = {
     "[specimen] height": ("Specimen height", "1.19 mm"),
@@ -47,14 +48,14 @@ QUANTITIES = {
 
 
 class Desk:
-    """The files, the test and the fit of one window, in a folder of its own."""
+    """The files, the test and the fit of one window, in its own folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir(mode=0o700)
         self.csv: Path | None = None
-        self.dropped: bytes | None = None  # a TOML that was not read yet
-        self.replaced = False  # whether the file replaced another and was not read since
+        self.dropped: bytes | None = None  # a TOML that has not been read yet
+        self.replaced = False  # whether the file has replaced another and has not been read yet
         self.measurement: Measurement | None = None
         self.worker: Worker | None = None
         self._fits = 0
@@ -68,16 +69,16 @@ class Desk:
     # ------------------------------------------------------------------------------- files
 
     def receive(self, name: str, content: bytes) -> str:
-        """Keep a dropped file under a safe name, which is returned.
+        """Store a dropped file under a safe name, and return the name.
 
-        InputError if it is too large or not a table.
+        Raises InputError if the file is too large or not a table.
         """
         if self.running:
             raise InputError(BUSY)
         name = safe_name(name)
         if len(content) > LARGEST:
             raise InputError(
-                f"{name} is larger than {LARGEST // 2**20} MB, which the page takes; "
+                f"{name} is larger than {LARGEST // 2**20} MB, the limit of the page; "
                 "use foamfit fit in a terminal."
             )
         suffix = Path(name).suffix.lower()
@@ -86,7 +87,7 @@ class Desk:
             return name
         if suffix not in TABLES:
             raise InputError(
-                f"{name} is no table; drop a file that ends in {listed(TABLES)}, or a TOML."
+                f"{name} is not a table; drop a file that ends in {listed(TABLES)}, or a TOML."
             )
         place = self.folder / "test"
         shutil.rmtree(place, ignore_errors=True)
@@ -97,9 +98,9 @@ class Desk:
         return name
 
     def take(self, csv: Path) -> None:
-        """Copy a test that is on this machine, and the TOML beside it, onto the desk.
+        """Copy a test from this machine, with its TOML, into the folder of the window.
 
-        Only the command and the list of reconstructions name such a file, never the browser.
+        Only the command and the list of reconstructions may name such a file, never the browser.
         """
         known = csv.suffix.lower() in TABLES
         self.receive(csv.name if known else f"{csv.stem}.csv", csv.read_bytes())
@@ -108,9 +109,9 @@ class Desk:
             self.dropped = toml.read_bytes()
 
     def dropped_toml(self) -> tuple[dict[str, str], str] | None:
-        """Split the TOML that was dropped last into quantities and the rest; None if there is none.
+        """Split the TOML dropped last into quantities and the rest; None if there is none.
 
-        It is read once. InputError if it is not valid.
+        It is read once. Raises InputError if it is invalid.
         """
         if self.dropped is None:
             return None
@@ -118,15 +119,15 @@ class Desk:
         try:
             return split_toml(raw.decode("utf-8-sig"))
         except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-            raise InputError(f"The TOML that was dropped is no valid TOML: {error}.") from None
+            raise InputError(f"The dropped file is not valid TOML: {error}.") from None
 
     # ------------------------------------------------------------------------------- the test
 
     def check(self, quantities: Mapping[str, str], rest: str, arguments: Sequence[str] = ()) -> str:
-        """Read the test as `foamfit check` does, and say what was understood.
+        """Read the test as `foamfit check` does, and return the text that it prints.
 
-        `arguments` are those of `foamfit fit` on cycles; of several apart the first is read.
-        InputError if it cannot be read.
+        `arguments` are the --cycle or --cycles of `foamfit fit`; of several cycles fitted one by
+        one, the first is read. Raises InputError if the test cannot be read.
         """
         if self.running:
             raise InputError(BUSY)
@@ -140,7 +141,7 @@ class Desk:
             wanted = cycles_of(asked)
             first = next(iter(wanted), None) if isinstance(wanted, tuple) else wanted
             measurement = read_test(self.csv, toml, first, cycles=asked["cycles"])
-            # By its own name: the folder of the window means nothing to a user.
+            # The folder of the window means nothing to a user.
             text = describe(replace(measurement, path=Path(self.csv.name)), audit(measurement))
         except InputError as error:
             raise InputError(self._plain(str(error))) from None
@@ -148,21 +149,21 @@ class Desk:
         return text
 
     def measured(self, cycle: int, last: int | None) -> Measurement:
-        """Return a cycle of the test that was checked last, or with a `last` one a history."""
+        """Return a cycle of the test checked last, or the history from `cycle` to `last`."""
         assert self.csv is not None
-        there = self.measurement
-        if there is not None and (cycle, last) == (there.cycle, there.last_cycle):
-            return there
+        checked = self.measurement
+        if checked is not None and (cycle, last) == (checked.cycle, checked.last_cycle):
+            return checked
         which: Any = {"cycles": (cycle, last)} if last else {"cycle": cycle}
         return read_test(self.csv, self.csv.with_suffix(".toml"), **which)
 
     @property
     def toml(self) -> bytes:
-        """The TOML as filled in."""
+        """The TOML with the values filled in."""
         return b"" if self.csv is None else self.csv.with_suffix(".toml").read_bytes()
 
     def _plain(self, text: str) -> str:
-        """Remove the folder of the window from a sentence."""
+        """Remove the path of the window's folder from a message."""
         for folder in (self.folder / "test", self.folder):
             text = text.replace(f"{folder}/", "").replace(f"{folder}\\", "")
         return text
@@ -170,9 +171,9 @@ class Desk:
     # ------------------------------------------------------------------------------- the fit
 
     def fit(self, arguments: list[str]) -> Worker:
-        """Start a fit of the test that was checked last, with arguments of `foamfit fit`."""
+        """Start a fit of the test checked last, with arguments of `foamfit fit`."""
         if self.csv is None or self.measurement is None:
-            raise InputError("There is no test that can be read yet; see what is wrong with it.")
+            raise InputError("The test cannot be read yet; see the error message.")
         if self.running:
             raise InputError(BUSY)
         parsed(arguments)
@@ -205,13 +206,13 @@ class Desk:
         return dict(sorted(cycles.items())) or {0: self.result}
 
     def ending(self) -> str:
-        """Say why the last fit has no result, "" if it has one."""
+        """Return why the last fit has no result, or "" if it has one."""
         assert self.worker is not None
         return self._plain(self.worker.ended or "")
 
     @property
     def command(self) -> str:
-        """The command of the last fit in a terminal, with the TOML beside the file."""
+        """The command that repeats the last fit in a terminal, with the TOML next to the file."""
         assert self.csv is not None
         assert self.worker is not None
         return shlex.join(["foamfit", "fit", self.csv.name, *self.worker.job.arguments])
@@ -227,15 +228,15 @@ class Desk:
         return content.getvalue()
 
 
-def wrong_quantity(told: str) -> str:
-    """Return the name of the quantity that a sentence refuses, "" for none."""
-    if "[specimen] needs a diameter" in told:
+def wrong_quantity(message: str) -> str:
+    """Return the name of the quantity that an error message rejects, or ""."""
+    if "[specimen] needs a diameter" in message:
         return "[specimen] diameter"
-    return next((name for name in QUANTITIES if f"{name} " in told), "")
+    return next((name for name in QUANTITIES if f"{name} " in message), "")
 
 
 def safe_name(name: str) -> str:
-    """Return a file name without folder, of characters that are harmless in a shell."""
+    """Return a file name without its folder, with only characters that are safe in a shell."""
     name = unicodedata.normalize("NFKC", name).replace("\\", "/").rsplit("/", 1)[-1]
     name = re.sub(r"[^\w.()+-]+", "_", name).lstrip("._-")
     stem, dot, suffix = name.rpartition(".")
@@ -248,7 +249,7 @@ def safe_name(name: str) -> str:
 
 
 def split_toml(text: str) -> tuple[dict[str, str], str]:
-    """Split a TOML into the quantities of the page, by name, and a TOML of the rest."""
+    """Split a TOML into the quantities of the page, by name, and the rest as TOML."""
     document = tomllib.loads(text)
     found = {}
     for name in QUANTITIES:
@@ -262,11 +263,11 @@ def split_toml(text: str) -> tuple[dict[str, str], str]:
 
 
 def join_toml(quantities: Mapping[str, str], rest: str) -> str:
-    """Join the quantities that are filled in to a TOML of the rest; InputError if invalid."""
+    """Merge the quantities filled in with the rest of the TOML; InputError if it is invalid."""
     try:
         document = tomllib.loads(rest)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"The further TOML is no valid TOML: {error}.") from None
+        raise InputError(f"The further TOML is not valid TOML: {error}.") from None
     for name in QUANTITIES:
         if value := quantities.get(name, "").strip():
             table, key = name[1:].split("] ")
@@ -274,6 +275,6 @@ def join_toml(quantities: Mapping[str, str], rest: str) -> str:
             if not isinstance(section, dict):
                 raise InputError(f"The further TOML: {table} must be a table, [{table}].")
             if key in section:
-                raise InputError(f"The further TOML: {name} is filled in above, too; give it once.")
+                raise InputError(f"The further TOML: {name} is also filled in above; give it once.")
             section[key] = value
     return tomli_w.dumps(document)

@@ -1,7 +1,7 @@
-"""The server of the page: for this machine alone, and only for those who know the address.
+"""The server of the page: for this machine only, and only for those who know the address.
 
-Every request is checked first: its Host and its Origin must be the page's own, which refuses DNS
-rebinding and requests from other sites, and its path must begin with a random token.
+Every request is checked: Host and Origin must be those of the page, which prevents DNS rebinding
+and requests from other sites, and the path must begin with a random token.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from foamfit.page.worker import FirstUse
 from foamfit.terminal import say
 
 HOST = "127.0.0.1"
-UNUSED = 20_000  # ms until the desk of a closed window is removed
-REFUSED = "This page is for the address that foamfit page has printed; open that."
+UNUSED = 20_000  # ms after which the files of a closed window are removed
+REFUSED = "Access denied; open the address that foamfit page has printed."
 
 
 class Handler(web.RequestHandler):
-    """Refuses every request."""
+    """Rejects every request."""
 
     def prepare(self) -> None:
-        """Answer that the request is refused."""
+        """Answer with status 403."""
         self.answer(403, REFUSED)
 
     def answer(self, code: int, sentence: str) -> None:
-        """Answer with a plain text, which no browser takes for a page."""
+        """Answer with plain text that no browser interprets as a page."""
         self.set_status(code)
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.set_header("X-Content-Type-Options", "nosniff")
@@ -52,17 +52,17 @@ class Handler(web.RequestHandler):
 
 
 class Receive(Handler):
-    """Takes a file that was dropped in a window onto its desk."""
+    """Receives the files that are dropped in a window."""
 
     def initialize(self, desks: dict[str, Desk]) -> None:
-        """Take the desks of all windows by their random names."""
+        """Store the desks of all windows by their random names."""
         self.desks = desks
 
     def prepare(self) -> None:
-        """Refuse nothing yet."""
+        """Accept the request; `post` checks it."""
 
     def post(self, window: str) -> None:
-        """Keep the file."""
+        """Store the file."""
         if window not in self.desks:
             self.answer(404, "This window is closed; load the page again.")
             return
@@ -74,7 +74,7 @@ class Receive(Handler):
 
 
 class Guard(routing.Router):
-    """Lets through only requests with the page's own Host, Origin and token."""
+    """Passes on only requests with the Host, Origin and token of the page."""
 
     def __init__(self, behind: web.Application, port: int, token: str) -> None:
         self.behind, self.token = behind, token
@@ -94,12 +94,12 @@ class Guard(routing.Router):
 
 
 class Page:
-    """The page while it is served; `address` has the token. Close it."""
+    """The running server of the page; call `close` at the end."""
 
     def __init__(self, test: Path | None = None, port: int = 0) -> None:
         self.port = _free_port(port)
         self.token = secrets.token_urlsafe(24)
-        self.folder = Path(tempfile.mkdtemp(prefix="foamfit-page-"))  # for this user alone
+        self.folder = Path(tempfile.mkdtemp(prefix="foamfit-page-"))  # for this user only
         self.desks: dict[str, Desk] = {}
         self.test = test
         self.first_use = FirstUse()
@@ -117,13 +117,13 @@ class Page:
             check_unused_sessions_milliseconds=UNUSED // 4,
             http_server_kwargs={"max_body_size": LARGEST},
         )
-        # In front of Bokeh's own application, which has no public way for that.
+        # Put in front of Bokeh's own application, which has no public interface for this.
         self.server._http.request_callback = Guard(self.server._tornado, self.port, self.token)
         self.server.start()
 
     @property
     def address(self) -> str:
-        """The address of the page, with its token."""
+        """The address of the page, including the token."""
         return f"http://{HOST}:{self.port}/{self.token}/"
 
     def close(self) -> None:
@@ -136,7 +136,7 @@ class Page:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _window(self) -> Any:
-        """Make one window, with a desk of its own, for one load of the page."""
+        """Create a window, with its own desk, each time the page is loaded."""
         name = secrets.token_urlsafe(12)
         desk = self.desks[name] = Desk(self.folder / f"window-{len(self.desks)}-{name}")
 
@@ -173,13 +173,13 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
 
 
 def _pass_over_closed_windows(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Report errors in tasks, except that a window was closed while a curve was sent."""
+    """Report errors in tasks, unless a window was closed while a curve was being sent."""
     if not isinstance(context.get("exception"), StreamClosedError | WebSocketClosedError):
         loop.default_exception_handler(context)
 
 
 def _free_port(wanted: int) -> int:
-    """Return the port that is wanted, or else a free one; InputError if it is taken."""
+    """Return the requested port, or a free one for 0; InputError if the port is in use."""
     with socket.socket() as free:
         free.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

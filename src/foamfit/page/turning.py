@@ -1,4 +1,4 @@
-"""Curves of parameters that are changed by hand, over the measured ones."""
+"""Curves for parameters that are changed by hand."""
 
 from __future__ import annotations
 
@@ -26,36 +26,37 @@ from foamfit.solve.plan import Motion
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.springs.spring import Spring
 
-WIDE = 4.0  # a slider reaches to so many times the value
-INSTANTS = 60  # at which a chain is drawn along one cycle
+WIDE = 4.0  # upper end of a slider, as a multiple of the value
+INSTANTS = 60  # number of drawings of the chain along one cycle
 PANELS = tuple(CURVES)
 
 
 @dataclass(frozen=True)
 class Row:
-    """A parameter with a slider: its value and limits in a readable unit.
+    """A parameter with a slider: value and limits in a readable unit.
 
     `low` and `high` are the ends of the slider, `least` and `most` the admissible limits.
     """
 
     name: str
     unit: str
-    factor: float  # SI over the unit
+    factor: float  # SI value of the unit
     value: float
     low: float
     high: float
     least: float
     most: float
-    held: bool = False  # whether a fit holds it by default
+    held: bool = False  # whether it is fixed in a fit by default
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Curves (x, y) by the name of their panel at some parameters, or why there are none.
+    """Curves (x, y) by the name of their panel, or the error of the simulation.
 
-    `chain` is the chain at instants along its loop: "strain" and "stress" (Pa) of the loop, "top"
-    and "heights" (n_springs, m) of the springs over the specimen's height at rest, and "snapped",
-    the fraction of each spring that has snapped, NaN where its law does not say.
+    `chain` describes the chain at m instants along its loop: "strain" and "stress" (Pa) of the
+    loop; "top" (m,) and "heights" (n_springs, m), divided by the height of the specimen at rest;
+    and "snapped" (n_springs, m), the fraction of each spring that has snapped, NaN if its law does
+    not define one.
     """
 
     curves: dict[str, tuple[Array, Array]]
@@ -66,7 +67,7 @@ class Drawn:
 
 
 class Turning:
-    """A model over a test: its parameters, and its curves at whatever values these are given."""
+    """A model of a test, whose curves are simulated at any values of the parameters."""
 
     def __init__(
         self,
@@ -75,7 +76,7 @@ class Turning:
         values: Mapping[str, float] | None = None,
         **options: Unpack[Keywords],
     ) -> None:
-        """Start at these values (SI), or at those read off the loop; options as of a fit."""
+        """Start at `values` (SI), or at values read off the loop; `options` as for a fit."""
         self.problem: Problem = Options(**options).problem(measurement, model)
         self.values = self._guess() if not values else self._at(self.problem.vector(), values)
         self.rows = [self._row(name) for name in self.problem.names if self._own(name)]
@@ -92,26 +93,27 @@ class Turning:
 
     @property
     def cycles(self) -> int:
-        """How many cycles of the record are one history."""
+        """Number of cycles in the history."""
         return len(cycles_of(self.problem.measurement)) or 1
 
     @property
     def named(self) -> dict[str, float]:
-        """The values (SI) by name; times and zeros are those of the file."""
-        told = self.values + self.problem.origins
-        return dict(zip(self.problem.names, told.tolist(), strict=True))
+        """The values (SI) by name; times and zeros refer to those of the file."""
+        values = self.values + self.problem.origins
+        return dict(zip(self.problem.names, values.tolist(), strict=True))
 
     def _own(self, name: str) -> bool:
-        """Whether a parameter has a slider: nothing else gives it, and it is not of the record.
+        """Return whether a parameter has a slider.
 
-        The contact time, for example, is of the record.
+        Parameters of the record (such as the contact time), known heights and parameters with an
+        expression have none; the time shift has one.
         """
         heights, short = self.problem.measurement.specimen.heights, split_name(name)[1]
         of_record = name in NUISANCE or (short == "height" and heights is not None)
         return name == "time_shift" or not (of_record or self.problem.params[name].expr)
 
     def _at(self, values: Array, moves: Mapping[str, float]) -> Array:
-        """Put some values into a vector; parameters that depend on them by expressions follow."""
+        """Return the vector with some values changed, and expressions evaluated again."""
         values, problem = values.copy(), self.problem
         for name, value in moves.items():
             if name in problem.index and math.isfinite(value):
@@ -130,7 +132,7 @@ class Turning:
         except (InputError, SimulationError) as error:
             return Drawn({}, {}, error=str(error))
         m, drive, found = problem.measurement, self.drive, simulated.curves
-        without_time = found.get("stress_strain")  # along the measured motion
+        without_time = found.get("stress_strain")  # simulated along the measured motion
         stress = m.stress if drive == "stress" else found.get("stress_time", without_time)
         moved = m.displacement if drive == "displacement" else found.get("displacement_time")
         panels = self._panels(stress, moved)
@@ -143,7 +145,7 @@ class Turning:
     def _chained(
         self, springs: Sequence[Spring], motion: Motion, strain: Array, stress: Array
     ) -> dict[str, Array]:
-        """Return the chain along its loop; before contact and after it the springs are at rest."""
+        """Return the chain along its loop; the springs are at rest before and after contact."""
         problem, total = self.problem, self.problem.measurement.specimen.height
         heights = problem.model.heights(self.values[: len(problem.model.names)], total)[:, None]
         strains = np.maximum(np.diff(motion.displacement, axis=0, prepend=0.0) / heights, 0.0)
@@ -152,7 +154,7 @@ class Turning:
         at = np.unique(np.searchsorted(along, steps))
         snapped = np.full(strains.shape, np.nan)
         for row, spring, own in zip(snapped, springs, strains, strict=True):
-            with suppress(SimulationError):  # at the end of a branch
+            with suppress(SimulationError):  # beyond the end of a branch
                 shares = spring.snapped_along(own)
                 row[:] = np.nan if shares is None else shares
         parts = {"strain": strain, "stress": stress, "top": 1.0 - motion.displacement[-1] / total}
@@ -161,18 +163,18 @@ class Turning:
 
     @cached_property
     def measured(self) -> dict[str, tuple[Array, Array]]:
-        """The measured curves by the name of their panel, in SI."""
+        """The measured curves by the name of their panel, SI."""
         return self._panels(self.problem.measurement.stress, self.problem.measurement.displacement)
 
     def _panels(self, stress: Array | None, moved: Array | None) -> dict[str, tuple[Array, Array]]:
-        """Return the curves (x, y) of a stress (Pa) and a displacement (m) by panel."""
+        """Return curves (x, y) of a stress (Pa) and a displacement (m) by the name of the panel."""
         m = self.problem.measurement
         strain = None if moved is None else moved / m.specimen.height
         pairs = zip(PANELS, (m.time, m.time, strain), (stress, moved, stress), strict=True)
         return {n: (x, y) for n, x, y in pairs if x is not None and y is not None}
 
     def _guess(self) -> Array:
-        """Return the best of the starts that a fit reads off the measured loop."""
+        """Return the best of the start points that a fit reads off the measured loop."""
         problem, space = self.problem, self.problem.space()
         if problem.measurement.displacement is None:
             return problem.vector()

@@ -1,7 +1,7 @@
 """Inputs of the page, and pieces of HTML.
 
-Dropped files and rows of sliders, which Panel lacks, are plain inputs of the browser, with labels
-and keys; `templates` has their scripts. A field is an option of `foamfit fit`.
+Panel has no inputs for dropped files and rows of sliders; here they are plain HTML inputs with
+labels and keyboard control (scripts in `templates`). A field is an option of `foamfit fit`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from foamfit.report.render import environment
 
 TEMPLATES = Path(__file__).with_name("templates")
 WIDE: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
-RELAXATIONS = 4  # numbers of terms that are listed
+RELAXATIONS = 4  # choices for the number of terms: 0 to 3
 OPTIONS = {
     one.name: one for one in fit_command.params if isinstance(one, click.Option) and one.name
 }
@@ -32,12 +32,12 @@ def style(name: str) -> str:
 
 
 def piece(name: str, *given: Any) -> str:
-    """Return a piece of `templates/pieces.html`; all texts in it are escaped."""
+    """Return a piece of `templates/pieces.html`, with all texts escaped."""
     return str(getattr(environment().get_template("pieces.html").module, name)(*given))
 
 
 class Upload(JSComponent):
-    """A place to drop files on; the server's answer to each is shown below."""
+    """An area to drop files on; the answer of the server is shown below."""
 
     address = param.String()
     limit = param.Integer()
@@ -50,7 +50,7 @@ class Sliders(JSComponent):
     """A slider and a number for each parameter; messages name those moved or ticked."""
 
     rows = param.List()
-    ticks = param.Boolean(doc="Whether each has a tick for a fit to hold it.")
+    ticks = param.Boolean(doc="Whether each has a tick box that fixes it in a fit.")
     told = param.String()
     wrong = param.Boolean()
 
@@ -58,7 +58,7 @@ class Sliders(JSComponent):
     _stylesheets: ClassVar[list[str]] = [style("inputs"), style("sliders")]
 
     def show(self, values: Mapping[str, float]) -> None:
-        """Move the sliders (in the units of their rows) without drawing."""
+        """Move the sliders (values in the units of their rows) without drawing."""
         self._send_msg({"values": dict(values)})
 
     def tell(self, sentence: str, wrong: bool = False) -> None:
@@ -66,12 +66,12 @@ class Sliders(JSComponent):
         self.param.update(told=sentence, wrong=wrong)
 
     def drawn(self) -> None:
-        """Say that the last move is drawn; the next may come."""
+        """Report that the last move has been drawn, so that the next can be sent."""
         self._send_msg({"drawn": True})
 
 
 class Chain(JSComponent):
-    """The chain as it deforms along its loop, at an instant that is chosen or played."""
+    """The deformed chain at an instant of its loop, selected or animated."""
 
     frames = param.Dict({})
 
@@ -80,12 +80,12 @@ class Chain(JSComponent):
 
 
 def message(event: Any) -> dict[str, Any]:
-    """Return what a browser sent, which may be anything, as a dictionary."""
+    """Return the data of a message as a dictionary; a browser may send anything."""
     return event.data if isinstance(event.data, dict) else {}
 
 
 class Field:
-    """One option of the command: a field with its name, default and help."""
+    """An input for one option of the command, with its name, default and help."""
 
     def __init__(self, name: str, listed: list[Any] | None = None, **style: Any) -> None:
         option = OPTIONS[name]
@@ -104,14 +104,14 @@ class Field:
             made["value"] = "" if self.default is None else self.default
             self.widget = pn.widgets.Select(**made)
         elif option.is_flag:
-            # A group of one: screen readers do not read the label of Panel's single checkbox.
+            # A group with one box: screen readers do not read the label of Panel's single checkbox.
             self.widget = pn.widgets.CheckBoxGroup(options=[self.label], **style)
         else:
             shown = "" if self.default is None else str(self.default)
             self.widget = pn.widgets.TextInput(value=shown, **made)
 
     def arguments(self) -> list[str]:
-        """Return the arguments for what is filled in; none for the default."""
+        """Return the arguments for the value filled in; none for the default."""
         value = self.widget.value
         if isinstance(value, list):
             return [self.flag] if value else []

@@ -1,7 +1,7 @@
-"""Processes beside the page: a fit, which it starts, watches and stops, and the compiler.
+"""Processes of the page: a fit, and the compilation of the solver.
 
-The process of a fit reads a job as one line of JSON and answers in lines of JSON; SIGINT stops its
-search, which keeps the best point, as Ctrl-C does in a terminal.
+The process of a fit reads a job as one line of JSON and reports in lines of JSON. SIGINT stops its
+search and keeps the best point, as Ctrl-C does in a terminal.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ if TYPE_CHECKING:
 
 PACKAGE = Path(__file__).parent.parent
 COMPILING = "compiling the solver, once after installation"
-# Compiled one after the other, for springs without memory and with it: a model, its relaxation, and
-# the loop that is cached last.
+# Compiled in this order, for springs without and with memory: model, number of relaxation terms,
+# and the function that is cached last.
 COMPILED = (("bistable", 0, "integrate"), ("microscale", 1, "relaxed_along"))
 COMPILE = """from foamfit.solve.precompile import at_first_use
 with at_first_use({!r}, {}, lambda: None) as compile_rest:
     compile_rest()"""
-STOPPED_EARLY = "The fit was stopped before anything was found; start it again."
+STOPPED_EARLY = "The fit was stopped before it had a result; start it again."
 
 
 @dataclass(frozen=True)
 class Job:
-    """The test to fit, the folder of the result, and the arguments of `foamfit fit`."""
+    """A fit to run: files, result folder and arguments of `foamfit fit`."""
 
     csv: str
     toml: str
@@ -54,7 +54,7 @@ class Job:
 
 @dataclass(frozen=True)
 class News:
-    """The last report of a fit; `values` are the parameters of `model` by name, SI."""
+    """Report of a running fit; `values` are the parameters of `model` by name, SI."""
 
     fraction: float = 0.0
     what: str = "starting"
@@ -68,13 +68,13 @@ class News:
 
 
 def with_package() -> dict[str, str]:
-    """Return the environment of a process that imports this very package."""
+    """Return an environment in which a process imports this copy of the package."""
     paths = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
     return os.environ | {"PYTHONPATH": paths.rstrip(os.pathsep)}
 
 
 def end_all(process: subprocess.Popen[Any]) -> None:
-    """Kill a process that leads a session, with all that it started."""
+    """Kill a process that leads a session, and all processes that it has started."""
     if process.poll() is None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -82,13 +82,13 @@ def end_all(process: subprocess.Popen[Any]) -> None:
 
 
 class Worker:
-    """A running fit as the page sees it: its last report, and how it ended."""
+    """A fit in another process: its last report, and how it ended."""
 
     def __init__(self, job: Job) -> None:
         self.job, self.news = job, News()
         self.stopping = False
-        self.told = ""  # what the command prints of several cycles
-        self.ended: str | None = None  # then why there is no result, "" if there is one
+        self.told = ""  # text that the command prints for several cycles
+        self.ended: str | None = None  # after the end: why there is no result, or ""
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed when the process ends)
         self.process = subprocess.Popen(
             [sys.executable, "-m", "foamfit.page.worker"],
@@ -97,7 +97,7 @@ class Worker:
             stderr=self._errors,
             encoding="utf-8",
             env=with_package(),
-            start_new_session=True,  # Ctrl-C in the terminal of the page does not reach it
+            start_new_session=True,  # so that Ctrl-C in the terminal of the page does not reach it
         )
         assert self.process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
@@ -106,7 +106,7 @@ class Worker:
         threading.Thread(target=self._listen, daemon=True).start()
 
     def stop(self) -> None:
-        """End the search; the result of the best point is written."""
+        """Stop the search; the result of the best point is still written."""
         if not self.stopping and self.process.poll() is None:
             self.stopping = True
             self.process.send_signal(signal.SIGINT)
@@ -117,13 +117,13 @@ class Worker:
         done: str | None = None
         for line in self.process.stdout:
             try:
-                told = json.loads(line)
-            except ValueError:  # printed by some library, or half a line
+                report = json.loads(line)
+            except ValueError:  # output of a library, or an incomplete line
                 continue
-            if "ended" in told:
-                done, self.told = told["ended"], told.get("told", "")
+            if "ended" in report:
+                done, self.told = report["ended"], report.get("told", "")
             else:
-                self.news = News(**told)
+                self.news = News(**report)
         code = self.process.wait()
         self.process.stdout.close()
         done = self._why(code) if done is None else done
@@ -131,7 +131,7 @@ class Worker:
         self.ended = done
 
     def _why(self, code: int) -> str:
-        """Say how a process ended that did not say so itself."""
+        """Describe how a process ended that did not report it."""
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
         last = lines[-1].strip() if lines else ""
@@ -143,9 +143,9 @@ class Worker:
 
 
 class FirstUse:
-    """Compiles what curves and fits need, once after installation, in other processes.
+    """Compiles the solver in other processes, once after installation.
 
-    The page answers meanwhile.
+    The page stays responsive meanwhile.
     """
 
     def __init__(self) -> None:
@@ -155,7 +155,7 @@ class FirstUse:
         self.parts = [pool.submit(self._compile, *part) for part in COMPILED]
 
     def needed(self, model: str, relaxation: int) -> Future[None]:
-        """Return what must be done before a model is simulated."""
+        """Return the compilation that must finish before a model is simulated."""
         memory = (
             model == "auto" or relaxation or any(one.remembers for one in Model.parse(model).laws)
         )
@@ -169,7 +169,7 @@ class FirstUse:
         self._process.wait()
 
     def close(self) -> None:
-        """End it."""
+        """Stop compiling."""
         self._closed = True
         if self._process is not None:
             end_all(self._process)
@@ -187,7 +187,7 @@ class _Teller(Watcher):
         self._said = 0.0
 
     def progress(self, fraction: float, what: str, *, now: bool = False) -> None:
-        """Report the share done, `now` or if the last report is some time ago."""
+        """Report the completed fraction, at most once per `APART` seconds unless `now`."""
         self.told |= {"fraction": fraction, "what": what}
         if now and self._best is not None:
             self._next = 0.0
@@ -219,13 +219,13 @@ def _say(told: dict[str, Any]) -> None:
 
 
 def parsed(arguments: list[str]) -> dict[str, Any]:
-    """Read arguments as `foamfit fit` does; InputError says which one is wrong."""
+    """Parse arguments as `foamfit fit` does; InputError names the wrong one."""
     import click
 
     from foamfit.cli.fit import fit as command
     from foamfit.cli.options import Output
 
-    # What a browser sends names no law file: that is code.
+    # A browser must not name a law file, because law files are code.
     own = click.Command("fit", params=[one for one in command.params if one.name != "law"])
     try:
         context = own.make_context("fit", ["TEST.csv", *arguments])
@@ -236,7 +236,7 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
 
 
 def _run(job: Job) -> tuple[str, str]:
-    """Fit and write the result; return "" or why the fit failed, and the text on cycles."""
+    """Fit and write the result; return why the fit failed or "", and the text on cycles."""
     try:
         from foamfit.cli.fit import fit_as_asked
         from foamfit.report.studies.cycles import cycles_text
@@ -267,7 +267,7 @@ def _run(job: Job) -> tuple[str, str]:
 
 
 def main() -> None:
-    """Do the job on stdin."""
+    """Run the job that stdin describes."""
     from foamfit.springs import laws
     from foamfit.terminal import ending_cleanly
 

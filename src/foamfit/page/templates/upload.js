@@ -22,7 +22,7 @@ export function render({ model, el }) {
       told.textContent = `reading ${file.name} …`;
       if (file.size > model.limit) {
         told.className = "error";
-        told.textContent = `${file.name} is larger than ${model.limit / 2 ** 20} MB, which the page takes; use foamfit fit in a terminal.`;
+        told.textContent = `${file.name} is larger than ${model.limit / 2 ** 20} MB, the limit of the page; use foamfit fit in a terminal.`;
         continue;
       }
       try {
