@@ -1,7 +1,8 @@
 """The coordinates of the search: a box in which every point is an admissible chain.
 
-Each parameter moves as the record of its law says: in its logarithm, over a scale of the test, or
-between ends that depend on other parameters; nuisance parameters move between their limits.
+The record of a law defines the coordinate of each parameter: its logarithm, its ratio to a scale of
+the test, or its position between two ends that depend on other parameters. The coordinate of a
+nuisance parameter runs between its limits.
 """
 
 from __future__ import annotations
@@ -21,28 +22,27 @@ from foamfit.springs.laws.record import Between, Param
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
 
-# Coordinates of nuisance parameters: from one limit to the other.
+# Coordinates of nuisance parameters at their two limits.
 NUISANCE_BOX = (-1.0, 1.0)
 
 
 def is_logarithmic(short: str) -> bool:
-    """Whether the coordinate of a parameter is its logarithm."""
+    """Return whether the coordinate of a parameter is its logarithm."""
     return short not in NUISANCE and any_param(short).is_logarithmic
 
 
 @dataclass(frozen=True)
 class Scales:
-    """The scales of a test that make its parameters dimensionless."""
+    """Scales of a test, which make its parameters dimensionless."""
 
-    # Largest stress (Pa) and overall strain.
-    stress: float
-    strain: float
-    rate: float  # Typical strain rate, 1/s; 0 where time is unknown
+    stress: float  # Largest stress, Pa
+    strain: float  # Largest overall strain
+    rate: float  # Typical strain rate, 1/s; 0 without time
     height: float  # m
 
     @classmethod
     def of(cls, measurement: Measurement) -> Scales:
-        """Scales of a test with stress and, if known, displacement."""
+        """Return the scales of a test with stress and, if known, displacement."""
         assert measurement.stress is not None
         height = measurement.specimen.height
         strain = 0.5
@@ -56,21 +56,21 @@ class Scales:
 
     @property
     def slope(self) -> float:
-        """Stress over strain, Pa."""
+        """Largest stress divided by largest strain, Pa."""
         return self.stress / self.strain
 
     @property
     def eta(self) -> float:
-        """Damping that would carry the whole stress, Pa·s."""
+        """Damping that would carry the whole stress at the typical rate, Pa·s."""
         return self.stress / self.rate if self.rate > 0.0 else 1.0
 
     @property
     def duration(self) -> float:
-        """Time under load, s; 1 where time is unknown."""
+        """Time under load, s; 1 without time."""
         return 2.0 * self.strain / self.rate if self.rate > 0.0 else 1.0
 
     def _hundredth(self, name: str) -> float:
-        """A hundredth of the time under load, or of the largest value of a channel."""
+        """Return a hundredth of the time under load, or of the largest value of a channel."""
         largest = {
             "stress_zero": self.stress,
             "displacement_zero": self.strain * self.height,
@@ -79,11 +79,11 @@ class Scales:
         return 0.01 * largest.get(name, self.duration)
 
     def unit(self, scale: str) -> float:
-        """A scale of a parameter by its name, see `springs.laws.record.Param`."""
+        """Return a scale by the name that `springs.laws.record.Param` gives it."""
         return 1.0 if scale == "one" else float(getattr(self, scale.replace("damping", "eta")))
 
     def of_parameter(self, model: Model, name: str, values: dict[str, float]) -> float:
-        """Scale of a parameter, in its unit: the unit of its relative change."""
+        """Return the scale of a parameter, in its unit: what its relative change is divided by."""
         if name in NUISANCE:
             return abs(values[name]) if name in nuisance.STRIKER else self._hundredth(name)
         param = model.param(name)
@@ -97,7 +97,7 @@ class Scales:
 
 
 def others(name: str, param: Param, values: dict[str, float]) -> list[float]:
-    """Values of the parameters of the same spring that a parameter is relative to."""
+    """Return the values of the parameters of the same spring that a parameter depends on."""
     prefix = name.partition("_")[0]
     return [values[f"{prefix}_{short}"] for short in param.of]
 
@@ -118,7 +118,7 @@ NUISANCE_IN_WORDS = {
 
 
 def scale_in_words(name: str, value: float, scale: float) -> str:
-    """Say what the scale of a parameter is."""
+    """Return the scale of a parameter in words."""
     if math.isclose(scale, abs(value), rel_tol=1e-9):
         return "its value"
     if name in NUISANCE:
@@ -134,62 +134,64 @@ def scale_in_words(name: str, value: float, scale: float) -> str:
     return f"{share} of {SCALES_IN_WORDS[param.scale]}"
 
 
-# Coordinates that every spring has, in their order behind those of its law.
+# Order of the coordinates that all springs have; they follow those of the law.
 COMMON_ORDER = ("g", "tau", "eta", "height")
 
 
 class Coordinate(NamedTuple):
-    """One coordinate: the place of its parameter in the vector, and how they depend on each other.
+    """One coordinate: the index of its parameter in the vector, and the transform between them.
 
-    The logarithm of the parameter over the second of its `ends` (SI), or the way from one end to
-    the other, 0 to 1; the ends may depend on the parameters at the places `of`.
+    It is the logarithm of the parameter divided by the second of its `ends` (SI), or the position
+    between the ends, 0 to 1. The ends may depend on the parameters with the indices `of`.
     """
 
     place: int
     short: str
-    param: Param | None  # None of a nuisance parameter or an absolute one
+    param: Param | None  # None for nuisance parameters and absolute coordinates
     limits: tuple[float, float]
     ends: tuple[float, float] | Between
     of: tuple[int, ...] = ()
 
     @property
     def is_logarithmic(self) -> bool:
-        """Whether it is the logarithm of the parameter."""
+        """Whether the coordinate is the logarithm of the parameter."""
         return self.param is not None and self.param.is_logarithmic
 
     def ends_at(self, values: Array) -> tuple[float, float]:
-        """Values of the parameter at the coordinates 0 and 1, unless its logarithm is one."""
+        """Return the values of the parameter at the coordinates 0 and 1 (if not logarithmic)."""
         if isinstance(self.ends, Between):
             return self.ends.ends(*(float(values[place]) for place in self.of))
         return self.ends
 
     def value(self, u: float, values: Array) -> float:
-        """Parameter of a coordinate, whatever its limits; what it needs of `values` is there."""
+        """Return the parameter at coordinate `u`, ignoring its limits.
+
+        `values` must contain the parameters that its ends depend on.
+        """
         first, last = self.ends_at(values)
         return float(np.exp(u)) * last if self.is_logarithmic else first + u * (last - first)
 
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """The box in which the search moves, and the way between it and the vector of parameters."""
+    """The box of the search, and the transforms between it and the vector of parameters."""
 
-    model: Model  # The springs
-    names: tuple[str, ...]  # Of all parameters: those of the springs, then the nuisance
-    scales: Scales  # Of the test
-    values: Array  # (n,): Values of the parameters that do not vary (SI); the others are ignored
+    model: Model
+    names: tuple[str, ...]  # All parameters: those of the springs, then the nuisance parameters
+    scales: Scales
+    values: Array  # (n,): Values of the fixed parameters, SI; the others are ignored
     free: tuple[str, ...]  # Names of the parameters that vary
-    # (n,): Limits of every parameter, SI.
-    low: Array
-    high: Array
-    # Completes a vector in which some parameters hang on others.
+    low: Array  # (n,): Lower limit of every parameter, SI
+    high: Array  # (n,): Upper limit of every parameter, SI
+    # Sets the parameters of a vector that depend on others through expressions.
     tied: Callable[[Array], Array] | None
-    # Parameters that are their own coordinates (SI) rather than relative to others, so that tests
-    # can share their values. Not every point is admissible then.
+    # Parameters whose coordinate is their SI value, so that several tests can share it. Not every
+    # point of the box is admissible then.
     absolute: tuple[str, ...] = ()
 
     @cached_property
     def coordinates(self) -> list[Coordinate]:
-        """The parameters that vary, each after those that it is relative to."""
+        """One coordinate per varied parameter, each after those that it depends on."""
         out, index = [], {name: i for i, name in enumerate(self.names)}
         for name in sorted(self.free, key=self._rank):
             at = index[name]
@@ -208,7 +210,7 @@ class Space:
         return out
 
     def _rank(self, name: str) -> int:
-        """Order of the coordinates: own parameters of the springs as their laws say, the others."""
+        """Return the rank of a coordinate: parameters of the law in its order, then all others."""
         spring, short = split_name(name)
         own = self.model.laws[spring].search_order if spring >= 0 else ()
         if short in own:
@@ -218,7 +220,7 @@ class Space:
 
     @cached_property
     def _fixed_ends(self) -> tuple[Any, ...]:
-        """Coordinates with ends of their own: columns, places, both ends, which are logarithms."""
+        """Coordinates with constant ends: columns, indices, both ends, which are logarithms."""
         coordinates = enumerate(self.coordinates)
         own = [(j, one) for j, one in coordinates if not isinstance(one.ends, Between)]
         ends = np.array([one.ends for _, one in own])
@@ -229,7 +231,7 @@ class Space:
 
     @cached_property
     def _between(self) -> list[tuple[int, Coordinate]]:
-        """The other coordinates, with their columns."""
+        """Coordinates whose ends depend on other parameters, with their columns."""
         coordinates = enumerate(self.coordinates)
         return [(j, one) for j, one in coordinates if isinstance(one.ends, Between)]
 
@@ -241,7 +243,7 @@ class Space:
         return low, high
 
     def encode(self, values: Array) -> Array:
-        """Coordinates of a vector of parameters, moved into the box."""
+        """Return the coordinates of a vector of parameters, moved into the box."""
         out = np.empty(len(self.coordinates))
         for j, one in enumerate(self.coordinates):
             first, last = one.ends_at(values)
@@ -254,7 +256,7 @@ class Space:
         return np.clip(out, low + margin, high - margin)
 
     def decode(self, point: Array) -> Array:
-        """Vector of parameters (SI) at a point of the box."""
+        """Return the vector of parameters (SI) at a point of the box."""
         values, (columns, places, first, last, by_log) = self.values.copy(), self._fixed_ends
         u = point[columns]
         found = first + u * (last - first)
@@ -266,9 +268,9 @@ class Space:
         return self.complete(values)
 
     def admit(self, values: Array, held: Collection[int] = ()) -> Array:
-        """Move what is relative to other parameters between its ends, in place, and complete it.
+        """Move dependent parameters between their ends, in place, and complete the vector.
 
-        What stands at the places `held` stays.
+        Parameters with the indices `held` stay.
         """
         for one in self.coordinates:
             if one.of and one.place not in held:
@@ -277,13 +279,13 @@ class Space:
         return self.complete(values)
 
     def complete(self, values: Array) -> Array:
-        """Complete a vector by what hangs on others."""
+        """Set the parameters of a vector that depend on others through expressions."""
         return values if self.tied is None else self.tied(values)
 
     def slopes(self, point: Array, values: Array) -> Array:
-        """Derivative of the parameters by the coordinates at a point, (n_values, n_free).
+        """Return the derivative of the parameters by the coordinates, (n_values, n_free).
 
-        `values` is the decoded point.
+        `values` is the decoded `point`.
         """
         moves = np.zeros((values.size, point.size))
         for j, one in enumerate(self.coordinates):
@@ -299,9 +301,9 @@ class Space:
         return self.follow(values, moves, np.full(point.size, 1e-5))
 
     def follow(self, values: Array, moves: Array, steps: Array) -> Array:
-        """Complete moves (n_values, m) of the parameters by those of what hangs on others.
+        """Complete moves (n_values, m) of the parameters by those of dependent parameters.
 
-        Differences of the expressions over `steps` (m,): no simulation is in them.
+        These are central differences of the expressions with `steps` (m,); nothing is simulated.
         """
         if self.tied is None:
             return moves
@@ -309,5 +311,5 @@ class Space:
         for j, step in enumerate(steps):
             ahead = self.tied(values + step * moves[:, j])
             out[:, j] = (ahead - self.tied(values - step * moves[:, j])) / (2.0 * step)
-        # what does not hang on others keeps its move to the last digit
+        # Independent parameters keep their exact moves.
         return np.where(moves != 0.0, moves, out)

@@ -1,4 +1,4 @@
-"""Which branches the springs are on along a simulated run."""
+"""The branches of the springs along a simulated run."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ FLIGHT = "free flight"
 
 
 def visited(problem: Problem, simulated: Simulated) -> dict[str, tuple[str, ...]]:
-    """Branches that each spring went through, in the order of the first visit.
+    """Return the branches that each spring has visited, in the order of the first visit.
 
-    It starts at rest, even where it is on another branch at the first sample.
+    Each spring starts at rest, even if it is on another branch at the first sample.
     """
     laws = problem.model.laws
     seen = {i: [next(iter(law.branches))] for i, law in enumerate(laws)}
@@ -32,15 +32,15 @@ def visited(problem: Problem, simulated: Simulated) -> dict[str, tuple[str, ...]
 
 
 def covered(seen: tuple[str, ...]) -> tuple[str, ...]:
-    """Branches that are told of where these were visited.
+    """Return the branches about which visits to `seen` carry information.
 
-    On the reversible branch of a microscale spring, too, micro-springs snap through by their law.
+    On the reversible branch of a microscale spring some micro-springs snap through as well.
     """
     return (*seen, "snap-through") if "reversible" in seen else seen
 
 
 def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:
-    """Parameters whose branch was never reached, and that branch; not those that have a prior."""
+    """Return the parameters without a prior whose branch was never reached, and that branch."""
     seen, known = visited(problem, simulated), {one.name for one in problem.objective.priors}
     out = {}
     for name in problem.model.names:
@@ -54,7 +54,7 @@ def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:
 
 
 def _states(problem: Problem, simulated: Simulated) -> list[tuple[int, dict[int, str]]]:
-    """Samples from which on the hysteretic springs (0 at the base) are on these branches."""
+    """Return the branches of the hysteretic springs (0 = base), and the sample where they begin."""
     laws = problem.model.laws
     state = {i: next(iter(law.branches)) for i, law in enumerate(laws) if law.hysteretic}
     out = [(0, dict(state))]
@@ -66,7 +66,7 @@ def _states(problem: Problem, simulated: Simulated) -> list[tuple[int, dict[int,
 
 
 def sections(problem: Problem, simulated: Simulated) -> list[str]:
-    """Branches of the hysteretic springs at each sample, base first: "d", "a·c"; or free flight."""
+    """Return the branches at each sample, base first ("d", "a·c"), or free flight."""
     clock, contact_end = problem.objective.time, simulated.motion.contact_end
     words = np.empty(clock.size, dtype=object)
     for at, on in _states(problem, simulated):
@@ -77,9 +77,9 @@ def sections(problem: Problem, simulated: Simulated) -> list[str]:
 
 
 def branch_of_samples(problem: Problem, simulated: Simulated) -> NDArray[np.str_]:
-    """Which branches the springs are on at each sample, in words, (n,).
+    """Return the branches of the springs at each sample in words, (n,).
 
-    For example "loading, spring 1 on d"; loading ends at the peak of the measured stress.
+    For example "loading, spring 1 on d". Loading ends at the peak of the measured stress.
     """
     stress = problem.measurement.stress
     assert stress is not None

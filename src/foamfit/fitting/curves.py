@@ -1,4 +1,4 @@
-"""What a test gives an objective: its drive, the curves to compare, and when they are simulated."""
+"""Drives, measured curves and simulated instants of a test."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ from foamfit.errors import InputError
 from foamfit.solve.scene import Motion
 from foamfit.springs.model import Model
 
-# Those of every objective, besides displacement_1_time … where masses inside were followed.
+# Curves of every test; tests with measured interior masses add displacement_1_time, ….
 CURVES = ("stress_time", "displacement_time", "stress_strain")
-# Of an impact whose striker carries an accelerometer and whose displacement was not measured.
+# Curve of an impact with an accelerometer on the striker and no measured displacement.
 ACCELERATION = "acceleration_time"
-# Those that need a motion.
+# Curves that need a motion.
 MOTION_CURVES = ("displacement_time", "stress_strain")
 DRIVES = ("impact", "stress", "displacement")
-# Noise of a motion, over its range, that counts as none; most that a smooth motion may leave of the
-# samples, over their noise.
+# A motion with less noise than this fraction of its range is exact. A smooth motion is used if its
+# residuals are at most this multiple of the noise.
 EXACT, FOLLOWED = 1e-6, 1.5
-# Gaps between samples by which the first may lie after contact, for it to be simulated from there.
+# Largest time between contact and the first sample, in sampling intervals, for which the simulation
+# starts at the contact.
 LATEST = 50.0
 
 
 def choose_drive(measurement: Measurement) -> str:
-    """Choose the drive: impact if striker and time are known, else displacement.
+    """Return "impact" if striker and time are known, else "displacement".
 
-    Raises InputError if the test has neither.
+    Raises InputError if neither is possible.
     """
     striker = measurement.striker
     moving = striker is not None and striker.mass is not None and striker.velocity
@@ -49,7 +50,7 @@ def choose_drive(measurement: Measurement) -> str:
 
 
 def check_drive(measurement: Measurement, drive: str) -> None:
-    """Refuse a drive that the test cannot feed (InputError, naming what is missing)."""
+    """Raise InputError if the test lacks the data for a drive; the message names them."""
     if drive not in DRIVES:
         raise InputError(f"drive '{drive}' is unknown; it must be one of {', '.join(DRIVES)}")
     striker, impact = measurement.striker, drive == "impact"
@@ -71,15 +72,15 @@ def check_drive(measurement: Measurement, drive: str) -> None:
 
 
 def interior_curves(measurement: Measurement, springs: int) -> dict[str, int]:
-    """Curves of the masses inside a chain whose motion was measured, and their node."""
+    """Return the curves of interior masses whose motion was measured, and their nodes."""
     nodes = sorted(node for node in measurement.interior if node < springs)
     return {f"{interior_channel(node)}_time": node for node in nodes}
 
 
 def check_interior(measurement: Measurement, springs: int) -> None:
-    """Refuse the displacement of a mass that is not inside the chain (InputError).
+    """Raise InputError for the displacement of a mass that is not inside the chain.
 
-    A single spring has nothing inside; the result's notes say so.
+    A single spring has no interior mass; the notes of the result say so.
     """
     wrong = min((node for node in measurement.interior if node >= springs), default=0)
     if wrong and springs > 1:
@@ -92,7 +93,7 @@ def check_interior(measurement: Measurement, springs: int) -> None:
 
 
 def checked_weights(weights: Mapping[str, float], curves: Sequence[str]) -> dict[str, float]:
-    """Weights of all curves; those that are not given are zero."""
+    """Return the weights of all curves; missing weights are zero."""
     for name, weight in weights.items():
         if name not in curves or not isinstance(weight, Real) or not 0 <= weight < np.inf:
             raise InputError(
@@ -103,12 +104,12 @@ def checked_weights(weights: Mapping[str, float], curves: Sequence[str]) -> dict
 
 
 def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> dict[str, float]:
-    """Weights that count each measured channel once.
+    """Return weights that count each measured channel once.
 
-    In the impact drive stress and displacement are compared in time; a displacement that was
-    integrated from the force is not a second measurement. In the displacement drive the only curve
-    is the stress along the measured displacement, in the stress drive the displacement.
-    Displacements of masses inside count in all drives: they tell the springs apart.
+    In the impact drive stress and displacement are compared in time; a displacement integrated from
+    the force is not a second measurement. The displacement drive compares the stress along the
+    measured displacement, the stress drive the displacement. Displacements of interior masses count
+    in all drives, because they distinguish the springs.
     """
     weights = dict.fromkeys(CURVES, 0.0)
     weights |= dict.fromkeys(interior_curves(measurement, springs), 1.0)
@@ -126,10 +127,10 @@ def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> d
 
 
 def smoothed(values: Array, window: int) -> Array:
-    """Smooth samples by the parabola through each (odd) window of them (Savitzky & Golay 1964).
+    """Smooth samples by a parabola through each (odd) window (Savitzky & Golay 1964).
 
-    Analytical Chemistry 36, 1627; as `scipy.signal.savgol_filter`, whose package takes longer to
-    import than a search. The first and the last half of a window lie on its parabola.
+    Analytical Chemistry 36, 1627. Same result as `scipy.signal.savgol_filter`, whose package takes
+    longer to import than a search. Half a window at each end lies on the parabola of that window.
     """
     half, clock = window // 2, np.arange(float(window))
     weights, *_ = lstsq(np.vander(half - clock, 3, increasing=True).T, np.array([1.0, 0.0, 0.0]))
@@ -140,11 +141,10 @@ def smoothed(values: Array, window: int) -> Array:
 
 
 def driving_stress(stress: Array, model: Model) -> Array:
-    """Smooth a measured stress (Pa) that is to drive a model.
+    """Smooth a measured stress (Pa) that drives a model.
 
-    The noise of a driving stress is taken for stress that acted, and biases the soft branches
-    (errors in variables): a parabola over a twenty-fifth of the samples takes it off. A chain with
-    a unilateral spring carries no tension.
+    Noise of a driving stress biases the soft branches (errors in variables); a moving parabola over
+    a twenty-fifth of the samples removes it. Chains with a unilateral spring carry no tension.
     """
     window = 2 * (stress.size // 50) + 1
     smooth = smoothed(stress, window) if window > 3 else stress
@@ -154,12 +154,11 @@ def driving_stress(stress: Array, model: Model) -> Array:
 def driving_motion(
     measurement: Measurement, time: Array, *, always: bool = False
 ) -> SmoothMotion | None:
-    """The measured motion without its noise; None where its samples say all, or are not there.
+    """Return the measured motion without its noise; None if the samples are to be used.
 
-    An exact motion that turns sharply between samples went further than they say. Where a noisy one
-    leaves the samples more than their noise the machine's motion is not that smooth: the samples
-    themselves are the better motion, unless it is to be smooth `always`. `time` (n,) is that of the
-    samples, s.
+    An exact motion with a sharp turn between samples has gone farther than the samples show. If the
+    residuals of a noisy motion exceed its noise, the true motion is not that smooth and the samples
+    are the better description, unless `always` is set. `time` (n,) is that of the samples, s.
     """
     values, level = measurement.displacement, measurement.noise.of("displacement")
     if values is None or level is None:
@@ -170,7 +169,7 @@ def driving_motion(
         beside = np.abs(found.turns[:, None] - time).min(axis=1, initial=np.inf)
         return found if np.any(beside > 1e-6 * float(np.median(np.diff(time)))) else None
     if measurement.block > 1 and found.turns.size:
-        # The mean of rows on either side of a turn lies off the motion.
+        # A mean over rows on both sides of a turn does not lie on the motion.
         gap = float(np.median(np.diff(time)))
         apart = np.abs(time[:, None] - found.turns).min(axis=1) > 0.75 * gap
         counts = apart if counts is None else counts & apart
@@ -179,7 +178,7 @@ def driving_motion(
 
 
 def moved_at(instants: Array, time: Array, values: Array, motion: SmoothMotion | None) -> Array:
-    """A measured motion (m) at some instants, straight on before its first sample."""
+    """Return the motion (m) at some instants; linear extrapolation before the first sample."""
     if motion is not None:
         return motion.at(instants)
     before = np.minimum(instants - time[0], 0.0) / (time[1] - time[0])
@@ -187,11 +186,11 @@ def moved_at(instants: Array, time: Array, values: Array, motion: SmoothMotion |
 
 
 def driven_instants(measurement: Measurement, clock: Array, motion: SmoothMotion | None) -> Array:
-    """Instants to simulate: those of the samples, turns between them, and the contact.
+    """Return the instants to simulate: the samples, the turns between them, and the contact.
 
-    How far a motion goes where it turns is what springs remember. Where the first sample lies a
-    little after the contact the springs start there without strain: what they carry at the first
-    sample relaxes already.
+    Springs remember the largest motion, which is reached at a turn. If the first sample lies
+    shortly after the contact, the simulation starts at the contact with zero strain, because the
+    stress has already relaxed at the first sample.
     """
     more = [] if motion is None else motion.turns.tolist()
     values = measurement.displacement
@@ -204,9 +203,9 @@ def driven_instants(measurement: Measurement, clock: Array, motion: SmoothMotion
 
 
 def without_tension(motion: Motion) -> Motion:
-    """The run of a specimen that is not fixed to the platen: where it would pull, it bears none.
+    """Return the run of a specimen that is not fixed to the platen: tension becomes zero.
 
-    It has lost contact there; what it remembers follows the platen on.
+    The specimen has lost contact there; its internal state still follows the platen.
     """
     lost = motion.base_stress < 0.0
     if not lost.any():
@@ -218,12 +217,12 @@ def without_tension(motion: Motion) -> Motion:
 
 
 def later(time: Array, curves: Array, late: float) -> Array:
-    """Curves (…, n) seen `late` seconds later, at the samples; straight past their ends."""
+    """Return curves (…, n) delayed by `late` seconds; linear extrapolation past the ends."""
     return np.asarray(make_interp_spline(time, curves, k=1, axis=-1)(time - late))
 
 
 def instants(time: Array, fine: int) -> Array:
-    """Instants that each sample averages: so many, evenly spread over its share of the clock."""
+    """Return `fine` instants per sample, evenly spread over the interval that it averages."""
     if fine == 1:
         return time
     gaps = np.diff(time)
@@ -233,7 +232,7 @@ def instants(time: Array, fine: int) -> Array:
 
 
 def check_time_shift(measurement: Measurement, drive: str) -> None:
-    """Refuse a time shift where the test has no two channels in time (InputError)."""
+    """Raise InputError if the test does not have two channels in time to shift."""
     if measurement.time is None:
         why = "it has no time"
     elif measurement.displacement is None or measurement.motion == INTEGRATED:

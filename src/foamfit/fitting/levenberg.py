@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt: the descent of one test, of several, and of refits near a minimum."""
+"""The Levenberg-Marquardt method for one test and for several."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 
-# Steps in a row after which the Jacobian is only updated, and how far the gain of such a step may
-# be from the expected one, as a share of it.
+# Largest number of consecutive Broyden updates of the Jacobian, and the largest relative difference
+# between actual and predicted gain for which it is updated.
 UPDATES, PREDICTED = 6, 0.5
-# Damping of the first step of what follows a move; more, until it lowers the cost.
+# Damping of the trial steps in `following`.
 FOLLOWING = (1e-9, 1e-6, 1e-3, 0.1)
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Jacobian of the residuals of several tests, one under the other.
+    """Jacobian of the stacked residuals of several tests, stored by test.
 
-    Each test has the derivatives (n_t, c_t) of its residual by those of the `count` coordinates
-    that it depends on, and their places.
+    For each test: the derivatives (n_t, c_t) of its residual by the coordinates that it depends on,
+    and their indices among all `count` coordinates.
     """
 
     tests: Sequence[tuple[Array, NDArray[np.intp]]]
@@ -49,7 +49,7 @@ class Blocks:
 
 @dataclass(frozen=True, eq=False)
 class Iterate:
-    """A point with its residual and the derivative of the residual by scaled coordinates."""
+    """A point, its residual, and the derivative of the residual by scaled coordinates."""
 
     point: Array
     residual: Array
@@ -75,14 +75,13 @@ class Iterate:
         return np.asarray(self.jacobian.T @ self.jacobian)
 
     def expected(self, step: Array) -> float:
-        """Gain of the cost that the Jacobian predicts for a step."""
+        """Return the decrease of the cost that the Jacobian predicts for a step."""
         return -float(step @ (2.0 * self.gradient + self.normal @ step))
 
     def updated(self, point: Array, residual: Array) -> Iterate:
-        """Return another point, its Jacobian that of this one but for what the step has shown.
+        """Return another point with Broyden's update of the Jacobian (1965, Math. Comp. 19, 577).
 
-        Of all Jacobians that agree with the step it is the one nearest to this (Broyden 1965, Math.
-        Comp. 19, 577).
+        It is the nearest Jacobian that reproduces the observed change of the residual.
         """
         step = point - self.point
         shown = residual - self.residual - self.jacobian @ step
@@ -90,7 +89,10 @@ class Iterate:
 
 
 def damped_step(gradient: Array, normal: Array, damping: float, held: NDArray[np.bool_]) -> Array:
-    """Gauss-Newton step of what is not held, its damping over the diagonal of the normal matrix."""
+    """Return the Gauss-Newton step of the coordinates not `held`.
+
+    `damping` multiplies the diagonal of the normal matrix.
+    """
     moving = np.flatnonzero(~held)
     step = np.zeros(gradient.size)
     if moving.size:
@@ -102,10 +104,10 @@ def damped_step(gradient: Array, normal: Array, damping: float, held: NDArray[np
 
 
 def following(at: Iterate, shift: Array, held: NDArray[np.bool_]) -> list[Array]:
-    """Steps that move what is `held` by a shift, alone and with all else following to first order.
+    """Return steps that shift the `held` coordinates, alone and with all others following.
 
-    Where the data hardly fix what follows, the whole step may lead far off: each is damped more
-    than the one before it.
+    The others follow to first order. As this may lead far off along poorly determined directions,
+    each step is damped more than the previous one.
     """
     ahead = at.gradient + at.normal @ shift
     return [shift, *(shift + damped_step(ahead, at.normal, one, held) for one in FOLLOWING)]
@@ -122,13 +124,14 @@ def descend(
     least: float = 0.0,
     damping: float = 1e-3,
 ) -> Iterate:
-    """Descend inside a box; what lies at a limit and is pressed outwards is held.
+    """Minimise a sum of squares inside a box.
 
-    The damping follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). It ends when two steps in a
-    row lower the cost by less than the share `enough`, or when the expected gain is below `least`.
-    A point with an infinite residual is refused; the start must have a finite one. Where steps gain
-    what was expected the Jacobian of one test, which costs as much as many residuals, is updated;
-    no descent ends on an updated one unless its `iterations` are over.
+    A coordinate at a limit whose gradient points outwards is fixed for the step. The damping
+    follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). The descent ends after two consecutive
+    steps that lower the cost by less than the fraction `enough`, or when the predicted gain is
+    below `least`. Points with an infinite residual are rejected; the start must have a finite one.
+    The Jacobian of a single test, which is expensive, is updated while steps gain what it predicts;
+    a descent ends with an exact Jacobian unless it runs out of `iterations`.
     """
     low, high = box
     at = Iterate(start, residual(start), jacobian(start))

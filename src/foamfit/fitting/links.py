@@ -1,8 +1,8 @@
-"""What a parameter is to several tests that are fitted together, and the laws of rate.
+"""Links between the parameters of several tests that are fitted together.
 
-A parameter is shared (one value), own (one value for each test), scatters (one for each test,
-log-normal about a common value), or follows a law of rate, of which the common value v and the
-slope b are shared: with x = ln(rate/rate0) of a test, v·(1 + b x) or v·(rate/rate0)^b = v·e^(b x).
+A parameter is shared (one value), own (one value per test), scattering (one value per test,
+log-normal about a common value), or follows a rate law with a common value v and slope b: with
+x = ln(rate/rate0) of a test, v·(1 + b x) or v·(rate/rate0)^b = v·e^(b x).
 """
 
 from __future__ import annotations
@@ -17,21 +17,20 @@ from foamfit.arrays import Array
 LOG_RATE, POWER_RATE = "log rate", "power rate"
 RATES = (LOG_RATE, POWER_RATE)
 KINDS = ("shared", "own", "scatter", *RATES)
-# Smallest factor of the law v·(1 + b x): past it the law has no positive value to give.
+# Smallest factor 1 + b x, below which the law has no positive value.
 LEAST_FACTOR = 1e-6
-# The slope of a law of rate lies within so much of zero.
+# Largest absolute slope of a rate law.
 STEEPEST = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """What the parameters are to n tests.
+    """The links between the parameters of n tests.
 
-    `kinds` has one of `KINDS` for each parameter that is named; the others are own. `log_rates`
-    (n,) are ln(rate/rate0), needed by laws of rate, and `rate_errors` (n,) their standard errors
-    (left out where the rates are exact). `pulls` (n,) of a scattering parameter are the roots of
-    the weights of (ln v - ln common value)²; a parameter without an entry is not drawn to a common
-    value.
+    `kinds` gives one of `KINDS` for each named parameter; all others are own. `log_rates` (n,) are
+    ln(rate/rate0), needed for rate laws, and `rate_errors` (n,) their standard errors (None if the
+    rates are exact). `pulls` (n,) of a scattering parameter are the square roots of the weights of
+    (ln v - ln common value)²; parameters without an entry have no such term.
     """
 
     kinds: Mapping[str, str]
@@ -40,19 +39,19 @@ class Links:
     rate_errors: Array | None = None
 
     def kind(self, name: str) -> str:
-        """Kind of a parameter."""
+        """Return the kind of a parameter."""
         return self.kinds.get(name, "own")
 
     def x(self, test: int) -> float:
-        """Return ln(rate/rate0) of a test; 0 where no law needs it."""
+        """Return ln(rate/rate0) of a test; 0 if no rates are known."""
         return 0.0 if self.log_rates is None else float(self.log_rates[test])
 
     def having(self, **kinds: str) -> Links:
-        """Return the same links but for some kinds."""
+        """Return links with some kinds replaced."""
         return replace(self, kinds={**self.kinds, **kinds})
 
     def of(self, tests: list[int]) -> Links:
-        """Return the links of some of the tests."""
+        """Return the links of a subset of the tests."""
         rates, errors = self.log_rates, self.rate_errors
         return replace(
             self,
@@ -63,7 +62,7 @@ class Links:
 
 
 def factor(kind: str, b: float, x: float) -> tuple[float, float, float]:
-    """Value at x = ln(rate/rate0) over the common one, and its first two derivatives by b."""
+    """Return value over common value at x = ln(rate/rate0), and its first two derivatives by b."""
     if kind == POWER_RATE:
         value = float(np.exp(b * x))
         return value, x * value, x * x * value
@@ -72,14 +71,14 @@ def factor(kind: str, b: float, x: float) -> tuple[float, float, float]:
 
 
 def law_values(kind: str, v: float, b: float, x: Array) -> Array:
-    """Values of several tests by a law of rate."""
+    """Return the values of several tests according to a rate law."""
     return np.array([v * factor(kind, b, float(one))[0] for one in x])
 
 
 def start_of(kind: str, values: Array, x: Array) -> tuple[float, float]:
-    """Common value and slope nearest to the values of some tests (least squares, as the law is).
+    """Return the common value and slope of the rate law fitted to the values of some tests.
 
-    Values that the law cannot meet give their median and no slope.
+    If the law cannot describe the values, their median and slope zero are returned.
     """
     middle = float(np.median(values))
     if not np.ptp(x) > 0.0:

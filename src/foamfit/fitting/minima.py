@@ -1,8 +1,8 @@
-"""Minima of the cost near the best one, which the search from start values may miss.
+"""Minima of the cost near the best point, which the search from start values may miss.
 
-Which spring of a chain owns which property, and where A1 or ε_* lies, may show in few samples: the
-cost then has several minima that differ by little. What is found here makes the best point better,
-or says what else the test leaves open.
+The assignment of properties to the springs of a chain, and the place of A1 or ε_*, may depend on a
+few samples; the cost then has several minima of similar depth. The minima found here improve the
+best point, or show what the test leaves undetermined.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from foamfit.springs.laws.record import Law
 from foamfit.springs.model import exchanges
 from foamfit.springs.parameters import relaxation_names, split_name
 
-# Most minima whose springs exchange properties, and most descents from each but the best.
+# Largest number of minima from which springs are exchanged, and of descents from each but the best.
 EXCHANGES, EXCHANGED = 8, 16
-# Where the best point misses more than noise: share of its cost by which another end may be worse
-# and still have its springs exchanged.
+# Above the noise floor: springs of another end are exchanged if its cost is higher by at most this
+# fraction.
 DETOUR = 0.5
-# Ends of the search whose cost is above the best by less than so many variances of the noise are
-# settled anew, at most so many; points of the box closer than the last are one minimum.
+# Ends of the search within NEAR noise variances of the best cost are refined, at most MINIMA of
+# them. Points of the box closer than SAME are one minimum.
 NEAR, MINIMA, SAME = 40.0, 24, 0.02
-# Steps of a scan: the first and the least as a share of the box, and the most to each side, half as
-# many where the curves miss more than noise: minima so near are equally good there. Rise of the
-# cost, in variances of what is left of the curves, above which a step is halved; its change below
-# which the next one is doubled, until one was halved; and below which the scan ends.
-STEP, SHORTEST, STEPS, TOO_HIGH, FLAT, NOTHING = 0.04, 0.015, 12, 300.0, 4.0, 0.05
+# Steps of a scan. STEP and SHORTEST: first and shortest step, as a fraction of the box. STEPS: most
+# steps to each side, halved above the noise floor, where nearby minima are equally good.
+STEP, SHORTEST, STEPS = 0.04, 0.015, 12
+# Changes of the cost, in residual variances: above TOO_HIGH a step is halved, below FLAT the next
+# one is doubled (until one has been halved), and below NOTHING the scan ends.
+TOO_HIGH, FLAT, NOTHING = 300.0, 4.0, 0.05
 
 
 def scan_places(tracker: Tracker, space: Space) -> bool:
-    """Descend from points whose ε_a or ε_* is moved step by step; say whether one is better.
+    """Move ε_a or ε_* in steps and descend from each; return whether the best point improved.
 
-    So is the contact time of an impact whose motion is not measured: with a dashpot, a wrong one
-    may fit almost as well.
-    At each step the other parameters follow, then all are free. Where the curves miss more than
-    noise only better ends are kept.
+    At each step the other parameters are fitted first, then all parameters. The contact time of an
+    impact without a measured motion is scanned as well, because with a dashpot a wrong one may fit
+    almost as well. Above the noise floor only better ends are kept.
     """
     if tracker.best_values is None:
         return False
@@ -79,7 +79,7 @@ def scan_places(tracker: Tracker, space: Space) -> bool:
 
 
 def _moved(tracker: Tracker, space: Space, point: Array, column: int, share: float) -> Array | None:
-    """Move one coordinate by a share of the box, the others following; None beyond the box."""
+    """Move one coordinate by a fraction of the box, the others following; None outside it."""
     (low, high), (residual, jacobian) = space.box, squares(tracker, space)
     held = np.arange(point.size) == column
     shift = np.where(held, share * (high - low), 0.0)
@@ -91,12 +91,11 @@ def _moved(tracker: Tracker, space: Space, point: Array, column: int, share: flo
 
 
 def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
-    """Descend from the best points with properties exchanged between springs of one kind.
+    """Exchange properties between springs of one kind, and descend; return the costs as `search`.
 
-    Which of two springs in series owns which branch shows in few samples: the loop of the chain
-    hardly changes where they exchange it, so each such exchange has a minimum of its own. Each
-    minimum that may lead to the best one is exchanged in turn. Returned are the costs of the ends,
-    as by `search`.
+    The loop of a chain hardly changes when two springs in series exchange a branch, so each
+    exchange has its own minimum. The exchanges of every minimum that may lead to the best one are
+    tried.
     """
     if tracker.best_values is None or not has_several(space.model):
         return []
@@ -104,7 +103,7 @@ def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
     met, open_ends = [], [(tracker.best_cost, tracker.best_values)]
     for _ in range(EXCHANGES):
         best = tracker.best_cost
-        # Where it misses more than noise the true springs, if there are any, are not yet found.
+        # Above the noise floor the true springs, if there are any, have not been found yet.
         detour = DETOUR * best if best > MISSING * objective.floor else 0.0
         open_ends = [end for end in open_ends if end[0] <= best + max(_near(objective), detour)]
         if not open_ends:
@@ -127,10 +126,10 @@ def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
 
 
 def settle_ends(tracker: Tracker, space: Space) -> None:
-    """Descend once more from the ends of the search that other noise could have made the best.
+    """Descend again from the ends of the search that would be the best with other noise.
 
-    What counts may have changed since they were found. Each minimum is kept once, its springs in
-    order. Where the curves miss more than noise all ends stay as they are: an error of the law
+    The weights may have changed since the ends were found. Each minimum is kept once, with its
+    springs in order. Above the noise floor all ends stay as they are, because an error of the law
     could make any of them the best.
     """
     objective = tracker.objective
@@ -154,21 +153,21 @@ def settle_ends(tracker: Tracker, space: Space) -> None:
 
 
 def _near(objective: Objective) -> float:
-    """Rise of the cost that other noise could make up for, with a wide margin."""
+    """Return the increase of the cost that other noise could cause, with a wide margin."""
     return NEAR * objective.floor / objective.n_data
 
 
 def _among(points: list[Array], point: Array) -> bool:
-    """Whether a point of the box is one of these."""
+    """Return whether a point of the box coincides with one of the points."""
     return any(float(np.max(np.abs(point - other))) < SAME for other in points)
 
 
 def in_order(space: Space, objective: Objective, values: Array) -> Array:
-    """Order springs that can be exchanged by where they start to snap, the softest at the base.
+    """Sort interchangeable springs by the strain at which they snap, the softest at the base.
 
-    Two springs can be exchanged if they are of one kind and the curves stay the same, so never
-    across a mass inside whose displacement is counted; the foam of the paper buckles first at its
-    base. Relaxation terms are ordered by their times, unless one of them is held.
+    The foam of the paper buckles first at its base. Springs are interchangeable if they are of one
+    kind and the curves do not change, so never across an interior mass whose displacement counts.
+    Relaxation terms are sorted by their times, unless one of them is fixed.
     """
     model, free = space.model, set(space.free)
     for law in dict.fromkeys(model.laws):
@@ -184,7 +183,7 @@ def in_order(space: Space, objective: Objective, values: Array) -> Array:
 
 
 def _of_law(space: Space, objective: Objective, values: Array, law: Law) -> Array:
-    """Order the springs of one law; see `in_order`."""
+    """Sort the springs of one law; see `in_order`."""
     model = space.model
     own = [i for i, other in enumerate(model.laws) if other is law]
     held = [split_name(name) for name in model.names if name not in space.free]

@@ -1,9 +1,8 @@
-"""What a record does not say exactly: contact, zeros of the channels, and the striker.
+"""Nuisance parameters: contact time, zeros of the channels, striker and time shift.
 
-These are unknowns beside the parameters of the springs: all of them in an impact, the zeros of
-motion and stress where a motion drives. Each value counts from what the record itself gives
-(`Measurement.origins`, the striker of the TOML), so that for an exact measurement times and zeros
-are 0, and velocity and mass those of the TOML.
+They are fitted together with the parameters of the springs: all of them in an impact, the zeros of
+motion and stress under a driving motion. Times and zeros are relative to the values found by the
+loader (`Measurement.origins`), 0 for an exact record; velocity and mass are those of the TOML.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from foamfit.springs.parameters import NUISANCE
 
 CONTACT_TIME, TIME_SHIFT = "contact_time", "time_shift"
 VELOCITY, STRIKER_MASS = "velocity", "striker_mass"
-# Zeros of the channels: what a channel shows where the quantity itself is zero.
+# Zeros of the channels: the reading of a channel when the quantity is zero.
 ZEROS = {
     "displacement_zero": "displacement",
     "stress_zero": "stress",
@@ -30,16 +29,17 @@ UNDER_DRIVE = {
     "impact": (CONTACT_TIME, *ZEROS, *STRIKER),
     "displacement": ("displacement_zero", "stress_zero"),
 }
-# Standard deviations of a prior within which its parameter is looked for.
+# Limits of a parameter with a prior, in standard deviations.
 REACH = 6.0
-# Largest contact time and time shift, over the time under load; largest zeros, over the range.
+# Largest contact time and time shift, as a fraction of the time under load; largest zero, as a
+# fraction of the range of the channel.
 LARGEST_CONTACT, LARGEST_SHIFT, LARGEST_ZERO = 0.15, 0.1, 0.5
-_LOW = 0.1  # share of the peak stress up to which a contact may be missed
+_LOW = 0.1  # fraction of the peak stress below which a contact may have been overlooked
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a parameter before the fit: a normal distribution, SI."""
+    """Normal prior distribution of a parameter, SI."""
 
     name: str
     mean: float
@@ -47,17 +47,17 @@ class Prior:
 
 
 def is_late(measurement: Measurement, *, time_shift: bool) -> bool:
-    """Whether a time shift is fitted: it was asked for, or the delay of a motion has a ±."""
+    """Return whether a time shift is fitted: by request, or because the delay has a ±."""
     return time_shift or bool(measurement.uncertainties.get("delay"))
 
 
 def names_of(drive: str, *, time_shift: bool) -> tuple[str, ...]:
-    """Names of the nuisance parameters under a drive, in the order of the flat vector."""
+    """Return the names of the nuisance parameters, in the order of the flat vector."""
     return (*UNDER_DRIVE.get(drive, ()), *((TIME_SHIFT,) if time_shift else ()))
 
 
 def values_of(measurement: Measurement) -> dict[str, float]:
-    """Values that the record and its TOML give, SI."""
+    """Return the values given by the record and its TOML, SI."""
     striker = measurement.striker
     values = dict.fromkeys(NUISANCE, 0.0)
     values[VELOCITY] = (striker.velocity if striker else None) or math.nan
@@ -66,11 +66,11 @@ def values_of(measurement: Measurement) -> dict[str, float]:
 
 
 def priors_of(measurement: Measurement, drive: str) -> dict[str, Prior]:
-    """Priors of nuisance parameters: zeros shown before contact, and each ± of the TOML.
+    """Return the priors of nuisance parameters: zeros measured before contact, ± of the TOML.
 
-    A machine may move before it touches the specimen: its rest does not show the zero of a motion
-    that drives. The mass has no prior where the stress was computed with it: force and inertia then
-    change together.
+    A machine may move before it touches the specimen, so its rest position is not the zero of a
+    driving motion. The mass has no prior if the stress was computed from it, because force and
+    inertia then change together.
     """
     values = values_of(measurement)
     known = {zero: measurement.zeros.get(channel) for zero, channel in ZEROS.items()}
@@ -84,11 +84,11 @@ def priors_of(measurement: Measurement, drive: str) -> dict[str, Prior]:
 
 
 def open_in(measurement: Measurement, drive: str, counted: Mapping[str, bool]) -> frozenset[str]:
-    """Nuisance parameters that a record leaves open, by which of its channels are `counted`.
+    """Return the nuisance parameters to fit, given which channels are `counted`.
 
-    The zero of a motion is arbitrary in an impact, and where a slow test was recorded from before
-    its contact; that of a force or an acceleration is the file's own where nothing recorded before
-    the contact shows another.
+    The zero of a motion is arbitrary in an impact, and in a slow test recorded from before the
+    contact. The zero of a force or an acceleration is that of the file unless samples before the
+    contact show another.
     """
     priors = priors_of(measurement, drive)
     known = {name for name in priors if counted.get(ZEROS.get(name, ""), True)}
@@ -103,7 +103,7 @@ def open_in(measurement: Measurement, drive: str, counted: Mapping[str, bool]) -
 def limits_of(
     name: str, measurement: Measurement, drive: str, duration: float
 ) -> tuple[float, float]:
-    """Limits of a nuisance parameter, SI."""
+    """Return the limits of a nuisance parameter, SI."""
     prior, middle = priors_of(measurement, drive).get(name), values_of(measurement)[name]
     if prior is not None:
         reach = REACH * prior.sigma
@@ -120,9 +120,10 @@ def limits_of(
 
 
 def _latest_contact(measurement: Measurement) -> float:
-    """Latest contact where no rest was found and the motion begins elsewhere than at zero.
+    """Return the latest possible contact of a record without a rest period, or 0.
 
-    Such a record may begin before the contact, which is then anywhere while the stress is low.
+    If its motion does not begin at zero, the record may begin before the contact, which can then be
+    anywhere while the stress is low.
     """
     time, stress = measurement.time, measurement.stress
     elsewhere = bool(measurement.origins.get("displacement_zero"))

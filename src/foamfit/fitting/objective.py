@@ -1,7 +1,7 @@
-"""The objective: how far a model's curves are from the measured ones, sample by sample.
+"""The objective: weighted residuals between simulated and measured curves.
 
-Curves are compared in time (or sample by sample along a history), never by interpolating across
-the loop. `weights` say which curves are counted, so that nothing is counted twice silently.
+Curves are compared in time, or sample by sample along a history, never by interpolation across the
+loop. Only curves with a weight above zero count, so that no measurement counts twice.
 """
 
 from __future__ import annotations
@@ -42,37 +42,36 @@ from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, Stres
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import MOVED
 
-# What a residual is, in units of the curve's scale, where a simulation failed.
+# Residual after a failed simulation, as a multiple of the measured range.
 PENALTY = 10.0
 NOWHERE = np.empty(0, np.int64)
-OF_DRIVE = ("those of the drive",)  # nuisance parameters, where none are named
-# Share of a channel's range that estimated noise counts for at least. The law has not followed a
-# measured foam closer than 1 % of its range: noise far below that must not let one channel outweigh
-# the other by what is an error of the model in both.
+OF_DRIVE = ("those of the drive",)  # default of `Objective.nuisance`
+# Lower limit of the estimated noise, as a fraction of the range of a channel. Fits of the bistable
+# law to measured foams have misfits above 1 %: a smaller noise must not let one channel outweigh
+# the other, as the residuals of both are then errors of the law.
 MODEL_ERROR = 0.005
-MAX_STEPS = 20_000  # a trial that needs more is too stiff to be worth waiting for
-RTOL_OF_ANY_LAW = 1e-5  # of a registered law, whose halved steps cost more
-NORMAL = 1.4826  # standard deviation of normal residuals over the median of their sizes
-FINEST = 8  # most instants that are simulated for each sample that averages rows of the file
-# Steps of differences: of the velocity and the mass, relative, of times over the instants' gap, and
-# of the zero of a motion over its range.
+MAX_STEPS = 20_000  # a trial that needs more steps is too stiff and counts as failed
+RTOL_OF_ANY_LAW = 1e-5  # least rtol for a registered law, whose solver is slower
+NORMAL = 1.4826  # standard deviation of normal residuals over their median absolute value
+FINEST = 8  # most instants simulated per sample that averages rows of the file
+# Steps of difference quotients: velocity and mass, relative; times, in sampling intervals; and the
+# zero of a motion, as a fraction of its range.
 RELATIVE_STEP, STEP_OF_TIME, STEP_OF_ZERO = 1e-3, 0.02, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """The curves of one set of parameters, the run itself, and derivatives if they were wanted."""
+    """The curves of one set of parameters, the simulated motion, and derivatives on request."""
 
-    # By their names in `Objective.curves`, absent where the drive prescribes or the test lacks
-    # them, or where they are not counted; stress_strain is the stress (Pa) along the measured
-    # displacement.
+    # By the names in `Objective.curves`, without those that the drive prescribes, the test lacks or
+    # the residual does not need; stress_strain is the stress (Pa) along the measured displacement.
     curves: dict[str, Array]
-    motion: Motion  # on the clock of the samples where everything was asked for
-    slopes: dict[str, Array] | None = None  # (p, n) each
+    motion: Motion  # At the times of the samples if everything was requested
+    slopes: dict[str, Array] | None = None  # Derivatives of each curve, (p, n)
 
 
 def _with_slopes(motion: Motion, node: int | None = None) -> Array:
-    """The base stress of a run, or the displacement of a node, and below it its derivatives."""
+    """Return the base stress, or the displacement of a node, stacked on its derivatives."""
 
     def of(base_stress: Array, displacement: Array) -> Array:
         return base_stress if node is None else displacement[..., node, :]
@@ -87,30 +86,27 @@ def _with_slopes(motion: Motion, node: int | None = None) -> Array:
 class Objective:
     """Residuals of a model under a drive against a measurement.
 
-    `curves` are the names of the curves that can be counted, `interior` those of masses inside and
-    their node.
+    `curves` are the names of all curves, `interior` maps those of interior masses to their node.
     """
 
-    measurement: Measurement  # Conditioned
+    measurement: Measurement
     model: Model
     drive: str  # "impact", "stress" or "displacement"
-    weights: dict[str, float]  # Of each curve: it multiplies the curve's squares
-    rtol: float = 1e-6  # Of the simulation
-    # Whether the specimen's mass sits between the springs, in equal parts, as in the paper.
+    weights: dict[str, float]  # Factor of the squared residuals of each curve
+    rtol: float = 1e-6  # Relative error of the simulation
+    # Whether the mass of the specimen is distributed equally between the springs, as in the paper.
     interior_mass: bool = False
-    # Whether the vector of parameters ends with how late the motion channel is, s.
-    time_shift: bool = False
-    # Names of the nuisance parameters that end the vector; by default those of the drive.
+    time_shift: bool = False  # Whether the delay of the motion, s, is a nuisance parameter
+    # Nuisance parameters at the end of the vector; by default those of the drive.
     nuisance: tuple[str, ...] = OF_DRIVE
-    # The covariance that a driving motion's own uncertainty gives the residual; see `weigh_motion`.
-    weighing: Weighing | None = None
-    given: tuple[nuisances.Prior, ...] = ()  # Priors of parameters of the springs
-    followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is known already
-    evaluations: int = field(default=0, init=False)  # Sets of parameters that were simulated
-    failures: int = field(default=0, init=False)  # Those of them that could not be
+    weighing: Weighing | None = None  # Effect of an uncertain driving motion; see `weigh_motion`
+    given: tuple[nuisances.Prior, ...] = ()  # Priors of spring parameters
+    followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is already known
+    evaluations: int = field(default=0, init=False)  # Number of simulated sets of parameters
+    failures: int = field(default=0, init=False)  # Number of failed simulations
 
     def __post_init__(self) -> None:
-        """Make the scenes ready and fix the scale of each curve."""
+        """Prepare the scenes and the scale of each curve."""
         check_drive(self.measurement, self.drive)
         if self.time_shift:
             check_time_shift(self.measurement, self.drive)
@@ -147,7 +143,7 @@ class Objective:
                 f"{self.drive} drive has a weight above zero"
             )
         least = {name: MODEL_ERROR * float(np.ptp(curve)) for name, curve in self.measured.items()}
-        self.scale = {  # one standard deviation of the noise; an estimated one not below `least`
+        self.scale = {  # standard deviation of the noise; if estimated, at least `least`
             name: level.sigma if (level := self.noise(name)).given else max(level.sigma, floor)
             for name, floor in least.items()
         }
@@ -164,20 +160,20 @@ class Objective:
 
     @cached_property
     def _moved(self) -> Array:
-        """The measured motion at the instants that are simulated, m."""
+        """The measured motion at the simulated instants, m."""
         assert self.measurement.displacement is not None
         return moved_at(self._clock, self.time, self.measurement.displacement, self.motion)
 
     @cached_property
     def _along(self) -> dict[bool, AnyPlan]:
-        """Scenes of the springs along the measured motion; none where there is no motion."""
-        there = self.measurement.displacement is not None
-        return self._scenes(DisplacementDrive(self._moved)) if there else {}
+        """Scenes of the springs along the measured motion; empty without a motion."""
+        is_measured = self.measurement.displacement is not None
+        return self._scenes(DisplacementDrive(self._moved)) if is_measured else {}
 
     def weigh_motion(self, values: Array) -> bool:
-        """Weigh residuals by the motion's own uncertainty at a point; False where it has none.
+        """Weight the residuals by the uncertainty of the driving motion; False if it has none.
 
-        What is left of a curve there, noise or an error of the law, is its level.
+        The residual of each curve at this point, noise or error of the law, sets its level.
         """
         uncertain = self.by_motion(values)
         if uncertain is None:
@@ -191,7 +187,7 @@ class Objective:
         return True
 
     def by_motion(self, values: Array) -> Array | None:
-        """Change of the residual by each mode of the motion that drives, (n_data, m), or None."""
+        """Return the change of the residual by each mode of the motion, (n_data, m), or None."""
         if not self._driven or self.motion is None:
             return None
         modes = self.motion.modes(self._clock)
@@ -203,7 +199,7 @@ class Objective:
         return out
 
     def _moved_by(self, change: Array | float) -> Objective:
-        """The same objective with another driving motion, and plain residuals."""
+        """Return the objective with a changed driving motion and unweighted residuals."""
         other = copy(self)
         other.weighing = None
         other._plans = {
@@ -213,7 +209,7 @@ class Objective:
         return other
 
     def _set_nuisance(self) -> None:
-        """Which zero each curve has, the steps of differences, and the priors."""
+        """Prepare the zero of each curve, the steps of difference quotients, and the priors."""
         channels = {channel: zero for zero, channel in nuisances.ZEROS.items()}
         self._zero_of = {
             curve: zero
@@ -246,9 +242,10 @@ class Objective:
         return DisplacementDrive(self._moved)
 
     def _scenes(self, loading: Drive) -> dict[bool, AnyPlan]:
-        """Make scenes without and with dashpots ready; the values of the springs do not matter.
+        """Prepare scenes without and with dashpots; they do not depend on the spring parameters.
 
-        Interior masses move in an impact only; along a given motion the springs are in equilibrium.
+        Interior masses are included in impacts only; along a prescribed motion the springs are in
+        equilibrium.
         """
         specimen, count = self.measurement.specimen, len(self.model.kinds)
         heights, masses = [specimen.height / count] * count, [0.0] * count
@@ -266,7 +263,7 @@ class Objective:
         return {damped: make(dashpots=damped, relaxing=relaxing) for damped in (False, True)}
 
     def _measured(self) -> dict[str, Array]:
-        """Measured curves that the drive leaves free."""
+        """Return the measured curves that the drive does not prescribe."""
         measured = {"stress_time": self.stress}
         if self.measurement.displacement is not None:
             measured["displacement_time"] = self.measurement.displacement
@@ -279,18 +276,18 @@ class Objective:
         return {name: curve for name, curve in measured.items() if name not in self._absent}
 
     def channel(self, name: str) -> str:
-        """Channel of the test that a curve is compared with."""
+        """Return the channel that a curve is compared with."""
         own = name.startswith("displacement") or name == ACCELERATION
         return name.removesuffix("_time") if own else "stress"
 
     def noise(self, name: str) -> NoiseLevel:
-        """Noise of a curve, stated or estimated."""
+        """Return the noise of a curve, stated or estimated."""
         level = self.measurement.noise.of(self.channel(name))
         assert level is not None  # completed by with_noise
         return level
 
     def _fitted(self, name: str) -> NDArray[np.intp]:
-        """Samples of a curve that count: those that its channel measured, but no outliers."""
+        """Return the indices of the samples that count: measured ones without outliers."""
         channel = self.channel(name)
         counts = self.measurement.sampled.get(channel, np.ones(self.time.size, dtype=bool))
         outliers = self.measurement.outliers.get(channel)
@@ -301,10 +298,10 @@ class Objective:
     def simulate(
         self, values: Array, *, everything: bool = False, places: NDArray[np.int64] = NOWHERE
     ) -> Simulated:
-        """Simulate a flat vector of parameters; what is not counted only if `everything`.
+        """Simulate the counted curves, or all curves with `everything`.
 
-        `places` are those of the parameters by which derivatives are wanted. Raises SimulationError
-        if the parameters are not admissible or the scene has no finite answer.
+        `places` are the indices of the parameters by which derivatives are returned. Raises
+        SimulationError if the parameters are not admissible or the scene has no finite answer.
         """
         count = len(self.model.names)
         self.evaluations += 1
@@ -316,14 +313,14 @@ class Objective:
             raise
 
     def add_counts(self, other: Objective) -> None:
-        """Count the evaluations and failures of another objective as one's own."""
+        """Add the evaluations and failures of another objective."""
         self.evaluations += other.evaluations
         self.failures += other.failures
 
     def _seen(
         self, values: Array, nuisance: Array, everything: bool, places: NDArray[np.int64]
     ) -> Simulated:
-        """Curves of springs as the channels show them, and their derivatives; see `simulate`."""
+        """Return the curves in the readings of the channels, with all derivatives."""
         own = places < values.size
         if own.all():
             return self._curves(values, nuisance, everything, places)
@@ -336,7 +333,7 @@ class Objective:
         for curve, rows in carried.items():
             slopes[curve][own] = rows[: np.count_nonzero(own)]
         for at, name in zip(np.flatnonzero(~own), named, strict=True):
-            if moved and name == zero:  # the motion goes back by as much
+            if moved and name == zero:  # a larger zero means a smaller motion
                 by = {curve: -rows[-1] for curve, rows in carried.items()}
             else:
                 by = self._nuisance_slope(values, nuisance, name)
@@ -345,31 +342,31 @@ class Objective:
         return replace(curves, slopes=slopes)
 
     def _is_damped(self, values: Array, places: NDArray[np.int64]) -> bool:
-        """Whether a spring has a dashpot, or a derivative by one is wanted."""
+        """Return whether a spring has a dashpot, or a derivative by one is requested."""
         eta = self._dashpots
         return bool(values[: eta.size][eta].any() or eta[places].any())
 
     def _nuisance_slope(self, values: Array, nuisance: Array, name: str) -> dict[str, Array]:
-        """Derivative of the curves by one nuisance parameter.
+        """Return the derivative of the curves by one nuisance parameter.
 
-        The zero of a channel adds to it; the others by a central difference of two simulations,
-        whose error is far below that of their steps. So is the zero of a motion along which the
-        stress of an impact is counted.
+        The zero of a channel is simply added to it. Other derivatives are central difference
+        quotients of two simulations, including the zero of a motion that the stress follows.
         """
         n, at, step = self.time.size, self.nuisance.index(name), self._steps[name]
         followed = self._driven or "stress_strain" in self.counted
         if name in nuisances.ZEROS and not (followed and name == "displacement_zero"):
-            own = {curve: self._zero_of.get(curve) == name for curve in self.curves}
-            return {curve: np.full(n, float(shifted)) for curve, shifted in own.items()}
+            return {
+                curve: np.full(n, float(self._zero_of.get(curve) == name)) for curve in self.curves
+            }
         if self.drive != "impact" and name not in (nuisances.TIME_SHIFT, "displacement_zero"):
             return {curve: np.zeros(n) for curve in self.curves}
         sides = []
         for side in (-0.5, 0.5):
-            there = nuisance.copy()
-            there[at] += side * step
-            sides.append(self._curves(values, there, False, NOWHERE).curves)
+            shifted = nuisance.copy()
+            shifted[at] += side * step
+            sides.append(self._curves(values, shifted, False, NOWHERE).curves)
         slopes = {curve: (sides[1][curve] - sides[0][curve]) / step for curve in sides[0]}
-        if name == nuisances.CONTACT_TIME:  # with a dashpot the stress jumps there
+        if name == nuisances.CONTACT_TIME:  # where the stress jumps if there is a dashpot
             jumped = np.abs(self._clock - nuisance[at]) <= step
             for slope in slopes.values():
                 slope[np.any(jumped.reshape(n, -1), axis=1)] = 0.0
@@ -383,15 +380,15 @@ class Objective:
         places: NDArray[np.int64],
         moved: bool = False,
     ) -> Simulated:
-        """Curves of springs with derivatives by their own parameters alone; see `simulate`.
+        """Return the curves with derivatives by parameters of the springs.
 
-        The last derivative is by the displacement if the driving motion is to be `moved`.
+        With `moved` the last derivative is by a shift of the driving motion.
         """
         height, rows = self.measurement.specimen.height, self.model.rows(values)
         heights = np.ascontiguousarray(self.model.heights(values, height))
         if rows is None or not (heights.min() > 0.0 and values[-1] >= 0.0):
             raise SimulationError("the parameters are not admissible")
-        damped = self._is_damped(values, places)  # a dashpot at zero is left out
+        damped = self._is_damped(values, places)  # dashpots at zero are omitted
         drag, everywhere = float(values[-1]) / height, everything or self._inside
         wanted = self.model.directions[places]
         wanted = np.append(wanted, [(0, MOVED)], axis=0) if moved else wanted
@@ -431,7 +428,7 @@ class Objective:
             motion = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
         return Simulated(curves, motion, slopes if len(wanted) else None)
 
-    # ------------------------------------------------------------------ where and when
+    # ------------------------------------------------------------------ times and zeros
 
     @property
     def _driven(self) -> bool:
@@ -439,10 +436,10 @@ class Objective:
         return self.drive == "displacement"
 
     def _placed(self, plan: AnyPlan, at: dict[str, float]) -> AnyPlan:
-        """Plan of an impact with its contact, and its striker, where the nuisance has them."""
+        """Return the plan with contact time, striker and zero of the driving motion applied."""
         if self._driven and at.get("displacement_zero", 0.0) != 0.0:
             moved = plan.values - at["displacement_zero"]
-            return plan._replace(values=np.maximum(moved, 0.0))  # contact comes later, or is lost
+            return plan._replace(values=np.maximum(moved, 0.0))  # no contact below zero
         if self.drive != "impact":
             return plan
         mass = plan.mass.copy()
@@ -453,7 +450,7 @@ class Objective:
         )
 
     def _followed(self, plan: AnyPlan, at: dict[str, float]) -> AnyPlan:
-        """Plan of the measured motion of an impact: its zero taken off, none before contact."""
+        """Return the plan along the measured motion of an impact, zero before the contact."""
         if self.drive != "impact":
             return plan
         values = plan.values - at["displacement_zero"]
@@ -461,7 +458,7 @@ class Objective:
         return plan._replace(values=np.where(before, 0.0, values))
 
     def _sampled(self, values: Array) -> Array:
-        """Mean over the instants that each sample averages, along the last axis."""
+        """Return the mean over the instants that each sample averages, along the last axis."""
         values = values if self._own is None else values[..., self._own]
         if self._fine == 1:
             return values
@@ -469,7 +466,7 @@ class Objective:
         return np.asarray(sum(parts[1:], parts[0]) / self._fine)
 
     def _averaged(self, motion: Motion, contact: float) -> Motion:
-        """A run on the clock of the samples."""
+        """Return a simulated motion at the times of the samples."""
         if self._fine > 1 or self._own is not None:
             motion = motion._replace(
                 displacement=self._sampled(motion.displacement),
@@ -482,7 +479,7 @@ class Objective:
         return motion._replace(switches=switches, contact_end=motion.contact_end + contact)
 
     def _late(self, name: str, curves: Array, late: float) -> Array:
-        """Stress along a motion that is late by so many seconds, seen on its clock: earlier."""
+        """Return curves on the clock of the file, whose motion is `late` seconds late."""
         if late == 0.0 or (self.drive == "impact" and name != "stress_strain"):
             return curves
         if self.drive == "stress":
@@ -496,10 +493,10 @@ class Objective:
     def _acceleration(
         self, motion: Motion, drag: float, at: dict[str, float], by_site: NDArray[np.intp]
     ) -> Array:
-        """Deceleration of the striker, m/s², and its derivatives: eq. of motion of the top mass.
+        """Return the deceleration of the striker, m/s², and its derivatives.
 
-        A (Σ_N + η_site/H dw/dt)/m; with masses inside the second derivative of the motion itself.
-        A sensor on the striker does not feel gravity, nor does its zero before contact show it.
+        By the equation of motion it is A (Σ_N + η_site/H dw/dt)/m; with interior masses it is the
+        second derivative of the motion. An accelerometer does not measure gravity in free fall.
         """
         speed = np.gradient(_with_slopes(motion, -1), self._clock, axis=-1)
         if self.interior_mass:
@@ -515,12 +512,12 @@ class Objective:
     # ------------------------------------------------------------------ residual
 
     def residual(self, values: Array) -> Array:
-        """Weighted residuals of all counted curves and of the priors, dimensionless.
+        """Return the weighted residuals of all counted curves and of the priors, dimensionless.
 
-        The first `n_data` are those of the curves: simulated minus measured over the curve's scale,
-        times the root of its weight; outliers are left out. Behind them stands a residual for each
-        of the `priors`, over its standard deviation. Parameters that cannot be simulated cost a
-        finite penalty and are counted in `failures`.
+        The first `n_data` belong to the curves: simulated minus measured, divided by the scale of
+        the curve, times the square root of its weight, without outliers. One residual per prior
+        follows, divided by its standard deviation. If the simulation fails, the residuals are a
+        finite penalty, and `failures` is increased.
         """
         try:
             curves = self.simulate(values)
@@ -529,39 +526,39 @@ class Objective:
         return self.compare(curves, values)
 
     def off_priors(self, values: Array) -> Array:
-        """How far parameters are off their priors, in standard deviations."""
+        """Return the deviations of parameters from their priors, in standard deviations."""
         known = zip(values[self._prior_places], self.priors, strict=True)
         return np.array([(value - one.mean) / one.sigma for value, one in known])
 
     def compare(self, curves: Simulated, values: Array) -> Array:
-        """Residuals of simulated curves; see `residual`."""
+        """Return the residuals of simulated curves; see `residual`."""
         parts = [
             (curves.curves[name] - self.measured[name])[self._kept[name]] * self.factor(name)
             for name in self.counted
         ]
-        # A stress near the pole of branch c is as bad as none.
+        # The stress may be huge near the pole of branch c.
         bounded = np.minimum(np.maximum(np.concatenate(parts), -self.penalty), self.penalty)
         bounded = bounded if self.weighing is None else self.weighing(bounded)
         return np.append(bounded, self.off_priors(values)) if self.priors else bounded
 
     @property
     def floor(self) -> float:
-        """Sum of squares that leaves no more of the curves than noise, with a margin of half."""
+        """The noise floor: 1.5 times the sum of squares expected from noise alone."""
         sizes = zip(self.counted, self.sizes, strict=True)
         return 1.5 * sum(n * (self.noise(one).sigma * self.factor(one)) ** 2 for one, n in sizes)
 
     def factor(self, name: str) -> float:
-        """Residual of a curve that is off by one SI unit."""
+        """Return the residual of a deviation of one SI unit in a curve."""
         return float(self.weights[name] ** 0.5 / self.scale[name])
 
     def span(self, name: str) -> float:
-        """Measured range of a curve, in the unit of its residual."""
+        """Return the measured range of a curve, in units of its residual."""
         return float(np.ptp(self.measured[name])) * self.factor(name)
 
     def jacobian(self, values: Array, places: NDArray[np.int64]) -> Array:
-        """Derivative of the residual by the parameters at `places`, (n, n_places), SI.
+        """Return the derivative of the residual by the parameters at `places`, (n, n_places), SI.
 
-        Carried along with the simulation; zeros where the parameters cannot be simulated.
+        It is integrated along with the simulation, and zero if the simulation fails.
         """
         by_priors = np.zeros((len(self.priors), places.size))
         for row, (one, place) in enumerate(zip(self.priors, self._prior_places, strict=True)):
@@ -570,7 +567,7 @@ class Objective:
             curves = self.simulate(values, places=places)
         except SimulationError:
             return np.concatenate([np.zeros((self.n_data, places.size)), by_priors])
-        if (by := curves.slopes) is None:  # none were asked for
+        if (by := curves.slopes) is None:  # `places` is empty
             return np.zeros((self.n_data + len(self.priors), 0))
         parts = [by[name][:, self._kept[name]] * self.factor(name) for name in self.counted]
         slopes = np.concatenate(parts, axis=1).T
@@ -580,43 +577,43 @@ class Objective:
         return np.concatenate([slopes, by_priors]) if self.priors else slopes
 
     def jacobian_along(self, values: Array, moves: Array) -> Array:
-        """Derivative of the residual along moves (n_values, m) of the parameters, (n_data, m)."""
+        """Return the derivative of the residual along moves (n_values, m), (n_data, m)."""
         places = np.flatnonzero(moves.any(axis=1))
         return self.jacobian(values, places) @ moves[places]
 
     def kept(self, name: str) -> NDArray[np.intp]:
-        """Samples of a curve that stand in the residual, in their order."""
+        """Return the indices of the samples of a curve that are in the residual."""
         return self._kept[name]
 
     def n_measured(self, name: str) -> int:
-        """Count the samples that the channel of a curve measured, outliers included."""
+        """Return the number of measured samples of a curve, outliers included."""
         taken = self.measurement.sampled.get(self.channel(name))
         return self.time.size if taken is None else int(np.count_nonzero(taken))
 
     def by_curve(self, residual: Array) -> dict[str, Array]:
-        """Return the part of each counted curve in a residual, or in rows like it."""
+        """Split a residual into the parts of the counted curves."""
         parts = np.split(residual[: self.n_data], np.cumsum(self.sizes)[:-1])
         return dict(zip(self.counted, parts, strict=True))
 
     def rms(self, residual: Array) -> dict[str, float]:
-        """RMS of each counted curve in its unit, from residuals."""
+        """Return the RMS deviation of each counted curve in its unit, from a residual."""
         return {
             name: float(np.sqrt(np.mean(part**2))) / self.factor(name)
             for name, part in self.by_curve(residual).items()
         }
 
     def misfit(self, curves: Simulated) -> dict[str, float | None]:
-        """RMS of simulated minus measured over the measured range, per curve; None if not there.
+        """Return the misfit of each curve: RMS of simulated minus measured over the measured range.
 
-        Outliers are left out. A motion that was integrated from the force is there only if it is
-        counted.
+        Outliers are left out. It is None if the test or the drive does not have the curve, or if
+        its motion was integrated from the force and does not count.
         """
         derived = MOTION_CURVES if self.measurement.motion == INTEGRATED else ()
-        there = [name for name in self.curves if name in self.counted or name not in derived]
-        return {name: self.off(curves, name) if name in there else None for name in self.curves}
+        shown = [name for name in self.curves if name in self.counted or name not in derived]
+        return {name: self.off(curves, name) if name in shown else None for name in self.curves}
 
     def shifted(self, curves: Simulated, late: float) -> dict[str, Array]:
-        """Curves as channels show them of which the motion is late by so many seconds."""
+        """Return the curves that channels with a motion `late` seconds late would show."""
         moved = "displacement" if self.drive == "impact" else " "
         return {
             name: later(self.time, curve, late)
@@ -626,7 +623,7 @@ class Objective:
         }
 
     def look(self, values: Array) -> dict[str, float | None] | None:
-        """Misfits of all curves of a point, which counts as no step; None if not simulated."""
+        """Return the misfits of all curves, without counting the evaluation; None if it fails."""
         counts = self.evaluations, self.failures
         try:
             return self.misfit(self.simulate(values, everything=True))
@@ -636,7 +633,7 @@ class Objective:
             self.evaluations, self.failures = counts
 
     def off(self, curves: Simulated, name: str) -> float | None:
-        """RMS of simulated minus measured over the measured range of one curve, if it is there."""
+        """Return the misfit of one curve; None if it was not measured or simulated."""
         measured, simulated = self.measured.get(name), curves.curves.get(name)
         if measured is None or simulated is None:
             return None

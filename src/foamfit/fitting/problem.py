@@ -1,4 +1,4 @@
-"""What is fitted: the parameters of a model, their bounds, and the objective that they feed."""
+"""The problem of a fit: the parameters of a model with bounds, and the objective."""
 
 from __future__ import annotations
 
@@ -32,11 +32,12 @@ def make_params(
     relaxation: int = 0,
     **options: bool,
 ) -> lmfit.Parameters:
-    """Parameters of a model for a test, with bounds from its scales; change them, then `fit`.
+    """Return the parameters of a model for a test; change them, and pass them to `fit`.
 
-    One damper varies in the impact drive: the dashpot of a single spring, and in a chain the onsite
-    damper of the striker, as in the paper. The other drives are rate-independent unless told
-    otherwise. Heights are the specimen's where it states them, else they vary with their sum fixed.
+    The bounds follow from the scales of the test. In the impact drive one damping parameter varies:
+    the dashpot of a single spring, or the onsite damper of the striker of a chain, as in the paper.
+    In the other drives all damping is fixed at zero by default. Heights are those of the specimen
+    if it states them; otherwise they vary with a fixed sum.
 
     Parameters
     ----------
@@ -47,12 +48,12 @@ def make_params(
     drive : str, optional
         "impact", "stress" or "displacement"; by default as in `fit`.
     time_shift : bool
-        Whether the delay of the motion against the force is a parameter. It always is if the motion
-        has its own clock and its delay has a ±.
+        Whether the delay of the motion relative to the force is a parameter. It always is if the
+        motion has its own clock and the delay has a ±.
     relaxation : int
-        Relaxation terms of every hysteretic spring of a model that is given by its name.
+        Number of relaxation terms of every hysteretic spring, if `model` is a name.
     options : bool
-        "stiffening" and "mullins", as for `fit`: whether they free more parameters.
+        "stiffening" and "mullins", as for `fit`.
 
     Returns
     -------
@@ -85,7 +86,7 @@ def make_params(
     _add_heights(params, measurement, model)
     late = nuisance.is_late(measurement, time_shift=time_shift)
     _add_nuisance(params, measurement, scales, drive, late)
-    for name in params:  # a fifth of the way between ends that depend on others, one of them zero
+    for name in params:  # a fifth of the upper end, where the ends are zero and other parameters
         if name in model.index and isinstance((param := model.param(name)).coordinate, Between):
             first, last = param.coordinate.ends(*others(name, param, params.valuesdict()))
             if first == 0.0:
@@ -96,7 +97,7 @@ def make_params(
 def fix_and_vary(
     params: lmfit.Parameters, model: str, fix: Mapping[str, float], vary: Iterable[str]
 ) -> lmfit.Parameters:
-    """Hold some parameters of a model at values in SI, and vary others that are held by default."""
+    """Fix some parameters of a model at SI values, and vary others that are fixed by default."""
     vary = tuple(vary)
     check_fixed_and_varied(params, model, fix, vary)
     for name in (*fix, *vary):
@@ -117,7 +118,7 @@ def fix_and_vary(
 def check_fixed_and_varied(
     names: Iterable[str], model: str, fix: Mapping[str, float], vary: Iterable[str]
 ) -> None:
-    """Refuse an unknown parameter, or one that is both fixed and varied (InputError)."""
+    """Raise InputError for an unknown parameter, or one that is both fixed and varied."""
     for name in (*fix, *vary):
         if name not in names:
             raise InputError(
@@ -129,7 +130,7 @@ def check_fixed_and_varied(
 
 
 def _add_heights(params: lmfit.Parameters, measurement: Measurement, model: Model) -> None:
-    """Heights of a chain: the specimen's, or varied with their sum fixed."""
+    """Add the heights of a chain: those of the specimen, or varied with a fixed sum."""
     count, specimen = len(model.kinds), measurement.specimen
     if specimen.heights is not None and len(specimen.heights) != count > 1:
         raise InputError(
@@ -149,7 +150,7 @@ def _add_heights(params: lmfit.Parameters, measurement: Measurement, model: Mode
 def _add_nuisance(
     params: lmfit.Parameters, measurement: Measurement, scales: Scales, drive: str, late: bool
 ) -> None:
-    """What the record does not say exactly, in the numbers of its file."""
+    """Add the nuisance parameters, in the numbers of the file."""
     weights = default_weights(measurement, drive)
     counted = {
         "displacement": weights["displacement_time"] > 0.0 or drive == "displacement",
@@ -169,7 +170,7 @@ def _add_nuisance(
 def _counted_from(
     params: lmfit.Parameters, origins: Mapping[str, float], sign: float
 ) -> lmfit.Parameters:
-    """Count nuisance parameters from what was taken off the record, or in its own numbers."""
+    """Shift nuisance parameters by the origins: sign 1 to the numbers of the file, -1 back."""
     for name in origins.keys() & params.keys():
         if by := sign * origins[name]:
             one = params[name]
@@ -178,14 +179,14 @@ def _counted_from(
 
 
 def _rest_of_height(measurement: Measurement, model: Model) -> str:
-    """Expression of the last spring's height: what the others leave of the specimen."""
+    """Return the expression for the height of the last spring: the specimen minus the others."""
     others = [f"s{i}_height" for i in range(1, len(model.kinds))]
     return " - ".join([repr(measurement.specimen.height), *others])
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What a fit works on, and the way between lmfit's parameters and the flat vector."""
+    """The problem of a fit, and the conversion between lmfit's parameters and a flat vector."""
 
     measurement: Measurement
     model: Model
@@ -196,53 +197,53 @@ class Problem:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all parameters in the order of the flat vector: the model's, the nuisance."""
+        """Names in the order of the flat vector: parameters of the model, then nuisance ones."""
         return (*self.model.names, *self.objective.nuisance)
 
     @property
     def index(self) -> dict[str, int]:
-        """Place of each parameter in the flat vector."""
+        """Index of each parameter in the flat vector."""
         return {name: i for i, name in enumerate(self.names)}
 
     @cached_property
     def origins(self) -> Array:
-        """What was taken off the record, by parameter, SI: values + origins are the file's own."""
+        """Values subtracted by the loader, SI: values + origins are the numbers of the file."""
         return np.array([self.measurement.origins.get(name, 0.0) for name in self.names])
 
     def vector(self, params: lmfit.Parameters | None = None) -> Array:
-        """Flat vector of these parameters, or of the problem's own."""
+        """Return the flat vector of `params`, or of the problem's own parameters."""
         values = (self.params if params is None else params).valuesdict()
         return np.array([values[name] for name in self.names])
 
     def told(self) -> lmfit.Parameters:
-        """Parameters for the user: nuisance parameters in the numbers of the file."""
+        """Return the parameters for the user: nuisance parameters in the numbers of the file."""
         return _counted_from(self.params.copy(), self.measurement.origins, 1.0)
 
     def is_exact(self, name: str) -> bool:
-        """Whether the record leaves a nuisance parameter no freedom, and nobody has held it."""
+        """Return whether a nuisance parameter is fixed by the record, not by the user."""
         one, usual = self.params[name], nuisance.values_of(self.measurement)
         return not one.vary and one.value == usual.get(name)
 
     def with_springs(self, vector: Array, own: Array | None = None) -> Array:
-        """Vector with the springs of another test where they vary here, all else its own."""
+        """Return `own` (by default the start) with varied spring parameters of another test."""
         values = self.vector() if own is None else own.copy()
         free = [self.index[name] for name in self.free() if name not in NUISANCE]
         values[free] = vector[free]
         return self.space().complete(values)
 
     def put(self, values: Array) -> None:
-        """Write a flat vector into the parameters that vary."""
+        """Store a flat vector in `params`."""
         for name, value in zip(self.names, values, strict=True):
             if self.params[name].expr is None:
                 self.params[name].value = float(value)
         self.params.update_constraints()
 
     def free(self) -> tuple[str, ...]:
-        """Names of the parameters that vary."""
+        """Return the names of the parameters that vary."""
         return tuple(name for name in self.names if self.params[name].vary)
 
     def holding(self, name: str, value: float) -> Problem:
-        """The same problem with a parameter held at a value; itself where it does not vary."""
+        """Return the problem with a varied parameter fixed at a value; unchanged if it is fixed."""
         if name not in self.free():
             return self
         params = self.params.copy()
@@ -250,7 +251,7 @@ class Problem:
         return replace(self, params=params)
 
     def tied(self) -> Callable[[Array], Array] | None:
-        """Completion of a vector by the expressions among the parameters; None if there is none."""
+        """Return a function that evaluates the expressions in a vector; None without any."""
         tied = [name for name in self.names if self.params[name].expr is not None]
         if not tied:
             return None
@@ -270,14 +271,14 @@ class Problem:
         return complete
 
     def _last_height(self, values: Array) -> Array:
-        """Complete the heights to that of the specimen; the expression itself, but fast."""
+        """Set the last height to the rest of the specimen; a fast form of the expression."""
         first, last = self.model.index["s1_height"], len(self.model.kinds) - 1
         others = values[first : first + last]
         values[first + last] = self.measurement.specimen.height - others.sum()
         return values
 
     def space(self) -> Space:
-        """The box in which the search moves."""
+        """Return the box of the search."""
         params = [self.params[name] for name in self.names]
         low, high = np.array([one.min for one in params]), np.array([one.max for one in params])
         vector = self.vector()
@@ -286,26 +287,26 @@ class Problem:
         )
 
     def sizes(self, names: tuple[str, ...], values: Array) -> Array:
-        """Scales of some parameters at a point."""
+        """Return the scales of some parameters at a point."""
         at = dict(zip(self.names, map(float, values), strict=True))
         return np.array([self.scales.of_parameter(self.model, name, at) for name in names])
 
     def slopes(self, values: Array, names: tuple[str, ...]) -> Array:
-        """Derivative of the residual by some parameters at a point, (n_data, n_names), per SI unit.
+        """Return the derivative of the residual by some parameters, (n_data, n_names), SI.
 
-        Exact; see `Objective.jacobian`. Parameters that hang on these by expressions move with
-        them.
+        It is exact; see `Objective.jacobian`. Parameters that depend on these through expressions
+        move with them.
         """
         return self.objective.jacobian_along(values, self.moves(values, names))
 
     def moves(self, values: Array, names: tuple[str, ...]) -> Array:
-        """Moves (n_values, n_names) of all parameters with each of these, those that hang on it."""
+        """Return how all parameters move with each of these, (n_values, n_names)."""
         moves = np.eye(values.size)[:, [self.index[name] for name in names]]
         return self.space().follow(values, moves, 1e-5 * self.sizes(names, values))
 
 
 def _check_held(params: lmfit.Parameters) -> None:
-    """Refuse by name a held value that no spring can have."""
+    """Raise InputError for a fixed value that is not admissible."""
     for name, parameter in params.items():
         if parameter.vary or parameter.expr is not None:
             continue
@@ -318,10 +319,12 @@ def _check_held(params: lmfit.Parameters) -> None:
 
 
 def _prior(name: str, value: object, model: Model) -> nuisance.Prior:
-    """Read a prior of a parameter of the springs: mean and standard deviation, or a text."""
+    """Read a prior of a spring parameter: mean and standard deviation, or a text."""
     where = f"priors: {name}"
     if name in NUISANCE:
-        raise InputError(f"{where} is none of the springs; give its ± in the TOML where it has one")
+        raise InputError(
+            f"{where} is not a parameter of the springs; if the TOML has it, give its ± there"
+        )
     if name not in model.names:
         raise InputError(
             f"{where} is not one of the model {model.name}; its parameters are "
@@ -337,9 +340,9 @@ def _prior(name: str, value: object, model: Model) -> nuisance.Prior:
         except (TypeError, ValueError):
             mean, sigma = math.nan, None
     if sigma is None or not (math.isfinite(mean) and 0.0 < sigma < math.inf):
-        told = f"({unit or 'a number'}, {unit or 'a number'})"
+        pair = f"({unit or 'a number'}, {unit or 'a number'})"
         raise InputError(
-            f"{where} = {value!r} must be a mean and a positive standard deviation {told}, or a "
+            f"{where} = {value!r} must be a mean and a positive standard deviation {pair}, or a "
             f'text like "{example}"'
         )
     return nuisance.Prior(name, mean, sigma)
@@ -357,9 +360,9 @@ def make_problem(
     relaxation: int = 0,
     priors: Mapping[str, object] | None = None,
 ) -> Problem:
-    """Make a problem ready; see `foamfit.fit` for the arguments.
+    """Return the problem of a fit; `foamfit.fit` describes the arguments.
 
-    Raises InputError if the test cannot feed the drive or a parameter is unknown, by its name.
+    Raises InputError if the test lacks data for the drive, or if a parameter is unknown.
     """
     model = Model.parse(model_name, relaxation)
     drive = choose_drive(measurement) if drive is None else drive
@@ -377,9 +380,9 @@ def make_problem(
         interior_mass=interior_mass, time_shift=time_shift,
         given=tuple(_prior(name, value, model) for name, value in (priors or {}).items()),
     )  # fmt: skip
-    measurement = objective.measurement  # with the noise of each channel
+    measurement = objective.measurement  # it has the noise of each channel
     wanted = make_params(measurement, model, drive, time_shift=time_shift)
-    params = lmfit.Parameters() if params is None else params.copy()  # a caller's own stay
+    params = lmfit.Parameters() if params is None else params.copy()  # do not change the caller's
     if unknown := [name for name in params if name not in wanted]:
         raise InputError(
             f"parameter '{unknown[0]}' is not one of the model {model.name}; "

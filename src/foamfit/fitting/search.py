@@ -1,7 +1,7 @@
 """The search: descents from the best of many start values.
 
-It moves in the box of `fitting.box`, so that no step leaves what the law admits. It first fits the
-loop (stress along the measured motion, closed form, cheap), then the curves of the drive itself.
+All points lie in the box of `fitting.box` and are admissible. The search first fits the loop (the
+stress along the measured motion, which is cheap to compute), then the curves of the drive.
 """
 
 from __future__ import annotations
@@ -25,71 +25,70 @@ from foamfit.springs.parameters import NUISANCE, family, relaxation_names
 
 Progress = Callable[[float, str], None]
 
-PULSE = 16  # evaluations
-# Shares of the time of a search, as measured, at which its parts begin.
+PULSE = 16  # evaluations between two calls of `Tracker.pulse`
+# Fractions of the run time of a search at which its parts begin, as measured.
 DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
-# Searches at most: a second one where a single descent led to the best end, and a third where this
-# still misses more of the curves than noise; one more for several hysteretic springs.
+# Largest number of rounds: a second one if only one descent led to the best end, and a third if its
+# cost is still above the noise floor; one more for several hysteretic springs.
 ATTEMPTS = 3
-IN_SERIES = 3  # searches at least for several hysteretic springs
-LOST = 30.0  # times the noise floor of the cost, above which no agreement is believed at once
-NOISY = 0.005  # noise of a motion, over its range, that is much
-AROUND = 200  # points about the best one among which another search begins
-# Share of the box that counts as its edge, that of what is moved where the curves miss more than
-# noise, and where inside a descent begins again.
+IN_SERIES = 3  # least number of rounds for several hysteretic springs
+LOST = 30.0  # cost, in noise floors, above which a second round always follows
+NOISY = 0.005  # noise of a motion, as a fraction of its range, above which it is smoothed
+AROUND = 200  # random points around the best one at the start of a further round
+# Width of the edge of the box, and a wider one used above the noise floor, as fractions of the box;
+# start points inside the box for a coordinate at its edge.
 EDGE, EDGE_MISSING, INSIDE = 0.02, 0.1, (0.35, 0.5, 0.65)
-# Change of the logarithm of a parameter, and further ones of a relaxation time, that lead out of a
-# wrong minimum; they are tried if the cost is above this share of the noise floor, which includes
-# a margin.
+# Changes of the logarithm of a parameter, and of a relaxation time, to leave a wrong minimum. They
+# are tried if the cost exceeds this fraction of the noise floor.
 APART, APART_IN_TIME, MISSING = 1.2, (3.0, -3.0, 4.8, -4.8), 0.8
-# Strength of each relaxation term that begins anew, and scales of what is as stiff as before then.
+# Strength of each new relaxation term, and the scales of parameters adjusted to it.
 ANEW, STIFF = 0.3, ("stress", "slope")
-# Points off the best one are tried again where it costs less than before by this share.
+# Points away from the best one are tried again if the cost has fallen by more than this fraction.
 NEWS = 1e-5
-# Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
+# Minima of the loop are continued if their cost on the curves is within this factor of the best.
 PROMISING = 100.0
-# Factors by which the stiffness that an interior mass vibrates on is changed, and their inverses.
+# Factors of the stiffness in the scan of the vibration of an interior mass; also their inverses.
 STIFFER = np.geomspace(1.0, 2.0, 71)[1:]
 
 
 class SearchStoppedError(Exception):
-    """The time is up; the best point so far is the result."""
+    """The time limit was reached; the best point so far is the result."""
 
 
-# What ends a search, refits or a chain before they are done: what was found is kept.
+# Exceptions that stop a search, a profile or a Markov chain early; results so far are kept.
 STOPPING = (SearchStoppedError, KeyboardInterrupt)
 
 
 def what_stopped(error: BaseException) -> str:
-    """Say what has raised one of `STOPPING`."""
+    """Return the cause of one of the exceptions in `STOPPING`."""
     return "the time limit" if isinstance(error, SearchStoppedError) else str(error) or "Ctrl-C"
 
 
 @dataclass(frozen=True)
 class SearchRecord:
-    """How a search went."""
+    """Record of a search."""
 
     seed: int
-    starts: int  # Descents on the loop that were asked for
+    starts: int  # Requested number of descents on the loop
     began: float  # `time.perf_counter` at its start, s
-    # Final costs of the descents on the drive's curves, best first, and how many descents on the
-    # loop led to each.
+    # Final costs of the descents on the curves, best first, and the number of descents on the loop
+    # that led to each.
     costs: tuple[tuple[float, int], ...] = ()
-    stopped: str | None = None  # What ended it early: "the time limit", "Ctrl-C", "SIGTERM"
+    stopped: str | None = None  # Why it ended early: "the time limit", "Ctrl-C", "SIGTERM"
 
     @property
     def agreeing(self) -> int:
-        """How many descents led to the best cost, within 2 %."""
+        """Number of descents that led to the best cost, within 2 %."""
         return sum(count for cost, count in self.costs if cost <= 1.02 * self.costs[0][0])
 
 
 @dataclass(eq=False)
 class Tracker:
-    """Counts and times the evaluations of an objective and keeps the best point ever seen.
+    """Evaluates an objective within a time limit, and keeps the best point.
 
-    `ends` holds the parameters at which the descents on the drive's curves ended; `better` is
-    called with every point that is the best so far, `pulse` at every so many evaluations, `looked`
-    with the best point of the first descents. What `looked` raises ends the fit.
+    `ends` are the end points of the descents on the curves. `better` is called with each new best
+    point, `pulse` every `PULSE` evaluations, and `looked` with the best point of the first
+    descents; an exception from `looked` ends the fit.
     """
 
     objective: Objective
@@ -102,7 +101,7 @@ class Tracker:
     ends: list[Array] = field(default_factory=list)
 
     def residual(self, values: Array) -> Array:
-        """Residual of the objective; raises SearchStoppedError once the time is up."""
+        """Return the residual of the objective; SearchStoppedError after the time limit."""
         residual = self.consider(values)
         if self.pulse is not None and self.objective.evaluations % PULSE == 0:
             self.pulse()
@@ -111,12 +110,12 @@ class Tracker:
         return residual
 
     def look(self) -> None:
-        """Show the best point, if there is one and somebody wants to see it."""
+        """Call `looked` with the best point, if there are both."""
         if self.looked is not None and self.best_values is not None:
             self.looked(self.best_values)
 
     def consider(self, values: Array) -> Array:
-        """Residual of the objective, whatever the time."""
+        """Return the residual of the objective, without a time limit."""
         failures = self.objective.failures
         residual = self.objective.residual(values)
         cost = float(residual @ residual)
@@ -130,7 +129,7 @@ class Tracker:
 def descend(
     tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
 ) -> tuple[float, Array]:
-    """Levenberg-Marquardt descent inside the box; returns (cost, coordinates) of its end."""
+    """Descend inside the box by Levenberg-Marquardt; return cost and coordinates of the end."""
     end = levenberg.descend(*squares(tracker, space), start, space.box, iterations, enough=enough)
     return end.cost, end.point
 
@@ -138,7 +137,7 @@ def descend(
 def squares(
     tracker: Tracker, space: Space, rows: slice | NDArray[np.bool_] = slice(None)
 ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """Residual of some rows by the coordinates of a box, and its derivative."""
+    """Return functions for some rows of the residual at a point of the box, and its derivative."""
 
     def residual(point: Array) -> Array:
         return tracker.residual(space.decode(point))[rows]
@@ -159,9 +158,9 @@ def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[floa
 
 
 def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
-    """Choose `count` of the ranked points: the best, then the best of each range of `Law.strata`.
+    """Return `count` of the ranked points, the best one of each range of `Law.strata` among them.
 
-    Where branch d is about as stiff as branch a, the minima of the cost differ by ε_a.
+    If branches d and a have similar stiffness, the cost has several minima that differ in ε_a.
     """
     wanted = {law.strata for law in space.model.laws}
     marks = [j for j, one in enumerate(space.coordinates) if one.short in wanted]
@@ -175,9 +174,9 @@ def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
 
 
 def distinct(ends: list[tuple[float, Array]], apart: float = 1e-3) -> list[tuple[int, Array]]:
-    """Distinct minima among the ends of descents, best first: how many ended there, and one end.
+    """Return the distinct minima among the ends of descents, best first: count and one end each.
 
-    Ends whose costs differ by less than the share `apart` are of one minimum.
+    Ends belong to one minimum if the relative difference of their costs is below `apart`.
     """
     groups: list[list[tuple[float, Array]]] = []
     for end in sorted(ends, key=itemgetter(0)):
@@ -191,12 +190,12 @@ def distinct(ends: list[tuple[float, Array]], apart: float = 1e-3) -> list[tuple
 def search(
     tracker: Tracker, space: Space, *, starts: int, rng: np.random.Generator, progress: Progress
 ) -> list[tuple[float, int]]:
-    """Search for the best parameters; the tracker keeps them.
+    """Search for the best parameters, which the tracker keeps.
 
-    Of the descents on the loop (so many `starts`) the best quarter go on to the curves of the
-    drive; see `ATTEMPTS` for when that is done again. Returned are the final costs there, best
-    first, and how many descents on the loop led to each. Raises SearchStoppedError when the time is
-    up.
+    The best quarter of the descents on the loop (`starts` in number) are continued on the curves of
+    the drive; `ATTEMPTS` says when this is repeated. Returns the final costs, best first, each with
+    the number of descents on the loop that led to it. Raises SearchStoppedError after the time
+    limit.
     """
     progress(0.0, "start values")
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
@@ -210,7 +209,7 @@ def search(
             points = [point for _, point in found]
             counts = {id(point): count for count, point in found}
         ranked = rank(tracker, space, points)
-        if attempt == 0 and tracker.objective.drive != "impact":  # there the loop is not the curves
+        if attempt == 0 and tracker.objective.drive != "impact":  # else the loop has other curves
             tracker.look()
         if tracker.objective.interior_mass:
             progress(ON_CURVES, "vibration")
@@ -224,13 +223,13 @@ def search(
             out.append((cost, counts.get(id(point), 1)))
         if attempt == 0:
             tracker.look()
-        if tracker.best_cost < (1.0 - NEWS) * left:  # else it would all be the same again
+        if tracker.best_cost < (1.0 - NEWS) * left:  # otherwise these points were tried before
             edges = _off_edges(tracker, space)
             apart = _descended(tracker, space, _apart(tracker, space))
             out += [(cost, 1) for cost in edges + apart]
             reached = tracker.best_cost
             _descended(tracker, space, _far_off(tracker, space))
-            if tracker.best_cost < reached:  # that several of them lead there is no agreement
+            if tracker.best_cost < reached:  # counts once, as these descents are not independent
                 out.append((tracker.best_cost, 1))
             left = tracker.best_cost
         least = IN_SERIES if several else max(attempts // 2, 2 if edges else 1)
@@ -241,12 +240,12 @@ def search(
 
 
 def has_several(model: Model) -> bool:
-    """Whether more than one spring of a chain is hysteretic."""
+    """Return whether a model has more than one hysteretic spring."""
     return sum(law.hysteretic for law in model.laws) > 1
 
 
 def _around_best(tracker: Tracker, space: Space, rng: np.random.Generator) -> list[Array]:
-    """Points about the best one: some of its coordinates moved by a share of the box or less."""
+    """Return random points around the best one, with about half of the coordinates changed."""
     if tracker.best_values is None:
         return []
     low, high = space.box
@@ -259,10 +258,10 @@ def _around_best(tracker: Tracker, space: Space, rng: np.random.Generator) -> li
 
 
 def _off_edges(tracker: Tracker, space: Space) -> list[float]:
-    """Descend from the best point with what lies at an edge of the box moved inside; the costs.
+    """Move coordinates at an edge of the box inside, and descend; return the costs.
 
-    A stiffness that few samples show may run to an edge and stay there while all else is found. In
-    a chain that misses far more than noise any stiffness may have run far off.
+    A stiffness that affects few samples may run to an edge and stay there while the rest converges.
+    In a chain above the noise floor any stiffness may be far off.
     """
     low, high = space.box
     best = space.encode(tracker.best_values) if tracker.best_values is not None else low
@@ -281,7 +280,7 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
 
 
 def _descended(tracker: Tracker, space: Space, starts: Iterable[Array]) -> list[float]:
-    """Descend from each start; the costs of the ends, which the tracker keeps."""
+    """Descend from each start; return the costs of the ends, which the tracker keeps."""
     costs = []
     for start in starts:
         cost, end = descend(tracker, space, start, 60)
@@ -291,9 +290,9 @@ def _descended(tracker: Tracker, space: Space, starts: Iterable[Array]) -> list[
 
 
 def _apart(tracker: Tracker, space: Space) -> Iterator[Array]:
-    """Points with one positive parameter of the best changed by a factor, larger and smaller.
+    """Yield the best point with one positive parameter multiplied or divided by a factor.
 
-    All descents may end in the same wrong minimum. There are none where only noise is left.
+    All descents may have ended in the same wrong minimum. At the noise floor nothing is yielded.
     """
     if tracker.best_values is None or tracker.best_cost < MISSING * tracker.objective.floor:
         return
@@ -307,10 +306,10 @@ def _apart(tracker: Tracker, space: Space) -> Iterator[Array]:
 
 
 def _far_off(tracker: Tracker, space: Space) -> Iterator[Array]:
-    """Points farther from the best than those of `_off_edges` and `_apart`, if more is missed.
+    """Yield points farther from the best one than those of `_off_edges` and `_apart`.
 
-    Other relaxation times, along which the cost is flat far off, a relaxation begun anew, and
-    what lies in the outer tenth of the box moved inside.
+    They have other relaxation times (far off, the cost is flat along them), new relaxation terms,
+    or coordinates in the outer tenth of the box moved inside.
     """
     if tracker.best_values is None or tracker.best_cost < MISSING * tracker.objective.floor:
         return
@@ -331,9 +330,9 @@ def _far_off(tracker: Tracker, space: Space) -> Iterator[Array]:
 
 
 def _relaxing_anew(space: Space, values: Array) -> Iterator[Array]:
-    """Point with new relaxation terms, their times a tenth to a hundredth of the time under load.
+    """Yield a point with new relaxation terms, of 1/100 to 1/10 of the time under load.
 
-    The springs keep their instantaneous stiffness k (1 + Σ g). Large strengths with long times are
+    The springs keep their instantaneous stiffness k (1 + Σ g). Large strengths with long times form
     a wide wrong minimum.
     """
     model, moved, count = space.model, values.copy(), space.model.relaxation
@@ -352,7 +351,7 @@ def _relaxing_anew(space: Space, values: Array) -> Iterator[Array]:
 
 
 def _neighbours(space: Space, values: Array) -> Iterator[Array]:
-    """Points whose springs have nearly the same loop, as their laws say."""
+    """Yield points with nearly the same loop, from `Law.neighbours` of each spring."""
     for spring, law in enumerate(space.model.laws):
         own = space.model.own(spring, values)[:-1]
         for near in law.neighbours(own, space.scales.stress):
@@ -364,10 +363,11 @@ def _neighbours(space: Space, values: Array) -> Iterator[Array]:
 
 
 def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int, least: int) -> bool:
-    """Whether descents agree on the best end, or none of a second search is better than noise.
+    """Return whether no further round is needed.
 
-    `least` searches are made in any case where the best end misses more of the curves than noise or
-    springs are in series, and two where it misses far more.
+    Several descents must agree on the best end, or after a second round its cost must be at the
+    noise floor. `least` rounds are made if the best end is above the noise floor or several springs
+    are hysteretic, and two if it is far above.
     """
     best, floor = min(ends)[0], tracker.objective.floor
     several = has_several(tracker.objective.model)
@@ -381,7 +381,7 @@ def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int, leas
 
 
 def ensure_feasible(tracker: Tracker, space: Space, rng: np.random.Generator) -> None:
-    """Find some point that can be simulated, if the search was stopped before it had one."""
+    """Find a point that can be simulated, if the search was stopped before it had one."""
     for point in [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]:
         if tracker.best_values is not None:
             return
@@ -392,9 +392,10 @@ def _search_loop(
     tracker: Tracker, space: Space, points: list[Array], starts: int,
     rng: np.random.Generator, progress: Progress,
 ) -> list[tuple[float, Array]]:  # fmt: skip
-    """Descend on the smoothed loop, from the curve's own starts too; returns costs and ends.
+    """Descend on the smoothed loop; return costs and ends.
 
-    However this ends, the best point of the loop is handed to the tracker.
+    Start values read off the loop are added to `points`. The best point of the loop is passed to
+    the tracker even if the search is stopped.
     """
     objective = tracker.objective
     followed = None
@@ -407,7 +408,7 @@ def _search_loop(
     )  # fmt: skip
     inner = Tracker(along, tracker.deadline, tracker.better)
     own = space
-    if objective.drive == "impact":  # whose contact and zero show in its curves alone
+    if objective.drive == "impact":  # contact and zeros do not affect its loop
         free = [name for name in space.free if name not in NUISANCE or name == TIME_SHIFT]
         own = replace(space, free=tuple(free))
     try:
@@ -418,7 +419,7 @@ def _search_loop(
         for i, point in enumerate(spread_out(own, points, starts)):
             progress(DESCENTS + (ON_CURVES - DESCENTS) * i / starts, "loop")
             if 2 * i == starts and objective.drive != "impact" and inner.best_values is not None:
-                tracker.consider(inner.best_values)  # half of them show whether more are worth it
+                tracker.consider(inner.best_values)  # after half of the descents
                 tracker.look()
             cost, end = descend(inner, own, point, 40)
             ends.append((cost, space.encode(own.decode(end))))
@@ -430,7 +431,7 @@ def _search_loop(
 
 
 def _is_noisy(objective: Objective) -> bool:
-    """Whether a loop needs the motion without its noise: where it drives, or has much of it."""
+    """Return whether the loop needs a smoothed motion: if it drives, or is noisy."""
     test = objective.measurement
     motion, level = test.displacement, test.noise.of("displacement")
     if objective.drive != "impact" or motion is None or level is None:
@@ -439,10 +440,10 @@ def _is_noisy(objective: Objective) -> bool:
 
 
 def _scan_vibration(tracker: Tracker, space: Space, start: Array) -> list[tuple[float, Array]]:
-    """Fits of the massless chain for each stiffness of a linear spring, ranked with its masses.
+    """Fit the massless chain for many stiffnesses of a linear spring, and rank with its masses.
 
-    The cost has a minimum for every cycle that the vibration of an interior mass on a stiff spring
-    gains on the measured one: no descent crosses from one to the next.
+    With interior masses the cost has a minimum for each number of vibration cycles of a mass on a
+    stiff spring, and no descent leads from one to the next.
     """
     objective = replace(tracker.objective, interior_mass=False)
     massless = Tracker(objective, tracker.deadline)

@@ -1,4 +1,4 @@
-"""Start values: springs read off a measured loop, and points all over the box of the search."""
+"""Start values: springs read off the measured loop, and points all over the box."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from foamfit.springs.loop import Loop
 
 LOOP_SAMPLES = 240
 CURVE_STARTS = 300
-OWN_MARKS = 5  # of each spring; what a law needs beyond them follows behind
-# Coordinates of nuisance parameters among random start values.
+OWN_MARKS = 5  # random numbers per spring; further ones that a law needs are appended
+# Range of random start values of nuisance parameters, and of the time shift.
 NEAR_USUAL, LATE = (-0.05, 0.05), (-0.3, 0.3)
 
 
 def smooth_loop(measurement: Measurement, followed: Array | None = None) -> Measurement:
-    """Smooth and thin the measured loop, for the first descent only.
+    """Return the measured loop, smoothed and with fewer samples, for the first descents.
 
-    `followed` is the motion without its noise, m, where it is known better.
+    `followed` is the motion without its noise, m, if it is known.
     """
     motion, stress, time = measurement.displacement, measurement.stress, measurement.time
     assert motion is not None
@@ -37,23 +37,23 @@ def smooth_loop(measurement: Measurement, followed: Array | None = None) -> Meas
         window = max(motion.size // 60, 1) * 2 + 1
         motion = smoothed(motion, window) if window > 3 else motion
     first = 0 if time is None else int(np.searchsorted(time, 0.0))  # no loop before contact
-    cycles = 1 if measurement.last_cycle is None else 2  # as many samples for all of several
+    cycles = 1 if measurement.last_cycle is None else 2  # twice the samples for a history
     count = min(motion.size - first, cycles * LOOP_SAMPLES)
     keep = np.linspace(first, motion.size - 1, count).astype(int)
     keep = np.unique(np.append(keep, find_turns(motion))) if cycles > 1 else np.unique(keep)
     thinned = None if time is None else time[keep]
     return replace(
         measurement, displacement=motion[keep], stress=stress[keep], time=thinned,
-        outliers={}, sampled={}, interior={},  # bridged, and smoothed over
+        outliers={}, sampled={}, interior={},  # already interpolated and smoothed
         acceleration=None, block=1, noise=replace(measurement.noise, displacement=0.0),
     )  # fmt: skip
 
 
 def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> list[Array]:
-    """Vectors of parameters read off the measured loop, from a Latin hypercube of marks.
+    """Return start points read off the measured loop at places from a Latin hypercube.
 
-    Linear springs take a share of the largest displacement; each hysteretic spring is then read off
-    what is left, with marks of its own.
+    Linear springs take a random fraction of the largest displacement; each hysteretic spring is
+    read off the remaining loop, at its own random places.
     """
     assert loop.displacement is not None
     assert loop.stress is not None
@@ -104,7 +104,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
 
 
 def _anywhere(space: Space, law: Law, marks: Array) -> Array:
-    """Own parameters of a law that reads none off a loop, and no dashpot, from marks in [0, 1]."""
+    """Return random parameters of a law that has no `read_off`, from marks in [0, 1]."""
     mark_of = dict(zip(law.search_order, marks, strict=False))
 
     def chosen(param: Param) -> float:
@@ -118,7 +118,7 @@ def _anywhere(space: Space, law: Law, marks: Array) -> Array:
 
 
 def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array]:
-    """Latin hypercube over the inner part of the box, whatever the curve looks like."""
+    """Return a Latin hypercube over the inner part of the box, independent of the curves."""
     limits = [
         one.param.start_limits if one.param is not None
         else LATE if one.short == "time_shift" else NEAR_USUAL

@@ -1,8 +1,8 @@
 """The fit of several tests with linked parameters.
 
-All residuals are minimised as one sum of squares, each test in units of its own noise. A parameter
-has one value for all tests, one for each, scatters about a common value or follows a law of rate
-(`fitting.links`).
+The residuals of all tests, each in units of its own noise, are minimised as one sum of squares. A
+parameter has one value for all tests or one per test, scatters about a common value, or follows a
+rate law (`fitting.links`).
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import Problem
 from foamfit.springs.parameters import NUISANCE
 
-# Descents end when two steps in a row gain less than this share, or after so many steps.
+# A descent ends after two consecutive steps with less than this relative gain, or after ITERATIONS.
 ENOUGH, ITERATIONS = 1e-5, 80
-# Blocks of a curve that can show an error of the law: noise averages out in them.
+# Number of blocks of a curve; noise averages out in each, so that an error of the law shows.
 BLOCKS = 50
-# Vectors that more than one test's shared parameters start from.
+# Largest number of tests whose own values are tried as start values for all tests.
 MOST_STARTS = 4
-# Least value of which a scattering parameter has the logarithm, and the largest logarithm.
+# Least value whose logarithm is taken, and the largest logarithm.
 _TINY, _FAR = 1e-30, 100.0
 
 
 @dataclass(frozen=True)
 class Rate:
-    """A coordinate of one test that follows a law of rate."""
+    """A coordinate of one test that follows a rate law."""
 
-    at: int  # Its place among the coordinates of the test
+    at: int  # Index among the coordinates of the test
     kind: str  # One of `RATES`
     x: float  # ln(rate/rate0) of the test
     logarithmic: bool  # Whether the coordinate is the logarithm of the parameter
@@ -53,41 +53,41 @@ class Rate:
 
 @dataclass(frozen=True)
 class Pull:
-    """What draws a scattering parameter of one test to its common value."""
+    """The residual between a scattering parameter of one test and its common value."""
 
-    place: int  # In the vector of parameters
-    common: int  # Coordinate of the logarithm of the common value
-    weight: float  # Root of the weight
+    place: int  # Index in the vector of parameters
+    common: int  # Index of the coordinate ln(common value)
+    weight: float  # Square root of the weight
 
 
 @dataclass(frozen=True, eq=False)
 class Term:
     """One test in a sum of squares.
 
-    Its parameters are those of the point of its box (`space`) whose coordinates stand at `places`
-    of all coordinates; the slope b of a law of rate stands behind the value at rate0.
+    `places` are the indices of its coordinates (in the box `space`) among all coordinates. The
+    slope b of a rate law follows directly after the value at rate0.
     """
 
     objective: Objective
     space: Space
-    names: tuple[str, ...]  # Of the coordinates
+    names: tuple[str, ...]  # Parameter of each coordinate
     places: NDArray[np.intp]
     rates: tuple[Rate, ...]
     pulls: tuple[Pull, ...]
 
     @property
     def size(self) -> int:
-        """Residuals of the test, those of what is drawn among them."""
+        """Number of residuals of the test, including priors and pulls."""
         return self.objective.n_data + len(self.objective.priors) + len(self.pulls)
 
     @cached_property
     def all_places(self) -> NDArray[np.intp]:
-        """Places of all coordinates on which the residual depends."""
+        """Indices of all coordinates on which the residual depends."""
         slopes = [self.places[rate.at] + 1 for rate in self.rates]
         return np.array([*self.places, *slopes, *(pull.common for pull in self.pulls)], np.intp)
 
     def _at(self, point: Array) -> tuple[Array, Array]:
-        """Point of the box at all coordinates, and its derivative by those in `all_places`."""
+        """Return the point of the test's box, and its derivative by `all_places`."""
         own = point[self.places]
         through = np.eye(own.size, self.all_places.size)
         for j, rate in enumerate(self.rates):
@@ -97,11 +97,11 @@ class Term:
         return own, through
 
     def values(self, point: Array) -> Array:
-        """Parameters at all coordinates, SI."""
+        """Return the parameters of the test, SI."""
         return self.space.decode(self._at(point)[0])
 
     def residual_at(self, point: Array) -> Array:
-        """Residual, then that of what is drawn to a common value; infinite if not simulated."""
+        """Return the residual of the test, then of the pulls; infinite if the simulation fails."""
         values, failures = self.values(point), self.objective.failures
         found = self.objective.residual(values)
         if self.objective.failures > failures:
@@ -113,7 +113,7 @@ class Term:
         return np.append(found, off) if off else found
 
     def jacobian_at(self, point: Array) -> Array:
-        """Derivative of `residual_at` by the coordinates in `all_places`, (n, c)."""
+        """Return the derivative of `residual_at` by the coordinates in `all_places`, (n, c)."""
         own, through = self._at(point)
         values = self.space.decode(own)
         moves = self.space.slopes(own, values) @ through
@@ -128,11 +128,11 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """Several tests with some parameters in common, at the best point found.
+    """Several tests with linked parameters, at the best point found.
 
-    `shared` are the names of the parameters that follow from what all tests have in common, `own`
-    those with a value for each test, scattering ones among them. `values` (n_values,) are those of
-    all parameters of each test (SI), `costs` the sum of squares of each, in units of its noise.
+    `shared` are the parameters determined by common values, `own` those with one value per test
+    (scattering ones included). `values` (n_values,) are all parameters of each test, SI, and
+    `costs` the sum of squares of each test, in units of its noise.
     """
 
     problems: tuple[Problem, ...]
@@ -141,20 +141,20 @@ class Together:
     own: tuple[str, ...]
     values: tuple[Array, ...]
     costs: tuple[float, ...]
-    # What all tests have in common, SI: the value of a shared parameter, value and slope by a law
-    # of rate, common value (its logarithm is the mean of theirs) of a scattering one.
+    # Common values, SI: the value of a shared parameter, value and slope of a rate law, and the
+    # common value of a scattering parameter (the mean logarithm).
     common: Mapping[str, tuple[float, ...]]
 
     @classmethod
     def of_own_fits(cls, problems: Sequence[Problem], values: Sequence[Array]) -> Together:
-        """Tests with nothing in common, at what the fit of each alone has found."""
+        """Return tests without links, at the results of their separate fits."""
         pairs = zip(problems, values, strict=True)
         costs = tuple(float(np.sum(p.objective.residual(own) ** 2)) for p, own in pairs)
         own = _varying(problems)
         return cls(tuple(problems), Links({}), (), own, tuple(values), costs, {})
 
     def starts(self, most: int = MOST_STARTS) -> list[list[Array]]:
-        """Where other fits of these tests start: at these values, and at some tests' for all."""
+        """Return start values for other links: these values, and the values of one test for all."""
         count = len(self.values)
         chosen = np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
         pairs = list(zip(self.problems, self.values, strict=True))
@@ -163,28 +163,28 @@ class Together:
 
     @cached_property
     def n_eff(self) -> int:
-        """Effective samples of the curves; see `effective_samples`."""
+        """Effective number of samples; see `effective_samples`."""
         return sum(map(effective_samples, self.problems, self.values))
 
     def bic(self, n_eff: int) -> float:
-        """Bayesian information criterion n_eff ln(χ²/n) + k ln(n_eff)."""
+        """Return the Bayesian information criterion n_eff ln(χ²/n) + k ln(n_eff)."""
         n, n_eff = self.n_data, max(n_eff, 2)
         return n_eff * math.log(max(self.cost, 1e-12 * n) / n) + self.n_vary * math.log(n_eff)
 
     @property
     def cost(self) -> float:
-        """Sum of squares of all tests."""
+        """Sum of squares over all tests."""
         return float(sum(self.costs))
 
     @property
     def n_vary(self) -> int:
-        """Numbers that the fit chose: those of all tests, and one of each test where it varies."""
+        """Number of varied parameters: common ones, and own ones of each test."""
         shared = sum(2 if self.links.kind(name) in RATES else 1 for name in self.shared)
         return shared + sum(name in p.free() for name in self.own for p in self.problems)
 
     @property
     def n_data(self) -> int:
-        """Samples of all tests."""
+        """Number of samples of all tests."""
         return sum(problem.objective.n_data for problem in self.problems)
 
     @cached_property
@@ -196,7 +196,7 @@ class Together:
         )
 
     def value(self, name: str) -> list[float]:
-        """Values of one parameter, one for each test that has it."""
+        """Return the values of one parameter in the tests that have it."""
         return [
             float(values[problem.index[name]])
             for problem, values in zip(self.problems, self.values, strict=True)
@@ -211,13 +211,13 @@ def fit_linked(
     *,
     iterations: int = ITERATIONS,
 ) -> Together:
-    """Fit several tests of one model at once, their parameters linked as `links` say.
+    """Fit several tests of one model together, with linked parameters.
 
-    Drives and noise may differ, and with them the nuisance parameters; what does not vary in a test
-    keeps its value there. Each of the `starts` holds a vector of parameters for each test: shared
-    ones start at the median over the tests, laws of rate at their least squares. The best end of
-    all starts is returned. Raises InputError if the problems are not of one model, SimulationError
-    if no start can be simulated.
+    Drives, noise and nuisance parameters may differ between tests; a fixed parameter keeps its
+    value in each test. Each of the `starts` has one vector of parameters per test. Shared
+    parameters start at the median over the tests, rate laws at a least-squares fit. The best end is
+    returned. Raises InputError if the problems have different models, and SimulationError if no
+    start can be simulated.
     """
     layout = _Layout.of(tuple(problems), links)
     ends = list[levenberg.Iterate]()
@@ -246,10 +246,10 @@ def fit_linked(
 
 
 def effective_samples(problem: Problem, values: Array) -> int:
-    """Stretches of the curves of a test in which its own fit lies on one side.
+    """Return the number of runs of equal sign in the residuals of a test's own fit.
 
-    What the own fit leaves is mostly an error of the law, which is no noise: one stretch on one
-    side, whatever its samples, says one thing. Counted over `BLOCKS` means of each curve.
+    The residuals are mostly an error of the law. A run of equal sign counts as one sample, however
+    many samples it has. Runs are counted over `BLOCKS` block means of each curve.
     """
     objective, count = problem.objective, 0
     for part in objective.by_curve(objective.residual(values)).values():
@@ -260,7 +260,7 @@ def effective_samples(problem: Problem, values: Array) -> int:
 
 
 def _varying(problems: Sequence[Problem]) -> tuple[str, ...]:
-    """Names of the parameters that vary in some test; all must be of one model."""
+    """Return the parameters that vary in any test; InputError if the models differ."""
     first = problems[0]
     for problem in problems[1:]:
         if problem.model.names != first.model.names:
@@ -273,7 +273,7 @@ def _varying(problems: Sequence[Problem]) -> tuple[str, ...]:
 
 
 def _spaces(problems: Sequence[Problem], absolute: Sequence[str]) -> list[Space]:
-    """Boxes of the tests, all on one set of scales and limits."""
+    """Return the boxes of the tests, with common scales and limits."""
     every, spaces = [problem.scales for problem in problems], [one.space() for one in problems]
     scales = Scales(
         max(one.stress for one in every),
@@ -281,7 +281,7 @@ def _spaces(problems: Sequence[Problem], absolute: Sequence[str]) -> list[Space]
         float(np.median([one.rate for one in every])),
         max(one.height for one in every),
     )
-    count = len(problems[0].model.names)  # nuisance parameters have limits of their own
+    count = len(problems[0].model.names)  # limits of nuisance parameters differ
     low = np.min([space.low[:count] for space in spaces], axis=0)
     high = np.max([space.high[:count] for space in spaces], axis=0)
     return [
@@ -298,18 +298,18 @@ def _spaces(problems: Sequence[Problem], absolute: Sequence[str]) -> list[Space]
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """The sum of squares of tests that are linked, by the coordinates (k,) of a box."""
+    """The sum of squares of linked tests as a function of the coordinates (k,) of a box."""
 
     problems: tuple[Problem, ...]
     links: Links
     own: tuple[str, ...]
-    common_places: Mapping[str, int]  # Of what is shared, follows a law of rate, or scatters
+    common_places: Mapping[str, int]  # Index of each common coordinate
     terms: tuple[Term, ...]
     box: tuple[Array, Array]
 
     @classmethod
     def of(cls, problems: tuple[Problem, ...], links: Links) -> _Layout:
-        """Lay out the coordinates: those in common first, then the own ones test by test."""
+        """Assign indices to the coordinates: common ones first, then own ones test by test."""
         names = _varying(problems)
         kinds = {name: links.kind(name) for name in names}
         own = tuple(name for name in names if kinds[name] in ("own", "scatter"))
@@ -355,20 +355,20 @@ class _Layout:
 
     @property
     def shared(self) -> tuple[str, ...]:
-        """Names of the parameters that follow from what all tests have in common."""
+        """Names of the parameters determined by common values."""
         return tuple(name for name in self.common_places if name not in self.own)
 
     def residual(self, point: Array) -> Array:
-        """Residuals of the tests, one after the other; infinite where one is not simulated."""
+        """Return the stacked residuals of the tests; infinite for a failed simulation."""
         return np.concatenate([term.residual_at(point) for term in self.terms])
 
     def jacobian(self, point: Array) -> levenberg.Blocks:
-        """Derivative of the residual by the coordinates."""
+        """Return the derivative of the residual by the coordinates."""
         found = [(term.jacobian_at(point), term.all_places) for term in self.terms]
         return levenberg.Blocks(found, point.size)
 
     def start(self, vectors: Sequence[Array]) -> Array:
-        """The point that has the own parameters of these vectors, and what is nearest in common."""
+        """Return the point with these own parameters and the nearest common values."""
         point, links = np.zeros(self.box[0].size), self.links
         found = [term.space.encode(own) for term, own in zip(self.terms, vectors, strict=True)]
         for term, own in zip(self.terms, found, strict=True):
@@ -391,7 +391,7 @@ class _Layout:
         return np.clip(point, *self.box)
 
     def common(self, point: Array, values: Sequence[Array]) -> dict[str, tuple[float, ...]]:
-        """What all tests have in common at a point, SI; see `Together.common`."""
+        """Return the common values at a point, SI; see `Together.common`."""
         out = dict[str, tuple[float, ...]]()
         for name, place in self.common_places.items():
             if name in self.own:
@@ -408,11 +408,11 @@ class _Layout:
 
 
 def _logarithm(value: float) -> float:
-    """Logarithm of the size of a parameter."""
+    """Return the logarithm of the absolute value of a parameter."""
     return float(np.log(max(abs(value), _TINY)))
 
 
 def _parents(problem: Problem, name: str) -> set[str]:
-    """Names of the parameters that the coordinate of this one is relative to."""
+    """Return the parameters on which the coordinate of a parameter depends."""
     of = () if name in NUISANCE else problem.model.param(name).of
     return {f"{name.partition('_')[0]}_{parent}" for parent in of}

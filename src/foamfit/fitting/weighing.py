@@ -1,4 +1,4 @@
-"""Weights of residuals where the motion that drives is itself uncertain."""
+"""Weights of residuals for an uncertain driving motion."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from foamfit.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class Weighing:
-    """What turns residuals of covariance v + SSᵀ into residuals of covariance v.
+    """Transform of residuals with covariance v + SSᵀ into residuals with covariance v.
 
-    v is diagonal, the noise of each sample; the columns of S are what one standard deviation along
-    each mode of the motion does to the residual. With S' = S/√v = U d Vᵀ the residual r becomes
+    v is diagonal, the noise of each sample. Each column of S is the change of the residual by one
+    standard deviation of a mode of the motion. With S' = S/√v = U d Vᵀ the residual r becomes
     √v (1 + S'S'ᵀ)^(-1/2) r/√v. `levels` (n,) are √v, `axes` (n, m) is U, and `less` (m,) is
     1 - (1 + d²)^(-1/2).
     """
@@ -25,11 +25,11 @@ class Weighing:
 
     @classmethod
     def of(cls, uncertain: Array, levels: Array) -> Weighing:
-        """Make it from S (n, m) and √v (n,)."""
+        """Make the transform from S (n, m) and √v (n,)."""
         axes, size, _ = np.linalg.svd(uncertain / levels[:, None], full_matrices=False)
         return cls(levels, axes, 1.0 - 1.0 / np.sqrt(1.0 + size**2))
 
     def __call__(self, rows: Array) -> Array:
-        """Weigh residuals (n,), or columns of their derivatives (n, k)."""
+        """Transform residuals (n,), or columns of their derivatives (n, k)."""
         along = (rows.T / self.levels) @ self.axes * self.less
         return np.asarray(rows - (self.levels * (along @ self.axes.T)).T)
