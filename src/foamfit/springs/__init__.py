@@ -1,7 +1,7 @@
 """The law of a spring, chains of springs, and the published parameter sets.
 
-`law` holds the formulas, `spring` and `chain` what a user makes, `parameters` names and units,
-`model` the vector of parameters that a fit varies, `microscale` micro-springs with any other laws
-of snapping. A newcomer may skip `kernels` and `microscale_kernels`, the same laws with their state
-(the branch, and what has snapped) compiled, and `sensitivities`, derivatives of the former.
+`law` has the formulas, `laws` the springs and their records, `chain` chains and drives,
+`parameters` names and units, and `model` the flat vector of parameters of a fit. At first reading
+skip `kernels` and `microscale_kernels` (the compiled laws with their state) and `sensitivities`
+(derivatives of springs in equilibrium).
 """

@@ -1,4 +1,4 @@
-"""A chain of springs and masses under a drive: what is simulated, not how."""
+"""Chains of springs and masses, and the drives that act on them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _finite(value: object, name: str, least: float, strict: bool) -> float:
 
 
 def _listed(values: Any, name: str, wanted: str) -> tuple[Any, ...]:
-    """Return what must be a sequence as a tuple."""
+    """Return a sequence as a tuple; InputError for anything else."""
     try:
         if not isinstance(values, str | bytes):
             return tuple(values)
@@ -38,7 +38,7 @@ def _listed(values: Any, name: str, wanted: str) -> tuple[Any, ...]:
 
 
 def padded(rows: Sequence[Array]) -> Array:
-    """Rows of several lengths as one array, filled up with zeros."""
+    """Return rows of several lengths as one array, padded with zeros."""
     out = np.zeros((len(rows), max(row.size for row in rows)))
     for line, row in zip(out, rows, strict=True):
         line[: row.size] = row
@@ -46,12 +46,12 @@ def padded(rows: Sequence[Array]) -> Array:
 
 
 class ChainArrays(NamedTuple):
-    """A chain as the kernels know it.
+    """A chain in the form that the kernels use.
 
-    rows (n_springs, columns) are the springs, all with room for as many relaxation terms as the one
-    with the most has; heights (m) and masses (kg) are (n_springs,), top (1,) is the number of
-    springs; `heavy` tells whether there are masses inside, `damped` dashpots. `stiffness` is
-    Σ h k_c, J/m²; of laws of a file it is NaN.
+    rows (n_springs, columns) are the springs, padded to the largest number of relaxation terms;
+    heights (m) and masses (kg) are (n_springs,), top (1,) is the number of springs. `heavy` is
+    whether there are interior masses, `damped` whether there are dashpots. `stiffness` is Σ h k_c,
+    J/m², and NaN for registered laws.
     """
 
     rows: Array
@@ -70,20 +70,20 @@ class Chain:
     Parameters
     ----------
     springs : sequence of springs
-        Base first: BistableSpring, MicroscaleSpring, LinearSpring, or of a registered law.
+        Base first: BistableSpring, MicroscaleSpring, LinearSpring, or springs of a registered law.
     heights : sequence of float
         Height h_i of each spring, m.
     area : float
         Cross-section A, m².
     masses : sequence of float, optional
-        Mass above each spring, kg; 0 = massless. Left out = all massless.
+        Mass above each spring, kg; 0 = massless. By default all are massless.
     site_damping : float
-        The onsite damper η_site of the paper on the top mass, Pa·s.
+        Onsite damper η_site of the paper, acting on the top mass, Pa·s.
 
     Raises
     ------
     ValueError
-        If something is not admissible; the message names it.
+        If a value is not admissible; the message names it.
     """
 
     springs: tuple[Spring, ...]
@@ -100,7 +100,7 @@ class Chain:
         masses: Sequence[float] | None = None,
         site_damping: float = 0.0,
     ) -> None:
-        """Check and freeze the chain."""
+        """Check the arguments and make the chain immutable."""
         springs = _listed(springs, "springs", "springs")
         n = len(springs)
         if n == 0:
@@ -137,17 +137,17 @@ class Chain:
 
     @cached_property
     def is_registered(self) -> bool:
-        """Whether a spring follows a registered law, not one of the paper's."""
+        """Whether a spring has a registered law."""
         return any(laws.is_registered(kind) for kind in self.kinds)
 
     @cached_property
     def relaxes(self) -> bool:
-        """Whether a spring has a relaxation term that is not zero."""
+        """Whether a spring has a nonzero relaxation term."""
         return any(g > 0.0 for spring in self.springs for g, _ in spring.relaxation)
 
     @cached_property
     def remembers(self) -> bool:
-        """Whether a spring keeps more than its branch, apart from relaxation."""
+        """Whether the state of a spring is more than its branch, apart from relaxation."""
         return any(spring.law.remembers for spring in self.springs)
 
     @cached_property
@@ -157,7 +157,7 @@ class Chain:
 
     @cached_property
     def arrays(self) -> ChainArrays:
-        """The chain as the kernels know it."""
+        """The chain in the form that the kernels use."""
         from foamfit.springs.kernels import KC
 
         room = max(self.relaxation)
@@ -202,7 +202,7 @@ class Impact:
     gravity: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what is not admissible, by name."""
+        """Raise InputError for an inadmissible value; the message names it."""
         object.__setattr__(self, "mass", _finite(self.mass, "mass", 0.0, True))
         object.__setattr__(self, "velocity", _finite(self.velocity, "velocity", 0.0, True))
         object.__setattr__(self, "gravity", _finite(self.gravity, "gravity", 0.0, False))
@@ -210,23 +210,23 @@ class Impact:
 
 @dataclass(frozen=True, eq=False)
 class StressDrive:
-    """A stress history (Pa), sampled at t and linear in between, acts on the top, from rest."""
+    """A prescribed stress (Pa) on the top, sampled at t and linear in between, from rest."""
 
     stress: Array
 
     def __post_init__(self) -> None:
-        """Check and freeze the samples."""
+        """Check the samples and make them immutable."""
         object.__setattr__(self, "stress", _samples(self.stress, "stress"))
 
 
 @dataclass(frozen=True, eq=False)
 class DisplacementDrive:
-    """The displacement of the top (m), sampled at t and linear between samples, is prescribed."""
+    """A prescribed displacement (m) of the top, sampled at t and linear in between."""
 
     displacement: Array
 
     def __post_init__(self) -> None:
-        """Check and freeze the samples."""
+        """Check the samples and make them immutable."""
         object.__setattr__(self, "displacement", _samples(self.displacement, "displacement"))
 
 
@@ -234,7 +234,7 @@ Drive = Impact | StressDrive | DisplacementDrive
 
 
 def check_scene(chain: object, drive: object) -> None:
-    """Refuse (ValueError) what is no chain or no drive."""
+    """Raise InputError if an argument is not a chain or a drive."""
     if not isinstance(chain, Chain):
         raise InputError(f"chain is a {type(chain).__name__}; it must be a Chain")
     if not isinstance(drive, Drive):

@@ -1,7 +1,8 @@
-"""Springs in series, undamped and massless: one stress in all, along a motion or a stress.
+"""Undamped, massless springs in series: a common stress, along a motion or a stress history.
 
-Along a monotone stretch each spring follows one monotone function of the common stress, so the sum
-of their elongations has one root, whatever switches lie on the way: nothing is integrated.
+Along a monotone part of the motion the strain of each spring is a monotone function of the common
+stress. The sum of their elongations therefore has one root, across any number of switches, and no
+integration in time is needed.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from foamfit.springs.kernels import (
 from foamfit.springs.law import MICROSCALE, UNILATERAL
 from foamfit.springs.microscale_kernels import rank_at, strain_along, strain_under
 
-# The least strain that an elongation is followed to is this times rounding.
+# Strain to whose rounding error elongations are always resolved.
 LEAST = 1e-6
 
 
@@ -45,7 +46,7 @@ class Group(NamedTuple):
 
 @inner
 def _series_strain(group: Group, sigma: float, eps: Array) -> tuple[float, float, float]:
-    """Fill the strains of springs under one stress; elongation, compliance, size of its terms."""
+    """Fill the strains under one stress; return elongation, compliance, and size of the terms."""
     rows, branches, ranks, heights = group
     total = compliance = size = 0.0
     for i in range(rows.shape[0]):
@@ -65,7 +66,7 @@ def _series_strain(group: Group, sigma: float, eps: Array) -> tuple[float, float
 
 @inner
 def _bracket(group: Group, elongation: float, sigma: float, eps: Array) -> tuple[float, float]:
-    """Stresses (low, high) between which springs in series reach `elongation`."""
+    """Return stresses (low, high) between which springs in series reach `elongation`."""
     step = 1e-3 * abs(sigma)
     for i in range(group.rows.shape[0]):
         step = max(step, 1e-6 * group.rows[i, K0])
@@ -87,9 +88,9 @@ def _bracket(group: Group, elongation: float, sigma: float, eps: Array) -> tuple
 
 @maker
 def _split_jump(group: Group, elongation: float, low: float, high: float, eps: Array) -> float:
-    """Share out an elongation inside a jump at one stress, from the base up; returns the stress.
+    """Distribute an elongation inside a jump from the base up; return the stress.
 
-    Where a unilateral spring opens, the stress is zero and the gap takes what the others leave.
+    If a unilateral spring opens, the stress is zero and the gap takes the rest of the elongation.
     """
     rows, heights, upper = group.rows, group.heights, np.empty(eps.size)
     _series_strain(group, high, upper)
@@ -108,11 +109,11 @@ def _split_jump(group: Group, elongation: float, low: float, high: float, eps: A
 
 @maker
 def equilibrate(group: Group, elongation: float, sigma: float, eps: Array) -> float:
-    """Common stress of undamped springs in series at an elongation; fills strains and memory.
+    """Return the common stress of springs in series at an elongation; fill strains and memory.
 
-    Newton's method, from the eighth trial on inside a bracket that every third trial halves. Where
-    the root lies in a jump of the elongation (k_h± = 0, or a very narrow snap), they share it from
-    the base up.
+    Newton's method, from the eighth trial on inside a bracket that every third trial halves. If the
+    root lies in a jump of the elongation (k_h± = 0, or a very narrow snap), the springs take their
+    part from the base up.
     """
     rows, branches, ranks, _ = group
     found = False
@@ -128,11 +129,11 @@ def equilibrate(group: Group, elongation: float, sigma: float, eps: Array) -> fl
         else:
             low = max(low, sigma)
         trial = sigma - miss / compliance
-        if trial_number == 8:  # a kink or a jump: bracket it
+        if trial_number == 8:  # a kink or a jump
             low, high = _bracket(group, elongation, sigma, eps)
         if trial_number >= 8 and (trial_number % 3 == 0 or not low < trial < high):
             trial = 0.5 * (low + high)
-            if trial in (low, high):  # neighbouring numbers: nothing lies between them
+            if trial in (low, high):  # adjacent floating-point numbers
                 found = abs(miss) <= 1e-12 * (size + abs(elongation))
                 break
         elif not low < trial < high:
@@ -153,9 +154,9 @@ def equilibrate(group: Group, elongation: float, sigma: float, eps: Array) -> fl
 def equilibrium_along(
     rows: Array, heights: Array, top: Array, sigma: Array, eps: Array, history: Branches
 ) -> None:
-    """Springs in series, undamped and massless, along a motion of the top (m).
+    """Follow undamped, massless springs in series along a motion of the top (m).
 
-    Fills the common stress (n,), the strains and the branches (springs, n).
+    Fills the common stress (n,), and strains and branches (springs, n).
     """
     count, n = rows.shape[0], top.size
     now, branches = np.empty(count), np.empty(count, np.int64)
@@ -175,9 +176,9 @@ def equilibrium_along(
 def strains_along(
     rows: Array, heights: Array, sigma: Array, top: Array, eps: Array, history: Branches
 ) -> bool:
-    """Springs in series along a stress: the motion of the top (n,), m, strains and branches.
+    """Follow springs in series along a stress; fill motion of the top (n,), m, strains, branches.
 
-    False if a spring cannot have its stress. `eps` and `history` may have no rows.
+    Returns False if a spring cannot carry the stress. `eps` and `history` may have no rows.
     """
     n, kept, total = sigma.size, eps.shape[0] > 0, 0.0
     strain, branches = np.empty(n), np.empty(n, np.int64)

@@ -1,8 +1,8 @@
-"""The compiled loops: the law of a spring along a history, and a chain in equilibrium.
+"""Compiled functions: the bistable and linear laws along a history.
 
-A spring is one row of numbers (`Row`); a chain is an array of rows, base first. The branch that a
-spring is on is its whole memory: a and d belong to the paper's flag a, c and e to its flag c
-(eq. 3). Everything is SI. The integration in time is in `explicit.taylor`.
+A spring is one row of numbers (`Row`); a chain is an array of rows, base first. The only memory of
+a bistable spring is its branch: a and d belong to the paper's flag a, c and e to flag c (eq. 3).
+All quantities are SI. Integration in time is in `explicit.taylor`.
 """
 
 from __future__ import annotations
@@ -32,43 +32,42 @@ if TYPE_CHECKING:
 Row = Array
 Branches = NDArray[np.int64]
 
-# Division by zero gives infinity, as in NumPy; every loop that can meet it says what it does then.
+# Division by zero gives infinity, as in NumPy; functions in which it can occur handle it.
 _PLAIN: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
 compiled = cast("_JITWrapper", njit(**_PLAIN, cache=True))
-# For what only other loops call: without the bridge to Python, which takes long to compile; without
-# counting who holds an array, which takes long to run; with a product and a sum in one rounding,
-# which is faster and no less exact; and with the body put where it is called.
+# For functions that are only called by compiled ones: without the wrapper for Python, which takes
+# long to compile, and with fused multiply-add, which is faster and at least as exact.
 _BRIDGELESS: dict[str, Any] = {**_PLAIN, "no_cpython_wrapper": True, "fastmath": {"contract"}}
-# An array is copied number by number: `a[:] = b` takes two seconds to compile in each process, for
-# the text of the error that shapes differ.
+# Without reference counting of arrays, which takes long to run. Such functions copy arrays element
+# by element: `a[:] = b` takes two seconds to compile, because of its error message.
 _COUNTLESS: dict[str, Any] = {**_BRIDGELESS, "_nrt": False}
 maker = njit(**_BRIDGELESS, cache=True)
 inner = njit(**_COUNTLESS)
 inlined = njit(**_COUNTLESS, forceinline=True)
-# For long loops that are called from one place: read apart, compiled as a part of the caller.
+# For long functions with a single caller, of which they are compiled as a part.
 once = njit(error_model="numpy", inline="always")
-# A piece of a loop (as is what makes its arrays) that is compiled apart from it; see
-# `solve.precompile`.
+# For parts of a large function that are compiled and cached separately; see `solve.precompile`.
 piece = njit(**_COUNTLESS, cache=True)
 
-# Columns of a row; the stress at each point stands OF_STRESS columns behind its strain.
+# Columns of a row; the stress of each point is OF_STRESS columns after its strain.
 KIND, K0, KC, KH_PLUS, KH_MINUS, ETA, EPS_STAR, OF_STRESS = *range(7), 4
 EPS_A, EPS_C, EPS_HAT_A, EPS_HAT_C = range(7, 11)
 SIGMA_A, SIGMA_C, SIGMA_HAT_A, SIGMA_HAT_C, N_COLUMNS = range(11, 16)
 
-# A microscale spring has in place of most of them the logarithms of sigma_plus and sigma_minus, the
-# spreads, and the logarithm of the stress where both laws of snapping meet (see `law.crossing`).
+# Columns that a microscale spring uses differently: the logarithms of sigma_plus and sigma_minus,
+# the spreads, and the logarithm of the stress at which both snap laws meet (see `law.crossing`).
 LOG_PLUS, SPREAD_PLUS, LOG_MINUS, SPREAD_MINUS, LOG_CROSS = EPS_A, EPS_C, KH_PLUS, KH_MINUS, SIGMA_A
-# If it remembers what has snapped (1, else 0): the stiffening n of branch a, k0 of what has snapped
-# once, and the logarithm of its median snap-through stress; LOG_CROSS is then where that one meets
-# snap-back.
+# REMEMBERS is 1 for microscale springs with softening, weakening or stiffening n, else 0. K_SNAPPED
+# and LOG_AGAIN are k0 and the logarithm of the median snap-through stress of micro-springs that
+# have snapped before; LOG_CROSS is then the stress at which the latter meets snap-back.
 REMEMBERS, STIFFENING, K_SNAPPED, LOG_AGAIN = SIGMA_C, EPS_HAT_A, EPS_HAT_C, SIGMA_HAT_A
-# After the columns follow the relaxation terms: g of term k (from 0) in N_COLUMNS + 2 k, its time τ
-# in the next; g = 0, τ = inf where a spring has fewer than others. Without any, rows end before.
+# The relaxation terms follow: g of term k = 0, 1, … is in column N_COLUMNS + 2 k, τ in the next.
+# Unused terms have g = 0 and τ = inf.
 
-# Branches: of the bistable spring, of a linear one, and of a unilateral one out of contact; of the
-# microscale spring (virgin, it is on A): the snapped fraction p is held, p = P₊, p = P₋ > P₊, and
-# p = P₊ = P₋; and p = P₊(σ e^s) of what has snapped before.
+# Branches: A to E of the bistable spring, LINE of a linear one, OPEN of a unilateral one out of
+# contact. Of the microscale spring (on A before its first snap): HELD for a constant snapped
+# fraction p, SNAP for p = P₊, BACK for p = P₋ > P₊, BOTH for p = P₊ = P₋, and AGAIN for
+# p = P₊(σ e^s) of micro-springs that have snapped before.
 A, D, C, E, LINE, OPEN, HELD, SNAP, BACK, BOTH, AGAIN = range(11)
 
 _derived_points = inner(derived_points)
@@ -79,7 +78,7 @@ _most_beyond = inner(most_beyond)
 
 @compiled
 def fill_bistable(values: Array, row: Row) -> bool:
-    """Write k0 … kh_minus and what follows from them; false if they are not admissible."""
+    """Write k0 … kh_minus and derived columns; return false if they are not admissible."""
     k0, kc, dsigma, eps_a = values[0], values[1], values[2], values[3]
     eps_c, kh_plus, kh_minus = values[4], values[5], values[6]
     if not _admissible(k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus):
@@ -99,9 +98,9 @@ def fill_bistable(values: Array, row: Row) -> bool:
 
 @compiled
 def fill_microscale(values: Array, row: Row) -> bool:
-    """Write own parameters and what follows from them; false if they are not admissible.
+    """Write own parameters and derived columns; return false if they are not admissible.
 
-    Behind spread_minus come, as far as there are any, stiffening, and softening and weakening.
+    Stiffening, softening and weakening, if present, follow spread_minus in this order.
     """
     count, stiffening, softening, weakening = values.size, 1.0, 0.0, 0.0
     if count == 8 or count == 10:
@@ -128,14 +127,14 @@ def fill_microscale(values: Array, row: Row) -> bool:
 
 @compiled
 def fill_linear(values: Array, row: Row) -> bool:
-    """Write k0; false if it is not admissible."""
+    """Write k0; return false if it is not admissible."""
     row[KIND], row[K0] = LINEAR, values[0]
     return 0.0 < values[0] < math.inf
 
 
 @compiled
 def fill_unilateral(values: Array, row: Row) -> bool:
-    """Write k0; false if it is not admissible."""
+    """Write k0; return false if it is not admissible."""
     row[KIND], row[K0] = UNILATERAL, values[0]
     return 0.0 < values[0] < math.inf
 
@@ -164,7 +163,7 @@ def branch_shape(row: Row, branch: int) -> tuple[bool, float, float, float]:
 
 @inner
 def stress_on(row: Row, branch: int, eps: float) -> float:
-    """Stress on a branch (eq. 2); infinite at or past the pole of a curved one."""
+    """Return the stress on a branch (eq. 2); infinite at or past the pole of a curved one."""
     curved, k, x0, s0 = branch_shape(row, branch)
     x = eps - x0
     if not curved:
@@ -174,7 +173,7 @@ def stress_on(row: Row, branch: int, eps: float) -> float:
 
 @inner
 def strain_on(row: Row, branch: int, sigma: float) -> float:
-    """Strain on a branch, the inverse of eq. 2; on a flat branch its end where it is entered."""
+    """Return the strain on a branch, the inverse of eq. 2; on a flat branch its first end."""
     curved, k, x0, s0 = branch_shape(row, branch)
     if curved:
         return x0 + sigma / (k + sigma) if sigma > -k else -math.inf
@@ -183,14 +182,14 @@ def strain_on(row: Row, branch: int, sigma: float) -> float:
 
 @inner
 def slope_on(row: Row, branch: int, eps: float) -> float:
-    """Slope dσ/dε of eq. 2 on a branch."""
+    """Return the slope dσ/dε of eq. 2 on a branch."""
     curved, k, x0, _ = branch_shape(row, branch)
     return k / (1.0 - (eps - x0)) ** 2 if curved else k
 
 
 @inner
 def interval(row: Row, branch: int, of: int = 0) -> tuple[float, float]:
-    """Strains (low, high) at which a spring leaves a branch; `of` OF_STRESS, the stresses."""
+    """Return the strains (low, high) at the ends of a branch; with `of` = OF_STRESS, stresses."""
     if branch == A:
         return -math.inf, row[EPS_A + of]
     if branch == D:
@@ -206,7 +205,7 @@ def interval(row: Row, branch: int, of: int = 0) -> tuple[float, float]:
 
 @inner
 def above(branch: int) -> int:
-    """Name the branch that a spring enters when it leaves `branch` upwards in strain."""
+    """Return the branch that a spring enters when it leaves `branch` upwards in strain."""
     if branch == A:
         return D
     return C if branch in (D, E) else LINE
@@ -214,7 +213,7 @@ def above(branch: int) -> int:
 
 @inner
 def below(branch: int) -> int:
-    """Name the branch that a spring enters when it leaves `branch` downwards in strain."""
+    """Return the branch that a spring enters when it leaves `branch` downwards in strain."""
     if branch == C:
         return E
     return A if branch in (D, E) else OPEN
@@ -222,13 +221,13 @@ def below(branch: int) -> int:
 
 @inner
 def first_branch(row: Row) -> int:
-    """Branch of a spring at rest."""
+    """Return the branch of a spring at rest."""
     return A if row[KIND] == BISTABLE or row[KIND] == MICROSCALE else LINE
 
 
 @inner
 def branch_at_strain(row: Row, branch: int, eps: float) -> int:
-    """Branch at strain `eps` of a spring that was last seen on `branch` (eqs. 2 and 3)."""
+    """Return the branch at strain `eps` of a spring that was on `branch` (eqs. 2 and 3)."""
     if row[KIND] == LINEAR:
         return LINE
     if row[KIND] == UNILATERAL:
@@ -244,7 +243,7 @@ def branch_at_strain(row: Row, branch: int, eps: float) -> int:
 
 @inner
 def branch_at_stress(row: Row, branch: int, sigma: float) -> int:
-    """Branch at stress `sigma` of a spring that was last seen on `branch` (eqs. 2 and 3)."""
+    """Return the branch at stress `sigma` of a spring that was on `branch` (eqs. 2 and 3)."""
     if row[KIND] == LINEAR:
         return LINE
     if row[KIND] == UNILATERAL:
@@ -264,7 +263,7 @@ def branch_at_stress(row: Row, branch: int, sigma: float) -> int:
 
 @inner
 def _follow_strain(row: Row, eps: Array, sigma: Array, history: Branches) -> None:
-    """Fill stress and branch along the strains of one spring from rest, a branch at a time."""
+    """Fill stress and branch along the strains of one spring from rest, branch by branch."""
     branch, first = first_branch(row), 0
     while first < eps.size:
         branch = branch_at_strain(row, branch, eps[first])
@@ -273,7 +272,7 @@ def _follow_strain(row: Row, eps: Array, sigma: Array, history: Branches) -> Non
         while last < eps.size and low < eps[last] < high:
             last += 1
         curved, k, x0, s0 = branch_shape(row, branch)
-        given, found = eps[first:last], sigma[first:last]  # no index of a slice is negative
+        given, found = eps[first:last], sigma[first:last]  # their indices are never negative
         if curved:
             for j in range(given.size):
                 x = given[j] - x0
@@ -287,9 +286,9 @@ def _follow_strain(row: Row, eps: Array, sigma: Array, history: Branches) -> Non
 
 @inner
 def follow_stress(row: Row, sigma: Array, eps: Array, history: Branches) -> None:
-    """Fill strain and branch along the stresses of one spring from rest, a branch at a time.
+    """Fill strain and branch along the stresses of one spring from rest, branch by branch.
 
-    The strain is -inf where the spring cannot have its stress.
+    The strain is -inf where the spring cannot carry the stress.
     """
     branch, first = first_branch(row), 0
     while first < sigma.size:
@@ -314,7 +313,7 @@ def follow_stress(row: Row, sigma: Array, eps: Array, history: Branches) -> None
 
 @compiled
 def stress_along(row: Row, eps: Array) -> tuple[Array, Branches]:
-    """Stress and branch of one spring along a strain history, from rest."""
+    """Return stress and branch of one spring along a strain history, from rest."""
     sigma = np.empty(eps.size)
     branches = np.empty(eps.size, np.int64)
     _follow_strain(row, eps, sigma, branches)
@@ -323,7 +322,7 @@ def stress_along(row: Row, eps: Array) -> tuple[Array, Branches]:
 
 @compiled
 def tangent_along(row: Row, eps: Array, branches: Branches) -> Array:
-    """Slope dσ/dε at each sample of a strain history whose branches are known."""
+    """Return the slope dσ/dε at each sample of a strain history with known branches."""
     slope = np.empty(eps.size)
     for j in range(eps.size):
         slope[j] = slope_on(row, branches[j], eps[j])
@@ -332,9 +331,9 @@ def tangent_along(row: Row, eps: Array, branches: Branches) -> Array:
 
 @compiled
 def fault(t: Array) -> int:
-    """First sample that is not finite, or not later than the one before it; -1 if there is none."""
+    """Return the first sample that is not finite or not later than the previous one, or -1."""
     rises = math.isfinite(t[0]) and math.isfinite(t[-1])
-    for j in range(1, t.size):  # without a branch, several samples are compared at once
+    for j in range(1, t.size):  # free of branches, so that it can be vectorised
         rises &= t[j] > t[j - 1]
     for j in range(t.size if not rises else 0):
         if not math.isfinite(t[j]) or (j > 0 and t[j] <= t[j - 1]):
@@ -344,7 +343,7 @@ def fault(t: Array) -> int:
 
 @compiled
 def list_switches(time: Array, strain: Array, branches: Branches) -> Array:
-    """List the changes of branch between samples, at the later sample."""
+    """Return the changes of branch between samples, at the later sample."""
     count, n = branches.shape
     seen = 0
     for i in range(count):
@@ -362,7 +361,7 @@ def list_switches(time: Array, strain: Array, branches: Branches) -> Array:
 
 @compiled
 def distance_to_pole(rows: Array, heights: Array, displacement: Array) -> float:
-    """Least distance, in strain, of a spring on branch c from its end at 1 + ε_*; at most 1.
+    """Return the least distance, in strain, of any spring on branch c from 1 + ε_*; at most 1.
 
     `displacement` (n, n_t) is that of the node above each spring.
     """
@@ -380,7 +379,7 @@ def distance_to_pole(rows: Array, heights: Array, displacement: Array) -> float:
 
 @compiled
 def total(values: Array) -> float:
-    """Sum of an array; finite only if all of it is."""
+    """Return the sum of an array, which is finite only if all elements are."""
     out = 0.0
     for value in values:
         out += value

@@ -1,33 +1,30 @@
-"""The formulas of the seven-parameter law (eqs. 2, 4 and 5) and of the microscale law, each once.
+"""Formulas of the seven-parameter law (eqs. 2, 4 and 5) and of the microscale law.
 
-Plain Python on numbers: `springs.spring` calls it as it stands, `springs.kernels` compiles it.
+They are plain Python functions of numbers, which are also compiled in `springs.kernels`.
 """
 
 from __future__ import annotations
 
 import math
 
-# The kinds of spring that the kernels tell apart.
+# Kinds of spring in the kernels.
 BISTABLE, LINEAR, UNILATERAL, MICROSCALE = 0, 1, 2, 3
-# Branches by their numbers: of the bistable spring, of a linear one, and of a unilateral one out of
-# contact; of the microscale spring, of which the snapped fraction p is held, p = P₊, p = P₋ > P₊,
-# and p = P₊ = P₋; and of what has snapped before, where that snaps through once more.
+# Names of the branches in the order of their numbers in `springs.kernels`.
 BRANCH_NAMES = (
     "a", "d", "c", "e", "line", "open", "held", "snap-through", "snap-back", "reversible",
     "snap-through again",
 )  # fmt: skip
-# Below this rank (in standard normal scores) a microscale spring counts as virgin: so few, a share
-# of 5e-17, have snapped.
+# Rank (standard normal score) below which no micro-spring counts as snapped: a fraction of 5e-17.
 LEAST_RANK = -8.3
 
 
 def derived_points(
     k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
 ) -> tuple[float, float, float, float, float]:
-    """Derive σ_a and σ̄_c (Pa), ε_*, ε̂_a (-inf: e never meets a) and ε̂_c (eqs. 4 and 5).
+    """Return σ_a and σ̄_c (Pa), ε_*, ε̂_a (-inf: e never meets a) and ε̂_c (eqs. 4 and 5).
 
-    Both quadratics are written about the known end of their branch (C2 for ε̂_c, A1 for ε̂_a), where
-    their coefficients hold no difference of nearly equal numbers.
+    Both quadratic equations are written relative to the known end of the branch (C2 for ε̂_c, A1 for
+    ε̂_a), so that their coefficients contain no difference of nearly equal numbers.
     """
     sigma_a = k0 * eps_a / (1.0 - eps_a)
     sigma_c = sigma_a + dsigma
@@ -59,9 +56,9 @@ def derived_points(
 def admissible(
     k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
 ) -> bool:
-    """Tell whether the seven parameters are admissible (model, section 1).
+    """Return whether the seven parameters are admissible (model, section 1).
 
-    The conditions not asked here follow: branch d lies above C2 and branch e below A1.
+    The other conditions follow from these: branch d lies above C2 and branch e below A1.
     """
     return (
         0.0 < k0 < math.inf
@@ -75,10 +72,10 @@ def admissible(
 
 
 def crossing(log_plus: float, spread_plus: float, log_minus: float, spread_minus: float) -> float:
-    """Logarithm of the stress where snap-through and snap-back of one rank are at one stress.
+    """Return the logarithm of the stress at which one rank snaps through and snaps back.
 
-    The side on which the spring is hysteretic (snap-back below snap-through) is below it where
-    spread_minus >= spread_plus, else above it; ±inf where they never meet.
+    The spring is hysteretic (snap-back below snap-through) below this stress if
+    spread_minus >= spread_plus, else above it. It is ±inf if the two laws never meet.
     """
     if spread_minus == spread_plus:
         return math.inf if log_minus < log_plus else -math.inf
@@ -86,9 +83,9 @@ def crossing(log_plus: float, spread_plus: float, log_minus: float, spread_minus
 
 
 def most_beyond(k: float, kc: float, n: float) -> tuple[float, float]:
-    """Largest excess of branch a over branch c without its ε_*, and the stress where it is.
+    """Return the least ε_* with which branch c never lies before branch a, and its stress.
 
-    With it as ε_* at least, branch c lies at or beyond branch a everywhere. The excess is
+    It is the maximum over σ of the difference
     f(σ) = a(σ; k) - σ/(kc+σ) with a = 1 - (1 + nσ/k)^(-1/n) (model, section 8). It rises where
     g(σ) = 2 ln(kc+σ) - ln(k kc) - (1+1/n) ln(1+nσ/k) is positive; g turns once at most, so f has
     one maximum at most.

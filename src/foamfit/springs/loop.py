@@ -1,4 +1,4 @@
-"""A measured loop, from which laws read start values of their parameters."""
+"""A measured loop, from which laws read start values."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import numpy as np
 
 from foamfit.arrays import Array
 
-CORNERS = 8  # of the polygon along each way of a loop
+CORNERS = 8  # corners of the polygon along loading, and along unloading
 
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Loading and unloading stress (Pa) as functions of strain, read from a measured loop."""
+    """Loading and unloading stress (Pa) of a measured loop as functions of strain."""
 
     strain: Array
     stress: Array
 
     @cached_property
     def kinks(self) -> tuple[Array, Array, Array, Array]:
-        """Where the loop bends: strain and stress (k, 2) at what may be A1, C1, C2 and A2.
+        """Return candidates for A1, C1, C2 and A2: strain and stress (k, 2) of bends of the loop.
 
-        On the way up the slope falls at A1 and rises at C1, or the loop turns there; on the way
-        down it falls at C2 and rises at A2, or the loop ends.
+        On loading the slope falls at A1 and rises at C1 (or the loop turns there). On unloading it
+        falls at C2 and rises at A2 (or the loop ends).
         """
         peak = int(np.argmax(self.strain))
         ways = slice(peak + 1), slice(peak, None)
@@ -42,16 +42,17 @@ class Loop:
         return a1, np.vstack([c1, up[-1]]), np.vstack([c2, down[0]]), np.vstack([a2, down[-1]])
 
     def at(self, strain: float, *, loading: bool) -> float:
-        """Stress (Pa) on the way up to the largest strain, or down from it."""
+        """Return the stress (Pa) on loading up to the largest strain, or on unloading."""
         peak = int(np.argmax(self.strain))
         way = slice(peak + 1) if loading else slice(None, peak - 1 if peak else None, -1)
         return float(np.interp(strain, np.maximum.accumulate(self.strain[way]), self.stress[way]))
 
 
 def corners(strain: Array, stress: Array, count: int) -> Array:
-    """Corners of the polygon with so many that follows a curve, (count, 2), its ends included.
+    """Return the corners of a polygon that approximates a curve, (count, 2), with its ends.
 
-    Each is where the polygon of those before is farthest off, over the ranges of the curve.
+    Each new corner is the sample farthest from the polygon so far, relative to the ranges of the
+    curve.
     """
     x, y = strain / (np.ptp(strain) or 1.0), stress / (np.ptp(stress) or 1.0)
     chosen = [0, x.size - 1]

@@ -1,8 +1,8 @@
-"""The parameters of a model: one flat vector, and how it becomes springs.
+"""Models, and the flat vector of their parameters.
 
-A model names its springs from the base up, joined by "+": "bistable", "linear+bistable", … Its
-parameters are one flat vector in SI: for each spring its own (prefix s1_, s2_, …) with those of its
-relaxation terms, then the heights of a chain, then `site_eta`.
+A model names its springs from the base up, joined by "+": "bistable", "linear+bistable", … The flat
+vector (SI) has the parameters of each spring (prefix s1_, s2_, …) with its relaxation terms, then
+the heights of a chain, then `site_eta`.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from foamfit.springs.laws.record import Law, Param
 from foamfit.springs.parameters import direction, names_of, param_of
 from foamfit.springs.spring import Spring
 
-# Relaxation terms of a spring, and springs of a chain: no test tells so many apart.
+# Largest numbers of relaxation terms and of springs; no test can distinguish more.
 MOST_TERMS, MOST_SPRINGS = 10, 20
 
 
 @dataclass(frozen=True)
 class Model:
-    """Springs from the base up and the flat vector of their parameters.
+    """The springs of a model, from the base up, and the flat vector of their parameters.
 
     `kinds` names the law of each spring; `relaxation` is the number of relaxation terms of every
     hysteretic one.
@@ -42,7 +42,7 @@ class Model:
 
     @classmethod
     def parse(cls, name: str, relaxation: int = 0) -> Model:
-        """Read a model's name, for example "linear+bistable".
+        """Parse the name of a model, for example "linear+bistable".
 
         Raises
         ------
@@ -71,23 +71,23 @@ class Model:
 
     @classmethod
     def of_result(cls, content: Mapping[str, Any]) -> Model:
-        """Model of a result (fit.json, joint.json); refuses (InputError) what is no known model."""
+        """Return the model of a result (fit.json, joint.json); InputError if it is unknown."""
         options = {name: content.get(name) is True for name in laws.OPTIONS}
         return cls.parse(with_options(content["model"], **options), content.get("relaxation", 0))
 
     @property
     def name(self) -> str:
-        """The model's name, springs from the base up, with the options of each."""
+        """The name of the model, springs from the base up, with the options of each."""
         return "+".join(self.kinds)
 
     @property
     def words(self) -> str:
-        """The same as `--model` takes it, without the options."""
+        """The name of the model as `--model` takes it, without options."""
         return "+".join(law.word or law.kind for law in self.laws)
 
     @property
     def options(self) -> dict[str, bool]:
-        """Which options free more parameters of some spring; see `laws.OPTIONS`."""
+        """The options that free further parameters of some spring; see `laws.OPTIONS`."""
         return {name: any(name in kind.split(", ") for kind in self.kinds) for name in laws.OPTIONS}
 
     @cached_property
@@ -97,26 +97,26 @@ class Model:
 
     @cached_property
     def is_registered(self) -> bool:
-        """Whether a spring follows a registered law, not one of the paper's."""
+        """Whether a spring has a registered law."""
         return any(laws.is_registered(kind) for kind in self.kinds)
 
     def param(self, name: str) -> Param:
-        """Record of a parameter of the model."""
+        """Return the record of a parameter."""
         return param_of(self.kinds, name)
 
     @cached_property
     def own_places(self) -> tuple[int, ...]:
-        """Place of the first own parameter of each spring in the flat vector."""
+        """Index of the first parameter of each spring in the flat vector."""
         return tuple(self.index[f"s{i}_{law.names[0]}"] for i, law in enumerate(self.laws, 1))
 
     def own(self, spring: int, values: Array) -> Array:
-        """Own parameters and eta of a spring (0 at the base) in a flat vector, a view."""
+        """Return a view of the parameters and eta of a spring (0 = base) in a flat vector."""
         first = self.own_places[spring]
         return values[first : first + len(self.laws[spring].names)]
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of all parameters in the order of the flat vector."""
+        """Names of all parameters, in the order of the flat vector."""
         names = [
             f"s{i}_{short}"
             for i, kind in enumerate(self.kinds, start=1)
@@ -128,7 +128,7 @@ class Model:
 
     @cached_property
     def index(self) -> dict[str, int]:
-        """Place of each parameter in the flat vector."""
+        """Index of each parameter in the flat vector."""
         return {name: i for i, name in enumerate(self.names)}
 
     @cached_property
@@ -138,7 +138,7 @@ class Model:
         return np.array([direction(self.kinds, name, terms) for name in self.names])
 
     def rows(self, values: Array) -> Array | None:
-        """Springs as the solver knows them, (n_springs, columns); None if one is not admissible."""
+        """Return the rows for the solver, (n_springs, columns); None if not admissible."""
         rows = []
         for i, law in enumerate(self.laws):
             own = self.own(i, values)
@@ -156,12 +156,12 @@ class Model:
         return padded(rows)
 
     def heights(self, values: Array, total: float) -> Array:
-        """Heights of the springs (m) in a specimen of height `total`."""
+        """Return the heights of the springs (m) in a specimen of height `total`."""
         count = len(self.kinds)
         return values[-1 - count : -1] if count > 1 else np.array([total])
 
     def springs(self, values: Array) -> tuple[Spring, ...]:
-        """Springs of a flat vector; one that is not admissible is refused by name (ValueError)."""
+        """Return the springs of a flat vector; InputError if one is not admissible."""
         springs = []
         for i, law in enumerate(self.laws):
             own = self.own(i, values)
@@ -171,7 +171,7 @@ class Model:
         return tuple(springs)
 
     def chain(self, values: Array, height: float, area: float) -> Chain:
-        """Chain, massless inside, of a flat vector of parameters."""
+        """Return the chain of a flat vector, without interior masses."""
         return Chain(
             self.springs(values),
             [float(h) for h in self.heights(values, height)],
@@ -181,10 +181,10 @@ class Model:
 
 
 def with_options(model: str, **options: bool) -> str:
-    """Name of a model in which options free more parameters of the springs that have them.
+    """Return the name of a model with options that free further parameters.
 
-    `model` is the name without options, or "auto"; `options` are those of `laws.OPTIONS`, true
-    where asked for. An option whose parameters no spring of the model has is refused (InputError).
+    `model` is the name without options, or "auto"; `options` are those of `laws.OPTIONS`. Raises
+    InputError for an option that applies to no spring of the model.
     """
     if unknown := [name for name in options if name not in laws.OPTIONS]:
         raise TypeError(f"unexpected option {unknown[0]!r}; there are {', '.join(laws.OPTIONS)}")
@@ -207,12 +207,11 @@ def with_options(model: str, **options: bool) -> str:
 
 
 def exchanges(model: Model, values: Array) -> Iterator[Array]:
-    """Give the chains in which two springs of one kind have exchanged some properties.
+    """Yield chains in which two springs of one kind have exchanged some properties.
 
-    A chain under a common stress shows the sum of its springs' elongations, so properties are put
-    as stresses and elongations (`Law.exchanged`): the springs snap at the same stresses, and the
-    rest of the loop moves as little as it can. Nuisance parameters behind those of the springs in
-    `values` (n,) stay.
+    The elongations of springs under a common stress add up. Properties are therefore exchanged as
+    stresses and elongations (`Law.exchanged`): the springs snap at the same stresses, and the rest
+    of the loop changes little. Nuisance parameters at the end of `values` (n,) do not change.
     """
     index, laws = model.index, model.laws
     for pair in combinations(range(len(laws)), 2):

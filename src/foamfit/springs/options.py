@@ -1,4 +1,4 @@
-"""Options of a fit that free more parameters of some springs."""
+"""Options of a fit that free further parameters of some springs."""
 
 from __future__ import annotations
 
@@ -6,18 +6,16 @@ from typing import NamedTuple
 
 
 class Freed(NamedTuple):
-    """The parameters that an option frees, and what it does, in a sentence."""
+    """The parameters that an option frees, and its help text."""
 
     names: tuple[str, ...]
     told: str
 
 
 OPTIONS = {
-    "stiffening": Freed(
-        ("stiffening",), "Let branch a of microscale springs stiffen as the test says."
-    ),
+    "stiffening": Freed(("stiffening",), "Fit the stiffening of branch a of microscale springs."),
     "mullins": Freed(
         ("softening", "weakening"),
-        "Let what has snapped once soften and weaken (microscale springs).",
+        "Fit softening and weakening after the first snap of microscale springs.",
     ),
 }

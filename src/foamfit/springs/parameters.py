@@ -1,8 +1,8 @@
-"""Parameters by their names, their units, and directions of derivatives.
+"""Names and units of parameters, and directions of derivatives.
 
-A direction is what a derivative is taken by: a spring (0 at the base) and one of its own parameters
-in the order of its law, or its height, or a number of a relaxation term; or no spring (-1) and the
-onsite damping of the top.
+A direction is a pair of numbers that names a parameter: the spring (0 = base) and the index of the
+parameter in its law, or one of the constants below for height, dashpot and relaxation terms; for
+the onsite damper the spring is -1.
 """
 
 from __future__ import annotations
@@ -13,14 +13,13 @@ from foamfit.errors import InputError
 from foamfit.springs import laws
 from foamfit.springs.laws.record import COMMON, ETA, Param
 
-# What a direction changes, besides the parameters of a spring's law (0, 1, …). From OWN_RELAXATION
-# on: the strength g_k of term k = 1, 2, … is OWN_RELAXATION + 2 (k-1), its time τ_k the number
-# after it.
+# Second number of a direction, apart from the parameters of a law (0, 1, …). The strength g_k of
+# relaxation term k = 1, 2, … is OWN_RELAXATION + 2 (k-1), its time τ_k the next number.
 OWN_ETA, OWN_HEIGHT, DRAG, OWN_RELAXATION = 20, 21, 22, 23
-# By the displacement of all samples of a known motion that are in contact; of one spring alone.
+# Derivative of a single spring by a shift of the prescribed motion of all samples in contact.
 MOVED = -1
 
-# What a record does not say exactly of an impact, and its unit: unknowns beside the springs.
+# Nuisance parameters (see `fitting.nuisance`) and their units.
 NUISANCE = {
     "contact_time": "s",
     "displacement_zero": "m",
@@ -33,18 +32,18 @@ NUISANCE = {
 
 
 def relaxation_names(terms: int) -> tuple[str, ...]:
-    """Names of the parameters of so many relaxation terms: g1, tau1, g2, …"""
+    """Return the names of the parameters of relaxation terms: g1, tau1, g2, …"""
     return tuple(f"{name}{k}" for k in range(1, terms + 1) for name in ("g", "tau"))
 
 
 def names_of(kind: str, relaxation: int = 0) -> tuple[str, ...]:
-    """Names of the own parameters of a kind of spring that has so many relaxation terms, if any."""
+    """Return the names of the parameters of a kind of spring, with its relaxation terms."""
     law = laws.law(kind)
     return law.names + (relaxation_names(relaxation) if law.hysteretic else ())
 
 
 def springs_first(names: Iterable[str]) -> list[str]:
-    """Return each name once: those of the springs as they come, then the nuisance parameters."""
+    """Return each name once: first parameters of the springs, then nuisance parameters."""
     rank = {name: i for i, name in enumerate(NUISANCE)}
     return sorted(dict.fromkeys(names), key=lambda name: rank.get(name, -1))
 
@@ -58,7 +57,7 @@ def split_name(name: str) -> tuple[int, str]:
 
 
 def family(short: str) -> str:
-    """Name of a parameter without the number of its relaxation term: "g1" is "g"."""
+    """Return a name without the number of a relaxation term: "g" for "g1"."""
     for name in ("g", "tau"):
         if short.startswith(name) and short.removeprefix(name).isdigit():
             return name
@@ -66,30 +65,30 @@ def family(short: str) -> str:
 
 
 def param_of(kinds: tuple[str, ...], name: str) -> Param:
-    """Record of a parameter ("s1_k0", "s2_height", "site_eta") of springs of these kinds."""
+    """Return the record of a parameter ("s1_k0", "s2_height") of springs of these kinds."""
     spring, short = split_name(name)
     common = COMMON.get(family(short))
     return common or laws.law(kinds[spring]).by_name[short]
 
 
 def any_param(short: str) -> Param:
-    """Record of a parameter by its short name alone, of the first law that has it."""
+    """Return the record of a parameter by its short name, from the first law that has it."""
     if (common := COMMON.get(family(short))) is not None:
         return common
     return next(law.by_name[short] for law in laws.records() if short in law.by_name)
 
 
 def unit_of(name: str) -> str:
-    """Unit of a parameter, SI; "" for a pure number."""
+    """Return the SI unit of a parameter; "" for a dimensionless one."""
     return NUISANCE[name] if name in NUISANCE else any_param(split_name(name)[1]).unit
 
 
 def direction(
     kinds: tuple[str, ...], name: str, relaxation: tuple[int, ...] = ()
 ) -> tuple[int, int]:
-    """Direction of the derivative by a parameter of springs with so many relaxation terms each.
+    """Return the direction of the derivative by a parameter.
 
-    A parameter that they do not have is refused (InputError).
+    Raises InputError if springs with these numbers of relaxation terms do not have it.
     """
     if name == "site_eta":
         return -1, DRAG

@@ -17,8 +17,8 @@ MPA, MM, MG = 1e6, 1e-3, 1e-6
 class PublishedSet:
     """One published model of one specimen, SI.
 
-    The specimen's mass sits between the springs of a two-spring model; the published damping is the
-    onsite damper of the striker.
+    In a two-spring model the mass of the specimen lies between the springs. The published damping
+    is the onsite damper of the striker.
     """
 
     name: str  #: for example "foam-1/model-2"
@@ -48,7 +48,7 @@ class PublishedSet:
 
 
 def _bistable(k0: float, drop: float, eps_a: float, eps_c: float, *ratios: float) -> BistableSpring:
-    """Make a spring of Tables 2 and 3: k0 in MPa, Δσ/σ_a, ε_a, ε_c, and k_h+, k_h-, k_c over k0."""
+    """Return a spring from k0 (MPa), Δσ/σ_a, ε_a, ε_c, k_h+/k0, k_h-/k0, k_c/k0 (Tables 2, 3)."""
     slope = k0 * MPA
     kh_plus, kh_minus, kc = (ratio * slope for ratio in ratios)
     dsigma = drop * slope * eps_a / (1.0 - eps_a)
@@ -85,7 +85,7 @@ def _foam_2() -> PublishedSet:
 
 
 class _Sets(dict[str, PublishedSet]):
-    """The published parameter sets by name; an unknown name is refused with a list of the names."""
+    """The published parameter sets by name; the KeyError of an unknown name lists all names."""
 
     def __missing__(self, name: object) -> PublishedSet:
         raise KeyError(f"there is no published set {name!r}; there are {', '.join(self)}")

@@ -1,4 +1,4 @@
-"""Derivatives of the law by the parameters of a spring, compiled."""
+"""Compiled derivatives of springs in equilibrium by their parameters."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 
 @inner
 def branch_derivative(row: Row, branch: int, own: int) -> tuple[float, float, float]:
-    """Derivatives of (k, x0, s0) of a branch of eq. 2 by k0 … kh_minus; none of an open gap."""
+    """Return the derivatives of (k, x0, s0) of a branch of eq. 2 by k0 … kh_minus."""
     if branch == kernels.OPEN:
         return 0.0, 0.0, 0.0
     if row[kernels.KIND] != BISTABLE or branch == kernels.A:
@@ -53,7 +53,7 @@ def branch_derivative(row: Row, branch: int, own: int) -> tuple[float, float, fl
 
 @inner
 def branch_tangents(row: Row, branch: int, eps: float, moved: float, out: Array) -> None:
-    """Fill the derivatives of the stress at a strain by k0 … kh_minus, then by what moves it."""
+    """Fill the derivatives of the stress at a strain by k0 … kh_minus, then by a shift `moved`."""
     slope = slope_on(row, branch, eps)
     curved, _, x0, _ = branch_shape(row, branch)
     x = eps - x0
@@ -66,9 +66,9 @@ def branch_tangents(row: Row, branch: int, eps: float, moved: float, out: Array)
 
 @compiled
 def stress_tangents_along(row: Row, eps: Array, branches: Branches) -> Array:
-    """Derivatives (8, n) of the stress of a spring without ranks along a strain history.
+    """Return the derivatives (8, n) of the stress of a bistable or linear spring.
 
-    They are by k0 … kh_minus, and by the logarithm of the strain.
+    They are taken along a strain history by k0 … kh_minus and by the logarithm of the strain.
     """
     out, now = np.empty((OF_STRAIN + 1, eps.size)), np.empty(OF_STRAIN + 1)
     for j in range(eps.size):
@@ -79,12 +79,12 @@ def stress_tangents_along(row: Row, eps: Array, branches: Branches) -> Array:
 
 
 class _Followed(NamedTuple):
-    """Springs at one sample, and what of their derivatives is carried along.
+    """Springs at one sample, and the derivatives that are carried from sample to sample.
 
-    slope (springs,) is dσ/dε, change (p, 3) the derivatives of k, x0 and s0 of a branch. Of
+    slope (springs,) is dσ/dε, change (p, 3) the derivatives of k, x0 and s0 of a branch. For
     microscale springs: ranks (springs, 2, n), derivatives of the strain `by` parameters (springs,
-    CARRIED) and by_ranks (springs, 2), the `pace` of the first rank with the stress, and d_ranks
-    (p, springs, 2).
+    CARRIED) and by_ranks (springs, 2), the derivative `pace` of the first rank by the stress, and
+    d_ranks (p, springs, 2).
     """
 
     slope: Array
@@ -98,7 +98,7 @@ class _Followed(NamedTuple):
 
 @maker
 def _followed(rows: Array, sigma: Array, size: int) -> _Followed:
-    """Springs at rest."""
+    """Return springs at rest."""
     count, n = rows.shape[0], sigma.size
     ranks = np.zeros((count, 2, n))
     for i in range(count):
@@ -117,7 +117,7 @@ def _follow(
     at: _Followed, rows: Array, i: int, j: int, sigma: float, eps: Array, branches: Branches,
     directions: Branches,
 ) -> None:  # fmt: skip
-    """Fill what belongs to spring i at sample j."""
+    """Fill the fields of spring i at sample j."""
     branch = branches[i, j]
     if rows[i, kernels.KIND] == MICROSCALE:
         w, ever = at.ranks[i, 0, j], at.ranks[i, 1, j]
@@ -136,18 +136,19 @@ def _follow(
 
 @inner
 def _moves_line(own: int) -> bool:
-    """Whether a parameter moves the ranks of a microscale spring, not its strain at them."""
+    """Return whether a parameter changes the ranks of a microscale spring, not the strain."""
     return 3 <= own < OF_STRAIN or own == OF_WEAKENING
 
 
 @inner
 def _mixture_tangent(at: _Followed, p: int, i: int, branch: int, own: int, held: bool) -> float:
-    """Derivative of a microscale spring's strain at a fixed stress by a parameter of its own.
+    """Return the derivative of the strain of a microscale spring at a fixed stress.
 
-    `own` is -1 for another spring's; `held` says that all that ever snapped is held.
+    It is taken by its parameter `own`, -1 for a parameter of another spring; `held` is whether all
+    micro-springs that have ever snapped are held.
     """
     d_rank, d_ever = at.d_ranks[p, i, 0], at.d_ranks[p, i, 1]
-    if branch == kernels.HELD:  # what is held moves with the stress where it turned
+    if branch == kernels.HELD:  # the held rank depends on the stress at the turn
         d_rank = d_ever if held else d_rank
     else:
         d_rank = at.by[i, own] if _moves_line(own) else 0.0
@@ -158,7 +159,7 @@ def _mixture_tangent(at: _Followed, p: int, i: int, branch: int, own: int, held:
 
 @inner
 def _rank_tangents(at: _Followed, p: int, branches: Branches, common: float) -> None:
-    """Let the ranks that move do so with the common stress."""
+    """Update the derivatives of moving ranks by the change of the common stress."""
     for i in range(branches.size):
         if branches[i] != kernels.HELD:
             at.d_ranks[p, i, 0] += at.pace[i] * common
@@ -176,17 +177,16 @@ def equilibrium_tangents(
     moved_top: bool,
     directions: Branches,
 ) -> tuple[Array, Array]:
-    """Derivatives along a history of springs in series, undamped and massless.
+    """Return derivatives along a history of undamped, massless springs in series.
 
-    Given are their common stress `sigma` (n,), strains and branches (springs, n), and whether the
-    motion of the top is prescribed, or else the stress. Returned are the derivatives in p
-    directions (see `parameters`) of the displacements above the springs (p, springs, n), m, and of
-    the common stress (p, n), Pa.
+    `sigma` (n,) is the common stress; strains and branches are (springs, n); the motion of the top
+    is prescribed, or else the stress. Returns the derivatives in p directions (see `parameters`) of
+    the displacements above the springs, (p, springs, n), m, and of the common stress, (p, n), Pa.
     """
     (count, n), size = eps.shape, directions.shape[0]
     out_w, out_s = np.empty((size, count, n)), np.empty((size, n))
     at, longer = _followed(rows, sigma, size), np.empty(count)
-    compliance, slope = np.zeros(count + 1), at.slope  # of all below each node
+    compliance, slope = np.zeros(count + 1), at.slope  # compliance of all springs below a node
     for j in range(n):
         flat = -1
         for i in range(count):
@@ -220,7 +220,7 @@ def equilibrium_tangents(
             common = gap = 0.0
             if moved_top and flat < 0:
                 common = -total / float(compliance[count])
-            elif moved_top:  # a flat branch takes up all that the others leave
+            elif moved_top:  # a flat branch takes the rest of the elongation
                 common = known if spring == flat else 0.0
                 gap = -total - common * float(compliance[count])
             out_s[p, j], total = common, 0.0

@@ -1,4 +1,4 @@
-"""What springs of every law have in common: following a history, and refusing wrong numbers."""
+"""Base class of all springs: histories of stress and strain, and checks of numbers."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from foamfit.springs.laws.record import Law
 
 FLOAT = np.dtype(np.float64)
-Relaxation = Sequence[tuple[float, float]]  # frozen to a tuple of tuples
+Relaxation = Sequence[tuple[float, float]]  # stored as a tuple of tuples
 
 
 def require(holds: bool, name: str, value: float, wanted: str) -> None:
-    """Refuse a value by the name of its parameter (InputError) unless a condition holds."""
+    """Raise InputError with the name of the parameter unless a condition holds."""
     if not holds:
         raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
 
 
 def as_number(value: object, name: str) -> float:
-    """Return a real number as a float, finite or not; refuse anything else by name."""
+    """Return a real number as a float, finite or not; InputError for anything else."""
     try:
         if not isinstance(value, str | bytes):
             return float(value)  # type: ignore[arg-type]
@@ -51,7 +51,7 @@ def as_samples(values: ArrayLike, name: str) -> Array:
 
 
 def freeze_numbers(spring: Any, law: Law) -> None:
-    """Make the parameters of a spring finite floats that the law's record admits."""
+    """Convert the parameters of a spring to floats; InputError if they are not admissible."""
     from foamfit.springs.laws.record import ADMISSIBLE
 
     for name in law.names:
@@ -59,13 +59,13 @@ def freeze_numbers(spring: Any, law: Law) -> None:
         require(math.isfinite(value), name, value, "finite")
         object.__setattr__(spring, name, value)
     for name, param in law.by_name.items():
-        if not param.of:  # the law itself refuses what its other parameters rule out
+        if not param.of:  # else the law checks it together with other parameters
             value, wanted = getattr(spring, name), param.admissible
             require(ADMISSIBLE[wanted](value), name, value, wanted)
 
 
 def freeze_terms(spring: object, given: Any) -> None:
-    """Make the relaxation terms of a spring pairs of finite floats of the right sign."""
+    """Convert relaxation terms to pairs of floats; InputError if they are not admissible."""
     wanted = "relaxation must be a sequence of pairs (g, tau in s)"
     try:
         pairs = [tuple(pair) for pair in given]
@@ -96,7 +96,7 @@ def _first(mask: NDArray[np.bool_]) -> int:
 
 
 class Spring(ABC):
-    """A spring of any law: what it does along a history, without its dashpot."""
+    """A spring of any law; its histories do not include the dashpot."""
 
     k0: float
     eta: float
@@ -108,16 +108,16 @@ class Spring(ABC):
 
     @cached_property
     def row(self) -> Row:
-        """The spring as the kernels of the paper's laws know it, without relaxation."""
+        """The row of the spring for the kernels, without relaxation."""
         return self.solver_row(0)
 
     def solver_row(self, room: int) -> Row:
-        """The same with room for so many relaxation terms; without any, none is written."""
+        """Return the row with `room` relaxation terms."""
         from foamfit.springs.laws import followed
 
         terms = self.relaxation if room else ()
         row = followed.solver_row(self.law, np.array(self.values), terms, room)
-        assert row is not None  # it was checked when the spring was made
+        assert row is not None  # checked when the spring was made
         return row
 
     @property
@@ -127,24 +127,24 @@ class Spring(ABC):
 
     @property
     def values(self) -> tuple[float, ...]:
-        """Own parameters in the order of the law, then eta, SI."""
+        """Parameters in the order of the law, then eta, SI."""
         return tuple(getattr(self, name) for name in self.law.names)
 
     @property
     def corners(self) -> dict[str, tuple[float, float]]:
-        """Named points of the loop, strain and stress (Pa); a law may have none."""
+        """Named points of the loop, strain and stress (Pa); may be empty."""
         return {}
 
     def fraction_along(self, stress: ArrayLike) -> Array | None:
-        """Fraction of micro-springs that has snapped along a stress history (Pa), if it has any."""
+        """Return the fraction of snapped micro-springs along a stress history (Pa), or None."""
         return None
 
     def snapped_along(self, strain: ArrayLike) -> Array | None:
-        """Fraction that has snapped along a strain history, (n,); None where the law has none."""
+        """Return the snapped fraction along a strain history, (n,), or None."""
         return None
 
     def stress(self, strain: ArrayLike) -> Array:
-        """Stress (Pa) along a strain history (n,), or at one strain, from rest (eqs. 2 and 3).
+        """Return the stress (Pa) along a strain history (n,), from rest (eqs. 2 and 3).
 
         Raises
         ------
@@ -154,9 +154,9 @@ class Spring(ABC):
         return self._along(strain)[1].reshape(np.shape(strain))
 
     def strain(self, stress: ArrayLike) -> Array:
-        """Strain along a stress history (Pa), shape (n,), from rest; the inverse of `stress`.
+        """Return the strain along a stress history (n,), Pa, from rest: the inverse of `stress`.
 
-        Where a branch is flat (k_h± = 0) a stress beyond it jumps to the next branch.
+        On a flat branch (k_h± = 0) a stress beyond it jumps to the next branch.
 
         Raises
         ------
@@ -173,43 +173,43 @@ class Spring(ABC):
         return strain.reshape(np.shape(stress))
 
     def tangent(self, strain: ArrayLike) -> Array:
-        """Slope dσ/dε (Pa) on the branch of each sample of a strain history, shape (n,)."""
+        """Return the slope dσ/dε (Pa) at each sample of a strain history, (n,)."""
         return self._slope_along(self._along(strain)[0]).reshape(np.shape(strain))
 
     def branches(self, strain: ArrayLike) -> NDArray[np.str_]:
-        """Name of the branch of each sample of a strain history, shape (n,).
+        """Return the name of the branch at each sample of a strain history, (n,).
 
-        A bistable spring is on "a", "d", "c" or "e"; a microscale spring on "a" while none of it
-        has snapped, then on "held" (what has snapped stays so), "snap-through", "snap-back" or
-        "reversible" (both at one stress); a linear spring on "line" or, out of contact, "open".
+        A bistable spring is on "a", "d", "c" or "e". A microscale spring is on "a" before its first
+        snap, then on "held" (the snapped fraction is constant), "snap-through", "snap-back" or
+        "reversible" (both at one stress). A linear spring is on "line" or, out of contact, "open".
         """
         numbers = self._along(strain)[2]
         names = np.array([self.law.named_branch(int(number)) for number in numbers])
         return names.reshape(np.shape(strain))
 
     def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Stresses and numbers of the branches of a strain history."""
+        """Return stresses and branch numbers along a strain history."""
         from foamfit.springs import kernels
 
         return kernels.stress_along(self.row, strain)
 
     def _strain_along(self, stress: Array) -> Array:
-        """Strains of a stress history; not finite where the spring cannot have its stress."""
+        """Return strains along a stress history; not finite where no strain exists."""
         from foamfit.springs import equilibrium
 
         strain, none = np.empty(stress.size), np.empty((0, stress.size))
-        row = self.row[None, :]  # of height 1: its elongation is its strain
+        row = self.row[None, :]  # with height 1 the elongation is the strain
         equilibrium.strains_along(row, np.ones(1), stress, strain, none, none.astype(np.int64))
         return strain
 
     def _slope_along(self, strain: Array) -> Array:
-        """Slopes of a strain history."""
+        """Return slopes along a strain history."""
         from foamfit.springs import kernels
 
         return kernels.tangent_along(self.row, strain, self._stress_along(strain)[1])
 
     def _along(self, strain: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Strains, stresses and branches of a strain history."""
+        """Return strains, stresses and branches along a strain history."""
         history = _as_history(strain, "strain")
         stress, branches = self._stress_along(history)
         if not np.all(np.isfinite(stress)):
@@ -223,16 +223,16 @@ class Spring(ABC):
 
 @dataclass(frozen=True, init=False)
 class LawSpring(Spring):
-    """A spring of a law that was made known by `foamfit.register`.
+    """A spring of a law registered with `foamfit.register`.
 
     Parameters
     ----------
     law : Law
         Its record.
     values : sequence of float
-        Its own parameters in the order of the law, then eta, SI; they are attributes too.
+        Parameters in the order of the law, then eta, SI; they are attributes as well.
     relaxation : sequence of pairs of float
-        Relaxation terms (g, τ in s) in parallel; left out = none.
+        Relaxation terms (g, τ in s) in parallel; by default none.
 
     Raises
     ------
@@ -245,7 +245,7 @@ class LawSpring(Spring):
     relaxation: Relaxation = ()
 
     def __init__(self, law: Law, values: Sequence[float], relaxation: Relaxation = ()) -> None:
-        """Check and freeze the spring."""
+        """Check the arguments and make the spring immutable."""
         from foamfit.springs.laws import followed
 
         put = object.__setattr__
@@ -276,7 +276,7 @@ class LawSpring(Spring):
 
     def _slope_along(self, strain: Array) -> Array:
         step = 1e-6 * max(float(np.max(np.abs(strain))), 1e-9)
-        beside = [  # stresses after a small step back and on, from each sample of the history
+        beside = [  # stresses after a small step backwards and forwards from each sample
             [self._stress_along(np.append(strain[:j], strain[j - 1] + by))[0][-1] for by in steps]
             for j in range(1, strain.size + 1)
             for steps in ((-step, step),)

@@ -1,6 +1,6 @@
-"""The laws of springs: the paper's, and those that are registered.
+"""The laws of springs: built-in ones, and those that users register.
 
-`law(kind)` is the record of a kind of spring; everything outside `springs` goes by it.
+`law(kind)` returns the record of a kind of spring, on which all code outside `springs` relies.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ ENTRY_POINTS = "foamfit.laws"
 _PAPER = (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)
 _OPTIONAL = (microscale.STIFFENING_LAW, microscale.MULLINS_LAW, microscale.MEMORY_LAW)
 _LAWS = {law.kind: law for law in (*_PAPER, *_OPTIONAL)}
-PAPER = tuple(_LAWS)  # laws that the kernels know
-_TEXTS: dict[str, str] = {}  # of the law files that were loaded, by path
+PAPER = tuple(_LAWS)  # built-in laws, which the kernels implement
+_TEXTS: dict[str, str] = {}  # text of each loaded law file, by path
 _asked_packages: list[bool] = []
 
 
 def law(kind: str) -> Law:
-    """Record of a kind of spring; an unknown one is refused (InputError)."""
+    """Return the record of a kind of spring; InputError if it is unknown."""
     if kind not in _LAWS:
         _load_packages()
     if kind not in _LAWS:
@@ -44,7 +44,7 @@ def law(kind: str) -> Law:
 
 
 def _by_kind(one: Law) -> tuple[Callable[[str], Law], tuple[str]]:
-    """Pickle a record as its name: its functions stay where they are."""
+    """Pickle a record by its name, because its functions cannot be pickled."""
     return law, (one.kind,)
 
 
@@ -52,47 +52,46 @@ copyreg.pickle(Law, _by_kind)
 
 
 def kinds() -> tuple[str, ...]:
-    """Names of all laws that are known, the paper's first; see `with_options` for the others."""
+    """Return the names of all laws, built-in ones first, without variants by options."""
     _load_packages()
     return tuple(kind for kind, law in _LAWS.items() if not law.word)
 
 
 def records() -> tuple[Law, ...]:
-    """All laws that are known, those with the parameters of options too."""
+    """Return the records of all laws, including variants by options."""
     _load_packages()
     return tuple(_LAWS.values())
 
 
 def with_options(kind: str, options: tuple[str, ...]) -> str:
-    """Name of a law with the parameters of some options; itself where it has none of these."""
+    """Return the name of a law's variant with some options; `kind` if it has none of them."""
     known = law(kind).options
     return known.get(tuple(one for one in OPTIONS if one in options and (one,) in known), kind)
 
 
 def is_registered(kind: str) -> bool:
-    """Whether a law is not one of the paper's, so that the loops for any law follow it."""
+    """Return whether a law is registered, and followed by the functions of its record."""
     return kind in _LAWS and kind not in PAPER
 
 
 def register(law: Law) -> Law:
-    """Make a law known: its kind becomes a word of a model's name.
+    """Register a law, so that its kind can be used in the name of a model.
 
     Parameters
     ----------
     law
-        The record. One that is registered already under this name is replaced; the paper's laws are
-        not.
+        The record. It replaces a registered law of the same name; built-in laws cannot be replaced.
 
     Returns
     -------
     Law
-        The record as it is known; `make` makes springs of it.
+        The registered record; its method `make` makes springs.
 
     Raises
     ------
     InputError
-        If something in it is wrong: a name, a missing function, a stress that is not finite, a
-        branch on which the stress falls.
+        If the record is wrong: an invalid name, a missing function, a stress that is not finite, or
+        a branch on which the stress falls.
     """
     from foamfit.springs.laws.checked import check
 
@@ -113,8 +112,8 @@ def load_file(path: str | Path) -> tuple[Law, ...]:
     Parameters
     ----------
     path
-        A file with one or more `Law` records at its top level. It is code of the user's own: only
-        the command line names one.
+        A file with one or more `Law` records at its top level. As it is code, only the command line
+        may name it.
 
     Returns
     -------
@@ -123,8 +122,8 @@ def load_file(path: str | Path) -> tuple[Law, ...]:
     Raises
     ------
     InputError
-        If the file cannot be read or run, or has no law, or one that is wrong; the message names
-        the file.
+        If the file cannot be read or run, or contains no law or a wrong one; the message names the
+        file.
     """
     path = Path(path)
     if not path.is_file():
@@ -137,19 +136,19 @@ def load_file(path: str | Path) -> tuple[Law, ...]:
 
 
 def texts() -> dict[str, str]:
-    """Return the texts of the law files that were loaded, by path, for `load_texts`."""
+    """Return the texts of all loaded law files, by path, for `load_texts`."""
     return dict(_TEXTS)
 
 
 def load_texts(given: Mapping[str, str]) -> None:
-    """Make the laws known that another process has loaded from files; see `load_file`."""
+    """Register the laws that another process has loaded from files; see `load_file`."""
     for path, text in given.items():
         if _TEXTS.get(path) != text:
             _load(path, text)
 
 
 def _load(path: str, text: str) -> tuple[Law, ...]:
-    """Register the laws of a text; those that it has had in this process stay compiled."""
+    """Register the laws of a text; a text loaded before is not compiled again."""
     found = _run(path, str(Path(path).resolve().parent), text)
     _LAWS.update({one.kind: one for one in found})
     _TEXTS[path] = text
@@ -158,7 +157,7 @@ def _load(path: str, text: str) -> tuple[Law, ...]:
 
 @cache
 def _run(path: str, folder: str, text: str) -> tuple[Law, ...]:
-    """Run the text of a law file and register its laws, all or none."""
+    """Run the text of a law file, and register all of its laws or none."""
     before = dict(_LAWS)
     name = f"foamfit_law_{Path(path).stem}"
     spec = importlib.util.spec_from_loader(name, loader=None, origin=path)
@@ -166,7 +165,7 @@ def _run(path: str, folder: str, text: str) -> tuple[Law, ...]:
     module = importlib.util.module_from_spec(spec)
     module.__file__ = path
     sys.modules[name] = module
-    sys.path.insert(0, folder)  # it may import what stands beside it
+    sys.path.insert(0, folder)  # so that it can import modules next to it
     try:
         exec(compile(text, path, "exec"), module.__dict__)
         given = [one for one in vars(module).values() if isinstance(one, Law)]
@@ -187,7 +186,7 @@ def _run(path: str, folder: str, text: str) -> tuple[Law, ...]:
 
 
 def _load_packages() -> None:
-    """Register the laws that installed packages name, once."""
+    """Register the laws of installed packages, once."""
     if _asked_packages:
         return
     _asked_packages.append(True)

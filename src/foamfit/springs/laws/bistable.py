@@ -49,8 +49,8 @@ class BistableSpring(Spring):
     eta : float
         η, dashpot in parallel, Pa·s.
     relaxation : sequence of pairs of float
-        Relaxation terms (g, τ in s) in parallel; left out = none. `stress` and `strain` follow the
-        equilibrium, without them.
+        Relaxation terms (g, τ in s) in parallel; by default none. `stress` and `strain` are the
+        equilibrium values, without relaxation.
 
     Raises
     ------
@@ -69,7 +69,7 @@ class BistableSpring(Spring):
     relaxation: Relaxation = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        """Refuse what is not admissible, by name."""
+        """Raise InputError for an inadmissible value; the message names it."""
         freeze_numbers(self, LAW)
         freeze_terms(self, self.relaxation)
         past = f"greater than eps_a = {self.eps_a:g}"
@@ -85,7 +85,7 @@ class BistableSpring(Spring):
 
     @property
     def seven(self) -> tuple[float, float, float, float, float, float, float]:
-        """The seven parameters of the law in their order, SI."""
+        """The seven parameters of the law, SI."""
         first = (self.k0, self.kc, self.dsigma, self.eps_a)
         return *first, self.eps_c, self.kh_plus, self.kh_minus
 
@@ -101,12 +101,12 @@ class BistableSpring(Spring):
 
     @property
     def eps_star(self) -> float:
-        """ε_*, strain at which branch c starts from zero stress (eq. 2)."""
+        """ε_*, strain of branch c at zero stress (eq. 2)."""
         return derived_points(*self.seven)[2]
 
     @property
     def eps_hat_a(self) -> float | None:
-        """ε̂_a, strain at A2 (eq. 4); None where branch e never meets branch a."""
+        """ε̂_a, strain at A2 (eq. 4); None if branch e never meets branch a."""
         eps_hat_a = derived_points(*self.seven)[3]
         return eps_hat_a if math.isfinite(eps_hat_a) else None
 
@@ -117,7 +117,7 @@ class BistableSpring(Spring):
 
     @property
     def sigma_hat_a(self) -> float | None:
-        """Stress at A2, Pa; None where branch e never meets branch a."""
+        """Stress at A2, Pa; None if branch e never meets branch a."""
         eps_hat_a = self.eps_hat_a
         return None if eps_hat_a is None else self.k0 * eps_hat_a / (1 - eps_hat_a)
 
@@ -128,7 +128,7 @@ class BistableSpring(Spring):
 
     @property
     def corners(self) -> dict[str, tuple[float, float]]:
-        """Strain and stress (Pa) at A1, C1, C2 and, where it exists, A2."""
+        """Strain and stress (Pa) at A1, C1, C2 and, if it exists, A2."""
         out = {
             "A1": (self.eps_a, self.sigma_a),
             "C1": (self.eps_hat_c, self.sigma_hat_c),
@@ -139,7 +139,7 @@ class BistableSpring(Spring):
         return out
 
     def snapped_along(self, strain: ArrayLike) -> Array:
-        """Share of the way from branch a (0) to c (1) along a strain history, (n,)."""
+        """Return the position between branch a (0) and c (1) along a strain history, (n,)."""
         history, _, branches = self._along(strain)
         back = self.eps_hat_a or 0.0
         on_d = (history - self.eps_a) / (self.eps_hat_c - self.eps_a)
@@ -149,7 +149,7 @@ class BistableSpring(Spring):
 
 
 def _sigma_a(k0: float, eps_a: float) -> float:
-    """σ_a = k0 ε_a/(1-ε_a), Pa."""
+    """Return σ_a = k0 ε_a/(1-ε_a), Pa."""
     return k0 * eps_a / (1.0 - eps_a)
 
 
@@ -157,17 +157,17 @@ def _sigma_a(k0: float, eps_a: float) -> float:
 
 
 def read_off(loop: Loop, marks: Array, scales: Any, way: int) -> Array:
-    """Read a spring off a loop, given where on it A1, C1 and C2 are taken to lie.
+    """Read a spring off a loop with A1, C1 and C2 at assumed positions.
 
-    `marks` (5,) in [0, 1] are the places of A1, C1 and C2 between their neighbours, and shares of
-    the stress at C2 and of the damping. Returned are k0 … kh_minus, eta (SI): initial slope from
-    A1, k_h+ from A1 to C1, k_c through C1 and C2 (of two such branches the stiff one, or on the
-    second `way` the one close to its pole), k_h- from C2 towards rest.
+    `marks` (5,) in [0, 1] are the positions of A1, C1 and C2, and fractions for the stress at C2
+    and the damping. Returns k0 … kh_minus, eta (SI): the initial slope from A1, k_h+ from A1 to C1,
+    k_c through C1 and C2 (the stiffer of two solutions, or on the second `way` the one near its
+    pole), and k_h- from C2 towards rest.
     """
     last = float(np.max(loop.strain))
     eps_a = min((0.02 + 0.85 * marks[0]) * last, 0.9)
     sigma_a = max(loop.at(eps_a, loading=True), 0.005 * scales.stress)
-    hat_c = eps_a + (0.15 + 1.1 * marks[1]) * max(last - eps_a, 1e-3)  # perhaps never reached
+    hat_c = eps_a + (0.15 + 1.1 * marks[1]) * max(last - eps_a, 1e-3)  # C1 may never be reached
     seen = min(hat_c, max(last, eps_a + 1e-3))
     kh_plus = max((loop.at(seen, loading=True) - sigma_a) / (seen - eps_a), 0.0)
     sigma_hat_c = sigma_a + kh_plus * (hat_c - eps_a)
@@ -176,17 +176,17 @@ def read_off(loop: Loop, marks: Array, scales: Any, way: int) -> Array:
     sigma_c = min(max(sigma_c, 0.02 * sigma_a), 0.98 * sigma_a)
     kc = _stiffness_between(hat_c - eps_c, sigma_c, sigma_hat_c)
     if way == 1:
-        kc = sigma_c * sigma_hat_c / kc  # the product of the two
+        kc = sigma_c * sigma_hat_c / kc  # the product of both solutions is known
     k0, eta = sigma_a * (1.0 - eps_a) / eps_a, 0.1 * scales.eta * marks[4] ** 2
     return np.array([k0, kc, sigma_c - sigma_a, eps_a, eps_c, kh_plus, sigma_c / eps_c, eta])
 
 
 def read_in_series(loop: Loop, marks: Array, share: float) -> Array:
-    """Read one of several springs off the kinks of their common loop.
+    """Read one of several springs in series off the kinks of their common loop.
 
-    While a spring that has but a `share` of the height snaps, the others keep their branches, so
-    the chain bends at the stresses of A1, C1, C2 and A2. `marks` (5,) in [0, 1] choose these among
-    the kinks of the loop, and k_c. Returned are k0 … kh_minus, and a dashpot of zero (SI).
+    While a spring with a `share` of the height snaps, the others stay on their branches, so the
+    loop bends at the stresses of A1, C1, C2 and A2. `marks` (5,) in [0, 1] select these among the
+    kinks, and k_c. Returns k0 … kh_minus and eta = 0 (SI).
     """
 
     def pick(kinks: Array, mark: float) -> tuple[float, float]:
@@ -215,9 +215,9 @@ def read_in_series(loop: Loop, marks: Array, share: float) -> Array:
 
 
 def _stiffness_between(rise: float, low: float, high: float) -> float:
-    """k_c of a branch c that rises by a strain from stress `low` to `high` (Pa).
+    """Return k_c of a branch c whose strain grows by `rise` from stress `low` to `high` (Pa).
 
-    The larger root k of rise (k+low)(k+high) = k (high-low); if none, √(low high) comes closest.
+    It is the larger root k of rise (k+low)(k+high) = k (high-low), or √(low high) without a root.
     """
     gain = max(high - low, 1e-9 * high)
     rise = max(rise, 1e-6)
@@ -234,7 +234,7 @@ def _neighbours(values: Array, top: float) -> Iterator[Array]:
 
 
 def _to_stresses(values: Array, height: float) -> Array:
-    """k0, kc, k_h+, k_h- over the height (Pa/m), σ_a, σ̄_c, elongation from branch a to C2 (m)."""
+    """Return k0, kc, k_h±, each per height (Pa/m), σ_a, σ̄_c, elongation from a to C2 (m)."""
     k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus = values
     sigma_a = _sigma_a(k0, eps_a)
     sigma_c = sigma_a + dsigma

@@ -1,4 +1,4 @@
-"""What is asked of a law before it becomes known."""
+"""Checks of a law before it is registered."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from foamfit.springs.laws.record import ADMISSIBLE, COMMON, EPS, Functions, Law,
 
 SCALES = {"one": 1.0, "strain": 0.5, "stress": 1e6, "slope": 2e6, "damping": 1e3, "duration": 1e-3}
 _UP = np.linspace(0.0, 0.5, 101)
-TRIED = np.concatenate([_UP, _UP[-2::-1]])  # strains of the trial: up and back to zero
-FALLS = 1e-9  # share of the largest stress by which a stress may fall on loading: rounding
+TRIED = np.concatenate([_UP, _UP[-2::-1]])  # strains of the trial: loading and unloading
+FALLS = 1e-9  # allowed decrease of stress on loading (rounding), relative to the largest stress
 
 
 def _names(law: Law, taken: Sequence[str]) -> str | None:
-    """What is wrong with the names and numbers of a record."""
+    """Return what is wrong with the names and numbers of a record, or None."""
     if not re.fullmatch(r"[a-z][a-z0-9-]*", law.kind):
         return "its kind must be small letters, digits and hyphens, beginning with a letter"
     if law.kind in taken:
@@ -34,7 +34,7 @@ def _names(law: Law, taken: Sequence[str]) -> str | None:
 
 
 def _param(law: Law, param: Param) -> str | None:
-    """What is wrong with one parameter."""
+    """Return what is wrong with one parameter, or None."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", param.name) or re.fullmatch(r"(g|tau)\d+", param.name):
         return "the name must be small letters, digits and underscores, and not g1, tau1, …"
     if param.name in COMMON or law.own.count(param.name) > 1:
@@ -53,12 +53,12 @@ def _param(law: Law, param: Param) -> str | None:
 
 
 def start_values(law: Law) -> Array:
-    """Own parameters at their start values, for a test of 1 MPa at a strain of 0.5."""
+    """Return the start values of the parameters for a test of 1 MPa at a strain of 0.5."""
     return law.assembled(lambda param: 0.5 if param.of else param.start[0] * SCALES[param.start[1]])
 
 
 def _missing(law: Law) -> str | None:
-    """What is wrong with the functions of a record."""
+    """Return what is wrong with the functions of a record, or None."""
     given = law.loaded_functions()
     if not isinstance(given, Functions):
         return "functions must be foamfit.Functions(fill, begin, leaves, switch, settle)"
@@ -68,16 +68,16 @@ def _missing(law: Law) -> str | None:
 
 
 def _overrun(law: Law, values: Array) -> str | None:
-    """What is wrong with the length of row and state.
+    """Return what is wrong with the lengths of row and state, or None.
 
-    Compiled functions check no index, and would write into the memory of others: so the law is
-    first followed as it was written.
+    Compiled functions do not check indices and could write outside an array. The law is therefore
+    first followed by the uncompiled functions.
     """
     given = law.loaded_functions()
     written: list[Any] = [getattr(one, "py_func", one) for one in given]
     plain = Functions(*written)
     if any(one and one.__module__.startswith("foamfit.") for one in written):
-        return None  # the paper's laws call what Python cannot
+        return None  # built-in laws call compiled functions
     columns, states = followed.sizes_of(law)
     row, state = np.zeros(columns), np.zeros(states)
     try:
@@ -97,12 +97,12 @@ def _overrun(law: Law, values: Array) -> str | None:
             "the law as many columns and states as it uses"
         )
     except Exception:
-        return None  # the trial of the compiled functions says what is wrong
+        return None  # the trial of the compiled functions reports it
     return None
 
 
 def _trial(law: Law) -> str | None:
-    """What is wrong along a loading and unloading at start values."""
+    """Return what is wrong in a loading and unloading at start values, or None."""
     values = start_values(law)
     if (wrong := _overrun(law, values)) is not None:
         return wrong
@@ -111,7 +111,7 @@ def _trial(law: Law) -> str | None:
         if followed.row_of(law, values) is None:
             return f"fill refuses its own start values ({shown}); give others"
         stress, branches = followed.stress_along(law, values, TRIED)
-    except Exception as error:  # whatever the compiler finds in a function of the user's
+    except Exception as error:  # any error of the compiler in a user's function
         told = " ".join(str(error).split())[:300]
         return f"its functions cannot be compiled or run ({type(error).__name__}: {told})"
     if not np.all(np.isfinite(stress)):
@@ -131,7 +131,7 @@ def _trial(law: Law) -> str | None:
 
 
 def check(law: Law, taken: Sequence[str]) -> None:
-    """Refuse (InputError) a law with something wrong in it; the names `taken` are the paper's."""
+    """Raise InputError if a law is wrong; `taken` are the names of built-in laws."""
     if not isinstance(law, Law):
         raise InputError(f"{law!r} is not a foamfit.Law")
     wrong = _names(law, taken) or _missing(law) or _trial(law)

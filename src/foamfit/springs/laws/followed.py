@@ -1,8 +1,8 @@
-"""Springs of any law, followed by the functions of its record: compiled loops.
+"""Compiled loops that follow springs of any law by the functions of their records.
 
-The loops are made for the laws that a chain has, in their order, and kept. All springs are rows of
-numbers and states of numbers (`laws.record`); `step` takes one of them to a strain within a time
-and returns its whole stress, that of the law, of the relaxation terms and of the dashpot.
+The loops are compiled for the laws of a chain, in their order, and cached. A spring is a row and a
+state of numbers (`laws.record`). `step` takes a spring to a strain within a time and returns its
+total stress: law, relaxation terms and dashpot.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from foamfit.springs.laws.record import BRANCH, EPS, SIGMA, Functions, Law
 
 Compiled = Callable[..., Any]
 compiled = njit(error_model="numpy")
-MOST_SWITCHES = 10_000  # of one spring on the way to one strain
+MOST_SWITCHES = 10_000  # largest number of switches of a spring in one step
 
 
-# ---------------------------------------------------------------- the paper's laws
+# ---------------------------------------------------------------- built-in laws
 
 
 @kernels.compiled
@@ -44,7 +44,7 @@ def _begin(row: Array, state: Array) -> None:
 
 @kernels.compiled
 def _leaves(row: Array, state: Array, eps: float) -> bool:
-    """Whether a spring leaves its branch before it reaches a strain."""
+    """Return whether a spring leaves its branch before it reaches a strain."""
     if row[kernels.KIND] == MICROSCALE:
         return micro.leaves(state, eps)
     return eps > state[micro.HIGH] if eps > state[EPS] else eps < state[micro.LOW]
@@ -52,7 +52,7 @@ def _leaves(row: Array, state: Array, eps: float) -> bool:
 
 @kernels.compiled
 def _settle(row: Array, state: Array, eps: float) -> None:
-    """Bring a spring to a strain that lies on its branch."""
+    """Move a spring to a strain on its branch."""
     if row[kernels.KIND] == MICROSCALE:
         micro.settle(row, state, eps)
     else:
@@ -61,7 +61,7 @@ def _settle(row: Array, state: Array, eps: float) -> None:
 
 @kernels.compiled
 def _switch(row: Array, state: Array, up: bool) -> None:
-    """Go over to the next branch, at the end of this one or where the strain turns."""
+    """Change to the next branch, at the end of this one or at a turn of the strain."""
     if row[kernels.KIND] == MICROSCALE:
         micro.switch(row, state, up)
         return
@@ -85,7 +85,7 @@ _FILL = {
 
 
 def functions_of(kind: str) -> Functions:
-    """Functions of one of the paper's laws."""
+    """Return the functions of a built-in law."""
     return Functions(_FILL[kind], _begin, _leaves, _switch, _settle)
 
 
@@ -94,43 +94,43 @@ def functions_of(kind: str) -> Functions:
 
 @cache
 def compiled_functions(law: Law) -> Functions:
-    """Functions of a law, compiled."""
+    """Return the compiled functions of a law."""
     given: tuple[Any, ...] = law.loaded_functions()
     ready = (None, *(one for one in given if hasattr(one, "py_func")))
     return Functions(*(one if one in ready else compiled(one) for one in given))
 
 
 def sizes_of(law: Law) -> tuple[int, int]:
-    """Length of a row and of a state of a law."""
+    """Return the lengths of a row and of a state."""
     if law.kind in _FILL:
         return kernels.N_COLUMNS, micro.STATE
     return law.columns or len(law.params), law.states
 
 
 def row_of(law: Law, values: ArrayLike) -> Array | None:
-    """Row of a spring of own parameters (eta may follow); None if they are not admissible."""
+    """Return the row of a spring from its parameters (and eta); None if not admissible."""
     row = np.zeros(sizes_of(law)[0])
     own = np.array(values, dtype=float)[: len(law.params)]
     return row if compiled_functions(law).fill(own, row) else None
 
 
 def solver_row(law: Law, values: Array, terms: ArrayLike, room: int) -> Array | None:
-    """Row of one of the paper's laws as the solver takes it; None if it is not admissible.
+    """Return the row of a built-in law for the solver; None if it is not admissible.
 
-    `values` are own parameters and eta; `room` relaxation terms have place behind the columns.
+    `values` are the parameters and eta; `room` is the number of relaxation terms in the row.
     """
     row, pairs = np.zeros(kernels.N_COLUMNS + 2 * room), np.ravel(terms)
     own, relaxing = row[: kernels.N_COLUMNS], row[kernels.N_COLUMNS :]
     fine = compiled_functions(law).fill(values[:-1], own) and values[-1] >= 0.0
     own[kernels.ETA] = values[-1]
-    relaxing[1::2] = np.inf  # no term
+    relaxing[1::2] = np.inf  # unused terms
     relaxing[: pairs.size] = pairs
     for g, tau in pairs.reshape(-1, 2).tolist():
         fine = fine and 0.0 <= g < math.inf and 0.0 < tau < math.inf
     return row if fine else None
 
 
-# Columns of a relaxation term: strength g, time τ (s), and its memory y, see `solve.relaxation`.
+# Columns of a relaxation term: strength g, time τ (s), and its state y (see `solve.relaxation`).
 STRENGTH, TIME, MEMORY = range(3)
 
 
@@ -145,12 +145,12 @@ class Springs(NamedTuple):
 
 
 class Loops(NamedTuple):
-    """Compiled loops of springs of some laws; i is the spring, 0 at the base.
+    """Compiled loops for springs of some laws; i is the spring, 0 at the base.
 
-    start(i, row, state, 0) brings it to rest. step(i, springs, strain, h) takes it to a strain
-    within the time h (s; 0 at once), its stress taken for linear in time by the relaxation terms,
-    and returns the whole stress, Pa; to_stress(i, springs, stress, h) is the inverse; both return
-    NaN without a solution. delayed(i, row, state, (rate, h)) is the stress that depends on time.
+    start(i, row, state, 0) sets it to rest. step(i, springs, strain, h) takes it to a strain within
+    the time h (s; 0 for a jump) and returns its total stress, Pa; relaxation terms assume a stress
+    linear in time. to_stress(i, springs, stress, h) is the inverse. Both return NaN without a
+    solution. delayed(i, row, state, (rate, h)) is the stress that depends on time.
     """
 
     start: Compiled
@@ -160,9 +160,9 @@ class Loops(NamedTuple):
 
 
 def _own_loops(law: Law) -> tuple[Compiled, Compiled, Compiled]:
-    """Start one spring at rest, walk it to a strain, and give what of its stress depends on time.
+    """Return loops that set a spring to rest, take it to a strain, and give its viscous stress.
 
-    Rows and states may be longer than its own.
+    Rows and states may be longer than those of the law.
     """
     _, begin, leaves, switch, settle, viscous = compiled_functions(law)
     columns, states = sizes_of(law)
@@ -195,7 +195,7 @@ def _own_loops(law: Law) -> tuple[Compiled, Compiled, Compiled]:
 
 
 def _chosen(functions: Sequence[Compiled]) -> Compiled:
-    """One function of those of several springs: called with i, it is the i-th of them."""
+    """Combine functions of several springs into one that takes the index i of a spring."""
     first = functions[0]
 
     @compiled
@@ -214,17 +214,17 @@ def _chosen(functions: Sequence[Compiled]) -> Compiled:
 
 
 def inverse(value_at: Compiled) -> Compiled:
-    """Find where value_at(given, x), which never falls with x, has a target.
+    """Return a root finder for value_at(given, x) = target, where value_at never falls with x.
 
-    find(given, start, pace, size, target) searches from `start` by steps of `pace`, to rounding of
-    x or of `size`; NaN if nothing has the target.
+    find(given, start, pace, size, target) searches from `start` with steps of `pace`, to rounding
+    of x or of `size`, and returns NaN without a root.
     """
 
     @compiled
     def find(given: Any, start: float, pace: float, size: float, target: float) -> float:
         low = high = start
         least = most = value_at(given, start)
-        for _ in range(200):  # ends between which the target lies
+        for _ in range(200):  # bracket the root
             if least <= target <= most:
                 break
             up = target > most
@@ -256,14 +256,14 @@ def inverse(value_at: Compiled) -> Compiled:
 
 @compiled
 def trial_of(springs: Springs) -> Springs:
-    """The same springs, whose states may be tried."""
+    """Return the springs with a copy of their states, for trial steps."""
     states, terms = springs.states.copy(), springs.terms.copy()
     return Springs(springs.rows, states, terms, springs.heights, springs.eta)
 
 
 @cache
 def loops_of(laws: tuple[Law, ...]) -> Loops:
-    """Loops of springs of these laws, base first."""
+    """Return the loops for springs of these laws, base first."""
     start, walk, delayed = map(_chosen, zip(*map(_own_loops, laws), strict=True))
 
     @compiled
@@ -287,7 +287,7 @@ def loops_of(laws: tuple[Law, ...]) -> Loops:
 
     @compiled
     def beside(given: Any, eps: float) -> float:
-        """Stress at a strain; the spring stays where it is."""
+        """Return the stress at a strain without moving the spring."""
         i, springs, h = given
         return step(i, trial_of(springs), eps, h)
 
@@ -304,7 +304,7 @@ def loops_of(laws: tuple[Law, ...]) -> Loops:
 
 
 def _followed(law: Law, values: ArrayLike) -> tuple[Loops, Springs]:
-    """Loops of one spring at rest, of height 1."""
+    """Return the loops and a single spring at rest, of height 1."""
     row, loops = row_of(law, values), loops_of((law,))
     assert row is not None
     springs = Springs(
@@ -315,7 +315,7 @@ def _followed(law: Law, values: ArrayLike) -> tuple[Loops, Springs]:
 
 
 def stress_along(law: Law, values: ArrayLike, strain: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Stress (Pa) and number of the branch along a strain history (n,), from rest."""
+    """Return stress (Pa) and branch number along a strain history (n,), from rest."""
     loops, springs = _followed(law, values)
     out, branches = np.empty(strain.size), np.empty(strain.size, np.int64)
     for j, eps in enumerate(strain):
@@ -325,6 +325,6 @@ def stress_along(law: Law, values: ArrayLike, strain: Array) -> tuple[Array, NDA
 
 
 def strain_along(law: Law, values: ArrayLike, stress: Array) -> Array:
-    """Strain along a stress history (n,), Pa, from rest; NaN where the law has no such stress."""
+    """Return the strain along a stress history (n,), Pa, from rest; NaN without a solution."""
     loops, springs = _followed(law, values)
     return np.array([loops.to_stress(0, springs, sigma, 0.0) for sigma in stress])

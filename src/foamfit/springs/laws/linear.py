@@ -1,4 +1,4 @@
-"""The linear spring S1 of the two-spring models, σ = k0 ε, and one that carries no tension."""
+"""The linear spring S1 of the two-spring models, σ = k0 ε, and its unilateral variant."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class LinearSpring(Spring):
     eta : float
         η, dashpot in parallel, Pa·s.
     unilateral : bool
-        If true the spring carries no tension.
+        Whether the spring carries no tension.
 
     Raises
     ------
@@ -34,7 +34,7 @@ class LinearSpring(Spring):
     unilateral: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what is not admissible, by name."""
+        """Raise InputError for an inadmissible value; the message names it."""
         freeze_numbers(self, LAW)
 
     @property
@@ -44,7 +44,7 @@ class LinearSpring(Spring):
 
     @property
     def relaxation(self) -> Relaxation:
-        """Relaxation terms: a linear spring has none."""
+        """Relaxation terms; a linear spring has none."""
         return ()
 
 

@@ -1,4 +1,4 @@
-"""Microscale springs: micro-springs in series whose snap stresses are spread log-normally."""
+"""Microscale springs: micro-springs in series with log-normally distributed snap stresses."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ from foamfit.springs.spring import (
 
 @dataclass(frozen=True)
 class MicroscaleSpring(Spring):
-    """Micro-springs in series whose snap stresses are spread log-normally, with a dashpot.
+    """Micro-springs in series with log-normally distributed snap stresses, and a dashpot.
 
-    Its state is the fraction p of them that has snapped. With P₊ and P₋ the fractions whose
-    snap-through and snap-back stress lies below σ (P₋ no less than P₊, both 0 in tension),
+    The state is the snapped fraction p. With P₊ and P₋ the fractions whose snap-through and
+    snap-back stress lies below σ (P₋ at least P₊, both 0 in tension),
 
         p ← min(max(p, P₊(σ)), P₋(σ))          along the history of σ, from p = 0,
         ε = (1-p) σ/(k0+σ) + p (eps_star + σ/(kc+σ))          (model, section 6).
 
-    Where it remembers what has snapped (model, section 8) its state also has P, the largest p ever.
-    What has snapped once is softer on branch a and snaps through at a lower stress, and branch a
-    stiffens as a(σ; k) = 1 - (1 + nσ/k)^(-1/n):
+    With stiffening, softening or weakening (model, section 8) the state also contains P, the
+    largest p so far. Micro-springs that have snapped once are softer on branch a and snap through
+    at a lower stress, and branch a is a(σ; k) = 1 - (1 + nσ/k)^(-1/n):
 
         U(σ) = max(P₊(σ), min(P₊(σ e^s), P)),   p ← min(max(p, U(σ)), max(U(σ), P₋(σ))),
         ε = (1-P) a(σ; k0) + (P-p) a(σ; k0 e^-d) + p (eps_star + σ/(kc+σ)).
@@ -58,26 +58,26 @@ class MicroscaleSpring(Spring):
     kc : float
         First slope of the densified branch c, at zero stress, Pa.
     eps_star : float
-        Strain at which branch c starts from zero stress.
+        Strain of branch c at zero stress.
     sigma_plus : float
-        Snap-through stress of the middle rank, Pa.
+        Median snap-through stress, Pa.
     spread_plus : float
         Standard deviation of the logarithm of the snap-through stress.
     sigma_minus : float
-        Snap-back stress of the middle rank, Pa.
+        Median snap-back stress, Pa.
     spread_minus : float
         Standard deviation of the logarithm of the snap-back stress.
     eta : float
         η, dashpot in parallel, Pa·s.
     stiffening : float
-        n > 0; 1 is the branch a of eq. 2.
+        n > 0; with n = 1 branch a is that of eq. 2.
     softening : float
-        d >= 0: what has snapped once has k0 e^-d for k0.
+        d >= 0: micro-springs that have snapped once have k0 e^-d instead of k0.
     weakening : float
-        s >= 0: what has snapped once snaps through at σ₊ e^-s.
+        s >= 0: micro-springs that have snapped once snap through at σ₊ e^-s.
     relaxation : sequence of pairs of float
-        Relaxation terms (g, τ in s) in parallel; left out = none. `stress` and `strain` follow the
-        equilibrium, without them.
+        Relaxation terms (g, τ in s) in parallel; by default none. `stress` and `strain` are the
+        equilibrium values, without relaxation.
 
     Raises
     ------
@@ -99,7 +99,7 @@ class MicroscaleSpring(Spring):
     relaxation: Relaxation = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        """Refuse what is not admissible, by name."""
+        """Raise InputError for an inadmissible value; the message names it."""
         freeze_numbers(self, MEMORY_LAW)
         freeze_terms(self, self.relaxation)
         least = _least_star(self.k0, self.kc, self.stiffening, self.softening)
@@ -108,22 +108,22 @@ class MicroscaleSpring(Spring):
 
     @property
     def law(self) -> Law:
-        """The record of its law: that with memory where it has any."""
+        """The record of its law, the variant with memory if it has any."""
         neutral = self.stiffening == 1.0 and self.softening == 0.0 == self.weakening
         return LAW if neutral else MEMORY_LAW
 
     @property
     def snap_strain(self) -> float:
-        """Strain by which a micro-spring of the middle rank jumps where it first snaps through."""
+        """Jump of the strain of the median micro-spring at its first snap-through."""
         on = self.elastic_branches(np.array([self.sigma_plus]))
         return float(on["c"][0] - on["a"][0])
 
     def fraction_along(self, stress: ArrayLike) -> Array:
-        """Fraction that has snapped along a stress history (Pa), shape (n,), from none."""
+        """Return the snapped fraction along a stress history (n,), Pa, from rest."""
         return self.fractions_along(stress)[0]
 
     def fractions_along(self, stress: ArrayLike) -> tuple[Array, Array]:
-        """Fractions that have snapped, and have ever snapped, along a stress history (Pa)."""
+        """Return the snapped fractions p and P along a stress history (Pa), from rest."""
         from scipy.special import ndtr
 
         from foamfit.springs import microscale_kernels
@@ -133,7 +133,7 @@ class MicroscaleSpring(Spring):
         return snapped, np.maximum.accumulate(snapped)
 
     def snapped_along(self, strain: ArrayLike) -> Array:
-        """Fraction that has snapped along a strain history, (n,), from none."""
+        """Return the snapped fraction along a strain history, (n,), from rest."""
         from scipy.special import ndtr
 
         from foamfit.springs import microscale_kernels
@@ -142,9 +142,9 @@ class MicroscaleSpring(Spring):
         return np.asarray(ndtr(ranks[0]))
 
     def elastic_branches(self, stress: Array) -> dict[str, Array]:
-        """Strains of branches a (none has snapped) and c (all have) at these stresses (Pa).
+        """Return the strains of branches a (p = 0) and c (p = 1) at these stresses (Pa).
 
-        With softening also a′, branch a of what has snapped once.
+        With softening also a′, branch a of micro-springs that have snapped once.
         """
         out = {"a": self._on_a(stress, self.k0)}
         if self.softening > 0.0:
@@ -152,13 +152,13 @@ class MicroscaleSpring(Spring):
         return out | {"c": self.eps_star + stress / (self.kc + stress)}
 
     def _on_a(self, stress: Array, k: float) -> Array:
-        """Strain a(σ; k) of branch a."""
+        """Return the strain a(σ; k) of branch a."""
         n = self.stiffening
         return np.asarray(-np.expm1(-np.log1p(n * stress / k) / n))
 
     @property
     def medians(self) -> tuple[tuple[str, str, float, float], ...]:
-        """Sign, direction, median and spread (of the logarithm) of both snap stresses, Pa."""
+        """Sign, direction, median (Pa) and spread (of the logarithm) of both snap stresses."""
         return (
             ("+", "through", self.sigma_plus, self.spread_plus),
             ("−", "back", self.sigma_minus, self.spread_minus),
@@ -179,7 +179,7 @@ class MicroscaleSpring(Spring):
 
 @lru_cache(maxsize=256)
 def _least_star(k0: float, kc: float, stiffening: float = 1.0, softening: float = 0.0) -> float:
-    """Least ε_*: with it branch c lies at or beyond branch a, softened too, at every stress."""
+    """Return the least ε_*, with which branch c never lies before branch a."""
     return most_beyond(k0 * math.exp(-softening), kc, stiffening)[0]
 
 
@@ -188,7 +188,7 @@ def _neighbours(values: Array, top: float) -> Iterator[Array]:
 
 
 def _to_stresses(values: Array, height: float) -> Array:
-    """k0 and kc over the height (Pa/m), elongation of ε_* (m), stresses and spreads."""
+    """Return k0 and kc per height (Pa/m), the elongation of ε_* (m), stresses and spreads."""
     k0, kc, eps_star, *rest = values
     return np.array([k0 / height, kc / height, eps_star * height, *rest])
 
@@ -200,7 +200,7 @@ def _from_stresses(mixed: Array, height: float) -> Array:
 def _least_slopes(
     k0: float, kc: float, stiffening: float = 1.0, softening: float = 0.0
 ) -> tuple[tuple[float, float], ...]:
-    """Derivatives of both ends of ε_* by k0, kc, stiffening and softening."""
+    """Return the derivatives of both ends of ε_* by k0, kc, stiffening and softening."""
     k, n = k0 * math.exp(-softening), stiffening
     excess, sigma = most_beyond(k, kc, n)
     if excess == 0.0:
@@ -275,15 +275,15 @@ _NOTE = (
 
 
 def _marked(param: Param, mark: float) -> float:
-    """Start value of an optional parameter from a mark in [0, 1]."""
+    """Return the start value of an optional parameter for a mark in [0, 1]."""
     return 3.0 ** (2.0 * mark - 1.0) if param.is_logarithmic else param.start_limits[1] * mark
 
 
 def _law(*options: str) -> Law:
-    """The law with the parameters of some options; without any, of springs that forget."""
+    """Return the law with the parameters of some options; without any, the basic law."""
     extra = tuple(param for option in options for param in _OPTIONAL[option])
     names = tuple(param.name for param in extra)
-    # What the least ε_* depends on besides k0 and kc, and where it stands among these arguments.
+    # Parameters on which the least ε_* depends besides k0 and kc, and their indices.
     also = tuple(name for name in names if name != "weakening")
     picked = [0, 1, *(2 + ("stiffening", "softening").index(name) for name in also)]
 
@@ -295,12 +295,12 @@ def _law(*options: str) -> Law:
         return tuple(all_of[place] for place in picked)
 
     def read_off(loop: Loop, marks: Array, scales: Any, way: int) -> Array:
-        """Read a spring off a loop, given where on it its snap stresses are taken to lie.
+        """Read a spring off a loop with its snap stresses at assumed positions.
 
-        `marks` in [0, 1]: the initial slope over that at a twentieth of the largest strain, k_c
-        over the largest stress, the place of ε_* above its least, the strains at which the median
-        micro-springs snap through and back with the spread behind each, and what is optional.
-        Returned are the own parameters and a dashpot of zero (SI).
+        `marks` in [0, 1]: the initial slope relative to that at a twentieth of the largest strain;
+        k_c relative to the largest stress; ε_* above its least; strain and spread of the median
+        snap-through, and of the median snap-back; and the optional parameters. Returns the
+        parameters and eta = 0 (SI).
         """
         last, top = float(np.max(loop.strain)), scales.stress
         first = max(loop.at(0.05 * last, loading=True), 0.002 * top) / (0.05 * last)

@@ -1,8 +1,8 @@
-"""What a law is: one record, by which everything else goes.
+"""The record of a law, which describes one kind of spring.
 
-A law describes one kind of spring. Solver, search, statistics, report, page, scene file and options
-ask its record and never which law it is: `Param` says all about a parameter, `Functions` follow the
-spring along its strain, and the other fields of `Law` are optional.
+Solver, search, statistics, report, page, scene file and options use only this record and never
+depend on a particular law. `Param` describes a parameter, `Functions` follow the spring along its
+strain, and all other fields of `Law` are optional.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.springs.loop import Loop
 
-# The state of a spring along its strain begins with strain, stress (Pa) and the number of its
-# branch; what else a law remembers follows.
+# The state of a spring begins with strain, stress (Pa) and the number of its branch; further
+# numbers of a law follow.
 EPS, SIGMA, BRANCH, OWN = 0, 1, 2, 3
 LAST_STRAIN = 0.999
 
-# What values of a parameter are admissible, in the words of a message.
+# Conditions on the value of a parameter, by their wording in messages.
 ADMISSIBLE: dict[str, Callable[[float], bool]] = {
     "positive": lambda value: value > 0.0,
     "zero or positive": lambda value: value >= 0.0,
@@ -38,8 +38,8 @@ ADMISSIBLE: dict[str, Callable[[float], bool]] = {
 class Between(NamedTuple):
     """Two ends that depend on other parameters: value = first + u (last - first).
 
-    `of` names the others, `ends` gives (first, last) of their values, `slopes` the derivatives of
-    both ends by each of them: ((dfirst, dlast), …).
+    `of` names these parameters, `ends` returns (first, last) for their values, and `slopes` the
+    derivatives of both ends by each of them: ((dfirst, dlast), …).
     """
 
     of: tuple[str, ...]
@@ -51,39 +51,39 @@ class Between(NamedTuple):
 class Param:
     """One parameter of a law; "Your own law" in the documentation explains the fields.
 
-    Numbers are multiples of a scale of the test: "one", "strain" (the largest), "stress" (the
-    largest, Pa), "slope" (stress over strain, Pa), "damping" (Pa·s) or "duration" (s).
+    Numbers are multiples of a scale of the test: "one", "strain" (largest strain), "stress"
+    (largest stress, Pa), "slope" (their ratio, Pa), "damping" (Pa·s) or "duration" (s).
     """
 
     name: str  #: as in s1_<name>
     symbol: tuple[str, str] = ("", "")  #: letter and index, ("ε", "a")
-    unit: str = ""  #: SI, "" for a pure number
-    what: str = ""  #: what it is, in words for a table
-    start: tuple[float, str] = (1.0, "one")  #: start value, where nothing is known, and its scale
+    unit: str = ""  #: SI, "" if dimensionless
+    what: str = ""  #: description for tables
+    start: tuple[float, str] = (1.0, "one")  #: default start value, and its scale
     bounds: tuple[float, float] = (1e-3, 1e3)  #: limits of the search
     scale: str = "one"  #: the scale of `bounds`
-    coordinate: str | Between = "logarithm"  #: what the search moves in; or "value", or Between
+    coordinate: str | Between = "logarithm"  #: of the search: "logarithm", "value" or Between
     box: tuple[float, float] | None = None  #: limits of the coordinate; by default `bounds`
-    inner: tuple[float, float] | None = None  #: those of random start values; by default `box`
-    least_size: float = 0.0  #: least share of its scale that its uncertainty is compared with
+    inner: tuple[float, float] | None = None  #: limits of random start values; by default `box`
+    least_size: float = 0.0  #: least size, relative to the scale, to judge uncertainty
     admissible: str = "positive"  #: one of `ADMISSIBLE`
-    neutral: float | None = None  #: the value at which the parameter has no effect
-    branch: str = ""  #: the branch that a test must reach for the parameter to leave a trace
-    example: str = ""  #: a value with its unit as a file states it
+    neutral: float | None = None  #: value at which the parameter has no effect
+    branch: str = ""  #: branch that a test must reach to determine the parameter
+    example: str = ""  #: a value with its unit, as in a file
 
     @property
     def is_logarithmic(self) -> bool:
-        """Whether the search moves in the logarithm."""
+        """Whether the coordinate of the search is the logarithm."""
         return self.coordinate == "logarithm"
 
     @property
     def of(self) -> tuple[str, ...]:
-        """Parameters that its coordinate is relative to."""
+        """Parameters on which its coordinate depends."""
         return self.coordinate.of if isinstance(self.coordinate, Between) else ()
 
     @cached_property
     def limits(self) -> tuple[float, float]:
-        """Lowest and highest coordinate."""
+        """Limits of the coordinate."""
         if self.box is not None:
             return self.box
         low, high = self.bounds
@@ -91,22 +91,22 @@ class Param:
 
     @cached_property
     def start_limits(self) -> tuple[float, float]:
-        """Lowest and highest coordinate of random start values."""
+        """Limits of the coordinate of random start values."""
         return self.limits if self.inner is None else self.inner
 
     @property
     def has_neutral(self) -> bool:
-        """Whether the parameter may be zero, so that its interval tells whether it is there."""
+        """Whether the parameter may be zero, so that its interval can show its absence."""
         return self.neutral == 0.0
 
 
 class Functions(NamedTuple):
-    """How a spring is followed along its strain: functions that Numba compiles.
+    """Functions that follow a spring along its strain; numba compiles them.
 
-    "Your own law" in the documentation says what each must do.
+    "Your own law" in the documentation specifies each of them.
     """
 
-    fill: Callable[..., bool]  #: fill(values, row): write own parameters; False if not admissible
+    fill: Callable[..., bool]  #: fill(values, row): write parameters; False if not admissible
     begin: Callable[..., None]  #: begin(row, state): set the state of a spring at rest
     leaves: Callable[..., bool]  #: leaves(row, state, strain): whether the branch ends before it
     switch: Callable[..., None]  #: switch(row, state, up): to the end of the branch, and the next
@@ -117,7 +117,7 @@ class Functions(NamedTuple):
 
 
 class PointOf(NamedTuple):
-    """A number that follows from the parameters, as the report lists it."""
+    """A derived number that the report lists."""
 
     attribute: str  # of the spring
     symbol: tuple[str, str]
@@ -126,12 +126,12 @@ class PointOf(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """A row of the comparison with published parameters: a formula of parameters."""
+    """A row of the comparison with published parameters: a function of the parameters."""
 
     label: str
     unit: str
     of: tuple[str, ...]
-    formula: Callable[..., Any]  # also of complex numbers, for its derivatives
+    formula: Callable[..., Any]  # must accept complex numbers, for its derivatives
 
 
 def _no_neighbours(values: Array, top: float) -> Iterator[Array]:
@@ -142,101 +142,100 @@ def _no_neighbours(values: Array, top: float) -> Iterator[Array]:
 class Law:
     """A kind of spring."""
 
-    kind: str  #: the word of a model's name: "bistable", "linear+bistable"
-    #: its own parameters, in the order of `Functions.fill`; dashpot, relaxation terms and height
-    #: come by themselves
+    kind: str  #: name in models: "bistable", "linear+bistable"
+    #: parameters in the order of `Functions.fill`, without dashpot, relaxation terms and height
     params: tuple[Param, ...]
-    functions: Functions | Callable[[], Functions]  #: how it is followed, or a callable for these
+    functions: Functions | Callable[[], Functions]  #: or a callable that returns them
     columns: int = 0  #: length of a row; by default one number per parameter
     states: int = OWN  #: length of a state; by default strain, stress and branch
-    #: branches by their number, the first at rest: name and what the spring does on it
+    #: branches in the order of their numbers, the first at rest: name and description
     branches: Mapping[str, str] = field(default_factory=lambda: {"line": "the law"})
-    title: str = ""  #: the spring in words, "bistable spring"
-    hysteretic: bool = True  #: whether it has a loop, and may relax
-    #: makes the spring of own parameters, eta, and relaxation=; by default `register` gives one
+    title: str = ""  #: name in words, "bistable spring"
+    hysteretic: bool = True  #: whether it has a loop and may relax
+    #: makes a spring from the parameters, eta and relaxation=; `register` sets a default
     spring: Callable[..., Any] | None = None
-    #: order of the coordinates of the search; by default those last that are relative to others
+    #: order of the coordinates of the search; by default dependent ones last
     searched: tuple[str, ...] = ()
-    #: read_off(loop, marks, scales, way): own parameters and eta, read off a measured loop where
-    #: `marks` (n,) in [0, 1] place them; without one, start values are random
+    #: read_off(loop, marks, scales, way): parameters and eta read off a measured loop at places
+    #: given by `marks` (n,) in [0, 1]; without it, start values are random
     read_off: Callable[[Loop, Array, Any, int], Array] | None = None
-    #: the same for one of several springs: (loop, marks, share of the height)
+    #: the same for one of several springs: (loop, marks, fraction of the height)
     read_in_series: Callable[[Loop, Array, float], Array] | None = None
     marks: int = 5  #: number of marks
     ways: int = 1  #: number of ways to read a loop
-    #: stress at which the spring starts to snap, of its own parameters, by which exchangeable
-    #: springs are ordered; by default the first parameter
+    #: stress of the first snap as a function of the parameters, by which interchangeable springs
+    #: are sorted; by default the first parameter
     onset: Callable[..., float] | None = None
-    scanned: str = ""  #: a parameter along which the cost may have several minima
-    strata: str = ""  #: one over whose range the points from which the search descends are spread
-    #: neighbours(values, largest stress): own parameters of springs with nearly the same loop, from
-    #: which the search begins again
+    scanned: str = ""  #: parameter along which the cost may have several minima
+    strata: str = ""  #: parameter over whose range start points are spread
+    #: neighbours(values, largest stress): parameters of springs with nearly the same loop, which
+    #: the search tries as further start points
     neighbours: Callable[[Array, float], Iterator[Array]] = _no_neighbours
-    #: (values, height) to stresses and elongations, and back: what springs in series exchange
+    #: (values, height) to the stresses and elongations that springs exchange, and back
     exchanged: tuple[Callable[[Array, float], Array], Callable[[Array, float], Array]] | None = None
-    points: tuple[PointOf, ...] = ()  #: what the report lists beside the parameters
-    compared: tuple[Compared, ...] = ()  #: what a comparison shows
-    note: str = ""  #: what the report says about the marks of the figure
+    points: tuple[PointOf, ...] = ()  #: derived numbers in the report
+    compared: tuple[Compared, ...] = ()  #: rows of a comparison
+    note: str = ""  #: sentence of the report on the marks of the figure
     inner_loops: bool = True  #: whether partial unloading leaves the branch
-    remembers: bool = True  #: whether the spring remembers more than its branch
-    published: bool = False  #: whether the paper publishes parameters of it
-    numbered: tuple[str, ...] = ()  #: names of branches by numbers, if not those of `branches`
-    #: options of a fit that free more parameters: the law with them
+    remembers: bool = True  #: whether its state is more than its branch
+    published: bool = False  #: whether the paper has parameters of it
+    numbered: tuple[str, ...] = ()  #: names of branches by number, if not those of `branches`
+    #: variants of the law by options of a fit
     options: Mapping[tuple[str, ...], str] = field(default_factory=dict)
-    word: str = ""  #: the word of a model's name, where it is not `kind`
-    #: places of derivatives by parameters, where these are not in the order of `params`
+    word: str = ""  #: name in models, if it is not `kind`
+    #: indices of derivatives by parameters, if not in the order of `params`
     places: Mapping[str, int] = field(default_factory=dict)
 
     @cached_property
     def own(self) -> tuple[str, ...]:
-        """Names of its own parameters."""
+        """Names of the parameters."""
         return tuple(param.name for param in self.params)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of its own parameters and of its dashpot."""
+        """Names of the parameters and of the dashpot."""
         return (*self.own, ETA.name)
 
     @cached_property
     def by_name(self) -> dict[str, Param]:
-        """Its own parameters and the dashpot by their names."""
+        """The parameters and the dashpot by their names."""
         return {param.name: param for param in (*self.params, ETA)}
 
     @property
     def wanted_marks(self) -> int:
-        """Number of marks that start values are made of: of a law that reads none, all of them."""
+        """Number of marks for start values; without `read_off`, one per parameter."""
         return self.marks if self.read_off is not None else len(self.params)
 
     @cached_property
     def search_order(self) -> tuple[str, ...]:
-        """Its own parameters in an order in which each follows those that it is relative to."""
+        """The parameters in an order in which each follows those that it depends on."""
         if self.searched:
             return self.searched
         return tuple(param.name for param in sorted(self.params, key=lambda param: len(param.of)))
 
     @cached_property
     def needed(self) -> tuple[str, ...]:
-        """Branches that some parameter needs a test to reach."""
+        """Branches that a test must reach to determine some parameter."""
         shown = {param.branch for param in self.params}
         return tuple(branch for branch in self.branches if branch in shown)
 
     def make(self, values: Sequence[float], relaxation: Sequence[tuple[float, float]]) -> Any:
-        """Make the spring of its own parameters and eta; refuses what is not admissible."""
+        """Return a spring of these parameters and eta; InputError if they are not admissible."""
         if self.spring is None:
             raise InputError(f"law '{self.kind}' is not known yet: register it first")
         return self.spring(*values, **({"relaxation": relaxation} if self.hysteretic else {}))
 
     def loaded_functions(self) -> Functions:
-        """Functions of the law, loaded where they are not given at once."""
+        """The functions of the law."""
         return self.functions if isinstance(self.functions, Functions) else self.functions()
 
     @cached_property
     def is_viscous(self) -> bool:
-        """Whether its stress depends on time."""
+        """Whether the stress depends on time."""
         return self.loaded_functions().viscous is not None
 
     def assembled(self, chosen: Callable[[Param], float]) -> Array:
-        """Own parameters from a choice for each: its place between its ends, or else its value."""
+        """Return parameters from a choice for each: its position between its ends, or its value."""
         values: dict[str, float] = {}
         for name in self.search_order:
             param = self.by_name[name]
@@ -247,20 +246,20 @@ class Law:
         return np.array([values[name] for name in self.own])
 
     def any_spring(self) -> Any:
-        """Make some spring of the law, whatever its numbers: of it only the law counts."""
+        """Return a spring of the law with arbitrary parameters."""
         own = self.assembled(lambda param: 0.2 if param.of else abs(param.start[0]) or 1.0)
         return self.make([*own, 0.0], ())
 
     def derivative(self, short: str) -> int:
-        """Place of the derivative by one of its own parameters."""
+        """Return the index of the derivative by a parameter."""
         return self.places.get(short, self.own.index(short))
 
     def named_branch(self, number: int) -> str:
-        """Name of a branch by its number."""
+        """Return the name of a branch by its number."""
         return (self.numbered or tuple(self.branches))[number]
 
 
-# Parameters that a spring has whatever its law.
+# Parameters of springs of all laws.
 ETA = Param(
     "eta", ("η", ""), "Pa s", "dashpot in parallel", (0.0, "damping"), (0.0, 10.0), "damping",
     "value", inner=(0.0, 0.3), least_size=0.1, admissible="zero or positive", neutral=0.0,
@@ -270,8 +269,8 @@ STRENGTH = Param(
     "g", ("g", ""), "", "strength of a relaxation term", (0.2, "one"), (0.0, 10.0), "one",
     "value", inner=(0.0, 1.0), least_size=0.1, admissible="zero or positive", example="0.5",
 )  # fmt: skip
-# The least time is about that of a sample, of which a record has 1500 at most: what relaxes faster
-# acts as a dashpot, and explicit steps would have to follow it.
+# The least time is about the interval of a record with 1500 samples: faster relaxation acts as a
+# dashpot, and explicit steps would have to resolve it.
 RELAXATION_TIME = Param(
     "tau", ("τ", ""), "s", "time of a relaxation term", (0.05, "duration"), (1e-3, 30.0),
     "duration", inner=(math.log(0.002), math.log(1.0)), example="0.2 s",

@@ -1,4 +1,4 @@
-"""What the paper's laws have in common: stiffnesses, rows of the comparison, steep branches c."""
+"""Shared parts of the built-in laws: stiffnesses, comparison, start points with other k_c."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.springs.laws.record import Compared, Functions, Param
 
-_INNER = (math.log(0.3), math.log(300.0))  # of stiffnesses over the largest stress
+_INNER = (math.log(0.3), math.log(300.0))  # of stiffness divided by largest stress
 K0 = Param(
     "k0", ("k", "0"), "Pa", "first slope of branch a", (3.0, "slope"), (1e-3, 1e4), "stress",
     inner=_INNER, branch="a", example="5.5 MPa",
@@ -22,12 +22,12 @@ KC = Param(
 COMPARED_K0 = Compared("k0", "MPa", ("k0",), lambda k0: k0 / 1e6)
 COMPARED_ETA = Compared("η", "Pa·s", ("eta",), lambda eta: eta)
 COMPARED_HEIGHT = Compared("h", "mm", ("height",), lambda height: height / 1e-3)
-# k_c over the largest stress from which a search begins again.
+# k_c of further start points, divided by the largest stress.
 STEEP = np.geomspace(1.0, 1000.0, 7)
 
 
 def functions_of(kind: str) -> Callable[[], Functions]:
-    """Functions of one of the paper's laws, loaded when they are first needed."""
+    """Return a callable that loads the functions of a built-in law."""
 
     def load() -> Functions:
         from foamfit.springs.laws import followed
@@ -38,10 +38,10 @@ def functions_of(kind: str) -> Callable[[], Functions]:
 
 
 def steeper(values: Array, kc: int, start: int, top: float, low: float) -> Iterator[Array]:
-    """Give springs with another k_c whose branch c has the same strain at the largest stress.
+    """Yield springs with another k_c whose branch c has the same strain at the largest stress.
 
-    A search that moves k_c alone misses a steep branch c. `kc` and `start` are the places of k_c
-    and of the strain where branch c begins, at the stress `low`.
+    A search that changes only k_c misses a steep branch c. `kc` and `start` are the indices of k_c
+    and of the strain at which branch c begins, at the stress `low`.
     """
     for other in top * STEEP:
         moved = values.copy()
