@@ -348,7 +348,7 @@ def test_many_reasons_are_left_to_the_table(monkeypatch: pytest.MonkeyPatch) -> 
     )
     monkeypatch.setattr(checklist, "REASONS", 1)
     assert concluded(slow).warnings[0] == (
-        "Not determined: s1_kc, s1_dsigma, s1_eps_c, s1_kh_minus (see why of each in the report)."
+        "Not determined: s1_kc, s1_dsigma, s1_eps_c, s1_kh_minus (the report gives the reasons)."
     )
 
 
