@@ -115,16 +115,12 @@ def assess(
         far[(best.rises(residual) < best.quantiles**2) & (apart > best.quantiles)] = np.inf
     order = sorted(known, key=lambda name: -far[best.names.index(name)])
     bent = [name for name in order if far[best.names.index(name)] > BENT]
-    local = [name for name in bent if _is_wider(best, name, ranges.get(name))]
+    # Where the range is wider, model error outweighs noise, and a local interval is enough.
+    halves = dict(zip(best.names, best.halves, strict=True))
+    local = [n for n in bent if n in ranges and np.ptp(ranges[n]) > 2.0 * halves[n]]
     made = _by_profiles(best, [n for n in bent if n not in local], minima, tracker, budget)
     made = _with_minima(best, replace(made, doubtful=(*made.doubtful, *local)), others)
     return made if best.misfits or made.better is not None else _with_far(best, made, tracker)
-
-
-def _is_wider(best: BestPoint, name: str, span: tuple[float, float] | None) -> bool:
-    """Whether a range is wider than the local interval, so that model error outweighs noise."""
-    half = float(best.halves[best.names.index(name)])
-    return span is not None and span[1] - span[0] > 2.0 * half
 
 
 def evaluations_of(best: BestPoint, choice: Choice) -> float:

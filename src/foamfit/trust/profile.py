@@ -50,10 +50,6 @@ class Refit:
         cuts = best.quantiles**2 * best.spread.inflation  # NaN for undetermined parameters
         self.enough = ENOUGH * float(min(cuts[np.isfinite(cuts)], default=1.0))
 
-    def start(self) -> Iterate:
-        """Return the best point."""
-        return Iterate(self.best.values, self.best.residual, self.best.scaled)
-
     def residual(self, point: Array) -> Array | None:
         """Return the residual of a point; None if the simulation fails."""
         objective = self.tracker.objective
@@ -126,7 +122,7 @@ class _Side:
         self.column = best.names.index(name)
         self.quantile, self.half = float(best.quantiles[self.column]), best.halves[self.column]
         self.limit = best.limits(name)[0 if sign < 0 else 1]
-        self.refits = [refit.start()]
+        self.refits = [Iterate(best.values, best.residual, best.scaled)]
 
     def value(self, at: Iterate) -> float:
         """Return the fixed value of the parameter."""
