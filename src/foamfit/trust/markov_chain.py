@@ -95,7 +95,7 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
                 begin, iterations=steps, skip_initial_state_check=True, store=False
             ):
                 if not np.isfinite(state.log_prob).any():
-                    stopped = "the best point, near which no simulation succeeds"
+                    stopped = "failures: nothing can be simulated near the best point"
                     break
                 steps_done.append(state.coords.copy())
     except STOPPING as error:
