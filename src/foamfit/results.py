@@ -1,4 +1,4 @@
-"""What a fit found: data only. Saving and drawing are in `report`."""
+"""Result of a fit: data only. Saving and drawing are in `report`."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from foamfit.trust.identifiability import Insight
 
 SCHEMA = 1
-# Of an uncertainty budget.
-STATED = ("mass", "height", "area", "calibration")  # by their ± in the TOML, not fitted
+# Sources of an uncertainty budget; those in `STATED` have a ± in the TOML and are not fitted.
+STATED = ("mass", "height", "area", "calibration")
 SOURCES = ("noise", "contact and zero", "velocity", *STATED, "law")
 
 
@@ -35,14 +35,14 @@ SOURCES = ("noise", "contact and zero", "velocity", *STATED, "law")
 class ParameterEstimate:
     """One identified parameter, in SI.
 
-    `stderr` and `ci95` are None where the test does not determine it; `state` is "determined",
-    "weak", "not determined" or "fixed" (fixed by the user or the model), and `why` says so in a
-    sentence. `ci95_method` is the source of the interval: "local covariance", "profile likelihood",
-    "MCMC" or "other minima" (of the search, which noise could have made the best). `range` includes
-    model error: the values that fit almost equally well; None where the residuals are noise.
-    `systematic` is one standard deviation from the ± of height, area, mass and calibration in the
-    TOML; it is not in `stderr` and `ci95`, and is 0 where no ± is stated or the test does not
-    determine the parameter.
+    `stderr` and `ci95` are None where the test does not determine the parameter; `state` is
+    "determined", "weak", "not determined" or "fixed" (by the user or the model), and `why` gives
+    the reason in a sentence. `ci95_method` is the source of the interval: "local covariance",
+    "profile likelihood", "MCMC" or "other minima" (minima of the search that different noise could
+    have made the best). `range` includes model error: the values that fit almost equally well; None
+    where the residuals are noise. `systematic` is one standard deviation from the ± of height,
+    area, mass and calibration in the TOML; `stderr` and `ci95` do not include it. It is 0 where no
+    ± is stated or the test does not determine the parameter.
     """
 
     value: float
@@ -57,20 +57,20 @@ class ParameterEstimate:
     systematic: float = 0.0
 
     def counted_from(self, zero: float) -> ParameterEstimate:
-        """Count value, interval and range from another zero."""
-        ends = (self.ci95, self.range)
-        ci95, span = (one and (one[0] - zero, one[1] - zero) for one in ends)
+        """Shift value, interval and range to another zero."""
+        pairs = (self.ci95, self.range)
+        ci95, span = (pair and (pair[0] - zero, pair[1] - zero) for pair in pairs)
         return replace(self, value=self.value - zero, ci95=ci95, range=span)
 
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Measured and fitted curves, one row per sample of the conditioned test; None = not there.
+    """Measured and fitted curves, one value per sample of the conditioned test; None if absent.
 
-    `stress` and `displacement` are what the drive gives (base stress in Pa, top displacement in m);
-    `stress_along` is the stress (Pa) that the identified springs give along the measured
-    displacement. `interior` holds measured and fitted displacement (m) of masses inside, 1 above
-    spring 1.
+    `stress` and `displacement` are simulated under the drive (base stress in Pa, top displacement
+    in m); `stress_along` is the stress (Pa) of the identified springs along the measured
+    displacement. `interior` contains the measured and fitted displacements (m) of the interior
+    masses; mass 1 is above spring 1.
     """
 
     time: Array | None
@@ -83,11 +83,11 @@ class Curves:
 
 
 class Loop(NamedTuple):
-    """The stress (Pa) of a test, measured and fitted, along its strain, or else its time (s)."""
+    """Measured and fitted stress (Pa) of a test against its strain, or else against time (s)."""
 
     name: str
     along: Array
-    label: str  # of what it is along
+    label: str  # of the abscissa
     measured: Array
     fitted: Array | None
 
@@ -96,7 +96,7 @@ class Loop(NamedTuple):
 class Correlation:
     """Correlation matrix of the identified parameters, in the order of `names`.
 
-    `stderr` are the local standard errors, SI, also of those that the test does not determine; NaN
+    `stderr` are the local standard errors, SI, including those of undetermined parameters; NaN
     where the data fix only a combination.
     """
 
@@ -107,28 +107,25 @@ class Correlation:
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Least cost along one parameter."""
+    """Profile of a parameter: the least cost at fixed values of it."""
 
-    name: str  # The parameter
-    values: Array  # (m,): Where it was held, ascending, SI; the best point is among them
-    rises: Array  # (m,): Rise of the cost there as a χ² of one degree of freedom
-    points: Array  # (m, n): All parameters of the model at each
+    name: str  # of the parameter
+    values: Array  # (m,): its fixed values, ascending, SI, including the best one
+    rises: Array  # (m,): rise of the cost as a χ² of one degree of freedom
+    points: Array  # (m, n): all parameters of the model
     cut: float  # χ² of the 95 % interval
-    # Outermost crossings of the cut, or a limit of the parameter
-    ci95: tuple[float, float]
-    # Whether the cost stays below the cut on that side
-    open_low: bool
-    open_high: bool
-    # What ended it early: "the time limit", "Ctrl-C"
-    stopped: str | None = None
+    ci95: tuple[float, float]  # outermost crossings of the cut, or limits of the parameter
+    open_low: bool  # whether the cost stays below the cut down to the lower limit
+    open_high: bool  # the same up to the upper limit
+    stopped: str | None = None  # what ended it early: "the time limit" or "Ctrl-C"
 
     @property
     def complete(self) -> bool:
-        """Whether it was followed to both ends."""
+        """Whether the profile was followed to both ends."""
         return self.stopped is None
 
     def rows(self) -> Iterator[dict[str, object]]:
-        """Give its rows of profiles.csv, SI."""
+        """Yield the rows of profiles.csv, SI."""
         about = {"chi2 of the 95 % cut": self.cut, "complete": self.complete}
         for value, rise in zip(self.values.tolist(), self.rises.tolist(), strict=True):
             yield {"name": self.name, "value": value, "chi2": rise, **about}
@@ -136,20 +133,20 @@ class Profile:
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """The 95 % intervals of a fit, and how they were made."""
+    """The 95 % intervals of a fit and their methods."""
 
-    # Ends of the intervals that are not those of the local covariance, and how each was made.
+    # Ends and methods of the intervals that are not from the local covariance
     ends: dict[str, tuple[float, float]] = field(default_factory=dict)
     methods: dict[str, str] = field(default_factory=dict)
-    profiles: tuple[Profile, ...] = ()  # All profiles that were followed, whole or not
+    profiles: tuple[Profile, ...] = ()  # including incomplete ones
     # Parameters with a local interval although the cost along them is not a parabola
     doubtful: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()  # Why they differ from what was asked for
-    better: Array | None = None  # A point of lower cost from which the fit should continue
-    # Values, far outside the interval, with which the curves fit almost as well
+    warnings: tuple[str, ...] = ()  # why the intervals differ from those requested
+    better: Array | None = None  # a point of lower cost from which the fit should continue
+    # Values far outside the interval that fit the curves almost as well
     elsewhere: dict[str, float] = field(default_factory=dict)
-    # Ends of the ranges that include the error of the law, where there is one
+    # Ends of the ranges that include model error, where there is one
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
     # Samples of a Markov chain, (walkers, steps) by parameter, SI; kept in `Fit.draws`
     draws: dict[str, Array] = field(default_factory=dict)
@@ -157,29 +154,29 @@ class Intervals:
 
 @dataclass(frozen=True, eq=False)
 class Snapping:
-    """How many of its micro-springs a microscale spring snapped along the fitted curves."""
+    """Snapping of the micro-springs of a microscale spring along the fitted curves."""
 
-    fraction: Array  # that has snapped, one per sample
-    stress: Array  # of the spring in equilibrium, Pa
+    fraction: Array  # of micro-springs in the snapped state, one per sample
+    stress: Array  # equilibrium stress of the spring, Pa
 
     @property
     def turn(self) -> int:
-        """Sample at which most have snapped."""
+        """Sample at which the snapped fraction is largest."""
         return int(np.argmax(self.fraction))
 
     @property
     def most(self) -> float:
-        """Largest fraction that has snapped; the test says nothing about the others."""
+        """Largest snapped fraction; the test gives no information about the other springs."""
         return float(self.fraction[self.turn])
 
     @property
     def ever(self) -> Array:
-        """Fraction that has ever snapped, one per sample."""
+        """Fraction that has snapped at least once so far, one per sample."""
         return np.maximum.accumulate(self.fraction)
 
     @property
     def halves(self) -> tuple[int | None, int | None]:
-        """First samples at which half have snapped, and half have snapped back; None if never."""
+        """First samples at which half have snapped and half have snapped back; None if never."""
         turn, snapped = self.turn, self.fraction >= 0.5
         if not snapped[turn]:
             return None, None
@@ -191,16 +188,17 @@ class Snapping:
 class Budget:
     """Uncertainty budget of a fit (after JCGM 100:2008, the GUM).
 
-    `contributions` holds for each determined parameter of the springs one standard deviation of
-    each source, in SI:
+    For each determined parameter of the springs, `contributions` contains one standard deviation
+    from each source, in SI:
 
-    - "noise": of the samples; together with the next two this is the standard error.
-    - "contact and zero", "velocity": what fitting the contact time and the zeros of the channels,
-      and the striker's velocity and mass and a delay within their ±, adds to it.
-    - "mass", "height", "area", "calibration": from their ± in the TOML; together `systematic`.
-    - "law": half of the parameter's `range` over 1.96, as if that were a 95 % interval.
+    - "noise": noise of the samples.
+    - "contact and zero": added by fitting the contact time and the zeros of the channels.
+    - "velocity": added by fitting the striker's velocity and mass, and a delay, within their ±.
+      These first three combine to the standard error.
+    - "mass", "height", "area", "calibration": from their ± in the TOML; combined, `systematic`.
+    - "law": half of the parameter's `range` over 1.96, as if the range were a 95 % interval.
 
-    `scales` (SI) are those of the parameters, mostly their values.
+    `scales` (SI) are the scales of the parameters, mostly their values.
     """
 
     contributions: dict[str, dict[str, float]]
@@ -208,21 +206,21 @@ class Budget:
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Sources that contribute to any parameter, in their order."""
+        """Sources that contribute to any parameter, in the order of `SOURCES`."""
         rows = self.contributions.values()
-        return tuple(one for one in SOURCES if any(row[one] > 0.0 for row in rows))
+        return tuple(source for source in SOURCES if any(row[source] > 0.0 for row in rows))
 
     @property
     def telling(self) -> bool:
-        """Whether it has more than the standard errors and ranges of the parameters."""
+        """Whether the budget adds anything to the standard errors and ranges."""
         return bool(set(self.sources) - {"noise", "law"})
 
     def combined(self, name: str) -> float:
-        """Combine all contributions to a parameter by their squares, SI."""
+        """Return the root sum of squares of all contributions to a parameter, SI."""
         return math.hypot(*self.contributions[name].values())
 
     def rows(self) -> Iterator[dict[str, object]]:
-        """Give the rows of budget.csv: SI, but for the last column."""
+        """Yield the rows of budget.csv, in SI except for the last column."""
         for name, row in self.contributions.items():
             total, scale = self.combined(name), self.scales[name]
             parts = {source: plain(row[source]) for source in SOURCES}
@@ -232,11 +230,11 @@ class Budget:
 
 @dataclass(frozen=True)
 class Switch:
-    """A change of branch in the fitted response: which spring, when, and where on the curves."""
+    """A change of branch in the fitted response: spring, time, and place on the curves."""
 
     spring: int  # 1 at the base
-    source: str  # name of a branch
-    target: str
+    source: str  # branch before
+    target: str  # branch after
     time: float | None  # s
     displacement: float  # of the top, m
     stress: float  # Pa
@@ -244,18 +242,18 @@ class Switch:
 
 @dataclass(frozen=True)
 class Check:
-    """One question of the checklist, put so that "yes" is good."""
+    """One question of the checklist, phrased so that "yes" is good."""
 
-    key: str  # Short name
+    key: str  # short name
     question: str
-    answer: bool | None  # None where the test or the search cannot tell
-    sentence: str  # What the answer rests on
-    warnings: tuple[str, ...] = ()  # What a reader must know if the answer is no
-    fatal: bool = False  # Whether a "no" means that no acceptable fit was found
+    answer: bool | None  # None if unknown
+    sentence: str  # evidence for the answer
+    warnings: tuple[str, ...] = ()  # for the reader, if the answer is no
+    fatal: bool = False  # whether a "no" means that no acceptable fit was found
 
 
 def rung_name(model: str, damping: str, relaxation: int = 0) -> str:
-    """Model, relaxation and damping in words."""
+    """Describe model, relaxation and damping in words."""
     words, more = _in_words(model)
     if relaxation:
         more.append("relaxation" if relaxation == 1 else counted(relaxation, "relaxation term"))
@@ -266,49 +264,44 @@ def rung_name(model: str, damping: str, relaxation: int = 0) -> str:
 
 
 def _in_words(model: str) -> tuple[str, list[str]]:
-    """Return a model as `--model` takes it, and what its springs have beside."""
+    """Return a model as `--model` takes it, and the parameters that its options free."""
     from foamfit.springs.model import Model  # drawing needs no compiler
 
     if model == "auto":
         return model, []
-    read = Model.parse(model)
-    asked = (name for name, there in read.options.items() if there)
-    return read.words, [word for name in asked for word in OPTIONS[name].names]
+    parsed = Model.parse(model)
+    options = (name for name, is_set in parsed.options.items() if is_set)
+    return parsed.words, [parameter for name in options for parameter in OPTIONS[name].names]
 
 
 @dataclass(frozen=True)
 class Rung:
-    """One model that was tried and the evidence for it."""
+    """One model of the comparison and the evidence for it."""
 
-    model: str  # Springs from the base up
-    # "with", "without" (every dashpot held at zero) or "none" (the drive has none to vary)
+    model: str  # springs from the base up
+    # "with", "without" (every dashpot fixed at zero) or "none" (no dashpot to vary in this drive)
     damping: str
-    misfit: dict[str, float | None]  # As `Fit.misfit`
-    chisqr: float  # Sum of the squared residuals
-    n_vary: int  # Parameters that were varied
-    rank: int  # How many combinations of them the curves fix: what AICc and BIC count
-    # Effective samples by its own residuals; AICc and BIC use `Ladder.n_eff`
-    n_eff: float
-    # Infinite if there are too few effective samples for so many parameters
-    aicc: float
+    misfit: dict[str, float | None]  # as `Fit.misfit`
+    chisqr: float  # sum of the squared residuals
+    n_vary: int  # number of varied parameters
+    rank: int  # number of their combinations that the curves fix, used in AICc and BIC
+    n_eff: float  # effective samples by its own residuals; AICc and BIC use `Ladder.n_eff`
+    aicc: float  # infinite with too few effective samples for the number of parameters
     bic: float
-    # p-value of the runs test: the chance that noise without structure has as few runs.
-    runs_p: float
-    # p-value of the neighbours test, which goes by size, the runs test by sign
-    neighbours_p: float
-    # Parameters in these states; by the 95 % intervals alone if it was not chosen
+    runs_p: float  # p-value of the runs test, which uses the signs of the residuals
+    neighbours_p: float  # p-value of the neighbours test, which also uses their sizes
+    # Parameters in these states; from the 95 % intervals alone unless this model was chosen
     not_determined: tuple[str, ...]
     weak: tuple[str, ...]
-    seconds: float  # Run time
-    stopped: str | None  # What ended the search before its time
-    chosen: bool  # Whether the result is that of this model
-    why: str  # Why it was chosen or not
-    relaxation: int = 0  # Terms of each hysteretic spring
-    # RMS over the range of samples that were held back in blocks; None if there was no time
+    seconds: float  # run time
+    stopped: str | None  # what ended the search early
+    chosen: bool  # whether the result is from this model
+    why: str  # why it was chosen or not
+    relaxation: int = 0  # terms of each hysteretic spring
+    # RMS over range of held-out samples (cross-validation in blocks); None if time ran out
     predicted_misfit: float | None = None
-    # By what share that is below the one of `gain_over`, if any
-    gain: float | None = None
-    # The best of the models before with no more parameters; None for the first
+    gain: float | None = None  # its relative reduction against `gain_over`, if any
+    # The best earlier model with no more parameters; None for the first
     gain_over: str | None = None
 
     @property
@@ -319,39 +312,42 @@ class Rung:
 
 @dataclass(frozen=True)
 class Ladder:
-    """The models that were tried, and what the comparison says."""
+    """Comparison of several models."""
 
-    rungs: tuple[Rung, ...]  # In the order in which they were tried, from the simplest up
-    n_eff: float  # Effective samples that AICc and BIC use
-    noise_from: str  # The model of the least chi-square, whose residuals are taken as noise
-    ended: str  # Why the comparison ended
+    rungs: tuple[Rung, ...]  # in the order of the trials, from the simplest up
+    n_eff: float  # effective samples in AICc and BIC
+    noise_from: str  # the model of the least chi-square, whose residuals are taken as noise
+    ended: str  # why the comparison ended
     stopped: str | None  # "the time limit" or "Ctrl-C" if that ended it
-    skipped: tuple[str, ...]  # Models that could not be tried, and why
-    sentences: tuple[str, ...]  # What the comparison says
-    cautions: tuple[str, ...]  # Those of them that are warnings
-    # Whether models were compared by their predictions, as none reaches the noise, not by AICc, BIC
+    skipped: tuple[str, ...]  # models that could not be tried, and why
+    sentences: tuple[str, ...]  # conclusions
+    cautions: tuple[str, ...]  # the conclusions that are warnings
+    # Whether predictions decide (no model reaches the noise) instead of AICc and BIC
     by_prediction: bool = False
 
     @property
     def chosen(self) -> Rung:
-        """The model whose result was taken."""
+        """The model of the result."""
         return next(rung for rung in self.rungs if rung.chosen)
 
     def rows(self) -> Iterator[dict[str, object]]:
-        """Give the rows of ladder.csv; a list of names is joined by blanks."""
+        """Yield the rows of ladder.csv; names in a list are separated by spaces."""
         misfits = [rung.misfit for rung in self.rungs]
         curves = [name for name in misfits[0] if any(one.get(name) is not None for one in misfits)]
         for rung in self.rungs:
             row: dict[str, Any] = plain(rung)
-            off = {f"misfit_{name}": row["misfit"].get(name) for name in curves}
-            cells = {"model": row.pop("model"), "damping": row.pop("damping"), **off}
-            del row["misfit"]
+            misfit = row.pop("misfit")
+            cells = {"model": row.pop("model"), "damping": row.pop("damping")}
+            cells |= {f"misfit_{name}": misfit.get(name) for name in curves}
             cells |= {k: " ".join(v) if isinstance(v, list) else v for k, v in row.items()}
             yield cells
 
 
 def loop_of(test: Measurement, along: Array | None, over_time: Array | None) -> Loop | None:
-    """The loop of a test, fitted along its displacement, or else over time; None without stress."""
+    """Return the loop of a test against strain, or else against time; None without stress.
+
+    The fitted stress (Pa) is `along` in the first case and `over_time` in the second.
+    """
     if test.stress is not None and test.displacement is not None and along is not None:
         strain = test.displacement / test.specimen.height
         return Loop(test.name, strain, "strain", test.stress, along)
@@ -361,7 +357,7 @@ def loop_of(test: Measurement, along: Array | None, over_time: Array | None) -> 
 
 
 def law_in_words(model: str, relaxation: int) -> str:
-    """Model, what its springs remember, and relaxation in words."""
+    """Describe a model, the parameters that its options free, and its relaxation in words."""
     words, more = _in_words(model)
     more += [counted(relaxation, "relaxation term")] if relaxation else []
     return f"{words} with {listed(more)}" if more else words
@@ -369,7 +365,7 @@ def law_in_words(model: str, relaxation: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Everything that a fit found."""
+    """Result of a fit."""
 
     measurement: Measurement
     model: str
@@ -393,21 +389,21 @@ class Fit:
     checklist: tuple[Check, ...] = ()
     insight: Insight | None = None
     stopped: str | None = None  # what ended the search early: "the time limit", "Ctrl-C"
-    noise: dict[str, dict[str, Any]] = field(default_factory=dict)  # of each counted curve
+    noise: dict[str, dict[str, Any]] = field(default_factory=dict)  # of each fitted curve
     intervals: Intervals | None = None
     ladder: Ladder | None = None
     relaxation: int = 0  # terms of each hysteretic spring
-    interior_mass: bool = False  # whether the specimen's mass sat between the springs
+    interior_mass: bool = False  # whether the specimen's mass was placed between the springs
     budget: Budget | None = None
-    # Mean and standard deviation of what was known of parameters before, SI
+    # Mean and standard deviation of the priors, SI
     priors: dict[str, tuple[float, float]] = field(default_factory=dict)
-    # Samples of a Markov chain, (walkers, steps) by parameter, SI; empty if none was made
+    # Samples of a Markov chain, (walkers, steps) by parameter, SI; empty without a chain
     draws: dict[str, Array] = field(default_factory=dict)
 
     @property
     def springs(self) -> dict[str, Spring]:
         """The springs of the chain by their prefix, "s1" at the base."""
-        return {f"s{i}": one for i, one in enumerate(self.chain.springs, start=1)}
+        return {f"s{i}": spring for i, spring in enumerate(self.chain.springs, start=1)}
 
     @property
     def words(self) -> str:
@@ -416,19 +412,20 @@ class Fit:
 
     @property
     def by_cycle(self) -> dict[int, dict[str, Any]]:
-        """Each of several cycles that are one history; {} of one cycle, or of another drive.
+        """Misfit, energy and snapping of each cycle of a history fitted under a driven motion.
 
-        Misfit over the cycle's own range, dissipated energy measured and fitted (J/m³), and the
-        fraction of each spring's micro-springs that has ever snapped by its end.
+        The misfit is over the cycle's own range. The dissipated energy is measured and fitted
+        (J/m³). "ever_snapped" is the fraction of each spring's micro-springs that has snapped at
+        least once by the end of the cycle. Empty for a single cycle and for the other drives.
         """
         c, strain, out = self.curves, self.strain, dict[int, dict[str, Any]]()
         fitted, measured = c.stress, c.measured_stress
         if self.drive != "displacement" or strain is None or fitted is None or measured is None:
             return out
         for number, part in cycles_of(self.measurement).items():
-            off = float(np.sqrt(np.mean((fitted - measured)[part] ** 2)))
+            rms = float(np.sqrt(np.mean((fitted - measured)[part] ** 2)))
             out[number] = {
-                "misfit": off / float(np.ptp(measured[part])),
+                "misfit": rms / float(np.ptp(measured[part])),
                 "dissipated_measured": float(np.trapezoid(measured[part], strain[part])),
                 "dissipated_fitted": float(np.trapezoid(fitted[part], strain[part])),
                 "ever_snapped": {
@@ -439,7 +436,7 @@ class Fit:
 
     @property
     def at_noise(self) -> bool | None:
-        """Whether the residuals are at the estimated noise; None where that is not known."""
+        """Whether the residuals are at the estimated noise; None if unknown."""
         return next((check.answer for check in self.checklist if check.key == "noise"), None)
 
     @property
@@ -456,15 +453,15 @@ class Fit:
 
     @property
     def loop(self) -> Loop | None:
-        """The loop measured and fitted; over time where no strain was measured."""
+        """The measured and fitted loop, against time where no strain was measured."""
         return loop_of(self.measurement, self.curves.stress_along, self.curves.stress)
 
     @property
     def snapping(self) -> dict[str, Snapping]:
-        """How each spring of micro-springs snapped along the fitted curves, where that is known.
+        """Snapping of each microscale spring along the fitted curves, where it is known.
 
-        That of a single spring follows from its strain; in a chain it follows from the stress if
-        all springs are in equilibrium and no striker is part of the motion.
+        For a single spring it follows from the strain; in a chain it follows from the stress if
+        all springs are in equilibrium and there is no striker.
         """
         springs, strain, out = self.springs, self.strain, dict[str, Snapping]()
         viscous = any(one.eta or one.relaxation or one.law.is_viscous for one in springs.values())
@@ -483,11 +480,11 @@ class Fit:
         return out
 
     def to_json_dict(self) -> dict[str, Any]:
-        """Return the content of ``fit.json``: SI, plain types, null for what is not there."""
+        """Return the content of ``fit.json``: SI, plain types, null for absent values."""
         from foamfit.springs.model import Model  # drawing needs no compiler
 
         test = self.measurement
-        asked = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
+        head = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
         found = ("visited", "misfit", "weights", "statistics", "noise", "energy")
         model = Model.parse(self.model)
         optional = {
@@ -513,10 +510,13 @@ class Fit:
                 "notes": test.notes,
             },
             "specimen": test.specimen,
-            **{name: getattr(self, name) for name in (*asked, "warnings", "notes")},
+            **{name: getattr(self, name) for name in head},
+            "warnings": self.warnings,
+            "notes": self.notes,
             **model.options,
             "model": model.words,
-            **{name: getattr(self, name) for name in ("checklist", "parameters")},
+            "checklist": self.checklist,
+            "parameters": self.parameters,
             "derived": self._derived(),
             **{name: getattr(self, name) for name in found},
             "outliers": {
@@ -524,20 +524,19 @@ class Fit:
                 for channel, found in test.outliers.items()
             },
             "runtime_s": self.runtime_s,
-            **{name: one for name, one in optional.items() if one},
+            **{name: value for name, value in optional.items() if value},
         }
-        made: dict[str, Any] = plain(content)
+        encoded: dict[str, Any] = plain(content)
         columns = self.columns
-        kept = vars(self)
-        fields = {name: encode(kept[name], columns) for name in KEPT}
-        rest = _without(made, fields)
-        rest["measurement"] = _without(made | made["data"], fields["measurement"])
+        fields = {name: encode(getattr(self, name), columns) for name in KEPT}
+        rest = _without(encoded, fields)
+        rest["measurement"] = _without(encoded | encoded["data"], fields["measurement"])
         length = max((column.size for column in columns.values()), default=0)
-        return made | {"load": {"samples": length, **rest}}
+        return encoded | {"load": {"samples": length, **rest}}
 
     @property
     def columns(self) -> dict[str, Array]:
-        """The columns of curves.csv: what is measured and fitted, SI, one value per sample."""
+        """The columns of curves.csv: measured and fitted values, SI, one per sample."""
         c, test = self.curves, self.measurement
         columns: dict[str, Array | None] = {
             "time (s)": c.time,
@@ -551,15 +550,15 @@ class Fit:
         for node, (measured, fitted) in c.interior.items():
             columns[f"measured {interior_channel(node)} (m)"] = measured
             columns[f"fitted {interior_channel(node)} (m)"] = fitted
-        for channel, found in test.outliers.items():
-            columns[f"outliers of {channel} left out"] = found.left_out.astype(int)
-        for channel, taken in test.sampled.items():
-            columns[f"{channel} is measured"] = taken.astype(int)
+        for channel, outliers in test.outliers.items():
+            columns[f"outliers of {channel} left out"] = outliers.left_out.astype(int)
+        for channel, sampled in test.sampled.items():
+            columns[f"{channel} is measured"] = sampled.astype(int)
         return {name: column for name, column in columns.items() if column is not None}
 
     def _derived(self) -> dict[str, dict[str, Any]]:
-        """Return derived points of the springs, and how far they snapped."""
-        found = dict[str, dict[str, Any]]()
+        """Return the derived points of the springs, and their largest snapped fraction."""
+        derived = dict[str, dict[str, Any]]()
         for name, spring in self.springs.items():
             points = {one.attribute: getattr(spring, one.attribute) for one in spring.law.points}
             if (snapped := self.snapping.get(name)) is not None:
@@ -568,19 +567,19 @@ class Fit:
                 points["p_max_strain"] = None if self.strain is None else self.strain[snapped.turn]
                 points["snap_strain"] = getattr(spring, "snap_strain", None)
             if points:
-                found[name] = points
-        return found
+                derived[name] = points
+        return derived
 
 
-# What fit.json and curves.csv keep of a fit; samples have a file of their own.
+# Fields of a fit in fit.json and curves.csv; the samples of a chain have a file of their own.
 KEPT = tuple(name for name in Fit.__dataclass_fields__ if name != "draws")
 
 
-def _without(told: Mapping[str, Any], fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields that fit.json does not have elsewhere."""
-    return {name: one for name, one in fields.items() if name not in told or one != told[name]}
+def _without(content: Mapping[str, Any], fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields that `content` does not already have with the same value."""
+    return {k: value for k, value in fields.items() if k not in content or value != content[k]}
 
 
 def plain(value: Any) -> Any:
-    """Return `value` in the types of JSON, with None for every number that is not finite."""
+    """Return `value` in JSON types, with None for every number that is not finite."""
     return encode(value)

@@ -324,7 +324,7 @@ def test_the_standard_error_is_local_whatever_made_the_interval() -> None:
         assert found.stderr == local.stderr
         assert found.ci95 == pytest.approx(ends)
         assert other.params["s1_k0"].stderr == found.stderr
-        assert found.why.endswith("; the local standard error does not give it")
+        assert found.why.endswith("; the local standard error implies a very different interval")
 
 
 def test_a_profile_much_narrower_than_the_local_interval_is_not_taken() -> None:
@@ -337,7 +337,7 @@ def test_a_profile_much_narrower_than_the_local_interval_is_not_taken() -> None:
     ]
     assert (found.ci95, found.stderr) == (local.ci95, local.stderr)
     assert found.ci95_method == "local covariance"
-    assert "was not taken" in found.why
+    assert "was not used" in found.why
 
 
 def test_many_reasons_are_left_to_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -348,7 +348,7 @@ def test_many_reasons_are_left_to_the_table(monkeypatch: pytest.MonkeyPatch) -> 
     )
     monkeypatch.setattr(checklist, "REASONS", 1)
     assert concluded(slow).warnings[0] == (
-        "Not determined: s1_kc, s1_dsigma, s1_eps_c, s1_kh_minus (see why of each in the report)."
+        "Not determined: s1_kc, s1_dsigma, s1_eps_c, s1_kh_minus (the report gives the reasons)."
     )
 
 
@@ -397,7 +397,8 @@ def test_a_damper_that_may_be_none_is_not_called_determined() -> None:
     # Its limit is known well, which is nothing to be warned of, but it is said.
     assert result.status == "ok"
     told = next(check for check in result.checklist if check.key == "determined")
-    assert told.sentence == "7 of 8 are; consistent with zero, with a small upper bound: s1_eta."
+    expected = "7 of 8 are determined; consistent with zero, with a small upper bound: s1_eta."
+    assert told.sentence == expected
     spring, test = synthetic_impact(eta=60.0)
     problem = problem_of(test, damped=True)
     result = conclude(best_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))

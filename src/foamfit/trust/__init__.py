@@ -1,9 +1,10 @@
-"""How certain the parameters are, and which of them the test determines.
+"""Uncertainty of the parameters, and which of them the test determines.
 
-`best_point` holds what was computed at the best point, `covariance` and `intervals` give numbers,
-`checklist` asks what a good fit must pass, `conclude` gives each parameter its state; `residuals`
-tells noise from an error of the law, `ranges` what the latter leaves open, and `sentences.toml` has
-the words for all of it. A newcomer may skip `profile`, `markov_chain` and `evidence`.
+`best_point` contains the curves, residuals and slopes at the best point; `residuals` separates
+noise from model error; `covariance` and `intervals` compute the uncertainty due to noise, `ranges`
+that due to model error; `checklist` tests the quality of a fit; `conclude` assembles the result and
+gives each parameter its state. All sentences are in `sentences.toml`. A newcomer may skip
+`profile`, `markov_chain` and `evidence`.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ SENTENCES: dict[str, Any] = tomllib.loads(
 def _environment() -> Environment:
     from jinja2 import Environment, StrictUndefined
 
-    made = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     filters = (text.percent, text.engineering, text.listed, text.quantity)
-    made.filters |= {one.__name__: one for one in filters}
-    made.filters |= {"fmt": format, "spoken": lambda name: name.replace("_", "-")}
-    return made
+    environment.filters |= {function.__name__: function for function in filters}
+    environment.filters |= {"fmt": format, "spoken": lambda name: name.replace("_", "-")}
+    return environment
 
 
 @functools.cache
@@ -43,5 +44,5 @@ def _template(section: str, key: str) -> Template:
 
 
 def say(section: str, key: str, **facts: object) -> str:
-    """Fill the facts into a sentence of a section, such as "why" or "check.noise"."""
+    """Return a sentence of a section, such as "why" or "check.noise", filled with facts."""
     return _template(section, key).render(facts)

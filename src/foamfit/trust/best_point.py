@@ -1,7 +1,8 @@
 """The best point of one test or several: curves, residual, Jacobian and covariance.
 
-All that is concluded from a fit reads this: one plain simulation and one with sensitivities. The
-unknowns of several tests are what all have in common, then the own parameters of each.
+The uncertainty, checklist and report of a fit all use this; it needs one plain simulation and one
+with sensitivities. The unknowns of several tests are the common ones, then the own parameters of
+each test.
 """
 
 from __future__ import annotations
@@ -27,16 +28,16 @@ from foamfit.trust.covariance import Block, Covariance, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.residuals.noise_process import basis_of
 
-# Share of the residuals along a direction that a cycle takes at most, so that it is not all.
+# Largest leverage of a cycle along a direction; at 1 its residual would be zero there.
 MOST_TAKEN = 0.99
 
 
 @dataclass(frozen=True, eq=False)
 class BestPoint:
-    """A point of the parameters (SI), usually the best one, and what holds locally there.
+    """A point of the parameters (SI), usually the best one, with its local properties.
 
-    `chosen` are the parameters whose uncertainty is wanted; by default those that vary and
-    whose branch was reached.
+    `chosen` are the k parameters whose uncertainty is wanted; by default those that vary and whose
+    branch was reached.
     """
 
     problem: Problem
@@ -45,7 +46,7 @@ class BestPoint:
 
     @cached_property
     def simulated(self) -> Simulated:
-        """All curves."""
+        """All simulated curves."""
         return self.problem.objective.simulate(self.values, everything=True)
 
     @cached_property
@@ -82,7 +83,7 @@ class BestPoint:
 
     @cached_property
     def sizes(self) -> Array:
-        """Their characteristic sizes, (k,)."""
+        """Scales of the k parameters, (k,)."""
         return self.problem.sizes(self.names, self.values)
 
     def limits(self, name: str) -> tuple[float, float]:
@@ -97,31 +98,31 @@ class BestPoint:
 
     @cached_property
     def jacobian(self) -> Array:
-        """Derivative of `residual` by them, (n_data, k)."""
+        """Derivative of `residual` by the k parameters, (n_data, k)."""
         return self.problem.slopes(self.values, self.names)
 
     @cached_property
     def errors(self) -> tuple[CurveError, ...]:
-        """Whether the residual of each counted curve is noise, or holds an error of the law too."""
+        """Noise and model error in the residual of each fitted curve."""
         return curve_errors(*self.to_judge())
 
     @cached_property
     def scaled(self) -> Array:
-        """Jacobian by the scaled parameters, (n_data, k)."""
+        """Derivative of `residual` by the scaled parameters, (n_data, k)."""
         return np.asarray(self.jacobian * self.sizes)
 
     def to_judge(self, taken: Array | None = None) -> tuple[Any, ...]:
-        """What `curve_errors` takes; `taken` is what a joint fit took of the noise."""
+        """Return the arguments of `curve_errors`; `taken` is the noise absorbed by a joint fit."""
         objective = self.problem.objective
         return self.residual, self.scaled, objective.sizes, taken, objective.drive == "stress"
 
     @property
     def misfits(self) -> bool:
-        """Whether the law misses more of some curve than its noise."""
+        """Whether there is model error in some curve."""
         return any(error.found for error in self.errors)
 
     def block(self, errors: Sequence[CurveError]) -> Block:
-        """Its part in a covariance, by the errors of its curves."""
+        """Return the block of this test in a covariance; `errors` are those of its curves."""
         return Block(
             self.scaled,
             self.residual,
@@ -133,9 +134,9 @@ class BestPoint:
         )
 
     def gradient(self, places: NDArray[np.intp], step: Array) -> Array:
-        """Half the gradient of the cost by some of the parameters, all scaled, at a step of them.
+        """Return half the gradient of the cost after a step of the parameters at `places`.
 
-        The step ends at their limits.
+        Step and gradient are scaled; the step is cut at the limits of the parameters.
         """
         at, sizes, (low, high) = self.places[places], self.sizes[places], self.box[:, places]
         values = self.values.copy()
@@ -145,7 +146,7 @@ class BestPoint:
 
     @cached_property
     def spread(self) -> Covariance:
-        """Their local covariance."""
+        """Local covariance of the k parameters."""
         return Uncertainty((self.block(self.errors),), self.sizes).covariance
 
     @cached_property
@@ -160,22 +161,22 @@ class BestPoint:
 
     @cached_property
     def known(self) -> list[str]:
-        """Parameters that the local interval does not leave undetermined."""
+        """Parameters that are determined or weak by their local interval."""
         known = np.flatnonzero(self.halves <= covariance.NOTHING * self.sizes)
         return [self.names[i] for i in known]
 
     def rises(self, residual: Array) -> Array:
-        """Rise of the cost at another point, from its residual, as χ² of each, (k,)."""
+        """Return the rise of the cost at another point as the χ² of each parameter, (k,)."""
         return np.asarray((float(residual @ residual) - self.cost) / self.spread.inflation)
 
 
 @dataclass(frozen=True, eq=False)
 class JointPoint:
-    """The best point of a joint fit, and what holds locally there.
+    """The best point of a joint fit with its local properties.
 
-    `errors` are those of the curves of each test (`BestPoint.errors`), `inflations` (n,) of each
-    scattering parameter its variance over that of white noise, by which the weight that draws it to
-    the common value is larger than its spread says.
+    `errors` are those of the curves of each test (`BestPoint.errors`). `inflations` (n,) contains
+    for each scattering parameter the ratio of its variance to that under white noise; the weight
+    that draws it to the common value exceeds the one that its spread implies by this factor.
     """
 
     found: Together
@@ -189,10 +190,10 @@ class JointPoint:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of what all tests have in common, the first of the unknowns.
+        """Names of the common unknowns, which precede the own ones.
 
-        A shared parameter itself, with ":b" the slope of a law of rate, and the logarithm of the
-        common value of what scatters.
+        They are the shared parameters, the slopes of rate laws (with ":b"), and the logarithms of
+        the common values of scattering parameters.
         """
         out, links = list[str](), self.found.links
         for name in self.found.shared:
@@ -204,31 +205,31 @@ class JointPoint:
         """Place of each own parameter of each test among the unknowns."""
         count, out = len(self.names), list[dict[str, int]]()
         for best in self.bests:
-            mine = [name for name in best.names if name in self.found.own]
-            out.append({name: count + i for i, name in enumerate(mine)})
-            count += len(mine)
+            own = [name for name in best.names if name in self.found.own]
+            out.append({name: count + i for i, name in enumerate(own)})
+            count += len(own)
         return out
 
     @cached_property
     def _scales(self) -> Array:
-        """Scales of the unknowns; 1 of a slope, or a logarithm."""
+        """Scales of the unknowns; 1 for a slope or a logarithm."""
         out, shared = list[float](), set(self.found.shared)
         for name in self.names:
-            shows = [b for b in self.bests if name in shared and name in b.problem.free()]
-            out += shows[0].problem.sizes((name,), shows[0].values).tolist() if shows else [1.0]
+            users = [b for b in self.bests if name in shared and name in b.problem.free()]
+            out += users[0].problem.sizes((name,), users[0].values).tolist() if users else [1.0]
         for best, own in zip(self.bests, self._own, strict=True):
             out += [best.sizes[best.names.index(name)] for name in own]
         return np.array(out)
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
-        """What the noise leaves uncertain of all unknowns."""
+        """Uncertainty of all unknowns due to noise."""
         bend = np.zeros((self._scales.size,) * 2)
         blocks = tuple(self._block(t, bend) for t in range(len(self.bests)))
         return Uncertainty(blocks, self._scales, self._drawn(), bend)
 
     def _block(self, t: int, bend: Array) -> Block:
-        """One test; what laws of rate add to the curvature of its cost is added to `bend`."""
+        """Return the block of a test, and add the curvature of its rate laws to `bend`."""
         best, links, scales = self.bests[t], self.found.links, self._scales
         block = best.block(self.errors[t] if self.errors else ())
         through = np.zeros((len(best.names), scales.size))
@@ -257,7 +258,7 @@ class JointPoint:
         return replace(block, through=through, given=given, room=room)
 
     def _drawn(self) -> tuple[Array, Array] | None:
-        """Slopes of the residuals of what is drawn to a common value, and their variances."""
+        """Return the slopes and variances of the residuals that draw values to a common one."""
         rows, variances = list[Array](), list[float]()
         for name, pulls in self.found.links.pulls.items():
             for t, (best, own) in enumerate(zip(self.bests, self._own, strict=True)):
@@ -271,50 +272,51 @@ class JointPoint:
         return (np.array(rows), np.array(variances)) if rows else None
 
     def of_common(self, name: str) -> tuple[float, float]:
-        """Standard error and degrees of freedom of what is in `names`; NaN of anything else."""
-        row = np.zeros(self._scales.size)
-        row[[i for i, one in enumerate(self.names) if one == name]] = 1.0
-        return self._known(row)
+        """Return standard error and degrees of freedom of a common unknown; NaN for others."""
+        return self._of_sum(np.array([common == name for common in self.names], dtype=float))
 
     def of_test(self, test: int, name: str) -> tuple[float, float]:
-        """Standard error and degrees of freedom of a parameter of one test; NaN if unreached."""
+        """Return standard error and degrees of freedom of a test's parameter; NaN if unreached."""
         best = self.bests[test]
         if name not in best.names:
-            return float("nan"), 1.0
+            return math.nan, 1.0
         i = best.names.index(name)
-        return self._known(self.uncertainty.blocks[test].through[i] * best.sizes[i] / self._scales)
+        row = self.uncertainty.blocks[test].through[i] * best.sizes[i] / self._scales
+        return self._of_sum(row)
 
-    def _known(self, row: Array) -> tuple[float, float]:
-        """Standard error and degrees of freedom of a sum of unknowns; NaN of none."""
+    def _of_sum(self, row: Array) -> tuple[float, float]:
+        """Return standard error and degrees of freedom of a weighted sum of unknowns."""
         if not (at := np.flatnonzero(row)).size:
-            return float("nan"), 1.0
+            return math.nan, 1.0
         covariance = self.uncertainty.covariance
         variance = row[at] @ covariance.matrix[np.ix_(at, at)] @ row[at]
         return float(np.sqrt(variance)), float(covariance.freedom[at[0]])
 
     def reach(self, name: str) -> float:
-        """How far a shared value is off where the cost has risen by one; 0 where it is unseen."""
-        at, known = self.names.index(name), self.uncertainty
-        off = 0.0 if known.lost[at] else math.sqrt(known.inverse[at, at])
-        return off * float(self._scales[at])
+        """Return the change of a shared value that raises the cost by 1; 0 if undetermined."""
+        at, uncertainty = self.names.index(name), self.uncertainty
+        change = 0.0 if uncertainty.lost[at] else math.sqrt(uncertainty.inverse[at, at])
+        return change * float(self._scales[at])
 
     def moved(self, name: str, change: float) -> list[Array]:
-        """Values of each test with a shared one moved, and the others after it, were all linear."""
+        """Return the values of each test after a change of a shared value.
+
+        The other unknowns follow to minimise the linearised cost.
+        """
         at, out = self.names.index(name), list[Array]()
         along = self.uncertainty.inverse[:, at]
         step = change / self._scales[at] * along / along[at]
         for block, best in zip(self.uncertainty.blocks, self.bests, strict=True):
             values = best.values.copy()
-            for one, by in zip(best.names, block.through @ step * best.sizes, strict=True):
-                low, high = best.limits(one)
-                values[best.index[one]] = np.clip(values[best.index[one]] + by, low, high)
+            moved = values[best.places] + block.through @ step * best.sizes
+            values[best.places] = np.clip(moved, *best.box)
             out.append(values)
         return out
 
     def taken(self, test: int) -> Array:
-        """What the joint fit took of the noise of a test; see `noise_processes`.
+        """Return the part of a test's noise that the joint fit absorbed; see `noise_processes`.
 
-        Along a direction that several tests determine it took a share of each one's noise only.
+        A direction that several tests determine absorbed only a share of each test's noise.
         """
         left = self.uncertainty.lefts[test]
         share, axes = np.linalg.eigh(left @ left.T)
@@ -323,10 +325,10 @@ class JointPoint:
 
     @cached_property
     def _undrawn(self) -> tuple[Array, Array]:
-        """Covariance and inverse curvature of the unknowns, whatever draws them, SI, (m, m)."""
-        known = self.uncertainty
-        held = known.held if known.errs else np.zeros(self._scales.size, dtype=bool)
-        alone = replace(known.bent if known.errs else known, drawn=None)
+        """Covariance and inverse curvature without the pull to common values, SI, (m, m) each."""
+        full = self.uncertainty
+        held = full.held if full.errs else np.zeros(self._scales.size, dtype=bool)
+        alone = replace(full.bent if full.errs else full, drawn=None)
         free = np.ix_(~held, ~held)
         matrix, inverse = np.full((2, held.size, held.size), np.nan)
         matrix[free], inverse[free] = alone.matrix, alone.inverse
@@ -334,34 +336,34 @@ class JointPoint:
         return matrix * scales, inverse * scales
 
     def own_errors(self, test: int, names: Sequence[str]) -> Array:
-        """Covariance of some own parameters of a test as the data alone have it, SI, (k, k).
+        """Return the covariance of own parameters of a test from the data alone, SI, (k, k).
 
-        Zero where the test says nothing of them.
+        Zero for undetermined parameters.
         """
         out, own = np.zeros((len(names), len(names))), self._own[test]
-        here = [i for i, name in enumerate(names) if name in own]
-        places = [own[names[i]] for i in here]
-        out[np.ix_(here, here)] = np.nan_to_num(self._undrawn[0][np.ix_(places, places)])
+        rows = [i for i, name in enumerate(names) if name in own]
+        places = [own[names[i]] for i in rows]
+        out[np.ix_(rows, rows)] = np.nan_to_num(self._undrawn[0][np.ix_(places, places)])
         return out
 
     def of_logarithms(self, name: str) -> tuple[Array, Array]:
-        """Covariance of the logarithms of a parameter in all tests that have it of its own, (n, n).
+        """Return covariance and inverse curvature of the logarithms of an own parameter, (n, n).
 
-        As the data alone have it, whatever draws it to a common value; then the inverse curvature.
-        NaN where a test says nothing of it.
+        Both are from the data alone, without the pull to a common value, over all n tests; NaN
+        where a test does not determine the parameter.
         """
         sizes = np.abs(self.found.value(name))
-        there = [t for t, own in enumerate(self._own) if name in own and sizes[t] > 0.0]
-        places = [self._own[t][name] for t in there]
+        tests = [t for t, own in enumerate(self._own) if name in own and sizes[t] > 0.0]
+        places = [self._own[t][name] for t in tests]
         out = np.full((2, len(self.bests), len(self.bests)), np.nan)
-        for whole, found in zip(out, self._undrawn, strict=True):
-            inner = found[np.ix_(places, places)]
-            whole[np.ix_(there, there)] = inner / np.outer(sizes[there], sizes[there])
+        for logs, linear in zip(out, self._undrawn, strict=True):
+            inner = linear[np.ix_(places, places)]
+            logs[np.ix_(tests, tests)] = inner / np.outer(sizes[tests], sizes[tests])
         return out[0], out[1]
 
 
 def cycle_growth(best: BestPoint) -> float | None:
-    """`growth` from the last fitted cycle to the next; None where there are not several cycles."""
+    """Return `growth` from the last fitted cycle to the next; None for a single cycle."""
     objective, spans = best.problem.objective, cycles_of(best.problem.measurement)
     if len(spans) < 2 or not best.names:
         return None
@@ -373,12 +375,12 @@ def cycle_growth(best: BestPoint) -> float | None:
 
 
 def growth(jacobian: Array, residual: Array, rows: NDArray[np.intp]) -> float:
-    """Mean square of what a law misses of a new cycle over that of a fitted one, less one.
+    """Return the relative increase of the mean square residual from a fitted cycle to a new one.
 
-    The fitted cycle has the samples `rows` and the part H of the hat matrix. Errors that differ
-    from cycle to cycle leave residuals r of covariance I - H in it, and of I + H in a new one like
-    it: r'(I + H)(I - H)⁻¹r there for r'r here. (To leave the fitted cycle out would tell more,
-    (I - H)⁻¹r, as one cycle fewer is fitted then.)
+    The fitted cycle has the samples `rows` and the part H of the hat matrix. If errors differ from
+    cycle to cycle, the residuals r have covariance I - H in a fitted cycle and I + H in a similar
+    new one; the sum of squares r'r of the former becomes r'(I + H)(I - H)⁻¹r. Leaving the fitted
+    cycle out, with residuals (I - H)⁻¹r, would overestimate this, as one cycle fewer is fitted.
     """
     onto, share, _ = np.linalg.svd(basis_of(jacobian)[rows], full_matrices=False)
     hat, left = np.minimum(share**2, MOST_TAKEN), residual[rows]

@@ -1,10 +1,10 @@
-"""What the ± of the TOML does to the parameters, and what their uncertainty is made of.
+"""Uncertainty budget: effect of the ± in the TOML on the parameters, and all other sources.
 
-Height, area, masses and the scales of the channels are not noise: every sample of a test has the
-same error of them. The response of the best point to each is that of Gauss and Newton,
-Δθ = −(JᵀJ)⁺ Jᵀ Δr, with the residual computed for a test in which that quantity alone differs.
-A stress counts as a force over the area, and a strain as a motion over the height, whichever of
-them the file has.
+Errors of height, area, masses and calibration are not noise, because they are the same for all
+samples of a test. The response of the best point to each is a Gauss-Newton step,
+Δθ = −(JᵀJ)⁺ Jᵀ Δr, with the residual computed for a test in which only that quantity differs.
+Stress is treated as force over area and strain as displacement over height, whichever the file
+contains.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from foamfit.springs.parameters import NUISANCE
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, SINGULAR
 
-# Largest relative change of a quantity for its derivative: curves have kinks where springs snap.
+# Largest relative change of a quantity for its derivative; curves have kinks where springs snap.
 STEP = 1e-4
-# Change of a parameter over the largest one, both over their scales, that counts as none.
+# Changes of parameters below this share of the largest one, all over their scales, are rounding.
 ROUNDING = 1e-6
 # Nuisance parameters by the source of uncertainty to which they contribute.
 _CONTACT = (nuisance.CONTACT_TIME, *nuisance.ZEROS)
 _STRIKER = (*nuisance.STRIKER, nuisance.TIME_SHIFT)
-# Quantities of a test: where they stand, and the source of uncertainty that they are.
+# Owner and field of each quantity in a test, and its source of uncertainty.
 _QUANTITIES = {
     "height": ("specimen", "height", "height"),
     "area": ("specimen", "area", "area"),
@@ -43,10 +43,10 @@ _QUANTITIES = {
 
 
 def responses(best: BestPoint) -> dict[str, Array]:
-    """Change of all parameters (n_values,), SI, by one standard deviation of each quantity.
+    """Return the change of all parameters (n_values,), SI, by one standard deviation of each.
 
-    The quantities are those of `Measurement.uncertainties` that are not fitted. NaN where the
-    changed test cannot be simulated.
+    The quantities are those of `Measurement.uncertainties` that are not fitted. NaN if the changed
+    test cannot be simulated.
     """
     measurement, free = best.problem.measurement, best.problem.free()
     return {
@@ -57,7 +57,7 @@ def responses(best: BestPoint) -> dict[str, Array]:
 
 
 def _value(test: Measurement, quantity: str) -> float:
-    """Value of a quantity of the TOML, SI; 1 of a scale, whose ± is a share."""
+    """Return the value of a quantity of the TOML, SI; 1 for a scale, whose ± is relative."""
     if quantity.startswith("height_"):
         return (test.specimen.heights or ())[int(quantity.removeprefix("height_")) - 1]
     owner, field, _ = _QUANTITIES.get(quantity, ("", "", ""))
@@ -65,18 +65,17 @@ def _value(test: Measurement, quantity: str) -> float:
 
 
 def response(best: BestPoint, quantity: str, share: float) -> Array:
-    """Change of all parameters (n_values,), SI, where a quantity is larger by a share of itself."""
+    """Return the change of all parameters (n_values,), SI, by a relative change of a quantity."""
     problem, step = best.problem, min(share, STEP)
     try:
         (low, before), (high, after) = (_changed(best, quantity, by) for by in (-step, step))
     except SimulationError:
         return np.full(best.values.size, np.nan)
-    moved = 0.5 * (after - before)
     scaled = best.scaled.copy()
-    # What lies at a limit stays there.
-    off = np.abs(best.box - best.values[best.places]).min(axis=0, initial=np.inf)
-    scaled[:, off <= AT_LIMIT * best.sizes] = 0.0
-    steps = -np.linalg.pinv(scaled, rcond=SINGULAR) @ moved
+    # Parameters at a limit stay there.
+    distance = np.abs(best.box - best.values[best.places]).min(axis=0, initial=np.inf)
+    scaled[:, distance <= AT_LIMIT * best.sizes] = 0.0
+    steps = -np.linalg.pinv(scaled, rcond=SINGULAR) @ (0.5 * (after - before))
     rounding = ROUNDING * np.max(np.abs(steps), initial=0.0)
     steps = np.where(np.abs(steps) > rounding, steps, 0.0) * best.sizes
     moves = problem.moves(best.values, best.names)
@@ -84,13 +83,14 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
 
 
 def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array]:
-    """Parameters that are the quantity itself, and the residual, where that is larger by a share.
+    """Return the parameters and the residual after a relative change of a quantity.
 
-    Raises SimulationError if the test cannot be simulated so.
+    Only parameters that are the quantity itself change. Raises SimulationError if the test cannot
+    be simulated.
     """
     problem, values = best.problem, best.values.copy()
     test = changed(problem.measurement, quantity, share)
-    if quantity.startswith("height"):  # a spring's own ± goes before that of the whole
+    if quantity.startswith("height"):  # a spring's own ± has precedence over that of the specimen
         stated = problem.measurement.uncertainties
         for i in range(1, len(problem.model.kinds) + 1):
             name, own = f"s{i}_height", f"height_{i}"
@@ -105,9 +105,9 @@ def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array
 
 
 def changed(test: Measurement, quantity: str, share: float) -> Measurement:
-    """The same test with one quantity larger by a share of itself, and nothing else changed.
+    """Return the test with one quantity larger by a share of itself.
 
-    The noise of a channel, and the error of its zero, change as the channel does.
+    The noise of a channel and the error of its zero scale with the channel.
     """
     by, (name, field, _) = 1.0 + share, _QUANTITIES.get(quantity, ("", "", ""))
     owner: Any = getattr(test, name, None)
@@ -130,8 +130,8 @@ def _scaled(test: Measurement, channel: str, by: float) -> Measurement:
     values, noise = getattr(test, channel), test.noise
     if values is None:
         return test
-    if (given := getattr(noise, channel, None)) is not None:
-        noise = replace(noise, **{channel: by * given})
+    if (stated := getattr(noise, channel, None)) is not None:
+        noise = replace(noise, **{channel: by * stated})
     if (level := noise.estimated.get(channel)) is not None:
         estimated = noise.estimated | {channel: replace(level, sigma=by * level.sigma)}
         noise = replace(noise, estimated=estimated)
@@ -142,51 +142,51 @@ def _scaled(test: Measurement, channel: str, by: float) -> Measurement:
 def make_budget(
     best: BestPoint, estimates: Mapping[str, ParameterEstimate]
 ) -> tuple[dict[str, ParameterEstimate], Budget | None]:
-    """Give the estimates their `systematic`, and make the budget; None if nothing is determined."""
+    """Return the estimates with `systematic` set, and the budget; None if none is determined."""
     moved = responses(best)
     out = dict(estimates)
-    for name, one in estimates.items():
-        if one.stderr is not None or not one.vary:
+    for name, item in estimates.items():
+        if item.stderr is not None or not item.vary:
             changes = [float(change[best.index[name]]) for change in moved.values()]
-            out[name] = replace(one, systematic=math.hypot(*changes))
+            out[name] = replace(item, systematic=math.hypot(*changes))
     rows = dict[str, dict[str, float]]()
     for name, shares in _of_covariance(best):
-        one = out[name]
-        if one.stderr is None or name in NUISANCE:
+        item = out[name]
+        if item.stderr is None or name in NUISANCE:
             continue
         row = dict.fromkeys(SOURCES, 0.0)
-        row |= {source: one.stderr * share for source, share in shares.items()}
+        row |= {source: item.stderr * share for source, share in shares.items()}
         for quantity, change in moved.items():
             kind = "height" if quantity.startswith("height_") else quantity
             *_, source = _QUANTITIES.get(kind, ("calibration",))
             row[source] = math.hypot(row[source], float(change[best.index[name]]))
-        if one.range is not None:
-            row["law"] = 0.5 * (one.range[1] - one.range[0]) / 1.96
+        if item.range is not None:
+            row["law"] = 0.5 * (item.range[1] - item.range[0]) / 1.96
         rows[name] = row
     scales = dict(zip(best.names, best.sizes.tolist(), strict=True))
     return out, Budget(rows, {name: scales[name] for name in rows}) if rows else None
 
 
 def _of_covariance(best: BestPoint) -> Iterator[tuple[str, dict[str, float]]]:
-    """Give each determined parameter and the parts of its standard error as shares of it.
+    """Yield each determined parameter and the parts of its standard error, relative to it.
 
-    Their squares add up to one. The variance without a group of nuisance parameters is the
-    conditional one, in which they are known.
+    The squares of the parts add up to one. The variance without a group of nuisance parameters is
+    the conditional one, with these parameters known.
     """
     if not best.names:
         return
     known = np.isfinite(best.spread.stderr) & (best.spread.stderr > 0.0)
-    names = [name for name, there in zip(best.names, known, strict=True) if there]
+    names = [name for name, is_known in zip(best.names, known, strict=True) if is_known]
     matrix = best.spread.correlation[np.ix_(known, known)]
 
-    def left(held: tuple[str, ...]) -> Array:
-        at = [i for i, name in enumerate(names) if name in held]
+    def conditional(fixed: tuple[str, ...]) -> Array:
+        at = [i for i, name in enumerate(names) if name in fixed]
         across = matrix[:, at]
-        told = np.linalg.pinv(matrix[np.ix_(at, at)], hermitian=True) if at else np.zeros((0, 0))
-        return np.asarray(np.clip(1.0 - np.sum((across @ told) * across, axis=1), 0.0, 1.0))
+        inner = np.linalg.pinv(matrix[np.ix_(at, at)], hermitian=True) if at else np.zeros((0, 0))
+        return np.asarray(np.clip(1.0 - np.sum((across @ inner) * across, axis=1), 0.0, 1.0))
 
-    striker = left(_STRIKER)
-    noise = np.minimum(left((*_CONTACT, *_STRIKER)), striker)
+    striker = conditional(_STRIKER)
+    noise = np.minimum(conditional((*_CONTACT, *_STRIKER)), striker)
     for i, name in enumerate(names):
         parts = {"noise": noise[i], "contact and zero": striker[i] - noise[i]}
         parts["velocity"] = 1.0 - striker[i]

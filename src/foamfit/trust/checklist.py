@@ -1,4 +1,4 @@
-"""What a fit must pass before it is called good: one question each, and the status that follows."""
+"""Checklist of a fit: questions that a good fit answers with yes, and the resulting status."""
 
 from __future__ import annotations
 
@@ -27,41 +27,41 @@ from foamfit.trust import SENTENCES, say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK, covariance
 
-# Misfit over the standard deviation of a curve above which the curve was not fitted at all, and
-# over its range above which it was fitted poorly.
-UNACCEPTABLE, POOR = 0.5, 0.05
-# Residuals over noise up to which they count as noise: a stated noise is seldom known better than
-# to a tenth, an estimated one to a half.
+# A fit is unacceptable if the misfit of a curve exceeds this multiple of its standard deviation.
+UNACCEPTABLE = 0.5
+# A fit is poor if the misfit of a curve exceeds this share of its range.
+POOR = 0.05
+# Largest ratio of residuals to noise that still counts as noise: a stated noise is seldom accurate
+# to better than 10 %, an estimated one to better than 50 %.
 STATED, ESTIMATED = 1.1, 1.5
-# Autocorrelation time, samples, from which on residuals count as correlated.
+# Residuals are correlated if their autocorrelation time, in samples, exceeds this.
 STRUCTURED = 5.0
-# Most reasons in one warning; more of them are easier to read in the table of parameters.
+# Largest number of reasons in a warning; more are easier to read in the table of parameters.
 REASONS = 3
-
 
 Estimates = Mapping[str, ParameterEstimate]
 
 
 def may_vanish(name: str) -> bool:
-    """Whether a parameter may be zero: its interval tells whether there is an effect at all."""
+    """Whether zero is a neutral value of a parameter, at which its effect is absent."""
     return name not in NUISANCE and any_param(split_name(name)[1]).has_neutral
 
 
 def status_of(checklist: Iterable[Check]) -> str:
-    """Status of a fit: "failed" after a fatal no, "warnings" after any other, else "ok"."""
-    wrong = [check for check in checklist if check.answer is False]
-    if any(check.fatal for check in wrong):
+    """Return the status of a fit: "failed" after a fatal no, "warnings" after any other no."""
+    failed = [check for check in checklist if check.answer is False]
+    if any(check.fatal for check in failed):
         return "failed"
-    return "warnings" if wrong else "ok"
+    return "warnings" if failed else "ok"
 
 
 def warnings_of(checklist: Iterable[Check]) -> tuple[str, ...]:
-    """Warnings of a fit in the order of its checklist, those about the input first."""
+    """Return the warnings of a fit in the order of its checklist, those about the input first."""
     return input_first(warning for check in checklist for warning in check.warnings)
 
 
 def input_first(warnings: Iterable[str]) -> tuple[str, ...]:
-    """Each warning once, those that `foamfit check` gives before all others."""
+    """Return each warning once, those that `foamfit check` also gives before all others."""
     return tuple(sorted(dict.fromkeys(warnings), key=lambda text: not text.startswith(ASKED)))
 
 
@@ -74,20 +74,20 @@ def make_checklist(
     intervals: Intervals,
 ) -> tuple[Check, ...]:
     """Answer all questions, in the order of `sentences.toml`."""
-    known = [name for name, item in estimates.items() if item.stderr is not None]
+    with_error = [name for name, item in estimates.items() if item.stderr is not None]
     checks = (
         *_of_search(best, record),
         _followed(best, misfit),
         _at_noise(best),
         _determined(best, estimates),
         _visited(best, estimates),
-        *_of_intervals(best, estimates, intervals, known),
+        *_of_intervals(best, estimates, intervals, with_error),
         *_of_test(best, balance),
-        _time_shift(best, estimates, known),
-        _damping(best, known),
+        _time_shift(best, estimates, with_error),
+        _damping(best, with_error),
     )
-    found = {check.key: check for check in checks}
-    return tuple(found[key] for key in SENTENCES["check"])
+    by_key = {check.key: check for check in checks}
+    return tuple(by_key[key] for key in SENTENCES["check"])
 
 
 def _check(
@@ -98,22 +98,21 @@ def _check(
     fatal: bool = False,
     **facts: object,
 ) -> Check:
-    """Check of `sentences.toml`; `warnings` are those of a "no" there if none are given."""
+    """Fill in a check of `sentences.toml`; `warnings` default to those given there."""
     table, section = SENTENCES["check"][key], f"check.{key}"
     case = {True: "yes", False: "no", None: "unknown"}[answer]
-    said = say(section, case if case in table else "said", **facts)
+    sentence = say(section, case if case in table else "said", **facts)
     if warnings is None:
-        told = answer is False and "warning" in table
-        warnings = say(section, "warning", **facts).splitlines() if told else ()
-    return Check(key, table["question"], answer, said, tuple(warnings), fatal)
+        warn = answer is False and "warning" in table
+        warnings = say(section, "warning", **facts).splitlines() if warn else ()
+    return Check(key, table["question"], answer, sentence, tuple(warnings), fatal)
 
 
 def _of_search(best: BestPoint, record: SearchRecord) -> Iterator[Check]:
     by, objective = record.stopped, best.problem.objective
     yield _check("ended", by is None, by=by, count=objective.evaluations)
-    total, agreeing = sum(count for _, count in record.costs), 0
-    if by is None and total:
-        agreeing = record.agreeing
+    total = sum(count for _, count in record.costs)
+    agreeing = record.agreeing if by is None and total else 0
     yield _check("agree", agreeing > 1 if agreeing else None, total=total, agreeing=agreeing)
     failed, tried = objective.failures, max(objective.evaluations, 1)
     yield _check("simulated", failed <= 0.5 * tried, failed=failed, tried=tried)
@@ -124,61 +123,59 @@ def _of_search(best: BestPoint, record: SearchRecord) -> Iterator[Check]:
 def _followed(best: BestPoint, misfit: Mapping[str, float | None]) -> Check:
     objective, curves = best.problem.objective, []
     for name in objective.counted:
-        off, measured = misfit[name] or 0.0, objective.measured[name]
-        lost = off * float(np.ptp(measured)) > UNACCEPTABLE * float(np.std(measured))
-        curves.append({"name": name, "off": off, "lost": lost, "poor": off > POOR or lost})
+        share, measured = misfit[name] or 0.0, objective.measured[name]
+        lost = share * float(np.ptp(measured)) > UNACCEPTABLE * float(np.std(measured))
+        curves.append({"name": name, "off": share, "lost": lost, "poor": share > POOR or lost})
     fine, fatal = not any(one["poor"] for one in curves), any(one["lost"] for one in curves)
     return _check("followed", fine, fatal=fatal, curves=curves)
 
 
 def _at_noise(best: BestPoint) -> Check:
-    """Whether the residuals are noise: by their size, an error of the law, and their correlation.
+    """Check whether the residuals are noise, by their size, correlation and model error.
 
-    This is the only verdict on the noise; `Fit.at_noise` has its answer.
+    This is the only verdict on the noise; `Fit.at_noise` returns its answer.
     """
-    objective, known, longest = best.problem.objective, False, 1.0
+    objective, has_noise, longest = best.problem.objective, False, 1.0
     errors = best.errors if best.names else (None,) * len(objective.counted)
     rms = objective.rms(best.residual)
     seen, missed = list[dict[str, Any]](), list[dict[str, Any]]()
     for name, size, error in zip(objective.counted, objective.sizes, errors, strict=True):
         noise, tau = objective.noise(name), error.noise.tau if error else 1.0
-        known, longest = known or noise.sigma > 0.0, max(longest, tau)
+        has_noise, longest = has_noise or noise.sigma > 0.0, max(longest, tau)
         if error and error.found and (span := objective.span(name)):
             missed.append({"name": name, "missed": error.law / span})
-        if noise.sigma > 1e-9 * objective.scale[name]:  # else too small to be seen
+        if noise.sigma > 1e-9 * objective.scale[name]:  # otherwise a ratio to it is meaningless
             source, most = ("stated", STATED) if noise.given else ("estimated", ESTIMATED)
             ratio = rms[name] / noise.sigma
-            # Three standard deviations of the RMS of so many effective samples.
+            # Allow three standard deviations of the RMS of size/tau effective samples.
             large = ratio > most + 3.0 * math.sqrt(tau / (2.0 * size))
             seen.append({"name": name, "ratio": ratio, "source": source, "large": large})
     long, large = longest > STRUCTURED, any(one["large"] for one in seen)
     answer = False if missed or long or large else None
-    if answer is None and known and (seen or longest >= 1.05):
+    if answer is None and has_noise and (seen or longest >= 1.05):
         answer = True
     return _check("noise", answer, seen=seen, missed=missed, tau=longest, long=long)
 
 
 def _determined(best: BestPoint, estimates: Estimates) -> Check:
-    """Whether the springs' parameters are; a small upper bound of one that may vanish is enough.
+    """Check whether the springs' parameters are determined, or zero with a small upper bound.
 
-    A nuisance parameter that is not determined shows in the intervals of the others.
+    An undetermined nuisance parameter widens the intervals of the others.
     """
     own = {name: item for name, item in estimates.items() if name not in NUISANCE}
     vanishing, reasons_of = [name for name in own if _vanishes(best, name, own[name])], {}
     for state in ("not determined", "weak"):
-        of = {n: p.why for n, p in own.items() if p.state == state and n not in vanishing}
-        groups = groupby(of, key=of.__getitem__)
+        why_of = {n: p.why for n, p in own.items() if p.state == state and n not in vanishing}
+        groups = groupby(why_of, key=why_of.__getitem__)
         reasons_of[state] = [(", ".join(names), why) for why, names in groups]
     states = [item.state for item in own.values() if item.state != "fixed"]
-    count, varied = states.count("determined"), len(states)
-    answer = not any(reasons_of.values())
     return _check(
         "determined",
-        answer,
+        not any(reasons_of.values()),
         reasons_of=reasons_of,
         vanishing=vanishing,
-        count=count,
-        all=varied,
+        count=states.count("determined"),
+        all=len(states),
         most=REASONS,
     )
 
@@ -193,31 +190,32 @@ def _vanishes(best: BestPoint, name: str, item: ParameterEstimate) -> bool:
 
 
 def _visited(best: BestPoint, estimates: Estimates) -> Check:
-    wanted = [law.needed for law in best.problem.model.laws]
+    needed = [law.needed for law in best.problem.model.laws]
     seen = visited(best.problem, best.simulated)
     absent = {
         spring: [branch for branch in branches if branch not in covered(seen[spring])]
-        for spring, branches in zip(seen, wanted, strict=True)
+        for spring, branches in zip(seen, needed, strict=True)
     }
     lost = [f"{branch} of {spring}" for spring, gone in absent.items() for branch in gone]
-    # It matters if a parameter that varies depends on it; its own warning says so.
+    # An absent branch is a fault only if a varied parameter depends on it, which has its own
+    # warning.
     depend = any(
         item.state == "not determined" and absent.get(f"s{split_name(name)[0] + 1}")
         for name, item in estimates.items()
     )
     answer = True if not lost else False if depend else None
-    every = tuple(dict.fromkeys(chain.from_iterable(wanted)))
+    every = tuple(dict.fromkeys(chain.from_iterable(needed)))
     return _check("visited", answer, wanted=every, lost=lost)
 
 
 def _of_intervals(
-    best: BestPoint, estimates: Estimates, intervals: Intervals, known: Sequence[str]
+    best: BestPoint, estimates: Estimates, intervals: Intervals, with_error: Sequence[str]
 ) -> Iterator[Check]:
-    made = Counter(item.ci95_method for item in estimates.values() if item.ci95_method)
-    answer = False if intervals.warnings else True if made else None
-    yield _check("intervals", answer, warnings=intervals.warnings, made=made)
+    methods = Counter(item.ci95_method for item in estimates.values() if item.ci95_method)
+    answer = False if intervals.warnings else True if methods else None
+    yield _check("intervals", answer, warnings=intervals.warnings, made=methods)
     stuck, natural = [], []
-    varied = tuple(name for name in known if estimates[name].vary)
+    varied = tuple(name for name in with_error if estimates[name].vary)
     for name, size in zip(varied, best.problem.sizes(varied, best.values), strict=True):
         for bound in best.limits(name):
             if abs(best.values[best.index[name]] - bound) > AT_LIMIT * size:
@@ -232,33 +230,33 @@ def _of_intervals(
 def _of_test(best: BestPoint, balance: EnergyAudit) -> Iterator[Check]:
     test = best.problem.measurement
     wrong = [note for note in test.notes if CONTRADICTED in note]
-    asked = [note for note in test.notes if note.startswith(ASKED) and note not in wrong]
+    doubts = [note for note in test.notes if note.startswith(ASKED) and note not in wrong]
     moves = best.problem.objective.drive == "impact" and test.displacement is not None
     yield _check("velocity", not wrong if moves else None, warnings=wrong if moves else ())
-    yield _check("input", not asked, warnings=asked)
-    taken, warnings = balance.absorbed_over_striker, balance.energy_warnings()
-    unknown = not warnings and (taken is None or balance.motion == INTEGRATED)
+    yield _check("input", not doubts, warnings=doubts)
+    absorbed, warnings = balance.absorbed_over_striker, balance.energy_warnings()
+    unknown = not warnings and (absorbed is None or balance.motion == INTEGRATED)
     answer = None if unknown else not warnings
-    yield _check("energy", answer, warnings=warnings, taken=taken)
+    yield _check("energy", answer, warnings=warnings, taken=absorbed)
     ratio, warnings = balance.impulse_ratio, balance.impulse_warnings()
     answer = None if ratio is None else not warnings
     yield _check("impulse", answer, warnings=() if ratio is None else warnings, ratio=ratio)
 
 
-def _damping(best: BestPoint, known: Sequence[str]) -> Check:
-    """Whether a driven single spring plainly lacks the damping (Pa·s) that was left out."""
+def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
+    """Check whether a driven single spring clearly lacks the damping (Pa·s) that was left out."""
     problem, name = best.problem, "s1_eta"
     if problem.objective.drive != "displacement" or not best.names:
         return _check("damping", None)
-    held, alone, eta = problem.params[name], len(problem.model.kinds) == 1, 0.0
-    if alone and problem.measurement.time is not None and not held.vary and held.value == 0.0:
+    damper, alone, eta = problem.params[name], len(problem.model.kinds) == 1, 0.0
+    if alone and problem.measurement.time is not None and not damper.vary and damper.value == 0.0:
         column = problem.slopes(best.values, (name,))[:, 0]
         size = float(problem.sizes((name,), best.values)[0])
-        eta = max(_one_step(best, known, column, size) or 0.0, 0.0)
+        eta = max(_one_step(best, with_error, column, size) or 0.0, 0.0)
     return _check("damping", eta == 0.0, eta=eta)
 
 
-def _time_shift(best: BestPoint, estimates: Estimates, known: Sequence[str]) -> Check:
+def _time_shift(best: BestPoint, estimates: Estimates, with_error: Sequence[str]) -> Check:
     test, objective = best.problem.measurement, best.problem.objective
     force = test.outliers.get("stress")
     clipped = force is not None and force.clipped_at is not None
@@ -270,41 +268,41 @@ def _time_shift(best: BestPoint, estimates: Estimates, known: Sequence[str]) -> 
     with suppress(InputError):
         check_time_shift(test, objective.drive)
         if not clipped:
-            late = _shift_hint(best, known) or 0.0
+            late = _shift_hint(best, with_error) or 0.0
             return _check("time_shift", late == 0.0, late=late, **facts)
     return _check("time_shift", None, **facts)
 
 
-def _shift_hint(best: BestPoint, determined: Sequence[str]) -> float | None:
-    """Time (s) by which the motion channel is late, where the test plainly shows it, else None.
+def _shift_hint(best: BestPoint, with_error: Sequence[str]) -> float | None:
+    """Return the delay (s) of the motion channel if the test shows it clearly, else None.
 
-    Read off the residuals by one linear step, accepted above a quarter of a sample; where a large
-    shift has spoilt the fit, off the balance of the striker's motion. The test must have both
-    channels in time; see `fitting.curves.check_time_shift`.
+    The delay is estimated by one linear step from the residuals, and accepted above a quarter of
+    the sampling interval. Where a large shift has spoilt the fit, the striker's equation of motion
+    gives it. The test must have both channels in time; see `fitting.curves.check_time_shift`.
     """
-    objective, there = best.problem.objective, best.simulated
+    objective, simulated = best.problem.objective, best.simulated
     gap = float(np.median(np.diff(objective.time)))
+    shifted = (objective.shifted(simulated, side * gap) for side in (-0.5, 0.5))
     early, late = (
-        objective.compare(replace(there, curves=objective.shifted(there, side * gap)), best.values)
-        for side in (-0.5, 0.5)
+        objective.compare(replace(simulated, curves=curves), best.values) for curves in shifted
     )
-    found = _one_step(best, determined, (late - early) / gap, gap)
-    if found is not None and abs(found) > 0.25 * gap:
-        return found
+    shift = _one_step(best, with_error, (late - early) / gap, gap)
+    if shift is not None and abs(shift) > 0.25 * gap:
+        return shift
     return _shift_of_motion(best.problem)
 
 
 def _one_step(
-    best: BestPoint, determined: Sequence[str], column: Array, size: float
+    best: BestPoint, with_error: Sequence[str], column: Array, size: float
 ) -> float | None:
-    """Value of a parameter that was left out, by one linear step of it and all determined ones.
+    """Estimate an omitted parameter by a linear step of it and of all parameters `with_error`.
 
-    `column` is the slope of the residual by it, `size` its scale. None unless it is more than four
-    standard errors and the step takes a fifth of χ².
+    `column` is the derivative of the residual by the parameter, `size` its scale. Returns None
+    unless the estimate exceeds four standard errors and the step lowers χ² by at least a fifth.
     """
     problem, residual = best.problem, best.residual
-    jacobian = np.column_stack([best.jacobian[:, [*map(best.names.index, determined)]], column])
-    sizes = np.append(problem.sizes(tuple(determined), best.values), size)
+    jacobian = np.column_stack([best.jacobian[:, [*map(best.names.index, with_error)]], column])
+    sizes = np.append(problem.sizes(tuple(with_error), best.values), size)
     move = sizes * np.linalg.lstsq(jacobian * sizes, -residual, rcond=1e-10)[0]
     left = residual + jacobian @ move
     if left @ left >= 0.8 * float(residual @ residual):
@@ -314,11 +312,11 @@ def _one_step(
 
 
 def _shift_of_motion(problem: Problem) -> float | None:
-    """Time (s) by which the motion is late, where the striker's balance of motion plainly shows it.
+    """Return the delay (s) of the motion if the striker's equation of motion shows it clearly.
 
-    m w'' = -F: the force, integrated twice, gives the motion but for its scale and its zero.
-    Accepted where a shift of a sample or more halves what is left, down to the noise, or takes nine
-    tenths.
+    With m w'' = -F, the force integrated twice gives the motion up to scale and zero. The delay is
+    accepted if it exceeds the sampling interval and lowers the sum of squares to a tenth, or to
+    half if the rest is at the noise.
     """
     test, striker = problem.measurement, problem.measurement.striker
     time, stress, motion = test.time, test.stress, test.displacement
@@ -339,6 +337,6 @@ def _shift_of_motion(problem: Problem) -> float | None:
         left.append(float(np.linalg.lstsq(columns, free, rcond=None)[1].sum()))
     best, none = int(np.argmin(left)), left[shifts.size // 2]
     floor = 4.0 * problem.objective.noise("displacement_time").sigma ** 2 * time.size
-    plain = 0 < best < shifts.size - 1 and left[best] < (0.5 if left[best] < floor else 0.1) * none
+    clear = 0 < best < shifts.size - 1 and left[best] < (0.5 if left[best] < floor else 0.1) * none
     gap = float(np.median(np.diff(time)))
-    return float(shifts[best]) if plain and abs(shifts[best]) > gap else None
+    return float(shifts[best]) if clear and abs(shifts[best]) > gap else None

@@ -1,4 +1,4 @@
-"""The result at the best point: estimates with their states, statistics and notes."""
+"""Result of a fit at the best point: estimates with their states, statistics and notes."""
 
 from __future__ import annotations
 
@@ -26,33 +26,28 @@ from foamfit.text import engineering, listed, percent
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
 from foamfit.trust.budget import make_budget
-from foamfit.trust.checklist import (
-    POOR,
-    make_checklist,
-    may_vanish,
-    status_of,
-    warnings_of,
-)
+from foamfit.trust.checklist import POOR, make_checklist, may_vanish, status_of, warnings_of
 from foamfit.trust.covariance import Ends
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
 
-# Factor between an interval and the local one from which on the local standard error is given up.
+# If an interval and the local one differ by more than this factor, the local one is misleading.
 ASTRAY = 2.0
 
 
 def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None = None) -> Fit:
-    """Assemble the result at the best point, with other intervals than local ones if there are."""
+    """Assemble the result at the best point; `intervals` replace the local ones."""
     problem, objective, simulated = best.problem, best.problem.objective, best.simulated
     measurement, specimen = problem.measurement, problem.measurement.specimen
     intervals = Intervals() if intervals is None else intervals
     insight = correlation = None
-    if best.names:  # one standard deviation of what is left of each curve, its correlation counted
-        left = {
+    if best.names:
+        spread = best.spread
+        noise = {  # one standard deviation per curve, enlarged by the autocorrelation
             name: math.sqrt(max(process.variance * process.tau, 1e-300)) / objective.factor(name)
-            for name, process in zip(objective.counted, best.spread.noise, strict=True)
+            for name, process in zip(objective.counted, spread.noise, strict=True)
         }
-        insight, spread = look(best, left), best.spread
+        insight = look(best, noise)
         correlation = Correlation(best.names, spread.correlation, spread.stderr)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals))
     balance, misfit = audit(measurement), objective.misfit(simulated)
@@ -97,63 +92,66 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         noise=noise_of(best, best.errors if best.names else ()),
         intervals=replace(intervals, draws={}),
         budget=budget,
-        priors={one.name: (one.mean, one.sigma) for one in objective.given},
-        draws={n: one + measurement.origins.get(n, 0.0) for n, one in intervals.draws.items()},
+        priors={prior.name: (prior.mean, prior.sigma) for prior in objective.given},
+        draws={n: draw + measurement.origins.get(n, 0.0) for n, draw in intervals.draws.items()},
     )
 
 
 def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[str, Any]]:
-    """Noise of each counted curve, how it is known, its scale, and the residuals over it, SI.
+    """Return the noise of each fitted curve, its source, and residuals and model error, SI.
 
-    `errors` are those of the counted curves, or none if nothing varies. `law_error` is the RMS of
-    the law's error beside the noise, None if there is none; `law_error_evidence` is by how much the
-    Bayesian information criterion favours it. 95 % of the residuals are below `residual_q95`.
+    `errors` has one entry per fitted curve, or none if nothing varies. `law_error` is the RMS model
+    error, None if there is none; `law_error_evidence` is the reduction of the Bayesian information
+    criterion by including it. `residual_q95` is the 95th percentile of the absolute residuals.
     """
-    objective, found = best.problem.objective, {}
-    known = dict(zip(objective.counted, errors, strict=True)) if errors else {}
+    objective, out = best.problem.objective, {}
+    error_of = dict(zip(objective.counted, errors, strict=True)) if errors else {}
     for name, rms in objective.rms(best.residual).items():
-        off = best.simulated.curves[name] - objective.measured[name]
-        level, error = objective.noise(name), known.get(name)
-        found[name] = asdict(level) | {
+        residual = best.simulated.curves[name] - objective.measured[name]
+        level, error = objective.noise(name), error_of.get(name)
+        out[name] = asdict(level) | {
             "scale": objective.scale[name],
             "range": float(np.ptp(objective.measured[name])),
             "law_error": error.law / objective.factor(name) if error and error.found else None,
             "law_error_evidence": error.evidence if error else None,
             "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
             "motion_smoothed": objective.drive == "displacement" and objective.motion is not None,
-            "residual_q95": float(np.quantile(np.abs(off[objective.kept(name)]), 0.95)),
+            "residual_q95": float(np.quantile(np.abs(residual[objective.kept(name)]), 0.95)),
         }
-    return found
+    return out
 
 
 def _notes(best: BestPoint) -> tuple[str, ...]:
-    """What was left out of the model and what it would change, and how residuals are counted."""
-    test, simulated, objective = best.problem.measurement, best.simulated, best.problem.objective
+    """Return notes on the effects that the model omits, on priors, noise and units of residuals."""
+    test, objective = best.problem.measurement, best.problem.objective
     single = len(best.problem.model.kinds) == 1
-    off = {
-        name: share
+    integrated = {
+        name: misfit
         for name in MOTION_CURVES
         if test.motion == INTEGRATED
-        if name not in objective.counted and (share := objective.off(simulated, name))
+        if name not in objective.counted and (misfit := objective.off(best.simulated, name))
     }
-    told = say(
+    text = say(
         "notes",
         "all",
         objective=objective,
         loops=_inner_loops(best),
         priors=[(p, unit_of(p.name), best.values[best.index[p.name]]) for p in objective.given],
-        off=off,
+        off=integrated,
         inside=list(map(interior_channel, sorted(test.interior))) if single else [],
         masses=None if single else _masses(best),
         noises=noise_sentences(test),
         floored=[n for n in objective.counted if objective.scale[n] > objective.noise(n).sigma],
         floor=MODEL_ERROR,
     )
-    return tuple(told.splitlines())
+    return tuple(text.splitlines())
 
 
 def _masses(best: BestPoint) -> dict[str, Any] | None:
-    """What the masses inside a chain, which are left out, would change in an impact."""
+    """Return the effect of interior masses omitted from an impact; None if none were omitted.
+
+    "ended" is the error if the simulation with the masses fails.
+    """
     objective, mass = best.problem.objective, best.problem.measurement.specimen.mass
     if objective.drive != "impact" or objective.interior_mass:
         return None
@@ -161,40 +159,40 @@ def _masses(best: BestPoint) -> dict[str, Any] | None:
         return {"changes": [], "ended": None}
     try:
         massive = replace(objective, interior_mass=True)
-        other = massive.simulate(best.values, everything=True).curves
+        with_mass = massive.simulate(best.values, everything=True).curves
     except SimulationError as error:
         return {"changes": [], "ended": error}
-    spoken, changes = {"stress_time": "base stress", "displacement_time": "displacement"}, []
+    titles = {"stress_time": "the base stress", "displacement_time": "the displacement"}
+    changes = []
     for name, curve in best.simulated.curves.items():
-        if name != "stress_strain" and name in other:
-            share = float(np.sqrt(np.mean((curve - other[name]) ** 2)) / np.ptp(curve))
-            size = "less than 0.01 %" if share < 1e-4 else percent(share)
-            what = f"the {spoken[name]}" if name in spoken else name.removesuffix("_time")
-            changes.append(f"{what} by {size}")
+        if name != "stress_strain" and name in with_mass:
+            change = float(np.sqrt(np.mean((curve - with_mass[name]) ** 2)) / np.ptp(curve))
+            size = "less than 0.01 %" if change < 1e-4 else percent(change)
+            changes.append(f"{titles.get(name, name.removesuffix('_time'))} by {size}")
     return {"mass": mass, "changes": changes}
 
 
 def _inner_loops(best: BestPoint) -> dict[str, Any] | None:
-    """What a partial unloading leaves in the residuals of a law that has no inner loops."""
+    """Return the share of partial unloadings in the residuals of laws without inner loops."""
     test, curve = best.problem.measurement, best.simulated.curves.get("stress_strain")
-    own = [law for law in best.problem.model.laws if law.hysteretic]
-    if not own or curve is None or any(law.inner_loops for law in own):
+    hysteretic = [law for law in best.problem.model.laws if law.hysteretic]
+    if not hysteretic or curve is None or any(law.inner_loops for law in hysteretic):
         return None
-    assert test.displacement is not None  # there is a curve along it
+    assert test.displacement is not None
     assert test.stress is not None
     squares, inside, spans = (curve - test.stress) ** 2, np.zeros(curve.size, dtype=bool), []
     for first, stop in inner_loops(test.displacement):
         inside[first:stop] = True
         ends = first, min(stop, curve.size - 1)
-        told = [f"sample {ends[0]}", f"{ends[1]}"]
+        start, end = f"sample {ends[0]}", f"{ends[1]}"
         if test.time is not None:
-            told = [engineering(test.time[at], "s") for at in ends]
-        spans.append(f"from {told[0]} to {told[1]}")
+            start, end = (engineering(test.time[at], "s") for at in ends)
+        spans.append(f"from {start} to {end}")
     if not spans or not (total := float(squares.sum())) > 0.0:
         return None
     with_loops = [law for law in map(laws.law, laws.kinds()) if law.inner_loops]
-    titles = (dict.fromkeys(f"{law.title}s" for law in some) for some in (own, with_loops))
-    without, others = map(listed, titles)
+    groups = (hysteretic, with_loops)
+    without, others = (listed(dict.fromkeys(f"{law.title}s" for law in group)) for group in groups)
     shares = {"samples": float(inside.mean()), "squares": float(squares[inside].sum()) / total}
     return {"spans": spans, "without": without, "others": others, **shares}
 
@@ -202,7 +200,7 @@ def _inner_loops(best: BestPoint) -> dict[str, Any] | None:
 def _estimates(
     best: BestPoint, insight: Insight | None, intervals: Intervals
 ) -> dict[str, ParameterEstimate]:
-    """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
+    """Return the estimates of all parameters; their standard errors are also set in lmfit's."""
     problem, out = best.problem, {}
     for name, value in zip(problem.names, best.values.tolist(), strict=True):
         if problem.is_exact(name):
@@ -210,43 +208,43 @@ def _estimates(
         parameter = problem.params[name]
         if name in best.names:
             assert insight is not None
-            one = _varied(best, name, insight, intervals)
+            estimate = _varied(best, name, insight, intervals)
         else:
             vary, spring = bool(parameter.vary), split_name(name)[0] + 1
             state, key = ("not determined", "unreached") if vary else ("fixed", "held")
             key, branch = "tied" if parameter.expr else key, best.unreached.get(name)
             why = say("why", key, branch=branch, spring=spring, expression=parameter.expr)
-            one = ParameterEstimate(value, None, None, unit_of(name), vary, state, why)
-        parameter.stderr = one.stderr
-        out[name] = one.counted_from(-problem.measurement.origins.get(name, 0.0))
+            estimate = ParameterEstimate(value, None, None, unit_of(name), vary, state, why)
+        parameter.stderr = estimate.stderr
+        out[name] = estimate.counted_from(-problem.measurement.origins.get(name, 0.0))
     return out
 
 
 def _varied(
     best: BestPoint, name: str, insight: Insight, intervals: Intervals
 ) -> ParameterEstimate:
-    """Estimate of a parameter that was varied and whose branch was reached."""
+    """Return the estimate of a varied parameter whose branch was reached."""
     (low, high), column = best.limits(name), best.names.index(name)
     problem, value, unit = best.problem, float(best.values[best.index[name]]), unit_of(name)
     half, method = float(best.halves[column]), intervals.methods.get(name, "local covariance")
     local = (value - half, value + half)
-    # Percentiles of refits, or of a chain, may all lie to one side of the best point.
-    given = (*intervals.ends.get(name, local), value)
-    ends = min(given), max(given)
-    made, by_local = (min(pair[1], high) - max(pair[0], low) for pair in (ends, local))
-    ratio = made / by_local if by_local > 0.0 else math.nan
-    # Refits that stall in a long minimum make a profile narrow: the wider interval is taken.
+    # The percentiles of a Markov chain may all lie to one side of the best point.
+    points = (*intervals.ends.get(name, local), value)
+    ends = min(points), max(points)
+    width, local_width = (min(pair[1], high) - max(pair[0], low) for pair in (ends, local))
+    ratio = width / local_width if local_width > 0.0 else math.nan
+    # Refits that stall in a long valley make a profile too narrow: use the wider local interval.
     stalled = ratio < 1.0 / ASTRAY and method == "profile likelihood"
     ends = local if stalled else ends
     span = intervals.ranges.get(name)
-    if span is not None:  # it may be that of the point before the last improvement
+    if span is not None:  # it may belong to the point before the last improvement
         span = min(span[0], value), max(span[1], value)
     state, why = _state_of(best, name, ends, insight, span)
-    objective, there = problem.objective, intervals.elsewhere.get(name)
-    off, curve = max((objective.off(best.simulated, one) or 0.0, one) for one in objective.counted)
-    if state == "determined" and (objective.interior_mass or there is not None or off > POOR):
-        there = None if there is None else there + problem.measurement.origins.get(name, 0.0)
-        facts = {"vibrates": objective.interior_mass, "there": there, "off": off, "curve": curve}
+    objective, other = problem.objective, intervals.elsewhere.get(name)
+    misfit, curve = max((objective.off(best.simulated, n) or 0.0, n) for n in objective.counted)
+    if state == "determined" and (objective.interior_mass or other is not None or misfit > POOR):
+        other = None if other is None else other + problem.measurement.origins.get(name, 0.0)
+        facts = {"vibrates": objective.interior_mass, "there": other, "off": misfit, "curve": curve}
         state, why = "weak", say("why", "weak", why=why, unit=unit, **facts)
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
@@ -260,10 +258,10 @@ def _varied(
 def _state_of(
     best: BestPoint, name: str, ends: Ends, insight: Insight, span: Ends | None
 ) -> tuple[str, str]:
-    """State of a parameter that varies and whose branch is reached, and the reason in one sentence.
+    """Return the state of a varied parameter whose branch was reached, and the reason.
 
-    `ends` are those of its 95 % interval, not cut at its limits; NaN or infinite where the data
-    fix only a combination. `span` is its range, if there is one; the wider of the two counts.
+    `ends` is its 95 % interval, not cut at its limits; NaN or infinite where the data fix only a
+    combination. `span` is its range, if there is one; the wider of the two decides.
     """
     (ends, what), limits, unit = covariance.wider(ends, span), best.limits(name), unit_of(name)
     value, size = float(best.values[best.index[name]]), float(best.sizes[best.names.index(name)])
@@ -287,9 +285,9 @@ def _state_of(
 
 
 def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int | None]:
-    """Statistics as lmfit defines them (chi-square, AIC, BIC), and what the search cost."""
+    """Return the statistics as lmfit defines them (χ², AIC, BIC), and the effort of the search."""
     objective, chisqr = best.problem.objective, best.cost
-    n, n_vary = objective.n_data, len(best.names)  # determined or not, they follow the data
+    n, n_vary = objective.n_data, len(best.names)  # including undetermined ones
     log_likelihood = n * math.log(max(chisqr, 1e-300) / n)
     aic, freedom = log_likelihood + 2 * n_vary, n - n_vary - 1
     return {
@@ -312,14 +310,14 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
 
 
 def _switches(best: BestPoint) -> tuple[Switch, ...]:
-    """Place the switches of the fitted response on its curves."""
+    """Return the switches of the fitted response with their place on the curves."""
     motion, clock = best.simulated.motion, best.problem.objective.time
-    own, timed = best.problem.model.laws, best.problem.measurement.time is not None
+    own_laws, timed = best.problem.model.laws, best.problem.measurement.time is not None
     return tuple(
         Switch(
             spring=int(spring) + 1,
-            source=own[int(spring)].named_branch(int(left)),
-            target=own[int(spring)].named_branch(int(entered)),
+            source=own_laws[int(spring)].named_branch(int(left)),
+            target=own_laws[int(spring)].named_branch(int(entered)),
             time=float(when) if timed else None,
             displacement=float(np.interp(when, clock, motion.displacement[-1])),
             stress=float(np.interp(when, clock, motion.base_stress)),

@@ -1,9 +1,9 @@
-"""How sure the identified parameters are: covariance, intervals, and which are determined at all.
+"""Uncertainty of the identified parameters: covariance, intervals and states.
 
-An interval tells where the best that the law can do would lie if the tests were measured again. So
-the covariance has the noise alone in it, correlated as it is (`noise_process`); an error of the law
-(`law_error`) only changes how the best point follows the noise. One test is the case of a single
-block whose parameters are the unknowns.
+A 95 % interval shows where the best point of the law would lie if the tests were measured again.
+The covariance therefore includes the noise only, with its correlation (`noise_process`); model
+error (`law_error`) only changes how the best point responds to the noise. A fit of one test is a
+single block whose parameters are the unknowns.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from foamfit.text import percent
 from foamfit.trust.residuals.noise_process import NoiseProcess, noise_processes, parts
 
 Ends = tuple[float, float]
-# Half widths of the 95 % interval, over the scale of a parameter (`fitting.box.Scales`), past which
-# it is weak, and past which the test does not determine it.
+# A parameter is weak if half its 95 % interval exceeds WEAK times its scale (`fitting.box.Scales`),
+# and not determined if it exceeds NOTHING times its scale.
 WEAK, NOTHING = 0.5, 3.0
 RULE = (
     f"Determined: 95 % interval and range are both within ±{WEAK:.0%} of the parameter's scale "
-    "(its value, or what its sentence names).",
-    f"Not determined: one of them is wider than ±{NOTHING:.0%}, or its branch was never reached; "
-    "weak: all between.",
+    "(its value, unless its sentence names another).",
+    f"Not determined: one of them is wider than ±{NOTHING:.0%}, or its branch was never reached. "
+    "Otherwise weak.",
 )
-# A parameter this close to a limit, over its scale, lies at it.
+# A parameter is at a limit if its distance to it, over its scale, is no more than this.
 AT_LIMIT = 1e-6
-# Two directions closer than this count as one.
+# Directions with a singular value below this share of the largest one are not seen by the data.
 SINGULAR = 1e-12
-# Curvature of the cost over that of JᵀJ below which it is not believed.
+# A ratio of the curvature of the cost to JᵀJ below this is unreliable, and JᵀJ is used instead.
 FLATTEST = 0.05
 
 
@@ -44,17 +44,16 @@ FLATTEST = 0.05
 class Covariance:
     """Covariance of the varied parameters at the best point."""
 
-    matrix: Array  # (k, k): Covariance, SI; NaN rows and columns where the test says nothing
-    # (k,): Variance of each parameter over that of a residual of white noise of unit variance: what
-    # a rise of the sum of squares along a parameter's profile must be divided by to be a χ².
+    matrix: Array  # (k, k): covariance, SI; NaN rows and columns for undetermined parameters
+    # (k,): variance of each parameter over its variance under white noise of unit variance. A rise
+    # of the sum of squares along a profile, divided by this, is a χ².
     inflation: Array
-    # (k,): Degrees of freedom of each variance: those of the χ² distribution that is as uncertain
-    # as the estimated noise makes it (Satterthwaite 1946, Biometrics Bull. 2, 110), but no more
-    # than the effective samples that the parameters have left: what a model cannot follow is no
-    # noise whose spectrum is known.
+    # (k,): degrees of freedom of each variance, which express how uncertain the estimated noise
+    # makes it (Satterthwaite 1946, Biometrics Bull. 2, 110); at most the number of effective
+    # samples less the number of parameters, because model error has no known noise spectrum.
     freedom: Array
-    effective: float  # Effective number of samples
-    noise: tuple[NoiseProcess, ...]  # Noise of each curve, in units of the residual
+    effective: float  # effective number of samples
+    noise: tuple[NoiseProcess, ...]  # noise of each curve, in units of the residual
 
     @property
     def stderr(self) -> Array:
@@ -69,7 +68,7 @@ class Covariance:
 
 
 def _directions(rows: Array) -> tuple[Array, Array, Array]:
-    """Singular value decomposition of some rows, without the directions that they do not show."""
+    """Return the singular value decomposition of some rows, without its null space."""
     left, singular, vt = np.linalg.svd(rows, full_matrices=False)
     seen = singular > SINGULAR * max(float(singular.max(initial=0.0)), 1e-300)
     return left[:, seen], singular[seen], vt[seen]
@@ -77,33 +76,33 @@ def _directions(rows: Array) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One test in a covariance; everything is scaled, so that directions compare.
+    """One test in a covariance, with all quantities scaled so that directions are comparable.
 
-    The covariance is that of m unknowns. Those of one test are its k parameters themselves; what
-    several tests have in common, one unknown for all, its parameters follow.
+    The covariance has m unknowns. For a single test these are its k parameters; for several tests
+    the parameters of a test depend on common unknowns and on its own ones.
     """
 
-    jacobian: Array  # (n, k): Slopes of its curves, one after the other, then of priors
+    jacobian: Array  # (n, k): derivatives of the residuals of its curves in turn, then of priors
     residual: Array  # (n,)
-    sizes: tuple[int, ...]  # Samples of each curve; what is behind them are priors of unit variance
-    noise: Sequence[NoiseProcess]  # Of each curve
-    through: Array  # (k, m): How its parameters follow the unknowns
-    # Jᵀr of some parameters (their places) at a step of these off the best point; None where the
-    # law misses no more than noise, so that the curvature is JᵀJ.
+    sizes: tuple[int, ...]  # samples of each curve; the remaining rows are priors of unit variance
+    noise: Sequence[NoiseProcess]  # of each curve
+    through: Array  # (k, m): derivatives of its parameters by the unknowns
+    # Jᵀr for some parameters (by place) after a step of these from the best point; None where the
+    # residual is noise only, so that the curvature is JᵀJ.
     gradient: Callable[[NDArray[np.intp], Array], Array] | None = None
-    room: Array | None = None  # (k, 2): How far they are above and below their limits
-    # (k,): What one standard error of a quantity that is taken for exact does to its parameters.
+    room: Array | None = None  # (k, 2): distances to the lower and upper limits
+    # (k,): change of its parameters by one standard error of a quantity that the fit takes as exact
     given: Array | None = None
 
     @cached_property
     def axes(self) -> tuple[Array, Array]:
-        """Orthonormal columns (n, r), and what leads from parameters to them (r, k): J is both."""
+        """Factors of the Jacobian: orthonormal columns (n, r) and orthogonal rows (r, k)."""
         left, singular, vt = _directions(self.jacobian)
         return left, singular[:, None] * vt
 
     @cached_property
     def steps(self) -> Array:
-        """Parameters that lead to each of the orthonormal columns, (k, r)."""
+        """Steps of the parameters that are unit steps along the orthonormal columns, (k, r)."""
         rows = self.axes[1]
         return np.asarray(rows.T / np.sum(rows**2, axis=1))
 
@@ -122,13 +121,13 @@ class Block:
         return float(sum(n / one.tau for n, one in zip(self.sizes, self.noise, strict=True)))
 
     def doubt(self, mix: Array) -> Array:
-        """Variance of the variances that the noise makes along `mix` (r, m), (m,)."""
+        """Return the variance of the estimated noise variances along `mix` (r, m), (m,)."""
         left = self.axes[0]
         pairs = zip(self.noise, parts(self.sizes), strict=True)
         return np.asarray(np.sum([one.doubt(left[p], mix) for one, p in pairs], axis=0))
 
     def without(self, held: NDArray[np.bool_]) -> Block:
-        """The block with some of the unknowns held."""
+        """Return the block with some of the unknowns fixed."""
         rows = np.flatnonzero(~(self.through[:, held] != 0.0).any(axis=1))
         full = self.gradient
         return replace(
@@ -140,14 +139,14 @@ class Block:
         )
 
     def curvature(self, spread: Array) -> Array:
-        """Curvature of half the cost along the orthonormal columns, (r, r), where JᵀJ is one.
+        """Return the curvature of half the cost along the orthonormal columns, (r, r).
 
-        By differences of the gradient, one standard error to either side along the principal axes
-        of `spread` (r, r), the covariance there.
+        In this basis JᵀJ is the unit matrix. The curvature is a difference of gradients, one
+        standard error to either side along the principal axes of the covariance `spread` (r, r).
         """
-        none = np.eye(len(spread))
+        unit = np.eye(len(spread))
         if self.gradient is None or not len(spread):
-            return none
+            return unit
         power, axes = np.linalg.eigh(0.5 * (spread + spread.T))
         axes = axes * np.sqrt(np.maximum(power, 1e-12 * power.max()))
         every = np.arange(self.jacobian.shape[1])
@@ -156,22 +155,22 @@ class Block:
             for step in (self.steps @ axes).T
         ]
         try:
-            found = np.linalg.solve(axes.T, np.array(change) @ self.steps)
+            curved = np.linalg.solve(axes.T, np.array(change) @ self.steps)
         except np.linalg.LinAlgError:
-            return none
-        return np.asarray(0.5 * (found + found.T))
+            return unit
+        return np.asarray(0.5 * (curved + curved.T))
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What the noise leaves uncertain of m unknowns at the best point of one test or several.
+    """Uncertainty of m unknowns due to noise at the best point of one test or several.
 
-    A covariance H⁻¹ JᵀΣJ H⁻¹ with Σ the noise of the curves of all tests, scaled. H is JᵀJ, or with
-    `curvatures` (of each test, along its `Block.axes`) that of half the cost, which a residual that
-    is no noise changes (White 1982, Econometrica 50, 1). `bend` (m, m) is what the bend of
-    `Block.through` adds to H. `drawn` (d, m) are the slopes of further residuals, of so much
-    variance each (d,). All is computed along s directions of the unknowns along which the residuals
-    of all tests together have unit slopes.
+    The scaled covariance is H⁻¹ JᵀΣJ H⁻¹, with Σ the noise covariance of the curves of all tests.
+    H is JᵀJ or, with `curvatures` (of each test, along its `Block.axes`), the Hessian of half the
+    cost, which differs from JᵀJ if there is model error (White 1982, Econometrica 50, 1). `bend`
+    (m, m) is the contribution to H of the nonlinearity of `Block.through`. `drawn` contains the
+    derivatives (d, m) and variances (d,) of additional residuals. All is computed along s
+    directions of the unknowns, along which the residuals of all tests together have unit slopes.
     """
 
     blocks: tuple[Block, ...]
@@ -182,7 +181,7 @@ class Uncertainty:
 
     @property
     def errs(self) -> bool:
-        """Whether the law misses more of some test than noise."""
+        """Whether there is model error in some test."""
         return any(block.gradient for block in self.blocks)
 
     @cached_property
@@ -194,18 +193,18 @@ class Uncertainty:
 
     @property
     def root(self) -> Array:
-        """Unknowns that lead to each of the directions, (m, s)."""
+        """Steps of the unknowns that are unit steps along each direction, (m, s)."""
         return self._solved[1]
 
     @cached_property
     def lost(self) -> NDArray[np.bool_]:
-        """Unknowns of which the tests say nothing, (m,)."""
+        """Unknowns that the tests do not determine, (m,)."""
         along = self.root / np.maximum(np.linalg.norm(self.root, axis=0), 1e-300)
         return np.asarray(np.sum(along**2, axis=1) < 1.0 - 1e-6)
 
     @cached_property
     def lefts(self) -> list[Array]:
-        """The directions along the orthonormal columns of each test (r, s), then of `drawn`."""
+        """Components of the directions along each test's orthonormal columns, then `drawn`."""
         return np.split(self._solved[0], np.cumsum([len(block.axes[1]) for block in self.blocks]))
 
     @property
@@ -214,17 +213,17 @@ class Uncertainty:
 
     @cached_property
     def axes(self) -> Array:
-        """Principal axes of the covariance of the noise, one deviation long, (s, s)."""
+        """Principal axes of the covariance of the noise, one standard deviation long, (s, s)."""
         rows = [block.meat @ left for left, block in self._pairs]
         rows += [] if self.drawn is None else [self.drawn[1][:, None] * self.lefts[-1]]
         meat = self._solved[0].T @ np.concatenate(rows)
         power, axes = np.linalg.eigh(0.5 * (meat + meat.T))
-        least = 1e-12 * power.max(initial=0.0)  # no variance is negative
+        least = 1e-12 * power.max(initial=0.0)  # rounding may make a variance negative
         return np.asarray(axes * np.sqrt(np.maximum(power, least)))
 
     @cached_property
     def _bread(self) -> Array:
-        """H⁻¹ along the directions; where there is no curvature, that of JᵀJ."""
+        """H⁻¹ along the directions; that of JᵀJ without curvature."""
         out = np.eye(self.root.shape[1])
         if self.curvatures is None:
             return out
@@ -237,12 +236,12 @@ class Uncertainty:
 
     @cached_property
     def inverse(self) -> Array:
-        """H⁻¹, (m, m); zero where the tests say nothing."""
+        """H⁻¹, (m, m); zero for undetermined unknowns."""
         return self.root @ self._bread @ self.root.T
 
     @cached_property
     def matrix(self) -> Array:
-        """The covariance of the scaled unknowns, (m, m); NaN where the tests say nothing."""
+        """Covariance of the scaled unknowns, (m, m); NaN for undetermined ones."""
         spread = self.root @ self._bread @ self.axes
         out = spread @ spread.T
         for t, (left, block) in enumerate(self._pairs):
@@ -256,40 +255,40 @@ class Uncertainty:
 
     @cached_property
     def held(self) -> NDArray[np.bool_]:
-        """Unknowns that the residuals press to a limit by more than their noise could, (m,)."""
-        pull, sure = np.zeros((2, self.scales.size))
+        """Unknowns that the residuals press against a limit more than noise could, (m,)."""
+        pull, variance = np.zeros((2, self.scales.size))
         near = np.zeros((2, self.scales.size), dtype=bool)
         for block in self.blocks:
             slopes = block.axes[1] @ block.through
             pull += block.through.T @ (block.jacobian.T @ block.residual)
-            sure += np.einsum("ij,ij->j", slopes, block.meat @ slopes)
+            variance += np.einsum("ij,ij->j", slopes, block.meat @ slopes)
             if block.room is not None:
                 near |= (block.room.T <= AT_LIMIT) @ (block.through != 0.0)
         outward = np.where(near[0], pull, np.where(near[1], -pull, 0.0))
-        return np.asarray(outward > 1.96 * np.sqrt(sure))
+        return np.asarray(outward > 1.96 * np.sqrt(variance))
 
     @cached_property
     def bent(self) -> Uncertainty:
-        """With the curvature of the cost of each test, what is pressed to a limit held."""
-        free, one = ~self.held, self
+        """The same with the curvature of the cost of each test, and without unknowns in `held`."""
+        free, reduced = ~self.held, self
         if not free.all():
-            one = Uncertainty(
+            reduced = Uncertainty(
                 tuple(block.without(self.held) for block in self.blocks),
                 self.scales[free],
                 None if self.drawn is None else (self.drawn[0][:, free], self.drawn[1]),
                 None if self.bend is None else self.bend[np.ix_(free, free)],
             )
-        spreads = [left @ one.axes for left in one.lefts]
-        pairs = zip(one.blocks, spreads, strict=False)
-        return replace(one, curvatures=tuple(block.curvature(s @ s.T) for block, s in pairs))
+        spreads = [left @ reduced.axes for left in reduced.lefts]
+        pairs = zip(reduced.blocks, spreads, strict=False)
+        return replace(reduced, curvatures=tuple(block.curvature(s @ s.T) for block, s in pairs))
 
     @cached_property
     def sandwich(self) -> Covariance:
-        """The covariance, SI, with the curvature that this has."""
+        """Covariance, SI, with H as it is here."""
         back, m = self._bread @ self.root.T, self.scales.size
         variance, doubt, most = np.zeros((3, m))
-        there = np.array([(block.through != 0.0).any(axis=0) for block in self.blocks])
-        own = there & (there.sum(axis=0) == 1)
+        used = np.array([(block.through != 0.0).any(axis=0) for block in self.blocks])
+        own = used & (used.sum(axis=0) == 1)
         effective = sum(block.effective for block in self.blocks)
         for (left, block), mine in zip(self._pairs, own, strict=True):
             mix = left @ back
@@ -300,21 +299,21 @@ class Uncertainty:
         if self.drawn is not None:
             mix = self.lefts[-1] @ back
             variance += self.drawn[1] @ mix**2
-        known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
+        freedom = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
         return Covariance(
             self.matrix * np.outer(self.scales, self.scales),
             np.diag(self.matrix) / np.where(self.lost, np.nan, np.diag(self.inverse)),
-            np.minimum(known, np.maximum(most, 1.0)),
+            np.minimum(freedom, np.maximum(most, 1.0)),
             effective,
-            tuple(one for block in self.blocks for one in block.noise),
+            tuple(process for block in self.blocks for process in block.noise),
         )
 
     @cached_property
     def covariance(self) -> Covariance:
-        """Covariance of the unknowns, SI: with the curvature of the cost where a law errs.
+        """Covariance of the unknowns, SI, with the curvature of the cost if there is model error.
 
-        That makes no variance smaller: the curvature of a cost with kinks is known to some tenths.
-        What is held is correlated with nothing.
+        The curvature of a cost with kinks is only roughly known, so it does not reduce any
+        variance. Unknowns in `held` are uncorrelated with the others.
         """
         plain = self.sandwich
         if not self.errs or self.held.all():
@@ -328,43 +327,41 @@ class Uncertainty:
 
 
 def covariance(
-    jacobian: Array, residual: Array, sizes: tuple[int, ...], sizes_of: Array
+    jacobian: Array, residual: Array, sizes: tuple[int, ...], scales: Array
 ) -> Covariance:
-    """Covariance of the least squares of one test, its noise read off the residual.
+    """Return the covariance of a least-squares fit of one test, with noise from its residual.
 
-    `residual` (n,) and `jacobian` (n, k) are those of the best point, so many samples of each curve
-    as in `sizes` and behind them priors of unit variance; `sizes_of` (k,) are the scales of the
-    parameters.
+    `residual` (n,) and `jacobian` (n, k) are taken at the best point; they contain `sizes` samples
+    of each curve in turn, then priors of unit variance. `scales` (k,) are those of the parameters.
     """
-    scaled = jacobian * sizes_of
+    scaled = jacobian * scales
     noise = noise_processes(residual, scaled, sizes)
-    block = Block(scaled, residual, sizes, noise, np.eye(sizes_of.size))
-    return Uncertainty((block,), sizes_of).covariance
+    block = Block(scaled, residual, sizes, noise, np.eye(scales.size))
+    return Uncertainty((block,), scales).covariance
 
 
 def half_width(stderr: float, freedom: float) -> float:
-    """Half of the 95 % interval by Student's t with `freedom` degrees of freedom."""
+    """Return half of the 95 % interval by Student's t with `freedom` degrees of freedom."""
     return float(stats.t.ppf(0.975, max(freedom, 1.0))) * stderr
 
 
 def wider(ends: Ends, span: Ends | None) -> tuple[Ends, str]:
-    """The wider of a 95 % interval and of a range, and which it is."""
+    """Return the wider of a 95 % interval and a range, and its name."""
     if span is not None and span[1] - span[0] > ends[1] - ends[0]:
         return span, "range"
     return ends, "95 % interval"
 
 
 def state(
-    name: str, value: float, known: tuple[Ends, str], size: float, limits: Ends
+    name: str, value: float, interval: tuple[Ends, str], size: float, limits: Ends
 ) -> tuple[str, str]:
-    """State of a parameter that was varied and whose branch was reached, and why.
+    """Return the state of a varied parameter whose branch was reached, and the reason.
 
-    The rule (`RULE`): determined if its 95 % interval and its range are within ±`WEAK` of its
-    scale, not determined if one of them is wider than ±`NOTHING`, weak between. `known` is the
-    wider of the two (`wider`), not cut at the limits, NaN where the data fix only a combination;
-    `size` is its scale.
+    It is determined if its 95 % interval and its range are within ±`WEAK` of its scale `size`, not
+    determined if one of them is wider than ±`NOTHING`, otherwise weak. `interval` is the wider of
+    the two (see `wider`), not cut at the limits; NaN where the data fix only a combination.
     """
-    ((low, high), what), of = known, scale_in_words(name, value, size)
+    ((low, high), what), of = interval, scale_in_words(name, value, size)
     half = 0.5 * (high - low)
     if not math.isfinite(half):
         return "not determined", "the data fix only a combination of it with other parameters"

@@ -1,15 +1,15 @@
-"""What speaks for a model: AICc and BIC where the noise is reached, else what it predicts.
+"""Evidence for a model: AICc and BIC if a model reaches the noise, else cross-validation.
 
-AICc and BIC count the effective samples and parameters: neither correlated residuals nor
-combinations of parameters that the curves do not fix are evidence. They take the residuals for
-noise, so they do not hold where every model has an error of its own; then models are compared by
-how well they predict blocks of the test that are held back.
+AICc and BIC use the numbers of effective samples and parameters, so that neither correlated
+residuals nor combinations of parameters that the curves do not fix count as evidence. They assume
+that the residuals are noise. If every model has an error of its own, models are compared by how
+well they predict held-out blocks of the test.
 
-Cross-validation in blocks (Burman, Chow & Nolan 1994, Biometrika 81, 351): neighbouring residuals
-are alike where a law does not follow a foam, so single samples held back would be predicted by
-their neighbours. Contiguous blocks in time are held back instead, each in turn; the parameters are
-fitted to the rest from the best point on, and the whole history is simulated, so that the blocks
-are predicted with the state in which the test enters them.
+Cross-validation in blocks (Burman, Chow & Nolan 1994, Biometrika 81, 351): where there is model
+error, neighbouring residuals are similar, and single held-out samples would be predicted by their
+neighbours. Instead, contiguous blocks in time are held out in turn. The parameters are fitted to
+the rest, starting from the best point, and the complete history is simulated, so that each block is
+predicted with the state in which the test enters it.
 """
 
 from __future__ import annotations
@@ -33,64 +33,64 @@ from foamfit.trust.covariance import NOTHING
 from foamfit.trust.residuals.noise_process import autocorrelation_time
 from foamfit.trust.residuals.residual_tests import neighbours_test, runs_test
 
-# Residuals are random where neither test of their order rejects it at the first level. Below the
-# second their order is an error of the model for sure: one true model in twenty or ten fails the
-# first by chance, hardly one the second.
-LEVEL, SURE = 0.05, 1e-4
-# By how much AICc and BIC must both fall for a richer model to be preferred: "strong" evidence of
-# Kass & Raftery (1995), J. Am. Stat. Assoc. 90, 773.
+# p-value of the runs and neighbours tests below which residuals are not random. One true model in
+# ten to twenty fails by chance.
+LEVEL = 0.05
+# p-value below which the residuals certainly contain model error.
+SURE = 1e-4
+# Reduction of both AICc and BIC for which a richer model is preferred: "strong" evidence in Kass &
+# Raftery (1995), J. Am. Stat. Assoc. 90, 773.
 MARGIN = 6.0
-# Where no model reaches the noise: by what share each further parameter of a richer model must
-# lower the predicted misfit for it to be preferred.
+# If no model reaches the noise, a richer model is preferred if it lowers the predicted misfit by
+# this share per additional parameter.
 SHARE = 0.03
-# A model whose misfit is this many times that of another with as many parameters is not chosen,
-# whatever it predicts.
+# A model is not chosen if its misfit is more than this many times that of another model with as
+# many parameters, whatever its prediction.
 WORSE = 2.0
-# Below this misfit (over the range) residuals are the simulation's own error.
+# Below this misfit over range, residuals are the numerical error of the simulation.
 EXACT = 1e-5
-# Blocks in time: an eighth of a loop takes a whole feature of it away (the turning point, the first
-# stress), so that the prediction is a matter of chance; from two dozen on the ranking is stable.
+# Number of blocks in time. With 8, a block removes an entire feature of the loop (turning point,
+# first stress), and its prediction is a matter of chance; from about 24 on the ranking is stable.
 BLOCKS = 24
-# Levenberg-Marquardt steps of the fit without one block, which ends when two in a row gain less
-# than a share.
+# Largest number of Levenberg-Marquardt steps without a block, and the relative gain of the cost
+# below which two successive steps end the fit.
 STEPS, ENOUGH = 20, 1e-3
 
 
 def misfit_of(objective: Objective, residual: Array) -> float:
-    """RMS over the measured ranges of all counted curves, of a residual as the objective has it."""
+    """Return the RMS over range of a residual, over all fitted curves."""
     spans = np.repeat([objective.span(name) for name in objective.counted], objective.sizes)
     return math.sqrt(float(np.mean((residual[: spans.size] / spans) ** 2)))
 
 
 def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
-    """RMS over the measured ranges of the samples of each block, predicted from the others.
+    """Return the RMS over range of all samples, each predicted without its block.
 
     Raises SearchStoppedError if the time (`time.monotonic`) is past the deadline.
     """
-    # With counts of its own, and each sample for itself: weighed residuals mix what is held back.
+    # A new objective has its own counters. Weighing would mix held-out samples with others.
     problem, objective = best.problem, replace(best.problem.objective, weighing=None)
     space, tracker = problem.space(), Tracker(objective, deadline)
     block = np.arange(objective.time.size) * BLOCKS // objective.time.size
     of_sample = np.concatenate([block[objective.kept(name)] for name in objective.counted])
-    of_sample = np.append(of_sample, np.full(len(objective.priors), BLOCKS))  # none of a block
+    of_sample = np.append(of_sample, np.full(len(objective.priors), BLOCKS))  # in no block
     start, predicted = space.encode(best.values), np.empty(of_sample.size)
-    for held in range(BLOCKS):
-        rest = of_sample != held
+    for held_out in range(BLOCKS):
+        rest = of_sample != held_out
         functions = squares(tracker, space, rest)
         end = levenberg.descend(*functions, start, space.box, STEPS, enough=ENOUGH)
-        there = objective.residual(space.decode(end.point))
-        predicted[~rest] = there[~rest]
+        predicted[~rest] = objective.residual(space.decode(end.point))[~rest]
     return misfit_of(objective, predicted)
 
 
 @dataclass(eq=False)
 class Tried:
-    """A fitted model: its result, "with" or "without" damping, its best point, and its run time.
+    """A fitted model: its result, "with" or "without" damping, its best point and run time (s).
 
-    `predicted` is the RMS over the range of samples that were held back, None where the time did
-    not allow it; `misfit` that of all samples, not less than the simulation's own error, like the
-    chi-square `chisqr`. `curves` are the residuals of each, and `grams` their JᵀJ, J the derivative
-    by relative changes, (n_curves, k, k).
+    `predicted` is the RMS over range of held-out samples, None if time ran out. `misfit` is that of
+    all samples. `misfit` and `chisqr` are at least those of the simulation's numerical error.
+    `curves` contains the residual of each curve and `grams` (n_curves, k, k) its JᵀJ, with J the
+    derivative by relative changes.
     """
 
     result: Fit
@@ -100,16 +100,16 @@ class Tried:
     predicted: float | None = None
 
     def __post_init__(self) -> None:
-        """Compute all that the comparison needs."""
+        """Compute the quantities of the comparison."""
         best, objective = self.best, self.best.problem.objective
         self.name = rung_name(self.result.model, self.damping, self.result.relaxation)
         self.varied = sum(item.vary for item in self.result.parameters.values())
         self.counted, self.sizes = objective.counted, objective.sizes
-        self.spans = [objective.span(name) for name in self.counted]  # in the unit of the residual
+        self.spans = [objective.span(name) for name in self.counted]  # in units of the residual
         residual = best.residual[: objective.n_data]
         self.curves = list(objective.by_curve(residual).values())
         self.taus = [autocorrelation_time(curve) for curve in self.curves]
-        self.grams = np.array([one.T @ one for one in objective.by_curve(best.scaled).values()])
+        self.grams = np.array([part.T @ part for part in objective.by_curve(best.scaled).values()])
         floor = sum(n * (EXACT * s) ** 2 for n, s in zip(self.sizes, self.spans, strict=True))
         self.chisqr = max(float(residual @ residual), floor)
         self.misfit = max(misfit_of(objective, residual), EXACT)
@@ -119,8 +119,8 @@ class Tried:
             for test in (runs_test, neighbours_test)
         )
         least = min(self.runs_p, self.neighbours_p)
-        self.structureless = self.chisqr <= floor or least >= LEVEL  # only noise is left
-        self.errs = self.chisqr > floor and least < SURE  # an error of the model is left for sure
+        self.structureless = self.chisqr <= floor or least >= LEVEL  # residuals are only noise
+        self.errs = self.chisqr > floor and least < SURE  # residuals contain model error
 
     @property
     def n_eff(self) -> float:
@@ -129,44 +129,45 @@ class Tried:
 
     @property
     def places(self) -> list[NDArray[np.str_]]:
-        """Branches that the springs are on at each counted sample of each curve."""
-        words = branch_of_samples(self.best.problem, self.best.simulated)
-        return [words[self.best.problem.objective.kept(name)] for name in self.counted]
+        """Branches of the springs at each fitted sample of each curve."""
+        branches = branch_of_samples(self.best.problem, self.best.simulated)
+        return [branches[self.best.problem.objective.kept(name)] for name in self.counted]
 
     def states(self, state: str) -> tuple[str, ...]:
-        """Names of the parameters in a state."""
+        """Return the names of the parameters in a state."""
         return tuple(n for n, item in self.result.parameters.items() if item.state == state)
 
 
 @dataclass(frozen=True)
 class Criteria:
-    """Information criteria of a model, all models by one measure of the noise."""
+    """Information criteria of a model, with the same noise for all models."""
 
     rank: int
     aicc: float
     bic: float
 
     def beats(self, other: Criteria) -> bool:
-        """Whether AICc and BIC both speak for this one, strongly."""
+        """Whether AICc and BIC both strongly favour this model."""
         return self.aicc < other.aicc - MARGIN and self.bic < other.bic - MARGIN
 
 
 def reference_of(tried: Sequence[Tried]) -> Tried:
-    """The model of the least chi-square: its residuals are taken for the noise of all.
+    """Return the model of the least χ², whose residuals are taken as the noise of all models.
 
-    As the variance inflation of the global model in QAICc (Burnham & Anderson 2002, Model Selection
-    and Multimodel Inference, section 2.5): what a simpler model leaves over is not noise.
+    This corresponds to the variance inflation of the global model in QAICc (Burnham & Anderson
+    2002, Model Selection and Multimodel Inference, section 2.5): the larger residuals of a simpler
+    model are not noise.
     """
     return min(tried, key=lambda one: one.chisqr)
 
 
 def effective_parameters(grams: Array, reference: Tried) -> int:
-    """How many combinations of its parameters the curves fix against the noise.
+    """Return the number of combinations of parameters that the curves determine.
 
-    The rank of the Jacobian (`grams` as in `Tried`), counted against the residuals of `reference`
-    as noise: a direction counts if its 95 % interval is narrower than a relative change of
-    ±`NOTHING`, the limit at which a parameter is called not determined. Where a linear spring in
-    series only bends the branches of a bistable one, the curves do not depend on such combinations.
+    This is the rank of the Jacobian (`grams` as in `Tried`) with the residuals of `reference` as
+    noise: a direction counts if its 95 % interval is narrower than a relative change of ±`NOTHING`,
+    the limit at which a parameter is called not determined. Where a linear spring in series only
+    bends the branches of a bistable one, the curves do not depend on some combinations.
     """
     information = np.zeros(grams.shape[1:])
     for gram, part, tau in zip(grams, reference.curves, reference.taus, strict=True):
@@ -176,9 +177,8 @@ def effective_parameters(grams: Array, reference: Tried) -> int:
 
 
 def criteria(one: Tried, reference: Tried) -> Criteria:
-    """AICc and BIC of a model: n_eff ln(χ²/n) and the penalty for its effective parameters."""
-    n_eff = reference.n_eff
-    rank = effective_parameters(one.grams, reference)
+    """Return AICc and BIC of a model: n_eff ln(χ²/n) plus a penalty for effective parameters."""
+    n_eff, rank = reference.n_eff, effective_parameters(one.grams, reference)
     fit = n_eff * math.log(max(one.chisqr, 1e-300) / sum(one.sizes))
     freedom = n_eff - rank - 1.0
     aicc = fit + 2.0 * rank + 2.0 * rank * (rank + 1.0) / freedom if freedom > 0.0 else math.inf
@@ -187,20 +187,20 @@ def criteria(one: Tried, reference: Tried) -> Criteria:
 
 @dataclass(frozen=True)
 class Score:
-    """What a comparison by prediction uses: parameters, fitted and predicted misfit."""
+    """Number of parameters, and fitted and predicted misfit, for a comparison by prediction."""
 
     varied: int
     misfit: float
     predicted: float
 
     def beats(self, other: Score) -> bool:
-        """Whether it predicts better, by `SHARE` for each parameter that it has more."""
+        """Whether it predicts better, by `SHARE` for each additional parameter."""
         return self.predicted < other.predicted * (1.0 - SHARE) ** (self.varied - other.varied)
 
     def rules_out(self, other: Score) -> bool:
-        """Whether it has no more parameters and follows the curves better, or much better.
+        """Whether it follows the curves better with fewer parameters, or much better with as many.
 
-        Better is enough for fewer parameters; as many need `WORSE` times better.
+        Much better means a misfit smaller by a factor of `WORSE`.
         """
         factor = 1.0 if self.varied < other.varied else WORSE
         return self.varied <= other.varied and factor * self.misfit < other.misfit
@@ -208,28 +208,26 @@ class Score:
 
 @dataclass(frozen=True)
 class Decision:
-    """Which model is chosen, and what it and the others were compared with."""
+    """Choice of a model, and which other model each was compared with."""
 
     best: int
     criteria: tuple[Criteria, ...]
-    by_prediction: bool  # Else by AICc and BIC
-    # Of each model: the best of those with fewer parameters, None of the first; another that
-    # follows the curves better with no more parameters, if any.
-    before: tuple[int | None, ...]
-    ruled_out_by: tuple[int | None, ...]
+    by_prediction: bool  # otherwise by AICc and BIC
+    before: tuple[int | None, ...]  # best model with fewer parameters; None for the first
+    ruled_out_by: tuple[int | None, ...]  # see `Score.rules_out`; None if not ruled out
 
 
 def scores_of(tried: Sequence[Tried]) -> list[Score]:
-    """Scores of all models; the fitted misfit is that predicted if one has no prediction."""
-    known = all(one.predicted is not None for one in tried)
+    """Return the scores of all models; if any has no prediction, fitted misfits replace all."""
+    complete = all(one.predicted is not None for one in tried)
     return [
-        Score(one.varied, one.misfit, one.predicted if known and one.predicted else one.misfit)
+        Score(one.varied, one.misfit, one.predicted if complete and one.predicted else one.misfit)
         for one in tried
     ]
 
 
 def decide(scores: Sequence[Score], criteria: Sequence[Criteria], by_prediction: bool) -> Decision:
-    """Go through the models from the fewest parameters up; see `choose`."""
+    """Compare the models in the order of their number of parameters; see `choose`."""
     before: list[int | None] = [None] * len(scores)
     rulers = [
         next((j for j, other in enumerate(scores) if j != i and other.rules_out(one)), None)
@@ -248,9 +246,9 @@ def decide(scores: Sequence[Score], criteria: Sequence[Criteria], by_prediction:
 def choose(tried: Sequence[Tried]) -> Decision:
     """Choose the simplest model that no richer one beats.
 
-    AICc and BIC decide where at least one model comes to the noise; else the misfit of samples that
-    were held back decides.
+    AICc and BIC decide if at least one model reaches the noise, otherwise the misfit of held-out
+    samples.
     """
     reference = reference_of(tried)
-    found = [criteria(one, reference) for one in tried]
-    return decide(scores_of(tried), found, all(one.errs for one in tried))
+    by_noise = [criteria(one, reference) for one in tried]
+    return decide(scores_of(tried), by_noise, all(one.errs for one in tried))

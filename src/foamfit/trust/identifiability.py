@@ -1,8 +1,8 @@
-"""What a test says about its parameters: sensitivities, information, directions.
+"""Local identifiability of the parameters: sensitivities, information, directions.
 
-Everything here is local: it holds at one point of the parameters, a start value or the best point.
-Sensitivities are in standard deviations of the noise per relative change of a parameter (over its
-scale, `fitting.box.Scales.of_parameter`), so that parameters and curves can be compared.
+All quantities are evaluated at one point, usually the best one. Sensitivities are in standard
+deviations of the noise per relative change of a parameter (over its scale,
+`fitting.box.Scales.of_parameter`), so that parameters and curves can be compared.
 """
 
 from __future__ import annotations
@@ -24,33 +24,31 @@ from foamfit.trust import say
 if TYPE_CHECKING:
     from foamfit.trust.best_point import BestPoint
 
-# Share of a direction below which a parameter has no part in it, share of the largest part below
-# which it is not named, and how many parameters of a joint change are named at most.
-PART, NAMED, MOST = 0.05, 0.3, 3
-# Times and zeros count from an arbitrary origin: their powers mean nothing.
+PART = 0.05  # smallest component of a direction that counts
+NAMED = 0.3  # smallest component, relative to the largest, that is named in a sentence
+MOST = 3  # largest number of parameters named in a joint change
+# Times and zeros have an arbitrary origin, so that powers of them are meaningless.
 OF_NO_POWER = set(NUISANCE) - {"velocity", "striker_mass"}
 
 
 @dataclass(frozen=True, eq=False)
 class Insight:
-    """Sensitivities of all counted curves to the parameters of which they can tell anything."""
+    """Sensitivities of all fitted curves to the parameters whose branch was reached."""
 
     names: tuple[str, ...]  # (k,): parameters that vary and whose branch was reached
     values: Array  # (k,), SI
-    sizes: Array  # (k,): their scales, SI
-    # A curve and the branches of the springs along a part of it.
-    parts: tuple[tuple[str, str], ...]
-    # (n_parts, k, k): the triangle of a QR factorization of the sensitivities along each part. They
-    # are by how many standard deviations of its noise a curve moves, sample by sample, if a
-    # parameter changes by its scale; their products tell all, and the triangle keeps these.
+    sizes: Array  # (k,): scales of the parameters, SI
+    parts: tuple[tuple[str, str], ...]  # curve, and branches of the springs along a part of it
+    # (n_parts, k, k): triangles R of QR factorizations of the sensitivities along each part; RᵀR
+    # contains all their information.
     triangles: Array
     silent: tuple[str, ...] = ()  # parameters that vary but whose branch was never reached
 
     @cached_property
     def _directions(self) -> tuple[Array, Array]:
-        """Standard errors along the principal directions, (k,), and these as rows, (k, k).
+        """Standard errors along the principal directions (k,), and the directions as rows (k, k).
 
-        The last one is the weakest. The error is infinite where the curves do not move at all.
+        The last direction is the weakest; its error is infinite if the curves do not depend on it.
         """
         k = len(self.names)
         triangle = np.linalg.qr(self.triangles.reshape(-1, k), mode="r")
@@ -61,7 +59,7 @@ class Insight:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance of the relative values, (k, k); NaN for what the curves do not tell."""
+        """Covariance of the relative values, (k, k); NaN for undetermined parameters."""
         errors, vt = self._directions
         seen = np.isfinite(errors)
         out = (vt[seen].T * errors[seen] ** 2) @ vt[seen]
@@ -71,27 +69,28 @@ class Insight:
 
     @property
     def correlation(self) -> Array:
-        """Correlation of the estimates, (k, k); NaN for what the curves do not tell."""
+        """Correlation of the estimates, (k, k); NaN for undetermined parameters."""
         scale = np.sqrt(np.diag(self.covariance))
         return np.asarray(self.covariance / np.outer(scale, scale))
 
     def shares(self) -> Array:
-        """Share (k, n_parts) of each of the `parts` in the information on a parameter.
+        """Return the share (k, n_parts) of each of the `parts` in the information on a parameter.
 
-        The information on a parameter, all others free, is the square of what is left of its column
-        of sensitivities once the other columns are projected out (Frisch and Waugh 1933,
-        Econometrica 1, 387); being a sum over samples it is shared out among them. Each row adds up
-        to one; NaN for a parameter that the curves do not tell.
+        The information on a parameter, with all others free, is the sum of squares of its column of
+        sensitivities after the other columns are projected out (Frisch and Waugh 1933, Econometrica
+        1, 387). As a sum over samples it can be divided among the parts. Each row adds up to one;
+        it is NaN for an undetermined parameter.
         """
         k = len(self.names)
-        own = np.linalg.pinv(self.triangles.reshape(-1, k), rcond=1e-12)  # own parts, rescaled
-        shares = np.sum(own.reshape(k, -1, k) ** 2, axis=2)
+        # The rows of the pseudo-inverse are the projected columns, up to a factor.
+        projected = np.linalg.pinv(self.triangles.reshape(-1, k), rcond=1e-12)
+        shares = np.sum(projected.reshape(k, -1, k) ** 2, axis=2)
         shares[np.isnan(np.diag(self.covariance))] = np.nan
         with np.errstate(invalid="ignore"):
             return np.asarray(shares / shares.sum(axis=1, keepdims=True))
 
     def weakest(self) -> tuple[float, dict[str, float]]:
-        """Relative standard error along the weakest direction, and its parts over the largest."""
+        """Return the error along the weakest direction, and its components over the largest."""
         errors, vt = self._directions
         direction = vt[-1] / vt[-1][np.argmax(np.abs(vt[-1]))]
         order = np.argsort(-np.abs(direction), kind="stable")
@@ -99,7 +98,7 @@ class Insight:
         return float(errors[-1]), named
 
     def sentence(self) -> str:
-        """Say what the test determines least; "" if no parameter is left to speak of."""
+        """Name the least determined direction; "" without parameters."""
         if not self.names:
             return ""
         error, parts = self.weakest()
@@ -112,11 +111,11 @@ class Insight:
         return say("least", "told", names=names, error=error, scale=scale, silent=self.silent)
 
     def combination(self, name: str, loose: float) -> str:
-        """Say what the data fix instead of a parameter; "" if it is loose by itself.
+        """Describe what the data fix instead of a parameter; "" if it is undetermined by itself.
 
-        Directions of a relative standard error above `loose` are taken for free. One combination
-        that is fixed is given as a product of powers, good to first order; else those parameters
-        that compensate a change of it.
+        Directions with a relative standard error above `loose` count as free. A single fixed
+        combination is given as a product of powers, exact to first order; otherwise the parameters
+        that compensate a change are named.
         """
         from scipy.sparse.csgraph import connected_components
 
@@ -142,12 +141,12 @@ class Insight:
         change[me] = 0.0
         order = np.argsort(-np.abs(change), kind="stable")
         parts = [i for i in order if abs(change[i]) > NAMED * abs(change[order[0]])]
-        told = ", ".join(f"{self.names[i]} ({change[i]:+.2g})" for i in parts[:MOST])
+        text = ", ".join(f"{self.names[i]} ({change[i]:+.2g})" for i in parts[:MOST])
         more = f" and {len(parts) - MOST} more" if len(parts) > MOST else ""
-        return say("why", "compensated", names=told.replace("-", "−") + more)
+        return say("why", "compensated", names=text.replace("-", "−") + more)
 
     def companion(self, name: str, least: float = 0.9) -> str:
-        """Name the parameter that one is correlated with; "" if no correlation is that strong."""
+        """Name the most correlated parameter; "" if no correlation reaches `least`."""
         me = self.names.index(name)
         row = np.nan_to_num(self.correlation[me])
         row[me] = 0.0
@@ -158,10 +157,10 @@ class Insight:
 
 
 def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
-    """Gather what a test can tell at a point of the parameters, usually the best one.
+    """Compute the sensitivities at a point of the parameters, usually the best one.
 
-    `noise` is one standard deviation of each counted curve, SI; of noise that is not white, the
-    root of its autocorrelation time larger.
+    `noise` is one standard deviation of each fitted curve, SI, times the root of the
+    autocorrelation time.
     """
     problem, objective, k = best.problem, best.problem.objective, len(best.names)
     labels, at = np.array(sections(problem, best.simulated)), 0
@@ -186,7 +185,7 @@ def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
 
 def _product(names: list[str], powers: Array) -> str:
     """Write Π p_i^e_i with the largest power 1: "s2_k0·s1_k0^0.43/s1_height^0.57"."""
-    order = np.argsort(-np.round(np.abs(powers), 6), kind="stable")  # rounding decides no tie
+    order = np.argsort(-np.round(np.abs(powers), 6), kind="stable")  # make ties reproducible
     powers = powers / powers[order[0]]
     sides: dict[bool, list[str]] = {True: [], False: []}
     for name, power in ((names[i], powers[i]) for i in order):

@@ -1,7 +1,7 @@
-"""The 95 % intervals of a fit: which are made, how, and what is said of them.
+"""The 95 % intervals of a fit: choice of method, computation and warnings.
 
 The local covariance assumes that the cost is a parabola. Where branches a and d are about equally
-stiff it is not: it is flat along ε_a, with several shallow minima. There the cost itself is used.
+stiff it is not: it is flat along ε_a, with several shallow minima. There, profiles are computed.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from foamfit.trust.markov_chain import mcmc, walkers
 from foamfit.trust.profile import BETTER, PLACED, STEPS, Refit, Tracing, departures
 from foamfit.trust.residuals.noise_process import parts
 
-# The default profiles a parameter if the root of the cost departs from a straight line by this
-# share at the end of its local interval.
-BENT = 0.15
 METHODS = ("auto", "local", "profile", "mcmc")
-# Refits of an average profile, for the announcement, and evaluations of a refit; there is a set of
-# slopes to ten of them.
+# "auto" profiles a parameter if the root of the cost departs from a straight line by this share at
+# an end of its local interval.
+BENT = 0.15
+# Assumed number of refits per profile and of evaluations per refit, for the expected run time.
 REFITS, EVALUATIONS = 9, 6.0
-# Samples of a Markov chain that percentiles need; its steps at least and at most.
-ENOUGH_DRAWS, LEAST_DRAWS, MOST_DRAWS = 40, 100, 100_000
-# A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
-# noise makes that much difference in one test of ten thousand, but there are many minima.
+# Smallest number of samples of a Markov chain from which percentiles are computed.
+ENOUGH_DRAWS = 40
+# Limits of the number of steps of a Markov chain.
+LEAST_DRAWS, MOST_DRAWS = 100, 100_000
+# A minimum is hardly worse than the best if the root of its χ² is within this multiple of the 95 %
+# cut. Noise alone exceeds that in one test of ten thousand, but there are many minima.
 HARDLY_WORSE = 2.0
-# A value is far if it lies so many widths of its interval outside of it: one, less rounding.
+# A value is far outside its interval beyond this multiple of the width: one, less rounding.
 FAR = 1.0 - 1e-9
-# Iterations of a refit one width outside of an interval; as many as for a profile where the
-# interval is local though the cost is not a parabola.
+# Iterations of a refit at a value one width outside an interval.
 ITERATIONS = 10
 Announce = Callable[[str], None]
 Minima = Sequence[tuple[Array, Array]]  # points at which descents ended, and their residuals
@@ -50,25 +50,26 @@ Minima = Sequence[tuple[Array, Array]]  # points at which descents ended, and th
 
 @dataclass(frozen=True)
 class Choice:
-    """Which intervals are wanted."""
+    """Requested intervals."""
 
-    method: str = "auto"  # One of `METHODS`; see `foamfit.fit`
-    draws: int = 0  # Steps of the Markov chain
-    seed: int = 0  # Source of all chance
-    ranges: bool = True  # Whether ranges are made where the law has an error
+    method: str = "auto"  # one of `METHODS`; see `foamfit.fit`
+    draws: int = 0  # steps of the Markov chain
+    seed: int = 0  # of the random numbers
+    ranges: bool = True  # whether to compute ranges where there is model error
 
     def __post_init__(self) -> None:
-        """Refuse what is unknown or cannot be done."""
+        """Reject an unknown method, an invalid number of draws and a missing package."""
         if self.method not in METHODS:
             raise InputError(
                 f"intervals '{self.method}' is unknown; it must be one of {', '.join(METHODS)}"
             )
         least = LEAST_DRAWS if self.method == "mcmc" else 0
         if not least <= self.draws <= MOST_DRAWS:
-            wrong = "few" if self.draws < least else "many"
+            few = self.draws < least
+            wrong, limit = ("few", f"least {least}") if few else ("many", f"most {MOST_DRAWS}")
             raise InputError(
                 f"{self.draws} draws are too {wrong} for intervals by {self.method}; "
-                f"it must be at {f'least {least}' if wrong == 'few' else f'most {MOST_DRAWS}'}"
+                f"there must be at {limit}"
             )
         if self.method == "mcmc" and importlib.util.find_spec("emcee") is None:
             raise InputError(
@@ -85,12 +86,12 @@ def assess(
     announce: Announce = lambda _: None,
     ranges: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> Intervals:
-    """Make the intervals that were chosen.
+    """Compute the requested intervals.
 
-    `minima` are points at which the descents of the search ended. It ends at the deadline of what
-    has `searched` with what was done; after `budget` evaluations "auto" begins no further profile,
-    and none of a parameter whose range (`ranges`) is wider than its local interval.
-    `announce` is called with the expected run time before it is spent.
+    `minima` are the points at which the descents of the search ended. At the deadline of the
+    tracker `searched` the computation stops with partial results. "auto" begins no new profile
+    after `budget` evaluations, and none for a parameter whose range (`ranges`) is wider than its
+    local interval. `announce` is called with the expected run time beforehand.
     """
     method, known = choice.method, best.known
     if method == "local":
@@ -109,34 +110,30 @@ def assess(
         return _by_profiles(best, known, minima, tracker, math.inf)
     others = [(point, tracker.consider(point)) for point in minima]
     far = np.abs(departures(best)).max(axis=1, initial=0.0)
-    for point, residual in others:  # one within the cut, outside of the local interval
+    for point, residual in others:  # a minimum within the cut but outside the local interval
         apart = np.abs(point - best.values)[best.places] / best.spread.stderr
         far[(best.rises(residual) < best.quantiles**2) & (apart > best.quantiles)] = np.inf
     order = sorted(known, key=lambda name: -far[best.names.index(name)])
     bent = [name for name in order if far[best.names.index(name)] > BENT]
-    within = [name for name in bent if _is_wider(best, name, ranges.get(name))]
-    made = _by_profiles(best, [n for n in bent if n not in within], minima, tracker, budget)
-    made = _with_minima(best, replace(made, doubtful=(*made.doubtful, *within)), others)
+    # Where the range is wider, model error outweighs noise, and a local interval is enough.
+    halves = dict(zip(best.names, best.halves, strict=True))
+    local = [n for n in bent if n in ranges and np.ptp(ranges[n]) > 2.0 * halves[n]]
+    made = _by_profiles(best, [n for n in bent if n not in local], minima, tracker, budget)
+    made = _with_minima(best, replace(made, doubtful=(*made.doubtful, *local)), others)
     return made if best.misfits or made.better is not None else _with_far(best, made, tracker)
 
 
-def _is_wider(best: BestPoint, name: str, span: tuple[float, float] | None) -> bool:
-    """Whether a range is wider than the local interval: the error of the law counts, not noise."""
-    half = float(best.halves[best.names.index(name)])
-    return span is not None and span[1] - span[0] > 2.0 * half
-
-
 def evaluations_of(best: BestPoint, choice: Choice) -> float:
-    """Evaluations that intervals which were asked for are expected to take; 0 by default."""
+    """Return the expected number of evaluations for profiles or MCMC; 0 for other methods."""
     if choice.method == "mcmc":
         return float((choice.draws + 1) * walkers(best))
     return EVALUATIONS * REFITS * len(best.known) if choice.method == "profile" else 0.0
 
 
 def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
-    """Intervals that hold the other minima which other noise could have made the best.
+    """Extend the intervals to other minima that different noise could have made the best.
 
-    A value much farther off, at a minimum that is hardly worse than the best, is named beside them.
+    Values far outside their intervals, at minima hardly worse than the best, go to `elsewhere`.
     """
     ends, methods = dict(made.ends), dict(made.methods)
     intervals = {name: _interval(best, made, name) for name in best.known}
@@ -144,8 +141,8 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
         halves = _halves(best, point, residual)
         for name, (low, high) in intervals.items():
             if math.isfinite(half := float(halves[best.names.index(name)])):
-                there = float(point[best.index[name]])
-                wider = min(low, there - half), max(high, there + half)
+                value = float(point[best.index[name]])
+                wider = min(low, value - half), max(high, value + half)
                 if wider[1] - wider[0] > (1.0 + PLACED) * (high - low):
                     intervals[name] = ends[name] = wider
                     methods[name] = "other minima"
@@ -156,7 +153,7 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
 
 
 def _interval(best: BestPoint, made: Intervals, name: str) -> tuple[float, float]:
-    """The interval of a parameter, the local one where no other was made."""
+    """Return the interval of a parameter, by default the local one."""
     value, half = float(best.values[best.index[name]]), best.halves[best.names.index(name)]
     return made.ends.get(name, (value - half, value + half))
 
@@ -164,21 +161,21 @@ def _interval(best: BestPoint, made: Intervals, name: str) -> tuple[float, float
 def _far_values(
     best: BestPoint, made: Intervals, point: Array, residual: Array
 ) -> dict[str, float]:
-    """Return the values of a point that are far outside of their intervals, if it fits well."""
+    """Return the values of a point far outside their intervals, if it is hardly worse."""
     near, far = best.rises(residual) <= (HARDLY_WORSE * best.quantiles) ** 2, dict[str, float]()
     for name in best.known:
-        there, (low, high) = float(point[best.index[name]]), _interval(best, made, name)
-        outside = max(low - there, there - high)
+        value, (low, high) = float(point[best.index[name]]), _interval(best, made, name)
+        outside = max(low - value, value - high)
         if near[best.names.index(name)] and outside > FAR * (high - low):
-            far[name] = there
+            far[name] = value
     return far
 
 
 def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
-    """Name values a whole width outside of an interval at which the curves fit hardly worse.
+    """Find values one width outside an interval at which a refit is hardly worse.
 
-    There a parabola has nine times the cut of the interval. The other parameters are refitted;
-    those that the refit moves as far outside of their own intervals are named too.
+    On a parabola, χ² there is nine times the cut. Other parameters that the refit moves as far
+    outside their own intervals are included.
     """
     refit, elsewhere = Refit(best, tracker), dict(made.elsewhere)
     try:
@@ -188,12 +185,13 @@ def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
             if name in NUISANCE or high - low > 2.0 * WEAK * best.sizes[column]:
                 continue
             least, most = best.limits(name)
+            # A local interval of a cost that is not a parabola needs as many as a profile.
             iterations = STEPS if name in made.doubtful else ITERATIONS
-            for there in (2.0 * low - high, 2.0 * high - low):
-                if name in elsewhere or not least <= there <= most:
+            for outside in (2.0 * low - high, 2.0 * high - low):
+                if name in elsewhere or not least <= outside <= most:
                     continue
-                start = refit.along(column, there - value)
-                found = refit.run(start, (column, there), iterations=iterations)
+                start = refit.along(column, outside - value)
+                found = refit.run(start, (column, outside), iterations=iterations)
                 if found is None:
                     continue
                 if best.rises(found.residual)[column] < -BETTER * best.quantiles[column] ** 2:
@@ -206,11 +204,11 @@ def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
 
 
 def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
-    """Half widths of the intervals at another minimum, (k,); NaN if noise cannot make it the best.
+    """Return half widths at another minimum, (k,); NaN if noise cannot make it the best.
 
-    The cost is taken for a parabola about that minimum too. Beside an error of the law two minima
-    differ by more than noise: of the difference of their costs the noise e makes 2 eᵀd, with d the
-    difference of their residuals.
+    The cost is assumed to be a parabola about that minimum too. With model error the minima are
+    compared by the effect of noise e on the difference of their costs, 2 eᵀd, with d the difference
+    of their residuals.
     """
     if best.misfits:
         apart, objective = (residual - best.residual)[:, None], best.problem.objective
@@ -222,25 +220,25 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     left = 1.0 - best.rises(residual) / best.quantiles**2
     if not np.any(left > 0.0):
         return np.full(left.shape, np.nan)
-    there = BestPoint(best.problem, point, best.names)
+    other = BestPoint(best.problem, point, best.names)
     with np.errstate(invalid="ignore"):
-        return np.where(left > 0.0, there.halves * np.sqrt(left), np.nan)
+        return np.where(left > 0.0, other.halves * np.sqrt(left), np.nan)
 
 
 def _by_profiles(
     best: BestPoint, names: Sequence[str], minima: Sequence[Array], tracker: Tracker, budget: float
 ) -> Intervals:
-    """Profiles of some parameters, until they are done, a better point is met or all ends.
+    """Profile some parameters, until all are done, a better point is found or time is up.
 
-    The intervals of all parameters must hold a point within the cut that the profile of one has
-    met: each profile goes on beyond what the others have met, and a parameter that these put
-    outside of its local interval is profiled as well.
+    A point within the cut that one profile has met must be in the intervals of all parameters:
+    each profile goes on beyond the points of the others, and a parameter for which one of these is
+    outside its local interval is profiled too.
     """
     allowed = tracker.objective.evaluations + budget
     tracings: dict[str, Tracing] = {}
     wanted, better = list(names), None
     for name in (*names, *best.known):
-        met = _met(best, name, [one for other, one in tracings.items() if other != name])
+        met = _met(best, name, [tracing for key, tracing in tracings.items() if key != name])
         if name not in wanted:
             at, half = best.index[name], best.halves[best.names.index(name)] * (1.0 + PLACED)
             if not any(abs(point[at] - best.values[at]) > half for point in met):
@@ -265,19 +263,20 @@ def _by_profiles(
 
 
 def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]:
-    """Lowest and highest of a parameter among the points within its cut that profiles have met."""
+    """Return the points within its cut, met by profiles, with a parameter's extreme values."""
     column, at = best.names.index(name), best.index[name]
     highest = best.quantiles[column] ** 2 * best.spread.inflation[column]
-    refits = [one for tracing in tracings for one in tracing.refits]
-    points = [one.point for one in refits if one.cost - best.cost < highest]
+    refits = [refit for tracing in tracings for refit in tracing.refits]
+    points = [refit.point for refit in refits if refit.cost - best.cost < highest]
     points.sort(key=lambda point: float(point[at]))
     return [points[0], points[-1]] if points else []
 
 
 def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
-    """Intervals between the 2.5th and the 97.5th percentile of a Markov chain.
+    """Return intervals between the 2.5th and 97.5th percentiles of a Markov chain.
 
-    What is said of it is a warning if it is too short or was stopped; too few samples give none.
+    A chain that is too short or was stopped gives a warning; with too few samples there are no
+    intervals.
     """
     chain = mcmc(best, choice.draws, choice.seed, tracker)
     few = len(chain.samples) < ENOUGH_DRAWS
@@ -299,7 +298,7 @@ def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
 
 
 def _seconds(best: BestPoint, evaluations: float) -> float:
-    """Expected run time of refits, s, from ten evaluations and one set of slopes."""
+    """Return the expected run time (s), from ten evaluations and one set of slopes."""
     began = time.perf_counter()
     for _ in range(10):
         best.problem.objective.residual(best.values)

@@ -1,4 +1,4 @@
-"""Markov chains of the parameters, which are made only on demand."""
+"""Markov chains of the parameters, computed only on request."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import Refit
 
-# Farthest that a walker of a Markov chain begins from the best point along a direction that the
-# test does not fix, over the scales of the parameters.
+# Largest start distance of a walker from the best point along an undetermined direction, over the
+# scales of the parameters.
 FARTHEST = 0.1
 
 
@@ -25,38 +25,38 @@ class MarkovChain:
 
     samples: Array  # (m, k): draws after the burn-in, all walkers, SI
     steps: int  # of each walker
-    burn_in: int  # the first of them, which were left out
+    burn_in: int  # number of first steps discarded
     walkers: int
     autocorrelation: float  # integrated autocorrelation time of the slowest parameter, steps
-    stopped: str | None = None  # what ended it before its steps were done
+    stopped: str | None = None  # what ended it early
 
     @property
     def converged(self) -> bool:
-        """Whether the chain is longer than fifty autocorrelation times, as emcee asks for."""
+        """Whether the chain has at least fifty autocorrelation times, as emcee recommends."""
         return self.times >= 50.0
 
     @property
     def times(self) -> float:
-        """Length of the chain over its autocorrelation time."""
+        """Length of the chain in autocorrelation times."""
         return (self.steps - self.burn_in) / self.autocorrelation
 
     def sentence(self, lost: Sequence[str] = (), few: bool = False) -> str:
-        """What the autocorrelation says of the chain; of what is `lost` there are no intervals."""
+        """Describe length and convergence; `lost` parameters have no intervals."""
         return say("interval", "chain", chain=self, lost=lost, few=few)
 
 
 def walkers(best: BestPoint) -> int:
-    """Number of walkers of a chain."""
+    """Return the number of walkers of a chain."""
     return 2 * len(best.names) + 4
 
 
 def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None) -> MarkovChain:
-    """Sample the posterior by emcee's affine-invariant ensemble (Foreman-Mackey et al. 2013).
+    """Sample the posterior with emcee's affine-invariant ensemble (Foreman-Mackey et al. 2013).
 
-    Flat priors within the limits; the likelihood counts n/τ samples of each curve: its sum of
-    squares over the variance of its noise is divided by τ. What the test does not determine is
-    sampled too and runs over its limits, so that the others are those whatever its value is. The
-    first fifth of the steps of each walker is left out.
+    Priors are flat within the limits. The likelihood uses n/τ effective samples of each curve: its
+    sum of squares over the variance of its noise is divided by τ. Undetermined parameters are
+    sampled between their limits too, so that the others are marginalised over them. The first fifth
+    of the steps of each walker is discarded.
     """
     import emcee
 
@@ -76,12 +76,12 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
 
     count, k = walkers(best), len(best.names)
     sampler = emcee.EnsembleSampler(count, k, log_probability)
-    # Not through emcee's wrapper, which prints a traceback of whatever ends the chain.
+    # Bypass emcee's wrapper, which prints a traceback for any exception that ends the chain.
     sampler.log_prob_fn = log_probability
-    bits = np.random.MT19937(np.random.SeedSequence([seed, 3]))  # of a seed of any size
+    bits = np.random.MT19937(np.random.SeedSequence([seed, 3]))  # accepts a seed of any size
     sampler.random_state = np.random.RandomState(bits).get_state()
-    # Walkers begin half a standard error off the best point along what the test fixes, no more than
-    # `FARTHEST` along the rest.
+    # Walkers start half a standard error from the best point along determined directions, and at
+    # most `FARTHEST` along the others.
     _, singular, axes = np.linalg.svd(best.scaled, full_matrices=False)
     reach = 0.5 * math.sqrt(max(variances)) / np.maximum(singular, 1e-300)
     away = np.random.default_rng([seed, 2]).standard_normal((count, singular.size))
@@ -90,19 +90,19 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     steps_done: list[Array] = []  # emcee would allocate all of them at once
     stopped = None
     try:
-        with np.errstate(invalid="ignore"):  # of walkers at which nothing can be simulated
+        with np.errstate(invalid="ignore"):  # walkers whose simulation fails
             for state in sampler.sample(
                 begin, iterations=steps, skip_initial_state_check=True, store=False
             ):
                 if not np.isfinite(state.log_prob).any():
-                    stopped = "the best point, next to which nothing can be simulated"
+                    stopped = "failures: nothing can be simulated near the best point"
                     break
                 steps_done.append(state.coords.copy())
     except STOPPING as error:
         stopped = what_stopped(error)
     done = len(steps_done)
     chain = np.array(steps_done[done // 5 :]).reshape(-1, count, k)
-    with np.errstate(invalid="ignore", divide="ignore"):  # of a walker that never moved
+    with np.errstate(invalid="ignore", divide="ignore"):  # a walker that never moved
         times = emcee.autocorr.integrated_time(chain, tol=0, quiet=True) if done > 10 else [np.inf]
     slowest = float(np.max(np.nan_to_num(times, nan=np.inf)))
     return MarkovChain(chain.reshape(-1, k) * best.sizes, done, done // 5, count, slowest, stopped)

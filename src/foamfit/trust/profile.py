@@ -1,7 +1,7 @@
-"""Least squares close to the best point, and profiles: the least cost with one parameter held.
+"""Least squares near the best point, and profiles: the least cost at fixed values of a parameter.
 
-A rise of the cost is compared with what the noise would make of it, correlated as it is
-(`Covariance.inflation`), so that on a parabola profile and local interval are the same.
+A rise of the cost is divided by `Covariance.inflation`, which accounts for correlated noise. If the
+cost is a parabola, profile and local interval are therefore the same.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ from foamfit.fitting.search import STOPPING, Tracker, what_stopped
 from foamfit.results import Profile
 from foamfit.trust.best_point import BestPoint
 
-# A refit ends where the expected gain of the cost is below this share of the 95 % cut, or after so
-# many steps. Refits that end earlier depend on where they began, and so on rounding.
-ENOUGH, STEPS = 1e-6, 40
-# A profile is followed until its χ² is this many times that of the 95 % cut: small barriers
-# between shallow minima are crossed.
+# A refit ends if the expected gain of the cost is below this share of the 95 % cut; with a coarser
+# limit its end would depend on the start, and so on rounding.
+ENOUGH = 1e-6
+STEPS = 40  # largest number of steps of a refit
+# A profile is followed until its χ² is this multiple of the 95 % cut, to cross small barriers
+# between shallow minima.
 BEYOND = 2.0
-# Refits of one side of a profile: to get beyond the cut, and to place it.
+# Largest number of refits on one side of a profile: outward until beyond the cut, and to place it.
 OUTWARD, INWARD = 14, 6
-# The cut is placed to this share of the root of its χ².
+# The root of χ² at a crossing differs from the root of the cut by at most this share.
 PLACED = 0.02
-# Two values are nearly the same if they differ by this share of their distance from the best.
+# Two values are nearly the same if they differ by this share of their distance from the best one.
 NEARLY = 0.01
 # A profile that falls below the best point by this share of the cut has found a better minimum.
 BETTER = 0.01
@@ -37,45 +38,41 @@ BETTER = 0.01
 
 @dataclass(eq=False)
 class Refit:
-    """Least squares close to the best point."""
+    """Least squares near the best point."""
 
     best: BestPoint
-    tracker: Tracker  # Simulates, counts and ends all at its deadline
+    tracker: Tracker  # simulates, counts evaluations and raises at the deadline
 
     def __post_init__(self) -> None:
-        """Find the box of the parameters and the gain at which a refit ends."""
+        """Set the space of the parameters and the gain at which a refit ends."""
         best = self.best
         self.space = best.problem.space()
-        cuts = best.quantiles**2 * best.spread.inflation  # NaN where the test says nothing
+        cuts = best.quantiles**2 * best.spread.inflation  # NaN for undetermined parameters
         self.enough = ENOUGH * float(min(cuts[np.isfinite(cuts)], default=1.0))
 
-    def start(self) -> Iterate:
-        """The best point itself."""
-        return Iterate(self.best.values, self.best.residual, self.best.scaled)
-
     def residual(self, point: Array) -> Array | None:
-        """Residual of a point that can be simulated, else None."""
+        """Return the residual of a point; None if the simulation fails."""
         objective = self.tracker.objective
         failures, residual = objective.failures, self.tracker.residual(point)
         return residual if objective.failures == failures else None
 
     def rise(self, point: Array) -> float:
-        """Rise of the cost from the best point; infinite where nothing can be simulated."""
+        """Return the rise of the cost from the best point; infinite if the simulation fails."""
         residual = self.residual(point)
         return np.inf if residual is None else float(residual @ residual) - self.best.cost
 
     def point(self, scaled: Array, box: Array) -> Array:
-        """Vector of all parameters from the scaled ones, moved between these limits (SI)."""
+        """Return all parameters from the scaled ones, clipped to the limits `box` (SI)."""
         point = self.best.values.copy()
         point[self.best.places] = np.clip(scaled * self.best.sizes, *box)
         return self.space.admit(point, self.best.places[box[0] == box[1]])
 
     def moved(self, at: Array, step: Array) -> Array:
-        """Point that is off another by a scaled step, within the limits."""
+        """Return a point moved by a scaled step, clipped to the limits."""
         return self.point(at[self.best.places] / self.best.sizes + step, self.best.box)
 
     def along(self, column: int, shift: float) -> Array:
-        """Point with one parameter moved (SI), the others following their correlation."""
+        """Return the best point with a parameter shifted (SI) and the others by correlation."""
         covariance = self.best.spread.matrix[:, column]
         along = np.nan_to_num(covariance / covariance[column]) / self.best.sizes
         return self.moved(self.best.values, shift * along)
@@ -88,7 +85,7 @@ class Refit:
         weights: Array | float = 1.0,
         iterations: int = STEPS,
     ) -> Iterate | None:
-        """Descend from a point, one parameter (its column) held at a value or none.
+        """Descend from a point; `hold` is the column and the value of a fixed parameter, if any.
 
         `weights` (n_data,) multiply the squares. Returns None if the start cannot be simulated.
         """
@@ -117,7 +114,7 @@ class Refit:
 
 
 class _Side:
-    """One side of a profile, down (-1) or up (+1): refits from the best point outward."""
+    """One side of a profile, below (-1) or above (+1): refits from the best point outward."""
 
     def __init__(self, refit: Refit, name: str, sign: float) -> None:
         best = refit.best
@@ -125,29 +122,29 @@ class _Side:
         self.column = best.names.index(name)
         self.quantile, self.half = float(best.quantiles[self.column]), best.halves[self.column]
         self.limit = best.limits(name)[0 if sign < 0 else 1]
-        self.refits = [refit.start()]
+        self.refits = [Iterate(best.values, best.residual, best.scaled)]
 
     def value(self, at: Iterate) -> float:
-        """Where the parameter was held."""
+        """Return the fixed value of the parameter."""
         return float(at.point[self.place])
 
     def rise(self, at: Iterate) -> float:
-        """Rise of the cost as a χ²."""
+        """Return the rise of the cost as a χ²."""
         best = self.refit.best
         return (at.cost - best.cost) / float(best.spread.inflation[self.column])
 
     def root(self, at: Iterate) -> float:
-        """Root of the rise, straight along a parabola."""
+        """Return the root of the rise, which is linear along a parabola."""
         return math.sqrt(max(self.rise(at), 0.0))
 
     @property
     def better(self) -> bool:
-        """Whether a better point than the best was met."""
+        """Whether a point of clearly lower cost than the best one was found."""
         return min(map(self.rise, self.refits)) < -BETTER * self.quantile**2
 
     @property
     def bracket(self) -> tuple[Iterate, Iterate | None]:
-        """The outermost refit below the cut, and the next one; none if the profile is open."""
+        """The outermost refit below the cut, and the next one; None if the profile is open."""
         last = max(i for i, at in enumerate(self.refits) if self.root(at) < self.quantile)
         return self.refits[last], self.refits[last + 1] if last + 1 < len(self.refits) else None
 
@@ -158,7 +155,7 @@ class _Side:
 
     @property
     def bound(self) -> float:
-        """Where the root of the rise crosses that of the cut; where it never does, the limit."""
+        """Value at which the root of the rise crosses that of the cut, or else the limit."""
         inner, outer = self.bracket
         if outer is None:
             return self.limit
@@ -166,9 +163,9 @@ class _Side:
         return self.value(inner) + share * (self.value(outer) - self.value(inner))
 
     def follow(self, minima: Sequence[Array]) -> None:
-        """Go outward until well beyond the cut and place the crossing; go on beyond the minima.
+        """Go outward until well beyond the cut, place the crossing, and go on beyond the minima.
 
-        What was followed before is not followed again.
+        A second call continues from the refits of the first.
         """
         if len(self.refits) == 1:
             self._outward()
@@ -184,20 +181,20 @@ class _Side:
                 continue
             met.append(found)
             if self.rise(found) < self.quantile**2:
-                # Refits farther out are of another minimum, or have stalled.
+                # Refits farther out belong to another minimum or have stalled.
                 inside = [at for at in self.refits if self.sign * (self.value(at) - value) < 0.0]
                 self.refits = [*inside, found]
                 self._outward()
 
     def _known(self, point: Array, value: float, met: Sequence[Iterate]) -> bool:
-        """Whether refits met a lower cost at nearly this value already: many descents end alike."""
+        """Whether an earlier refit has a lower cost at nearly this value; many descents agree."""
         start = self.value(self.refits[0])
         near = [at for at in met if abs(self.value(at) - value) < NEARLY * abs(value - start)]
         least = min((at.cost for at in near), default=0.0)
         return bool(near) and self.refit.rise(point) >= least - self.refit.best.cost
 
     def _outward(self) -> None:
-        """Go on from the outermost refit until well beyond the cut, and place its crossing."""
+        """Go on from the outermost refit until well beyond the cut, and place the crossing."""
         step, refused = 0.5 * self.half, 0
         for _ in range(OUTWARD):
             last = self.refits[-1]
@@ -226,9 +223,9 @@ class _Side:
             self.refits.sort(key=lambda at: self.sign * self.value(at))
 
     def _hold(self, value: float, near: Iterate) -> Iterate | None:
-        """Refit with the parameter held, starting from a refit near by; None if nothing is found.
+        """Refit at a fixed value, starting from a nearby refit; None if the start fails.
 
-        The others follow as far as that lowers the cost.
+        At the start the other parameters follow if that lowers the cost.
         """
         shift = np.zeros(len(self.refit.best.names))
         shift[self.column] = (value - self.value(near)) / self.refit.best.sizes[self.column]
@@ -244,14 +241,14 @@ class _Side:
 
 
 class Tracing:
-    """A profile that is being followed; a side that was not begun ends at the best point.
+    """A profile in progress; a side not yet begun ends at the best point.
 
-    The adjusted likelihood ratio: the rise of the cost over `Covariance.inflation` is χ² with one
-    degree of freedom also where the noise is correlated (Chandler & Bate 2007, Biometrika 94, 167).
+    It uses the adjusted likelihood ratio: the rise of the cost over `Covariance.inflation` is a χ²
+    of one degree of freedom even if noise is correlated (Chandler & Bate 2007, Biometrika 94, 167).
     """
 
     def __init__(self, best: BestPoint, name: str, tracker: Tracker) -> None:
-        """Begin at the best point."""
+        """Start at the best point."""
         refit = Refit(best, tracker)
         self.name, self.sides = name, [_Side(refit, name, sign) for sign in (-1.0, 1.0)]
         self.stopped: str | None = None
@@ -260,9 +257,9 @@ class Tracing:
     def follow(self, minima: Sequence[Array] = ()) -> None:
         """Follow the least cost to both sides, past the 95 % cut.
 
-        `minima` are other points at which descents ended: it goes on beyond them where they are
-        within the cut, whatever barrier lies between. It is incomplete if the deadline or Ctrl-C
-        ended it: `ci95` is then that of what was done.
+        `minima` are other points at which descents ended. The profile goes on beyond those within
+        the cut, whatever barrier lies between. If the deadline or Ctrl-C ends it early, it is
+        incomplete and `ci95` covers only the part computed so far.
         """
         low, high = self.sides
         try:
@@ -279,13 +276,13 @@ class Tracing:
 
     @property
     def better(self) -> Array | None:
-        """A point that is better than the best."""
+        """A point of clearly lower cost than the best one, if there is one."""
         least = min(self.refits, key=lambda at: at.cost)
         return least.point if any(side.better for side in self.sides) else None
 
     @property
     def profile(self) -> Profile:
-        """What was found so far."""
+        """The profile so far."""
         (low, high), refits = self.sides, self.refits
         return Profile(
             name=self.name,
@@ -301,18 +298,18 @@ class Tracing:
 
 
 def departures(best: BestPoint) -> Array:
-    """How far the cost is from a parabola at either end of each local interval, (k, 2).
+    """Return the departure of the cost from a parabola at both ends of each interval, (k, 2).
 
-    The parameter is put at the end of its interval (nearer if nothing can be simulated there), the
-    others follow their correlation, and what they could still gain is read off the local slopes.
-    Given is the root of the rise over what a parabola has, less one; zero where a limit is next to
-    the best point, infinite where nothing can be simulated.
+    A parameter is moved to an end of its local interval (less if the simulation fails there), the
+    others follow their correlation, and one linear step of these, with the local slopes, completes
+    the refit. The departure is the root of the rise over that of a parabola, less 1; it is zero if
+    a limit is close to the best point, infinite if the simulation fails.
     """
     refit, k = Refit(best, Tracker(best.problem.objective)), len(best.names)
     out, normal = np.zeros((k, 2)), best.scaled.T @ best.scaled
 
     def least(residual: Array, others: NDArray[np.intp]) -> float:
-        """Sum of squares after one linear step of the other parameters."""
+        """Return the sum of squares after one linear step of the other parameters."""
         inverse = np.linalg.pinv(normal[np.ix_(others, others)], rcond=1e-10, hermitian=True)
         slope = best.scaled[:, others].T @ residual
         return float(residual @ residual - slope @ inverse @ slope)

@@ -1,8 +1,8 @@
-"""What the error of a law leaves open: parameters that follow the curves about as well.
+"""Ranges of the parameters due to model error: values that fit almost equally well.
 
-Where a law misses part of the curves, its best point depends on the weights of the samples, the
-window of time that is fitted and on the minimum of the cost that is found. The range of a
-parameter is the hull of its values over such descriptions.
+With model error, the best point depends on the weights of the samples, on the fitted time window
+and on the minimum that the search finds. The range of a parameter is the hull of its values over
+such points.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import BETTER, ENOUGH, Refit
 from foamfit.trust.residuals.law_error import CurveError
 
-# A description follows the curves about as well if the RMS of what it misses of them, the noise
-# taken off, is larger by this factor at most.
+# A point fits almost equally well if its RMS model error is larger by at most this factor.
 ALIKE = 1.2
-# Weight of some samples over that of the others, and windows that are left out in turn.
-HEAVIER, WINDOWS = 4.0, 3
-# Iterations of a refit, and trials to find one that follows the curves about as well.
-ITERATIONS, TRIALS = 6, 4
-# Iterations of a descent to another minimum.
-DESCENT = 15
+# Weight of emphasised samples relative to the others.
+HEAVIER = 4.0
+# Number of time windows that are de-emphasised in turn.
+WINDOWS = 3
+ITERATIONS = 6  # of a refit
+TRIALS = 4  # refits until one fits almost equally well
+DESCENT = 15  # iterations of a descent to another minimum
 
 
 def tolerance(best: BestPoint, errors: Sequence[CurveError] | None = None) -> float:
-    """Rise of the cost up to which a description follows the curves about as well."""
-    found, sizes = best.errors if errors is None else errors, best.problem.objective.sizes
-    missed = sum(n * error.law**2 for error, n in zip(found, sizes, strict=True))
+    """Return the largest rise of the cost of a point that fits almost equally well."""
+    errors, sizes = best.errors if errors is None else errors, best.problem.objective.sizes
+    missed = sum(n * error.law**2 for error, n in zip(errors, sizes, strict=True))
     return (ALIKE**2 - 1.0) * missed
 
 
 def alike(
     best: BestPoint, minima: Sequence[Array], tracker: Tracker, budget: float = math.inf
 ) -> list[Array]:
-    """Descriptions that follow the curves about as well as the best point, which is the first.
+    """Return points that fit almost as well as the best point, which is the first of them.
 
-    Ends of the search's descents (`minima`); refits with each parameter held as far off as it can
-    be, starting from where it would be if the law were linear; and refits with other weights of the
-    samples, moved back towards the best point where they miss too much. After `budget` evaluations
-    no further refit is begun.
+    They are the ends of the search's descents (`minima`); refits with each parameter fixed as far
+    from the best point as possible, starting from the linear prediction; and refits with other
+    weights of the samples, moved back towards the best point if they fit worse. After `budget`
+    evaluations no further refit is begun.
     """
     most, refit = tolerance(best), Refit(best, tracker)
     refit.enough, allowed = 0.01 * most, tracker.objective.evaluations + budget
@@ -63,11 +63,11 @@ def alike(
 
 @dataclass(frozen=True, eq=False)
 class Open:
-    """What the error of a law leaves open: nothing where only noise is left of the curves."""
+    """Ranges due to model error, and points found on the way; empty if there is only noise."""
 
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)  # of each parameter
-    minima: tuple[Array, ...] = ()  # to which descriptions that follow the curves descend
-    better: Array | None = None  # a point of lower cost: the fit should go on from there
+    minima: tuple[Array, ...] = ()  # to which points that fit almost equally well descend
+    better: Array | None = None  # a point of lower cost from which the fit should continue
 
 
 def left_open(
@@ -77,9 +77,9 @@ def left_open(
     budget: float = math.inf,
     descents: bool = True,
 ) -> Open:
-    """Ranges of the parameters, and minima near by that the search has not found; see `alike`.
+    """Find the ranges of the parameters, and nearby minima that the search missed; see `alike`.
 
-    Without `descents`, a half to two thirds of the work, such minima are not looked for.
+    Without `descents`, which are half to two thirds of the work, these minima are not computed.
     """
     if not best.misfits:
         return Open()
@@ -91,20 +91,21 @@ def left_open(
         if new and tracker.objective.evaluations < allowed:
             found = refit.run(point, iterations=DESCENT)
             further += [] if found is None else [found.point]
-    values = np.array(points)[:, best.places] + 0.0  # no -0
+    values = np.array(points)[:, best.places] + 0.0  # turns -0 into 0
     ends = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
-    lower = best.cost - tracker.best_cost > refit.enough / ENOUGH * BETTER  # of a cut
+    cut = refit.enough / ENOUGH
+    lower = best.cost - tracker.best_cost > BETTER * cut
     better = tracker.best_values if lower else None
     return Open(dict(zip(best.names, ends, strict=True)), tuple(further), better)
 
 
 def _weights(best: BestPoint) -> Iterator[Array]:
-    """Weights of the counted samples: loading, unloading, low or high stress heavier; windows."""
+    """Yield weights that emphasise loading, unloading, low or high stress, or some windows."""
     objective = best.problem.objective
-    stress, number = objective.stress, np.arange(objective.time.size)
-    loading, low = number <= int(np.argmax(stress)), stress < 0.5 * float(np.max(stress))
+    stress, sample = objective.stress, np.arange(objective.time.size)
+    loading, low = sample <= int(np.argmax(stress)), stress < 0.5 * float(np.max(stress))
     heavy = [loading, ~loading, low, ~low]
-    heavy += [number * WINDOWS // stress.size != window for window in range(WINDOWS)]
+    heavy += [sample * WINDOWS // stress.size != window for window in range(WINDOWS)]
     for samples in heavy:
         kept = [samples[objective.kept(name)] for name in objective.counted]
         priors = np.zeros(len(objective.priors), dtype=bool)
@@ -112,40 +113,40 @@ def _weights(best: BestPoint) -> Iterator[Array]:
 
 
 def _towards(refit: Refit, weights: Array, most: float) -> list[Array]:
-    """Refit with other weights, moved towards the best point until it follows the curves."""
+    """Refit with other weights, then move towards the best point until the rise is small enough."""
     best, share = refit.best, 1.0
     found = refit.run(best.values, weights=weights, iterations=ITERATIONS)
     assert found is not None  # the best point can be simulated
     step = (found.point - best.values)[best.places] / best.sizes
     for _ in range(TRIALS):
         point = refit.moved(best.values, share * step)
-        missed = refit.rise(point)
-        if missed <= most:
+        rise = refit.rise(point)
+        if rise <= most:
             return [point]
-        share *= nearer(most, missed, 0.9)
+        share *= nearer(most, rise, 0.9)
     return []
 
 
 def _held(
     refit: Refit, column: int, sign: float, limit: float, along: Array, most: float
 ) -> list[Array]:
-    """Refit with one parameter held as far off as the curves are followed about as well."""
+    """Refit with one parameter fixed as far from its best value as the rise `most` allows."""
     best = refit.best
     size, value = best.sizes[column], best.values[best.places[column]]
     if not along[column] > 0.0:
         return []
-    off = min(math.sqrt(most * along[column]), abs(limit - value) / size)
-    for _ in range(TRIALS if off > 0.0 else 0):
-        point = refit.moved(best.values, sign * off * along / along[column])
-        hold = (column, value + sign * off * size)
+    shift = min(math.sqrt(most * along[column]), abs(limit - value) / size)
+    for _ in range(TRIALS if shift > 0.0 else 0):
+        point = refit.moved(best.values, sign * shift * along / along[column])
+        hold = (column, value + sign * shift * size)
         found = refit.run(point, hold, iterations=ITERATIONS)
-        missed = math.inf if found is None else found.cost - best.cost
-        if found is not None and missed <= most:
+        rise = math.inf if found is None else found.cost - best.cost
+        if found is not None and rise <= most:
             return [found.point]
-        off *= nearer(most, missed, 0.8)
+        shift *= nearer(most, rise, 0.8)
     return []
 
 
-def nearer(most: float, missed: float, largest: float) -> float:
-    """Factor of a step whose rise was too large; the rise is about the square of the step."""
-    return min(max(math.sqrt(most / missed), 0.3), largest) if math.isfinite(missed) else 0.5
+def nearer(most: float, rise: float, largest: float) -> float:
+    """Return the factor for a step whose rise was too large; the rise is about quadratic."""
+    return min(max(math.sqrt(most / rise), 0.3), largest) if math.isfinite(rise) else 0.5

@@ -1,8 +1,8 @@
-"""Common value and spread of a parameter between specimens, apart from the errors of measurement.
+"""Common value and spread of a parameter between specimens, separated from estimation errors.
 
 The estimates u of n tests have errors of covariance C; the specimens scatter about a common value μ
-with a standard deviation τ: u ~ N(μ, C + τ²). τ is that of the largest restricted likelihood
-(REML), μ the generalised mean. How several parameters vary together is in `correlation`.
+with a standard deviation τ: u ~ N(μ, C + τ²). τ maximises the restricted likelihood (REML), and μ
+is the generalised mean. `correlation` is that of several parameters between specimens.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from scipy.optimize import brentq, minimize_scalar
 
 from foamfit.arrays import Array
 
-# A spread is looked for between these multiples of the smallest error and of the estimates' own.
-SMALLEST, LARGEST = 1e-3, 100.0
+SMALLEST = 1e-3  # lower limit of a nonzero spread, in units of the smallest error
+LARGEST = 100.0  # upper limit of a spread, in units of the standard deviation of the estimates
 
 
 @dataclass(frozen=True)
@@ -35,30 +35,30 @@ class Spread:
 
 
 def common_and_spread(values: Array, errors: Array) -> Spread:
-    """Common value and spread of estimates (n,) with errors of covariance (n, n), n at least 2.
+    """Estimate common value and spread from n >= 2 estimates (n,) with error covariance (n, n).
 
     The interval of the mean is that of Knapp and Hartung (2003, Stat. Med. 22, 2693) with Student's
-    t of n-1 degrees of freedom; that of the spread is the generalised Q profile (Viechtbauer 2007,
-    Stat. Med. 26, 37): Q(τ²) has the χ² distribution of n-1 degrees of freedom.
+    t of n-1 degrees of freedom. The interval of the spread is the generalised Q profile
+    (Viechtbauer 2007, Stat. Med. 26, 37): Q(τ²) is χ² distributed with n-1 degrees of freedom.
     """
     n = values.size
-    # In the directions in which the errors are independent.
+    # Rotate to directions in which the errors are independent.
     variances, axes = np.linalg.eigh(0.5 * (errors + errors.T))
     variances = np.maximum(variances, 1e-12 * max(float(variances[-1]), 1e-300))
     seen, ones = axes.T @ values, axes.sum(axis=0)
 
     def mean(tau2: float) -> tuple[float, float]:
-        """Generalised mean at a spread, and the inverse of its variance."""
+        """Return the generalised mean at a spread, and the inverse of its variance."""
         weights = 1.0 / (variances + tau2)
         precision = float(weights @ ones**2)
         return float(weights @ (ones * seen)) / precision, precision
 
     def q(tau2: float) -> float:
-        """Sum of squares about the mean in units of the errors and the spread."""
+        """Return the sum of squares about the mean, in units of error plus spread."""
         return float(np.sum((seen - mean(tau2)[0] * ones) ** 2 / (variances + tau2)))
 
     def criterion(tau2: float) -> float:
-        """Twice the negative logarithm of the restricted likelihood."""
+        """Return minus twice the logarithm of the restricted likelihood."""
         return float(np.sum(np.log(variances + tau2))) + math.log(mean(tau2)[1]) + q(tau2)
 
     least = SMALLEST**2 * float(variances[0])
@@ -72,7 +72,7 @@ def common_and_spread(values: Array, errors: Array) -> Spread:
             lambda u: criterion(math.exp(u)), bounds=ends, method="bounded", options={"xatol": 1e-8}
         )
         tau2 = math.exp(float(best.x)) if best.fun < costs[0] else 0.0
-    if tau2 > 0.0:  # from the expected information on τ², half the trace of PP
+    if tau2 > 0.0:  # the expected information on τ² is half the trace of PP
         weights = 1.0 / (variances + tau2)
         once, twice = (float(np.sum(weights**power * ones**2)) for power in (2, 3))
         total = float(weights @ ones**2)
@@ -89,7 +89,7 @@ def common_and_spread(values: Array, errors: Array) -> Spread:
 
 
 def _crossing(q: Callable[[float], float], level: float, most: float) -> float:
-    """τ² at which the falling Q reaches a level; 0 if it is below from the start."""
+    """Return τ² at which the decreasing Q reaches a level; 0 if Q(0) is below it."""
     if q(0.0) <= level:
         return 0.0
     while q(most) > level:
@@ -98,20 +98,20 @@ def _crossing(q: Callable[[float], float], level: float, most: float) -> float:
 
 
 def correlation(values: Array, errors: Array) -> Array:
-    """Correlation (k, k) between specimens of k parameters, estimated in n tests: (n, k).
+    """Return the correlation (k, k) of k parameters between specimens, from n tests (n, k).
 
-    It is that of the covariance of the estimates less the mean covariance (k, k) of their errors,
-    shrunk towards none, 0, by the share that Schäfer and Strimmer (2005, Stat. Appl. Genet. Mol.
-    Biol. 4, 32) give: the variances of the correlations over their squares. The fewer the tests,
-    the larger it is; two tests say nothing of a correlation.
+    It follows from the covariance of the estimates minus the mean covariance `errors` (k, k) of
+    their errors, and is shrunk towards 0 by the factor of Schäfer and Strimmer (2005, Stat. Appl.
+    Genet. Mol. Biol. 4, 32): the sum of the variances of the correlations over that of their
+    squares. Shrinkage is stronger for fewer tests and complete for two.
     """
     n, k = values.shape
-    off = values - values.mean(axis=0)
-    scale = np.sqrt(np.sum(off**2, axis=0) / max(n - 1, 1))
-    scale = np.where(scale > 0.0, scale, 1.0)
     if n < 3:
         return np.eye(k)
-    products = np.einsum("ti,tj->tij", off / scale, off / scale)
+    deviations = values - values.mean(axis=0)
+    scale = np.sqrt(np.sum(deviations**2, axis=0) / (n - 1))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    products = np.einsum("ti,tj->tij", deviations / scale, deviations / scale)
     mean = products.mean(axis=0)
     apart = ~np.eye(k, dtype=bool)
     doubt = np.sum((products - mean) ** 2, axis=0)[apart].sum() * n / (n - 1) ** 3

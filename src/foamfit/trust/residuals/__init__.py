@@ -1,4 +1,4 @@
-"""What the residuals of a fit are made of: noise with its correlation, or an error of the law too.
+"""Analysis of the residuals of a fit: correlated noise and model error.
 
-`law_error` tells them apart by their spectra; `residual_tests` tests for structure.
+`law_error` separates the two by their spectra; `residual_tests` tests for structure.
 """

@@ -1,9 +1,9 @@
-"""Noise or error of the law: what the residual of each curve is made of.
+"""Noise and model error in the residual of each curve.
 
-What a law cannot follow is left in the residual and is the same whenever the test is measured
-again: it is not noise. It shows as slow waves, a peak of the spectrum at low frequencies that falls
-faster beyond than noise does. Where there is evidence for such a peak, the noise is read off the
-frequencies beyond it; elsewhere the residual is the noise.
+Model error ("error of the law") is not noise, because it would be the same if the test were
+measured again. It appears as slow waves: a spectral peak at low frequencies that falls off faster
+than noise. Where there is evidence for such a peak, the noise is estimated at the frequencies
+beyond it; otherwise the residual is the noise.
 """
 
 from __future__ import annotations
@@ -25,44 +25,44 @@ from foamfit.trust.residuals.noise_process import (
     parts,
 )
 
-# Least RMS of an error of the law, in units of the residual: below it is that of the simulation.
+# Smallest RMS of a model error, in units of the residual; below it is the error of the simulation.
 SMALLEST = 2e-3
-# Frequencies (half waves in the record) that stand alone, and the ratio of the bands beyond them.
-ALONE, BAND = 64, 1.06
-# The most half waves in the record at which an error of the law has its corner. Beyond it the
-# spectrum falls as the frequency to the power of minus twice the steepness (a kink leaves 2, noise
-# of first order has 1); up to it, it rises as twice the rise, because a fit takes what is slow.
-LAST_CORNER, STEEPNESS, RISES = 60.0, (1.5, 2.0, 3.0), (0.0, 1.0, 2.0)
-# Corner of noise on top of white noise, as a share of the frequencies: slower noise of that kind
-# cannot be told from an error of the law.
+ALONE = 64  # lowest frequencies (half waves in the record), each with a band of its own
+BAND = 1.06  # ratio of successive band limits above these
+LAST_CORNER = 60.0  # highest corner frequency of a model error, half waves in the record
+# Above its corner the spectrum of a model error falls as the frequency to the power of minus twice
+# the steepness (a kink has 2, noise of first order has 1). Below, it rises as the frequency to the
+# power of twice the rise, because a fit absorbs slow components.
+STEEPNESS, RISES = (1.5, 2.0, 3.0), (0.0, 1.0, 2.0)
+# Lowest corner frequency of noise on top of white noise, as a share of all frequencies; slower
+# noise of this kind cannot be distinguished from model error.
 FAST = 0.25
-# Autocorrelations from sample to sample: of noise alone, and beside an error of the law.
+# Autocorrelations of first-order noise from sample to sample, without and with model error.
 ANY, VISIBLE = 1.0 - np.geomspace(1.0, 0.01, 32), 1.0 - np.geomspace(0.99, 0.07, 16)
-# Frequencies of which the fit took more than this share do not count.
-TAKEN = 0.9
-ROUNDS = 60  # of the fit of the amplitudes
-FEWEST = 40  # samples of a curve of which anything is said
-ORDER = 10  # of the autoregression that has the spectrum of the noise
+TAKEN = 0.9  # frequencies are ignored if the fit absorbed more than this share of their noise
+ROUNDS = 60  # iterations for the amplitudes
+FEWEST = 40  # smallest number of samples of a curve for which model error is estimated
+ORDER = 10  # order of the autoregression fitted to the noise spectrum
 
 
 @dataclass(frozen=True, eq=False)
 class CurveError:
-    """What the residual of one curve is made of, in units of the residual."""
+    """Noise and model error in the residual of one curve, in units of the residual."""
 
     noise: NoiseProcess
-    # Of an error of the law beside noise: how much lower its Bayesian information criterion is than
-    # that of noise alone; None where the curve has too few samples.
+    # Reduction of the Bayesian information criterion by model error in addition to noise; None if
+    # the curve has too few samples
     evidence: float | None = None
-    law: float = 0.0  # RMS of the law's error; 0 where all is noise
+    law: float = 0.0  # RMS of the model error; 0 if all is noise
 
     @property
     def found(self) -> bool:
-        """Whether the residual holds an error of the law."""
+        """Whether the residual contains model error."""
         return self.law > 0.0
 
 
 class _Sum(NamedTuple):
-    """A spectrum as the sum of an error of the law, red noise and white noise, each (b,)."""
+    """A spectrum as the sum of model error, red noise and white noise, each (b,)."""
 
     criterion: float  # Bayesian information criterion
     law: Array
@@ -72,17 +72,17 @@ class _Sum(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Spectrum:
-    """Power of a residual by frequency: its cosine transform (each of variance S), in bands."""
+    """Power spectrum of a residual, from its cosine transform, in bands of frequency."""
 
     frequency: Array  # (b,): half waves in the record
-    power: Array  # (b,): mean square of the transform, what the fit took of noise given back
-    count: Array  # (b,): frequencies in the band
-    left: Array  # (b,): share of the noise that the fit left
+    power: Array  # (b,): mean square of the transform, corrected for absorbed noise
+    count: Array  # (b,): number of frequencies in the band
+    left: Array  # (b,): share of the noise that the fit did not absorb
     samples: int
 
     @classmethod
     def of(cls, residual: Array, basis: Array) -> _Spectrum:
-        """Spectrum of a residual of a fit; `basis` (n, k) is what that took, over all curves."""
+        """Return the spectrum of a residual; `basis` (n, k) is the part that the fit absorbed."""
         n = residual.size
         k = np.arange(1, n)
         power = dct(residual, norm="ortho")[1:] ** 2
@@ -93,37 +93,39 @@ class _Spectrum:
         band = np.searchsorted(edges, k, side="right") - 1
         use = left > 1.0 - TAKEN
         count = np.bincount(band, use, len(edges))
-        there = count > 0.0
+        filled = count > 0.0
 
         def mean(values: Array) -> Array:
             sums = np.bincount(band, np.where(use, values, 0.0), len(edges))
-            return np.asarray(sums[there] / count[there])
+            return np.asarray(sums[filled] / count[filled])
 
         power = np.maximum(mean(power / np.where(use, left, 1.0)), 1e-300)
-        return cls(np.exp(mean(np.log(k))), power, count[there].astype(float), mean(left), n)
+        return cls(np.exp(mean(np.log(k))), power, count[filled].astype(float), mean(left), n)
 
     def fall(self, corners: Array, steepness: float) -> Array:
-        """Spectra that are flat up to a corner and fall beyond, (corners, b)."""
+        """Return spectra that are flat up to a corner and fall beyond, (corners, b)."""
         return np.asarray((1.0 + (self.frequency / corners[:, None]) ** 2) ** -steepness)
 
     def first_order(self, phi: Array) -> Array:
-        """Spectra of noise with these autocorrelations from one sample to the next, (phi, b)."""
+        """Return spectra of first-order noise with autocorrelations `phi` at lag one, (phi, b)."""
         phi = phi[:, None]
         angle = np.pi * self.frequency / self.samples
         return np.asarray((1.0 - phi**2) / (1.0 + phi**2 - 2.0 * phi * np.cos(angle)))
 
     def peaks(self) -> Array:
-        """Spectra of an error of the law: a fall beyond a corner, and a rise or none up to it."""
+        """Return spectra of model error: a fall above a corner, and perhaps a rise below it."""
         corners = np.geomspace(1.0, LAST_CORNER, 16)
         rising = {rise: (self.frequency / corners[:, None]) ** (2.0 * rise) for rise in RISES}
         out = [up * self.fall(corners, s + rise) for rise, up in rising.items() for s in STEEPNESS]
-        return np.concatenate(out) / self.left  # the fit took nothing of what it left
+        # `power` is corrected for absorbed noise, but a fit does not absorb its own model error.
+        return np.concatenate(out) / self.left
 
     def sum(self, laws: Array, reds: Array, *, floor: bool = True) -> _Sum:
-        """The sum of the least criterion of one of these laws, one of these reds and white noise.
+        """Find the best sum of one of `laws`, one of `reds` and white noise (if `floor`).
 
-        Likelihood of Whittle (1953, Ark. Mat. 2, 423); multiplicative steps lower it and keep
-        amplitudes positive (Févotte, Bertin & Durrieu 2009, Neural Computation 21, 793).
+        The likelihood is that of Whittle (1953, Ark. Mat. 2, 423). Multiplicative steps minimise
+        its negative logarithm and keep amplitudes positive (Févotte, Bertin & Durrieu 2009, Neural
+        Computation 21, 793).
         """
         flat = np.ones_like(laws[:1]) if floor else np.zeros_like(laws[:1])
         kinds = [kind for kind in (laws, reds, flat) if kind.any()]
@@ -137,16 +139,16 @@ class _Spectrum:
             up = np.matmul(shapes, (weights * inverse**2)[:, :, None])[:, :, 0]
             down = np.matmul(shapes, (self.count * inverse)[:, :, None])[:, :, 0]
             sizes = np.maximum(sizes * up / down, 1e-12 * level)
-        whole = np.einsum("mc,mcb->mb", sizes, shapes)
-        cost = (np.log(whole) + self.power / whole) @ self.count
+        total = np.einsum("mc,mcb->mb", sizes, shapes)
+        cost = (np.log(total) + self.power / total) @ self.count
         at = int(np.argmin(cost))
-        own = list(sizes[at][:, None] * shapes[at])
-        law = own.pop(0) if laws.any() else laws[0]
-        red = own.pop(0) if reds.any() else reds[0]
-        white = own.pop(0) if floor else flat[0]
-        spent = floor + 3 * bool(laws.any()) + 2 * bool(reds.any())
-        price = spent * math.log(float(self.count.sum()))
-        return _Sum(float(cost[at]) + price, law, red, white)
+        terms = list(sizes[at][:, None] * shapes[at])
+        law = terms.pop(0) if laws.any() else laws[0]
+        red = terms.pop(0) if reds.any() else reds[0]
+        white = terms.pop(0) if floor else flat[0]
+        parameters = floor + 3 * bool(laws.any()) + 2 * bool(reds.any())
+        penalty = parameters * math.log(float(self.count.sum()))
+        return _Sum(float(cost[at]) + penalty, law, red, white)
 
 
 def curve_errors(
@@ -156,16 +158,15 @@ def curve_errors(
     taken: Array | None = None,
     driven: bool = False,
 ) -> tuple[CurveError, ...]:
-    """Tell noise from an error of the law in the residual of each curve, whichever is likelier.
+    """Separate noise and model error in the residual of each curve.
 
-    Arguments as of `noise_processes`, whose noise is taken where the residual holds no error of the
-    law. Noise alone is white, of first order (one autocorrelation from sample to sample), or of
-    first or second order with a corner above `FAST` on top of white noise. With an error of the
-    law, a peak at low frequencies comes to white noise or to noise of first order. The Bayesian
-    information criterion decides; one of 1200 records of white noise and of noise of first order
-    (up to 0.95 from sample to sample, 120 to 5000 samples) was taken for an error of the law. Where
-    the test is `driven` by a stress all is noise: that of the stress comes through the springs as
-    slow waves of the displacement, which look like an error of the law.
+    The arguments are those of `noise_processes`, whose result is used where there is no model
+    error. Noise alone is white, of first order, or of first or second order with a corner above
+    `FAST` on top of white noise. Model error adds a peak at low frequencies to white or first-order
+    noise. The Bayesian information criterion decides between the two; among 1200 records of white
+    and first-order noise (autocorrelations up to 0.95, 120 to 5000 samples) it found model error in
+    one. If the test is `driven` by a stress, all is taken as noise: noise of the stress passes
+    through the springs as slow waves of the displacement, which look like model error.
     """
     basis = basis_of(jacobian) if taken is None else taken
     own = noise_processes(residual, jacobian, sizes, taken)
@@ -182,19 +183,18 @@ def _curve_error(residual: Array, basis: Array, own: NoiseProcess) -> CurveError
     seen = _Spectrum.of(residual, basis)
     none, fast = np.zeros((1, seen.frequency.size)), np.geomspace(FAST * n, n, 12)
     reds = [seen.fall(fast, order) for order in (1.0, 2.0)]
-    first = seen.sum(none, seen.first_order(ANY), floor=False)
-    alone = min(
-        [seen.sum(none, red) for red in (none, *reds)] + [first], key=attrgetter("criterion")
-    )
+    noises = [seen.sum(none, red) for red in (none, *reds)]
+    noises.append(seen.sum(none, seen.first_order(ANY), floor=False))
+    alone = min(noises, key=attrgetter("criterion"))
     laws, firsts = seen.peaks(), seen.first_order(VISIBLE)
     both = []
     for red in (none, seen.sum(none, firsts, floor=False).red[None]):
         both.append(seen.sum(laws, red, floor=not red.any()))
         both.append(seen.sum(both[-1].law[None], firsts, floor=False))
-    found = min(both, key=attrgetter("criterion"))
-    evidence = alone.criterion - found.criterion
-    noise = found.red + found.white
-    process = _process(seen, noise, max(float(seen.count @ (found.law < noise)), 1.0))
+    with_law = min(both, key=attrgetter("criterion"))
+    evidence = alone.criterion - with_law.criterion
+    noise = with_law.red + with_law.white
+    process = _process(seen, noise, max(float(seen.count @ (with_law.law < noise)), 1.0))
     size = math.sqrt(max(float(residual @ residual) / n - process.variance, 0.0))
     if evidence <= 0.0 or size < SMALLEST:
         return CurveError(own, evidence)
@@ -202,7 +202,7 @@ def _curve_error(residual: Array, basis: Array, own: NoiseProcess) -> CurveError
 
 
 def _process(seen: _Spectrum, noise: Array, samples: float) -> NoiseProcess:
-    """Autoregressive noise with a spectrum that is given in bands."""
+    """Return autoregressive noise with a spectrum given in bands."""
     k = np.arange(seen.samples)
     spectrum = np.exp(np.interp(k, seen.frequency, np.log(noise)))
     lags = np.fft.irfft(np.append(spectrum, spectrum[-1]))[: ORDER + 1]

@@ -1,7 +1,7 @@
-"""The noise of each curve as an autoregressive process, read off the residuals of a fit.
+"""The noise of each curve as an autoregressive process, estimated from the residuals of a fit.
 
-Measured noise is seldom white: oversampled curves repeat themselves. n/τ is the effective number of
-samples, τ the autocorrelation time.
+Measured noise is seldom white: neighbouring samples of an oversampled curve are correlated. The
+effective number of samples is n/τ, with τ the autocorrelation time.
 """
 
 from __future__ import annotations
@@ -15,33 +15,33 @@ from scipy.linalg import orth, toeplitz
 
 from foamfit.arrays import Array
 
-# Of the autoregressive noise: most orders, largest reflection coefficient, rounds of correction.
-MOST_ORDERS, LARGEST, CORRECTIONS = 10, 0.995, 4
+MOST_ORDERS = 10  # highest order of an autoregression
+LARGEST = 0.995  # largest reflection coefficient
+CORRECTIONS = 4  # iterations of the correction for the noise that a fit absorbed
 
 
 def parts(sizes: tuple[int, ...]) -> list[slice]:
-    """Slices of the curves in a residual, from their numbers of samples."""
+    """Return the slices of the curves in a residual, from their numbers of samples."""
     ends = np.cumsum(sizes)
     return [slice(int(end - size), int(end)) for size, end in zip(sizes, ends, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseProcess:
-    """Autoregressive noise of one curve: x_t = Σ φ_j x_(t-j) + white."""
+    """Autoregressive noise of one curve: x_t = Σ φ_j x_(t-j) + white noise."""
 
-    coefficients: Array  # (p,): φ_1 … φ_p; none for white noise
-    variance: float  # Of the process itself, not of the white noise that drives it
-    # How many it was read off, less those that the parameters of the fit took; infinite if it is
-    # known.
+    coefficients: Array  # (p,): φ_1 … φ_p; empty for white noise
+    variance: float  # of the process itself, not of the white noise that drives it
+    # Number of samples of the estimate less those absorbed by the parameters; infinite if known
     samples: float = math.inf
 
     def autocovariance(self, n: int) -> Array:
-        """Autocovariance at the lags 0 … n-1."""
+        """Return the autocovariance at the lags 0 … n-1."""
         lags = self._response(4 * max(n, 256))[:n]
         return np.asarray(lags * (self.variance / lags[0]))
 
     def _response(self, size: int) -> Array:
-        """Autocovariance at `size` lags if the driving white noise has unit variance."""
+        """Return the autocovariance at `size` lags for driving white noise of unit variance."""
         transfer = np.abs(np.fft.rfft(np.append(1.0, -self.coefficients), size)) ** -2
         return np.asarray(np.fft.irfft(transfer))
 
@@ -58,12 +58,12 @@ class NoiseProcess:
         return max(self.white / (1.0 - float(self.coefficients.sum())) ** 2, 1.0)
 
     def times(self, columns: Array) -> Array:
-        """Covariance matrix of n samples times the columns of an (n, k) array."""
+        """Multiply the covariance matrix of n samples by the columns of an (n, k) array."""
         if not self.coefficients.size:
             return self.variance * columns
         n = len(columns)
         lags = self.autocovariance(n)
-        # A circulant matrix that has the covariance in a corner: the transform makes it diagonal.
+        # Embed the covariance in a circulant matrix, which the Fourier transform diagonalises.
         circulant = np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]]))
         product: Array = np.fft.irfft(
             np.fft.rfft(columns, 2 * n, axis=0) * circulant[:, None], axis=0
@@ -71,9 +71,9 @@ class NoiseProcess:
         return product[:n]
 
     def forms(self, columns: Array, mix: Array | None = None) -> Array:
-        """Variance lᵀΣl of the noise times each column l of an (n, m) product, (m,).
+        """Return the variance lᵀΣl of the noise along each column l of `columns @ mix`, (m,).
 
-        The product is that of `columns` (n, k) and `mix` (k, m), by default the columns themselves.
+        `columns` is (n, k) and `mix` (k, m), by default the identity.
         """
         inner = columns.T @ self.times(columns)
         if mix is None:
@@ -81,16 +81,17 @@ class NoiseProcess:
         return np.asarray(np.einsum("ij,ij->j", mix, inner @ mix))
 
     def doubt(self, columns: Array, mix: Array) -> Array:
-        """Variance of `forms`, as estimated from `samples`, (m,): the delta method.
+        """Return the variance of `forms` due to the estimate from `samples`, (m,).
 
-        Estimates of the white variance w and of φ are independent for large n. That of w has the
-        variance 2w²/n of normal noise; those of φ have the covariance w Γ⁻¹/n with Γ that of p
-        successive samples (Brockwell & Davis 1991, Time Series: Theory and Methods, theorem 8.1.1).
+        By the delta method. Estimates of the white-noise variance w and of φ are independent for
+        large n. The former has variance 2w²/n if the noise is normal; the latter has covariance
+        w Γ⁻¹/n, with Γ the covariance of p successive samples (Brockwell & Davis 1991, Time Series:
+        Theory and Methods, theorem 8.1.1).
         """
         if math.isinf(self.samples):
             return np.zeros(mix.shape[1])
-        here = self.forms(columns, mix)
-        out = 2.0 * here**2
+        forms = self.forms(columns, mix)
+        out = 2.0 * forms**2
         order = self.coefficients.size
         if order:
             white = self.variance * self.white
@@ -99,14 +100,14 @@ class NoiseProcess:
                 NoiseProcess(phi, white / NoiseProcess(phi, 1.0).white)
                 for phi in self.coefficients + step * np.eye(order)
             ]
-            slopes = np.array([(other.forms(columns, mix) - here) / step for other in moved])
+            slopes = np.array([(other.forms(columns, mix) - forms) / step for other in moved])
             gamma = toeplitz(self.autocovariance(order))
             out += white * np.einsum("ik,ik->k", slopes, np.linalg.solve(gamma, slopes))
         return np.asarray(out / self.samples)
 
 
 def levinson(lags: Array) -> list[tuple[Array, float]]:
-    """Autoregressions of order 0, 1, … from autocovariances, with their white variance."""
+    """Return the autoregressions of order 0, 1, … and their white-noise variances from lags."""
     fits = [(np.empty(0), float(lags[0]))]
     for order in range(1, lags.size):
         phi, white = fits[-1]
@@ -120,7 +121,7 @@ def levinson(lags: Array) -> list[tuple[Array, float]]:
 
 
 def _lag_sums(one: Array, other: Array, order: int) -> Array:
-    """Σ_t (one_t ⊗ other_(t+k), symmetric in k) for k = 0 … order, (order+1, columns, columns)."""
+    """Return Σ_t one_t ⊗ other_(t+k), symmetrised in k, for k = 0 … order, (order+1, m, m)."""
     n = len(one)
     sums = [one[: n - k].T @ other[k:] + one[k:].T @ other[: n - k] for k in range(order + 1)]
     return 0.5 * np.array(sums)
@@ -129,17 +130,17 @@ def _lag_sums(one: Array, other: Array, order: int) -> Array:
 def noise_processes(
     residual: Array, jacobian: Array, sizes: tuple[int, ...], taken: Array | None = None
 ) -> list[NoiseProcess]:
-    """Noise of each curve as an autoregressive process, from the residuals of a fit.
+    """Estimate the noise of each curve as an autoregressive process from the residuals of a fit.
 
-    The order is that of the least Bayesian information criterion. A fit takes what its parameters
-    can follow out of the noise, mostly at low frequencies: residuals look less correlated and
-    smaller than the noise was. With the hat matrix H = QQᵀ of the fit, residuals (I-H)e have the
-    expected lag sums tr S_k (I-H)Σ(I-H); the autocovariances are corrected by what Σ itself loses.
+    The order minimises the Bayesian information criterion. The parameters of a fit absorb part of
+    the noise, mostly at low frequencies, so that residuals are smaller and less correlated than the
+    noise. With the hat matrix H = QQᵀ of the fit, residuals (I-H)e have the expected lag sums
+    tr S_k (I-H)Σ(I-H); the autocovariances are corrected by the part of Σ that is absorbed.
 
-    `residual` (n,) holds all curves, one after the other, each in the order of time with `sizes`
-    samples; `jacobian` (n, k) may have any scaling of its columns. Where other data took part in
-    the fit, `taken` (n, k) says what it took of these: orthogonal columns, each as long as the root
-    of the share of the noise along it.
+    `residual` (n,) contains all curves in turn, each with `sizes` samples in the order of time; the
+    columns of `jacobian` (n, k) may have any scale. If the fit used other data too, `taken` (n, k)
+    is the part of the noise that it absorbed: orthogonal columns, each with the length of the root
+    of the absorbed share along it.
     """
     basis = basis_of(jacobian) if taken is None else _shortened(taken)
     curves = parts(sizes)
@@ -147,14 +148,13 @@ def noise_processes(
     for part in curves:
         own = residual[part][:, None]
         n = len(own)
-        highest = min(MOST_ORDERS, n // 10)
-        sums.append(_lag_sums(own, own, highest)[:, 0, 0])
-        fits = levinson(sums[-1] / n)
+        lag_sums = _lag_sums(own, own, min(MOST_ORDERS, n // 10))[:, 0, 0]
+        fits = levinson(lag_sums / n)
         scores = [n * math.log(max(white, 1e-300)) + len(f) * math.log(n) for f, white in fits]
         order = int(np.argmin(scores))
-        sums[-1] = sums[-1][: order + 1]
+        sums.append(lag_sums[: order + 1])
         left = max(n - float(np.sum(basis[part] ** 2)), 1.0)
-        processes.append(NoiseProcess(_damped(fits[order][0], n), float(sums[-1][0] / n), left))
+        processes.append(NoiseProcess(_damped(fits[order][0], n), float(lag_sums[0] / n), left))
     if not basis.shape[1]:
         return processes
     for _ in range(CORRECTIONS):
@@ -171,9 +171,9 @@ def noise_processes(
 
 
 def _shortened(taken: Array) -> Array:
-    """Columns q with which (I-qqᵀ) twice leaves of white noise what `taken` leaves of it once.
+    """Return columns q for which (I-qqᵀ)² leaves the same share of white noise as `taken`.
 
-    A share λ of the noise along a column is gone from a residual; 1-λ is the square of (1-λ').
+    A share λ of the noise along a column is absorbed; 1-λ is the square of 1-λ'.
     """
     share = np.clip(np.sum(taken**2, axis=0), 1e-300, 1.0)
     return np.asarray(taken * np.sqrt((1.0 - np.sqrt(1.0 - share)) / share))
@@ -182,13 +182,13 @@ def _shortened(taken: Array) -> Array:
 def _corrected(
     process: NoiseProcess, seen: Array, basis: Array, image: Array, middle: Array
 ) -> NoiseProcess:
-    """Process whose lag sums, less what the fit took of them, are those seen in the residual."""
+    """Return the process whose lag sums, less the absorbed part, are those `seen` in residuals."""
     n, order = len(basis), seen.size - 1
     once = np.trace(_lag_sums(basis, image, order), axis1=1, axis2=2)
     twice = np.einsum("kij,ji->k", _lag_sums(basis, basis, order), middle)
     taken = 2.0 * once - twice
     lags = (seen + taken) / (n - np.arange(order + 1))
-    # A fit that took most of a curve's noise leaves nothing to correct it by.
+    # If a fit absorbed most of a curve's noise, the correction is unreliable and must be limited.
     lags *= min(1.0, 4.0 * seen[0] / n / lags[0]) if lags[0] > 0.0 else 1.0
     if lags[0] <= 0.0:
         return process
@@ -197,18 +197,18 @@ def _corrected(
 
 
 def _radius(coefficients: Array) -> float:
-    """Largest factor from sample to sample of the waves of an autoregression."""
+    """Return the largest decay factor per sample of the modes of an autoregression."""
     return float(np.max(np.abs(np.roots(np.append(1.0, -coefficients))), initial=0.0))
 
 
 def _damped(coefficients: Array, n: int) -> Array:
-    """Coefficients of an autoregression none of whose waves lives longer than a quarter of n."""
+    """Limit the decay times of the modes of an autoregression to a quarter of n samples."""
     share = min(1.0, (1.0 - 4.0 / n) / max(_radius(coefficients), 1e-300))
     return np.asarray(coefficients * share ** np.arange(1, coefficients.size + 1))
 
 
 def basis_of(jacobian: Array) -> Array:
-    """Orthonormal basis of the columns of a Jacobian."""
+    """Return an orthonormal basis of the columns of a Jacobian."""
     if not jacobian.shape[1]:
         return jacobian
     scale = np.linalg.norm(jacobian, axis=0)
@@ -216,7 +216,7 @@ def basis_of(jacobian: Array) -> Array:
 
 
 def autocorrelation_time(residual: Array) -> float:
-    """Autocorrelation time τ = 1 + 2 Σ ρ_k >= 1 of a residual, in samples; 1 of white noise."""
+    """Return the autocorrelation time τ = 1 + 2 Σ ρ_k >= 1 in samples; 1 for white noise."""
     if residual.size < 8 or not residual.any():
         return 1.0
     return noise_processes(residual, np.empty((residual.size, 0)), (residual.size,))[0].tau
