@@ -444,7 +444,7 @@ def test_refuses_values(here: Path, factors: tuple[float, float], words: tuple[s
 @pytest.mark.parametrize(
     ("toml", "args", "words"),
     [
-        ("[specimen\n", (), ("test.toml", "no valid TOML", "line 1")),
+        ("[specimen\n", (), ("test.toml", "not valid TOML", "line 1")),
         ('[specimen]\narea = "1 mm^2"\n', (), ("test.toml", "height is missing", '"1.19 mm"')),
         ("[specimen]\n", (), ("height is missing", "diameter", "area", '"1.19 mm"', '"5 mm"')),
         (SPECIMEN.replace('"10', '"-10'), (), ("test.toml", "height", "must be positive")),
@@ -605,7 +605,7 @@ DRIVE = '[drive]\nkind = "stress"\nfile = "drive.csv"\n'
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[chain\n", ("no valid TOML", "line 1")),
+        ("[chain\n", ("not valid TOML", "line 1")),
         (OWN, ("[drive] is missing",)),
         (IMPACT, ("[chain] is missing",)),
         (OWN + "[drive]\n", ("[drive] kind", "impact, stress or displacement")),

@@ -72,8 +72,7 @@ def find_cycles(record: Record) -> list[Cycle]:
             peaks.append(int(peak))
         elif stress[peaks[-1]] < least or w[peak] > w[peaks[-1]]:
             peaks[-1] = int(peak)
-    column = record.cycle
-    found = []
+    column, found = record.cycle, list[Cycle]()
     for place, (first, top, after) in enumerate(zip(rests, peaks, [*peaks[1:], None], strict=True)):
         fall, end = w[top:after], len(record)
         if fall[0] - fall.min() > _UNLOADED * size:

@@ -75,10 +75,8 @@ class Source:
                 self.factor(channel)
             except InputError:
                 has.remove(channel)
-        sources = "velocity" in has or (
-            striker.velocity and (striker.mass or "acceleration" in has)
-        )
-        if "time" not in has or not sources:
+        integrable = striker.velocity and (striker.mass or "acceleration" in has)
+        if "time" not in has or not ("velocity" in has or integrable):
             timed = "" if "time" in has else f"{entries_of(table, has, 'time')} there, and "
             more = f", or give {timed}the [striker] mass and velocity to integrate the motion"
             raise self._missing(_MOTIONS, (), more)
@@ -117,9 +115,7 @@ class Source:
     def scale_spreads(self) -> dict[str, float]:
         """Return the relative standard deviations of the scales of the channels in use."""
         sources = _SOURCES | {c: (c,) for c in ("velocity", "acceleration")}
-        used = {
-            name: next((c for c in cs if c in self.columns), "") for name, cs in sources.items()
-        }
+        used = {n: next((c for c in cs if c in self.columns), "") for n, cs in sources.items()}
         if used["stress"] == "acceleration":  # then acceleration is not a separate channel
             del used["acceleration"]
         spreads = {f"{name}_scale": self.given.get(c, _NONE).spread for name, c in used.items()}
