@@ -403,7 +403,7 @@ def test_refuses_files(here: Path, command: str, content: bytes, words: tuple[st
     ("header", "words"),
     [
         ("time (ms),stress (xyz),displacement (mm)", ("'stress (xyz)'", "'xyz'", "stress (MPa)")),
-        ("time (ms),stress (mm),displacement (mm)", ("stress (mm)", "another kind", "(MPa)")),
+        ("time (ms),stress (mm),displacement (mm)", ("stress (mm)", "wrong dimension", "(MPa)")),
         ("time (ms),torque (N m),displacement (mm)", ("no column is a stress", "'torque (N m)'")),
         ("time (ms),stress (MPa),torque (N m)", ("no column is a displacement", "[striker]")),
         ("time (ms),stress (MPa),stress (MPa)", ("'stress (MPa)' (number 3)", "keep one")),
@@ -444,7 +444,7 @@ def test_refuses_values(here: Path, factors: tuple[float, float], words: tuple[s
 @pytest.mark.parametrize(
     ("toml", "args", "words"),
     [
-        ("[specimen\n", (), ("test.toml", "no valid TOML", "line 1")),
+        ("[specimen\n", (), ("test.toml", "not valid TOML", "line 1")),
         ('[specimen]\narea = "1 mm^2"\n', (), ("test.toml", "height is missing", '"1.19 mm"')),
         ("[specimen]\n", (), ("height is missing", "diameter", "area", '"1.19 mm"', '"5 mm"')),
         (SPECIMEN.replace('"10', '"-10'), (), ("test.toml", "height", "must be positive")),
@@ -495,7 +495,7 @@ def test_without_a_toml_all_that_is_missing_is_shown(
     assert (result.exit_code, result.stdout, list(files(here))) == (1, "", ["test.csv"])
     told, *shown = result.stderr.splitlines()
     assert told.startswith(f"foamfit: {path.with_suffix('.toml')}: no such file; test.csv needs")
-    assert told.endswith(f"write it by: foamfit init {path}")
+    assert told.endswith(f"create it with: foamfit init {path}")
     assert f"a TOML with {', '.join(keys[:-1])} and {keys[-1]}, and" in told
     assert [line.split(" = ")[0].strip() for line in shown if " = " in line] == [
         *keys, "mass", "velocity",
@@ -605,7 +605,7 @@ DRIVE = '[drive]\nkind = "stress"\nfile = "drive.csv"\n'
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[chain\n", ("no valid TOML", "line 1")),
+        ("[chain\n", ("not valid TOML", "line 1")),
         (OWN, ("[drive] is missing",)),
         (IMPACT, ("[chain] is missing",)),
         (OWN + "[drive]\n", ("[drive] kind", "impact, stress or displacement")),
@@ -614,9 +614,9 @@ DRIVE = '[drive]\nkind = "stress"\nfile = "drive.csv"\n'
         ("[chain]\nspring = 1\n" + IMPACT, ("[chain]", "'spring'", "springs")),
         ('[chain]\narea = "1 mm^2"\n' + IMPACT, ("[[chain.springs]]",)),
         (OWN.replace("0.14", "0.4") + IMPACT, ("spring 1", "eps_a")),
-        (OWN.replace('"5.5 MPa"', '"5.5 mm"') + IMPACT, ("spring 1", "k0", "another kind")),
+        (OWN.replace('"5.5 MPa"', '"5.5 mm"') + IMPACT, ("spring 1", "k0", "wrong dimension")),
         (OWN.replace('"5.5 MPa"', "5.5") + IMPACT, ("spring 1", "k0 = 5.5", '"5.5 MPa"')),
-        (OWN + 'eta = "1 Pa"\n' + IMPACT, ("spring 1", "eta", "another kind", "Pa*s")),
+        (OWN + 'eta = "1 Pa"\n' + IMPACT, ("spring 1", "eta", "wrong dimension", "Pa*s")),
         (OWN.replace('"bistable"', '"rubber"') + IMPACT, ("spring 1", "'rubber'", "bistable")),
         (OWN.replace('"1.19 mm"', '"0 mm"') + IMPACT, ("[chain]", "heights", "greater than 0")),
         (OWN.replace('"5 mm"', '"5 mm"\narea = "1 mm^2"') + IMPACT, ("diameter and an area",)),

@@ -191,7 +191,7 @@ def test_few_rows_are_shared_between_zeros_and_contact(before, rest, after):
     by_end = after > 0 and rest < 20
     assert ("stress" in done.zeros) == (rest > 0 or by_end)
     assert any("The stress at the end of the record" in n for n in done.notes) == by_end
-    stands = any("file's own zero of the stress stands" in n for n in done.notes)
+    stands = any("zero of the stress in the file is kept" in n for n in done.notes)
     assert stands == (rest == 0 and not by_end)
     assert abs(done.origins["stress_zero"]) <= 3.0 * done.zeros.get("stress", 0.0)
 
@@ -281,7 +281,7 @@ def test_a_file_of_the_motion_alone_gives_a_derived_stress(tmp_path, gauge):
     assert np.sqrt(np.mean((done.stress - truth) ** 2)) < 0.05 * PEAK
     assert ("displacement" in done.zeros) == (gauge != "flight")
     turned = write(tmp_path, "time (s),displacement (m)", given.time, -given.displacement)
-    with pytest.raises(InputError, match="displacement is negative or gets smaller"):
+    with pytest.raises(InputError, match="displacement is negative or decreases"):
         read_test(turned)
 
 
@@ -311,7 +311,7 @@ def test_a_start_from_which_the_motion_passes_the_height_is_moved():
     done = condition(given, thin, striker=STRIKER)
     assert done.displacement.max() == pytest.approx(0.97 * thin.height, rel=1e-3)
     assert error(done) == pytest.approx((top - 0.97 * thin.height) / VELOCITY, rel=0.02)
-    assert any("does not go farther than the height" in note for note in done.notes)
+    assert any("does not exceed the height" in note for note in done.notes)
     with pytest.raises(InputError, match="beyond one"):
         condition(given, replace(SPECIMEN, height=top / 1.5), striker=STRIKER)
 
@@ -352,7 +352,7 @@ def test_where_gravity_matters_and_the_record_does_not_show_it_the_toml_is_asked
     assert len(notes) == asks
     assert done.striker.gravity == given
     if asks:
-        assert notes[0].startswith("Check: a striker that falls gains 2 % of its velocity")
+        assert notes[0].startswith("Check: a falling striker gains 2 % of its velocity")
 
 
 @pytest.mark.parametrize("channels", ["FW", "AW"])

@@ -122,7 +122,7 @@ def test_a_loop_run_the_wrong_way_is_found():
         ({"striker": Striker(velocity=1.75)}, "momentum_change", "mass"),
         ({"displacement": None}, "absorbed_energy", "displacement"),
         ({"time": None}, "impulse", "momentum"),
-        ({"motion": "integrated from force"}, "momentum_change", "motion comes from the force"),
+        ({"motion": "integrated from force"}, "momentum_change", "integrated from the force"),
     ],
 )
 def test_what_is_missing_is_named(change, gone, words):

@@ -69,7 +69,7 @@ def test_frames_are_put_on_the_clock_of_the_force(tmp_path):
     )
     assert "the delay is 0 s exactly" in notes
     assert "41 of 401 samples have a frame of the displacement" in notes
-    assert test.noise.of("displacement").how.endswith("of 41 frames on their own clock")
+    assert test.noise.of("displacement").how.endswith("to 41 frames on their own clock")
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -290,19 +290,22 @@ def test_a_motion_is_no_test_of_its_own(tmp_path):
         ('[motion]\nfile = "test.csv"\n', ["test.toml: [motion] file", "is the file of the force"]),
         ('[motion]\nfile = "./test.csv"\n', ["is the file of the force"]),
         (MOTION + 'shift = "1 us"\n', ["[motion] has no key 'shift'"]),
-        (MOTION + "delay = 5\n", ["[motion] delay = 5 is no quantity"]),
-        (MOTION + 'delay = "5"\n', ["[motion] delay", "another kind"]),
-        (MOTION + 'delay = "5 mm"\n', ["[motion] delay", "another kind"]),
+        (MOTION + "delay = 5\n", ["[motion] delay = 5 is not a quantity"]),
+        (MOTION + 'delay = "5"\n', ["[motion] delay", "wrong dimension"]),
+        (MOTION + 'delay = "5 mm"\n', ["[motion] delay", "wrong dimension"]),
         (MOTION + 'delay = "0 ± -5 us"\n', ["[motion] delay", "must not be negative"]),
-        (MOTION + 'delay = "0 ± 5 %"\n', ["[motion] delay", "is of another kind"]),
+        (MOTION + 'delay = "0 ± 5 %"\n', ["[motion] delay", "has the wrong dimension"]),
         (MOTION + 'delay = "0 us ± 5 %"\n', ["[motion] delay", "less than the value"]),
-        (MOTION + 'delay = "0 us ± 5 um"\n', ["[motion] delay", "± is of another kind"]),
+        (MOTION + 'delay = "0 us ± 5 um"\n', ["[motion] delay", "± has the wrong dimension"]),
         (MOTION + 'delay = "5 ms"\n', ["[motion] delay = 5 ms is longer than the record, 4 ms"]),
         (MOTION + 'delay = "-1 s"\n', ["[motion] delay = -1 s is longer than the record"]),
         (MOTION + 'delay = "0 ± 5 ms"\n', ["[motion] ± of delay = 5 ms is longer"]),
         (
             MOTION + 'delay = "3.95 ms"\n',
-            ["camera.csv overlaps with 6 samples of the force in time, not with 10", "0 s to 4 ms"],
+            [
+                "camera.csv overlaps in time with 6 samples of the force; at least 10 are needed",
+                "0 s to 4 ms",
+            ],
         ),
         (
             MOTION + '[motion.columns]\nforce = { column = "F" }\n',
@@ -346,7 +349,7 @@ def refused(path, *words):
         ),
         (
             {"time (ms)": lambda t: 1e3 * t, "displacement (mm)": lambda t: -1e3 * press(t)},
-            ["negative or gets smaller", "in [motion.columns]"],
+            ["negative or decreases", "in [motion.columns]"],
         ),
         (
             {"time (s)": lambda t: t + 1.0, "displacement (mm)": press},
@@ -363,7 +366,7 @@ def test_a_file_of_frames_that_cannot_be_used_is_refused(tmp_path, motion, words
 @pytest.mark.parametrize("name", ["displacement (mm)", "strain (%)", "displacement_1 (mm)"])
 def test_a_motion_in_both_files_is_refused(tmp_path, name):
     path = written(tmp_path, force={name: 1e3 * press(clock(1e5))})
-    refused(path, "test.csv: column", "'camera.csv' has the motion; leave one of them out")
+    refused(path, "test.csv: column", "'camera.csv' contains the motion; leave one of them out")
 
 
 def test_a_force_without_a_time_is_refused(tmp_path):

@@ -150,7 +150,7 @@ def test_without_headers_columns_have_numbers(tmp_path, sep):
     assert test.rows.rows == N
     refused(write(tmp_path, lines, toml.replace("3", "7")), "column 7", "has 3 columns")
     refused(write(tmp_path, lines, toml.replace("= 3", "= 0")), "column = 2")
-    refused(write(tmp_path, lines, toml.replace("N", "mm")), "'column 1'", "another kind")
+    refused(write(tmp_path, lines, toml.replace("N", "mm")), "'column 1'", "wrong dimension")
 
 
 def test_a_header_that_is_not_understood_is_quoted_with_the_lines_that_help(tmp_path):
@@ -180,7 +180,7 @@ def test_tests_side_by_side_are_chosen_by_number(tmp_path):
     test = read_test(write(tmp_path, lines, chosen(1)))
     expect(test)
     assert (test.rows.rows, test.rows.used) == (N + 9, N)
-    assert "nothing in the columns" in test.rows.dropped[0].why
+    assert "no numbers in the columns" in test.rows.dropped[0].why
     test = read_test(write(tmp_path, lines, chosen(4)))
     assert test.stress.max() == pytest.approx(1e6, rel=1e-2)
     assert "force from 'Force (N)' (number 5)" in test.notes[0]
@@ -296,7 +296,7 @@ def test_a_gzip_file(tmp_path, monkeypatch):
     expect(test)
     assert test.name == "test"
     packed.write_bytes(packed.read_bytes()[:-20])
-    refused(packed, "no whole gzip file")
+    refused(packed, "not a complete gzip file")
     monkeypatch.setattr("foamfit.data.tables.layouts._LARGEST", 1000)
     packed.write_bytes(gzip.compress(path.read_bytes()))
     refused(packed, "unpacks to more than")
@@ -331,9 +331,9 @@ def test_a_workbook(tmp_path):
         workbook(tmp_path, two, chosen.replace("e 2", "e 3")), "no sheet 'Probe 3'", "'Probe 1'"
     )
     path = write(tmp_path, PLAIN, chosen)
-    refused(path, "no Excel workbook", "leave [data] sheet out")
+    refused(path, "not an Excel workbook", "leave [data] sheet out")
     (tmp_path / "test.xlsx").write_bytes(b"PK\x03\x04 no workbook")
-    refused(tmp_path / "test.xlsx", "no Excel workbook that can be read")
+    refused(tmp_path / "test.xlsx", "not a readable Excel workbook")
 
 
 def test_a_workbook_without_the_extra(tmp_path, monkeypatch):
@@ -511,4 +511,4 @@ def test_a_striker_without_a_time_is_warned_of(tmp_path):
     lines = [line.partition(",")[2] for line in PLAIN]
     test = read_test(write(tmp_path, lines, SPECIMEN + STRIKER))
     expect(test, None)
-    assert any("there is a [striker], but no column is a time" in n for n in asked(test))
+    assert any("there is a [striker] but no time column" in n for n in asked(test))

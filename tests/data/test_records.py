@@ -70,7 +70,7 @@ def test_a_repeated_header_is_refused_with_both_rows(tmp_path, at):
 
 def test_two_tables_in_a_file_are_refused(tmp_path):
     lines = [*table(*loop()[:2], header="time (ms),stress (MPa)"), *table(*loop())]
-    refused(write(tmp_path, lines), "rows 2 to 102 hold numbers above the header in row 103")
+    refused(write(tmp_path, lines), "rows 2 to 102 contain numbers above the header in row 103")
 
 
 def test_duplicate_time_stamps_are_averaged_and_counted(tmp_path):
@@ -405,7 +405,10 @@ def test_decimal_commas_in_quotation_marks(tmp_path):
     test = read_test(write(tmp_path, [header, *quoted]))
     np.testing.assert_allclose(test.displacement, 1e-3 * loop()[2], atol=1e-9)
     rows = [f'{i},"1,{i:03d}",{i / 100}' for i in range(100)]
-    refused(write(tmp_path, [header, *rows]), "'1,000' may have a decimal comma or a separator")
+    refused(
+        write(tmp_path, [header, *rows]),
+        "'1,000' may have a decimal comma or a thousands separator",
+    )
     quoted[40] = quoted[40].replace(",", ".").replace('"."', '","')
     refused(write(tmp_path, [header, *quoted]), "row 42", "the same decimal sign")
 

@@ -41,7 +41,7 @@ def test_a_prior_draws_the_value_and_narrows_the_interval(impact: ff.Measurement
         ("s1_k0", (5e6, -1e5), "positive standard deviation"),
         ("s1_k0", "5 MPa", "positive standard deviation"),
         ("s1_k0", "5 ± -1 MPa", "must not be negative"),
-        ("s1_k0", "5.5 ± 0.1 mm", "of another kind"),
+        ("s1_k0", "5.5 ± 0.1 mm", "wrong dimension"),
         ("s1_k0", 5e6, "positive standard deviation"),
         ("site_eta", "1 ± 0.1 Pa s", "is held fixed"),
         ("velocity", "2 ± 0.1 m/s", "its ± in the TOML"),

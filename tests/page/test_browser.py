@@ -188,7 +188,7 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     api.expect(height).to_have_value("1.19 mm")
     height.fill("5 kg")
     height.press("Tab")
-    api.expect(page.get_by_text("is of another kind").first).to_be_visible()
+    api.expect(page.get_by_text("has the wrong dimension").first).to_be_visible()
     api.expect(page.get_by_label("s1_k0", exact=True)).to_have_count(0)
     height.fill("1.19 mm")
     height.press("Tab")

@@ -142,7 +142,7 @@ def test_a_quantity_that_is_given_twice_is_refused():
 @pytest.mark.parametrize(
     ("quantity", "value", "told"),
     [
-        ("[specimen] height", "5 kg", "of another kind"),
+        ("[specimen] height", "5 kg", "wrong dimension"),
         ("[specimen] height", "", "height is missing"),
         ("[specimen] diameter", "", "needs a diameter"),
         ("[striker] velocity", "fast", "velocity"),

@@ -29,7 +29,11 @@ def test_a_width_is_columns_or_a_length(width: str, wide: float) -> None:
 
 @pytest.mark.parametrize(
     ("width", "words"),
-    [("wide", "is no quantity"), ("3 mm", "from 64 to 508 mm"), ("5 s", "is of another kind")],
+    [
+        ("wide", "is not a quantity"),
+        ("3 mm", "from 64 to 508 mm"),
+        ("5 s", "has the wrong dimension"),
+    ],
 )
 def test_what_is_no_width_is_refused_before_anything_is_done(
     width: str, words: str, tmp_path: Path

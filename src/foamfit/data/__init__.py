@@ -1,9 +1,9 @@
-"""From the files of a test to a measurement in SI, ready to be fitted.
+"""Read the files of a test and prepare a measurement in SI units, ready to be fitted.
 
-`csv_file.read_test` tells the whole way. `tables` finds the numbers of a file, their channels and
-units, `toml_file` the specimen and the striker. `frames` puts a motion with a clock of its own on
-that of the force. `prepare.condition` turns the samples into one loading and unloading: `outliers`
-mends single samples and a gauge that stood still, `cycles` and `contact` find the part that counts,
-`zeros` what the channels show without load. `noise` estimates, `motion` follows a noisy one,
-`energy` audits what striker, force and motion say of each other, `describe` prints a test.
+Start with `csv_file.read_test`. `tables` finds the columns of a file, their channels and units;
+`toml_file` reads the specimen and the striker. `frames` aligns a motion that has its own clock with
+the force. `prepare.condition` reduces the samples to one loading and unloading: `outliers` repairs
+single samples and a stuck gauge, `cycles` and `contact` select the samples in contact, `zeros`
+finds the zero of each channel. `noise` estimates the noise, `motion` smooths a noisy displacement,
+`energy` checks striker, force and motion against each other, `describe` prints a test.
 """

@@ -1,4 +1,4 @@
-"""Where contact starts: a start value for the fit of an impact, time zero of a slow test."""
+"""Find the start of contact: a start value for an impact, time zero for a slow test."""
 
 from __future__ import annotations
 
@@ -11,23 +11,22 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import NoiseLevel, Record
 from foamfit.data.noise import MIN_REST, level_on_line
 
-# A signal rests where its slope is less than this share of the slope that follows: the branches of
-# a foam differ less on loading (6 times in the published sets), so that a soft start is no rest.
-# For an impact, whose fit refines the start, and for a motion a larger share will do.
+# A signal is at rest if its slope is less than this share of the slope that follows. The slopes of
+# the loading branches differ by a smaller factor (6 in the published sets), so a soft start is not
+# mistaken for rest. The limit is larger for a motion, and for an impact, whose fit refines it.
 STILL, _STILL_IMPACT, STILL_MOTION = 0.15, 0.3, 0.5
-# Standard errors that are added to the slope of a rest; fewer where the motion of an impact begins
-# elsewhere than at zero, so that the record may begin before contact.
-_ERRORS, _ERRORS_AWAY = 2.0, 1.0
-# Share of the peak by which the rest of an impact may drift: without a motion, where the motion
-# begins at its zero (a stress that rises then is no rest), and where it begins elsewhere. There a
-# rest that drifts more is taken if there is no other.
+_ERRORS = 2.0  # standard errors added to the slope at rest
+_ERRORS_AWAY = 1.0  # the same if a motion starts away from zero, probably before contact
+# Largest drift of an impact's stress at rest, as a share of the peak: without a motion; if the
+# motion starts at zero (a rising stress is then contact); and if it starts away from zero, unless
+# there is no other rest.
 _DRIFT, _DRIFT_AT_ZERO, _DRIFT_AWAY = 0.01, 0.002, 0.06
-_APPROACH = 0.02  # share of its travel beyond which a machine without a stress is not in contact
+_APPROACH = 0.02  # share of its travel beyond which a machine without load is not in contact
 _BRAKED = 0.02  # share of the peak of a derived stress at which contact starts
-# Shares of the peak up to which a rise is taken for straight: the least that is so many standard
-# deviations of the noise, or else the largest.
-_SHARES, _CLEAR, _LARGEST = (0.025, 0.05, 0.1, 0.2), 8.0, 0.5
-ELSEWHERE = 5.0  # standard errors of a motion whose zero lies elsewhere
+_SHARES = 0.025, 0.05, 0.1, 0.2  # shares of the peak up to which a rise is taken as straight
+_CLEAR = 8.0  # the smallest share of at least this many standard deviations of noise is used
+_LARGEST = 0.5  # else this share
+ELSEWHERE = 5.0  # standard errors of a displacement that is significantly not zero
 
 Levels = dict[str, NoiseLevel]
 Kink = tuple[float, float]  # where a signal starts to rise: time and standard error, s
@@ -35,12 +34,12 @@ Kink = tuple[float, float]  # where a signal starts to rise: time and standard e
 
 @dataclass(frozen=True)
 class Start:
-    """Where contact starts: at a `time` of the file, s, at or before its sample `first`.
+    """Start of contact: at a `time` of the file, s, at or before its sample `first`.
 
-    `error` is the standard error of that time; `how` says in words what shows it, `by` which
-    channel: "stress", "motion", or "file" where nothing was recorded before contact. If `free`, the
-    specimen was unloaded before. `gauge` is the motion before contact: "rest", "flight" (at the
-    velocity that it goes on with), "other", or "" where none was recorded.
+    `error` is the standard error of that time; `how` describes in words how it was found, and `by`
+    is the channel: "stress", "motion", or "file" if nothing was recorded before contact. If `free`,
+    the specimen was unloaded before. `gauge` is the motion before contact: "rest", "flight" (at the
+    initial velocity of contact), "other", or "" if not recorded.
     """
 
     how: str
@@ -53,16 +52,16 @@ class Start:
 
     @property
     def resting(self) -> int:
-        """Number of rows that certainly show the specimen without load."""
+        """Number of initial rows in which the specimen is certainly unloaded."""
         return max(0, self.first - 2) if self.free else 0
 
 
 def _kink(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
-    """Time from which a signal rises as a straight line; None if it rises from the first sample on.
+    """Find the time from which a signal rises linearly; None if it rises from the first sample.
 
-    Least squares on a grid of times, then on a finer one.
+    Least squares over a grid of times, then over a finer grid.
     """
-    block = 1 + len(time) // 500  # their means show it as well
+    block = 1 + len(time) // 500  # means of blocks are accurate enough
     rows = len(time) // block
     if rows < 6:
         return None
@@ -76,22 +75,22 @@ def _kink(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
         return np.asarray(y @ y - np.maximum(ramps @ y, 0.0) ** 2 / size)
 
     coarse = np.linspace(t[0], t[-2], 200)
-    off = misfit(coarse)
-    at = int(np.argmin(off))
+    misfits = misfit(coarse)
+    at = int(np.argmin(misfits))
     fine = np.linspace(coarse[max(at - 2, 0)], coarse[min(at + 2, 199)], 41)
     near = misfit(fine)
     best = float(near.min())
     white = noise.sigma**2 * min(noise.time / block, 1.0)
     variance = max(best / rows, 0.25 * white) * max(noise.time / block, 1.0)
-    if off[0] <= best + 9 * variance + 1e-9 * float(y @ y):
+    if misfits[0] <= best + 9 * variance + 1e-9 * float(y @ y):
         return None
-    alike = int(np.count_nonzero(off <= best + variance))
+    alike = int(np.count_nonzero(misfits <= best + variance))
     error = 0.5 * max(float(alike) - 1.0, 0.5) * float(coarse[1] - coarse[0])
     return float(fine[int(np.argmin(near))]), error
 
 
 def _reached(values: Array, share: float) -> tuple[int, int]:
-    """First of three samples in a row above a share of the rise; samples from a third of it on."""
+    """Return the first of three samples above a share of the rise, and samples since a third."""
     up = values[: int(np.argmax(values)) + 1]
     base = float(np.percentile(up, 5))
     level = (up - base) / ((up[-1] - base) or 1.0)
@@ -102,7 +101,7 @@ def _reached(values: Array, share: float) -> tuple[int, int]:
 
 
 def _onset(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
-    """Where a signal starts to rise, by the least part of its rise that stands out of its noise."""
+    """Find where a signal starts to rise, from the smallest part of the rise above the noise."""
     clear, size = _CLEAR * noise.sigma, float(np.ptp(values[: int(np.argmax(values)) + 1]))
     for share in [s for s in _SHARES if s * size >= clear] or [_LARGEST] * bool(size >= clear):
         high, lasts = _reached(values, share)
@@ -120,11 +119,11 @@ def leave_rest(
     drift: float = np.inf,
     errors: float = _ERRORS,
 ) -> Kink | None:
-    """Where a signal leaves its rest, or None if the record shows no rest before the rise.
+    """Find where a signal leaves its rest; None if there is no rest before the rise.
 
-    A line is extrapolated back from the first part of the rise. At rest the slope is surely less
-    than a share `still` of the mean slope that follows, up to 15 % of the peak, and the signal does
-    not change significantly by more than `drift`. A kink within a rise is passed over.
+    A line is extrapolated back from the first part of the rise. At rest the slope, plus `errors`
+    standard errors, is less than a share `still` of the mean slope up to 15 % of the peak, and the
+    signal does not change significantly by more than `drift`. A kink within a rise is skipped.
     """
     rows = len(time)
     while rows >= 10 and (found := _onset(time[:rows], values[:rows], noise)):
@@ -132,8 +131,8 @@ def leave_rest(
         n = int(np.searchsorted(time, at))
         if n < max(3 * noise.time, 5) or n >= rows:
             return None
-        own = n >= MIN_REST * noise.time  # else they do not show their own noise
-        slope = level_on_line(t[:n], y[:n], at, replace(noise, sigma=0.0) if own else noise)
+        enough = n >= MIN_REST * noise.time  # to estimate the noise from these samples
+        slope = level_on_line(t[:n], y[:n], at, replace(noise, sigma=0.0) if enough else noise)
         size, error, rest = abs(slope[1].value), slope[1].error, float(y[:n].mean())
         high = _reached(y, 0.15)[0]
         high = high if t[high] > at else int(np.argmax(y))
@@ -151,20 +150,20 @@ def _at_kink(channel: str, time: Array, at: Kink, by: str, what: str = "rest") -
 
 
 def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool]:
-    """First value of a motion, by a line through its rise, and whether it is clearly not zero."""
+    """Return the initial value of a motion, from a line, and whether it is clearly not zero."""
     top = int(np.argmax(w))
     early = slice(0, max(5, top // 12))
     first = level_on_line(time[early], w[early], time[0], noise)[0]
     least = max(ELSEWHERE * first.error, 0.02 * (float(w[top]) - first.value))
-    return first.value, top >= 5 and abs(first.value) > least  # fewer show no zero
+    return first.value, top >= 5 and abs(first.value) > least  # not with fewer samples
 
 
 def start_of_impact(record: Record, levels: Levels) -> Start:
-    """Estimate where an impact starts: where the stress or the motion leaves its rest.
+    """Estimate the start of an impact: stress or motion leaves its rest.
 
-    Without a force, contact starts where the flight is braked. Without a rest, the first part of
-    the rise is extrapolated back to zero, by a few samples at most, unless the first sample is a
-    step or two after the file's time zero.
+    Without a force, contact starts where the flight decelerates. Without a rest, the first part of
+    the rise is extrapolated back to zero, by a few samples at most, unless the file's time zero is
+    at most two steps before the first sample.
     """
     time, stress, w = record.instants, record.stress, record.displacement
     drift, at, elsewhere = _DRIFT, None, False
@@ -180,11 +179,11 @@ def start_of_impact(record: Record, levels: Levels) -> Start:
         return start
     noise, up = levels["displacement"], slice(int(np.argmax(w)) + 1)
     if at := leave_rest(time[up], w[up], noise, STILL_MOTION):
-        # Far from the onset of the stress, something other than contact has moved the gauge.
+        # A motion that starts far from the onset of the stress is not due to contact.
         alike = abs(at[0] - start.time) < 0.1 * (time[up][-1] - start.time)
         if not start.free or (at[1] < start.error and alike):
             start = _at_kink("displacement", time, at, "motion")
-    elif "stress" in record.derived and elsewhere:  # it brakes a motion followed in flight
+    elif "stress" in record.derived and elsewhere:  # the motion was recorded in flight
         below = np.flatnonzero(stress[: int(np.argmax(stress))] < _BRAKED * stress.max())
         last = int(below[-1]) if below.size else 0
         at = float(time[last]), _BRAKED * float(np.ptp(time))
@@ -193,26 +192,26 @@ def start_of_impact(record: Record, levels: Levels) -> Start:
 
 
 def _at_first(time: Array) -> Start:
-    """Start of a file that starts in contact: its time zero if that is two steps before at most."""
+    """Return the start for a file that begins in contact: its time zero if that is close."""
     first = 0.0 if 0 <= time[0] <= 2 * (time[1] - time[0]) else float(time[0])
     return Start("at the first sample", first, 0)
 
 
 def _first_sample(record: Record, levels: Levels) -> Start:
-    """Start of an impact whose record begins in contact or at it."""
+    """Return the start of an impact whose record begins during or at contact."""
     time, stress, start = record.instants, record.stress, _at_first(record.instants)
     early = slice(0, max(5, _reached(stress, 0.2)[0]))
     level, slope = level_on_line(time[early], stress[early], time[0], levels["stress"])
     back = level.value / slope.value if slope.value > 0 else 0.0
     most = max(8 * (time[1] - time[0]), 0.15 * (time[np.argmax(stress)] - time[0]))
     if start.time == time[0] != 0 and back < most and level.value > _ERRORS * level.error:
-        how = "before the first sample, where the rise leads back to zero"
+        how = "before the first sample, where the rise extrapolates to zero"
         return Start(how, start.time - back, 0)
     return start
 
 
 def start_of_slow_test(record: Record, levels: Levels) -> Start:
-    """Start where the motion leaves a rest, or the stress does later, or the motion passes zero."""
+    """Return the start of a slow test: motion or stress leaves its rest, or motion is zero."""
     time, w, stress = record.instants, record.displacement, record.stress
     first, elsewhere, peak = 0.0, False, float(stress.max())
     if w is not None:

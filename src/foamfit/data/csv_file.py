@@ -1,8 +1,8 @@
-"""A test file and its TOML become a `Measurement` in SI.
+"""Read a test file and its TOML into a `Measurement` in SI units.
 
-A file holds one table, one row per sample; the unit of a channel is in its header, in a row of
-units beneath it, or in ``[columns]`` of the TOML. The motion may be in a second file, which
-``[motion]`` of the TOML names.
+A file contains one table, one row per sample. The unit of a channel is given in its header, in a
+row of units below the header, or in ``[columns]`` of the TOML. The motion may be in a second file
+named in ``[motion]`` of the TOML.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from foamfit.errors import InputError, naming
 from foamfit.text import engineering, percent
 
 
-def _chosen(window: Window, cycle: int | None, cycles: tuple[int, int] | None) -> Window:
-    """The window with the cycles that a call names."""
+def _with_cycles(window: Window, cycle: int | None, cycles: tuple[int, int] | None) -> Window:
+    """Override the cycles of the TOML by those passed to `read_test`."""
     if cycles is None:
         return window if cycle is None else replace(window, cycle=cycle, last=None)
     if cycle is not None:
@@ -60,31 +60,31 @@ def read_test(
     *,
     cycles: tuple[int, int] | None = None,
 ) -> Measurement:
-    """Read a test file and its TOML, check both and condition the data.
+    """Read and check a test file and its TOML, and prepare the data for a fit.
 
     Parameters
     ----------
     path : str or Path
-        The table: CSV, separated by commas, semicolons or tabs, one row per sample.
+        CSV file separated by commas, semicolons or tabs, one row per sample.
     specimen : str or Path, optional
-        The TOML; without it, the file beside the table that ends in ``.toml``.
+        TOML file; by default the file of the same name ending in ``.toml`` next to the table.
     cycle : int, optional
-        Number of the cycle of a slow test; without it that of ``[window]`` in the TOML, or else the
-        first. A later cycle starts at its own contact: the strain that the foam has not recovered
-        by then is taken off, and is the measurement's `start_strain`.
+        Number of the cycle of a slow test; by default the one in ``[window]`` of the TOML, or else
+        the first. Strain in a later cycle is counted from the contact of that cycle; the strain
+        not recovered until then is subtracted and returned as `start_strain`.
     cycles : (int, int), optional
-        Numbers of the first and the last of several cycles, taken as one history.
+        Numbers of the first and last of several cycles that are used as one history.
 
     Returns
     -------
     Measurement
-        Channels in SI, compression positive, time zero where contact starts. Its notes say what
-        was done.
+        Channels in SI, compression positive, time zero at the start of contact. Its `notes`
+        describe each step of the preparation.
 
     Raises
     ------
     InputError
-        Where the file, its TOML or what they hold cannot be used.
+        If the file, the TOML or their contents are invalid.
     """
     path = Path(path)
     toml = Path(specimen) if specimen is not None else toml_beside(path)
@@ -92,7 +92,7 @@ def read_test(
         raise without_toml(toml, read_text(path, "the CSV file of a test"))
     settings = read_settings(toml, path, channels=CHANNELS)
     text = read_text(path, "the CSV file of a test", settings.sheet)
-    window = _chosen(settings.window, cycle, cycles)
+    window = _with_cycles(settings.window, cycle, cycles)
     with naming(path):
         source = Source.of(text, settings.columns)
         record = _record(source, settings)
@@ -138,7 +138,7 @@ def read_test(
 
 
 def read_history(path: Path, channel: str) -> tuple[Array, Array]:
-    """Read time and one other channel of a table in SI; a column without a unit is in SI."""
+    """Read time and one other channel of a table in SI; columns without a unit are in SI."""
     wanted = f"a CSV with the columns 'time (ms)' and '{example(channel)}'"
     text = read_text(path, wanted)
     with naming(path):
@@ -156,9 +156,9 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
 
 
 def _read_motion(path: Path, toml: Path, settings: Settings) -> tuple[Source, Frames, list[str]]:
-    """Read the file that [motion] names: what is read from it, the frames, and notes."""
+    """Read the file named in [motion]; return its source, its frames and notes."""
     motion, spreads = settings.motion, settings.uncertainties
-    assert motion is not None  # else there is nothing to read
+    assert motion is not None  # checked by the caller
     name = motion.file.name
     if os.path.realpath(motion.file) == os.path.realpath(path):
         raise InputError(
@@ -185,17 +185,16 @@ def _of_motion(text: str) -> str:
 
 
 def _record(source: Source, settings: Settings) -> Record:
-    """Read the channels that are needed, in SI, and say what was read from where."""
+    """Read the channels needed for the test, in SI; notes name the columns used."""
     source = source.needed(settings)
     numbers, rows, dropped, notes = _channels(source, settings)
     notes += _compare(source, numbers, settings)
     specimen, striker = settings.specimen, settings.striker or Striker()
     if settings.striker is not None and "time" not in numbers:
         notes.append(
-            "Check: there is a [striker], but no column is a time, so that this is taken for a "
-            "slow test and the striker is not used; name the time in [columns]."
+            "Check: there is a [striker] but no time column, so this is treated as a slow test "
+            "and the striker is not used; name the time in [columns]."
         )
-    # Stress and displacement are derived from the channels that stand for them.
     stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
     acceleration = numbers.get("acceleration")
@@ -211,8 +210,8 @@ def _record(source: Source, settings: Settings) -> Record:
             stress = stress_of_motion(*motion, ratio, striker.gravity or 0.0)
             derived = ("stress",)
             notes.append(
-                "The force is the striker's mass times the deceleration of its motion, read off a "
-                "smoothing spline; it is no measurement of its own."
+                "The force is the striker's mass times the deceleration of its motion, from a "
+                "smoothing spline; it is not an independent measurement."
             )
     inside = _inside(numbers, displacement, notes)
     return Record(
@@ -234,7 +233,7 @@ def _record(source: Source, settings: Settings) -> Record:
 def _channels(
     source: Source, settings: Settings
 ) -> tuple[dict[str, Array], Integers, list[Dropped], list[str]]:
-    """Channels of a table in SI, the numbers of their rows, the rows left out, and notes."""
+    """Return the channels of a table in SI, their row numbers, dropped rows, and notes."""
     table, dropped = without_cut_row(source.table)
     factors = {channel: source.factor(channel) for channel in source.columns}
     numbers, rows, empty = read_numbers(table, source.columns)
@@ -249,20 +248,20 @@ def _channels(
         numbers[channel] = _nominal(measure, values * factors[channel])
         if not 1.0 / LARGEST < np.max(np.abs(numbers[channel])) < LARGEST:
             raise InputError(
-                f"{column} is up to {np.max(np.abs(values)):.3g} in the file, which is no "
+                f"{column} is up to {np.max(np.abs(values)):.3g} in the file, which cannot be a "
                 f"{channel}; correct its numbers, its unit or its scale."
             )
         if measure:
             notes.append(f"The strain is converted from the {measure} strain {header.text!r}.")
-    # An instrument's header may announce the number of samples.
+    # Some instruments write the number of samples into the header.
     for row, line in enumerate(table.content.split("\n", table.first_row)[: table.first_row], 1):
         match = re.match(r"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE | re.ASCII)
         if match and int(match[1]) != rows.size:
-            told = f"announces {int(match[1])} samples, the table has {rows.size}"
-            notes.append(f"Check: row {row} {told}.")
+            counts = f"{int(match[1])} samples, the table has {rows.size}"
+            notes.append(f"Check: row {row} announces {counts}.")
             break
     if empty.size:
-        dropped.append(Dropped.of(empty, "nothing in the columns that are read"))
+        dropped.append(Dropped.of(empty, "no numbers in the columns in use"))
     if "time" in numbers:
         if settings.duplicates == "average":
             numbers, rows = _averaged(numbers, rows, dropped, notes)
@@ -271,31 +270,30 @@ def _channels(
 
 
 def _nominal(measure: str, strain: Array) -> Array:
-    """Engineering strain of one of another measure, all positive in compression."""
+    """Convert a strain of another measure to engineering strain, positive in compression."""
     if measure == "logarithmic":
         return 1.0 - np.exp(-strain)
     if measure and strain.max() >= 0.5:
         raise InputError(
-            f"the {measure} strain reaches {strain.max():.3g}; in compression it stays "
-            "below 0.5, so that the column must hold another strain or have another unit."
+            f"the {measure} strain reaches {strain.max():.3g}; in compression it stays below 0.5, "
+            "so the column must contain another strain or have another unit."
         )
     return 1.0 - np.sqrt(1.0 - 2.0 * strain) if measure else strain
 
 
 def _compare(source: Source, numbers: dict[str, Array], settings: Settings) -> list[str]:
-    """Compare what is read with the columns that could have been read instead.
+    """Compare the columns in use with alternative columns of the same channel.
 
-    InputError if an impact has two clocks that do not agree.
+    Raises InputError if an impact has two inconsistent time columns.
     """
-    table = source.table
-    notes = list[str]()
+    table, notes = source.table, list[str]()
     as_used = {"force": 1 / settings.specimen.area, "strain": settings.specimen.height}
     for channel, k in source.left_out().items():
         try:
             values = read_numbers(table, {channel: k})[0][channel]
             values = values * si_factor(table, channel, k, None)
             values = _nominal(table.headers[k].measure(channel), values)
-        except InputError:  # no alternative
+        except InputError:  # not usable as an alternative
             continue
         used = TWINS.get(channel, channel)
         one, name = numbers[used] * as_used.get(used, 1.0), table.name(k)
@@ -321,7 +319,7 @@ def _compare(source: Source, numbers: dict[str, Array], settings: Settings) -> l
 
 
 def _inside(numbers: dict[str, Array], top: Array | None, notes: list[str]) -> dict[int, Array]:
-    """Displacements of masses inside; one that is that of the top is left out."""
+    """Return the displacements of interior masses, without a copy of that of the top."""
     inside = {}
     for channel, values in numbers.items():
         node = interior_node(channel)
@@ -335,7 +333,7 @@ def _inside(numbers: dict[str, Array], top: Array | None, notes: list[str]) -> d
 def _averaged(
     numbers: dict[str, Array], rows: Integers, dropped: list[Dropped], notes: list[str]
 ) -> tuple[dict[str, Array], Integers]:
-    """Average neighbouring rows with the same time stamp; each is counted with its reason."""
+    """Average consecutive rows with the same time stamp, and count them as dropped."""
     time = numbers["time"]
     starts, _ = fresh_samples(time)
     again = np.delete(rows, starts)
@@ -352,7 +350,7 @@ def _averaged(
 
 
 def _check_time(time: Array, name: str, rows: Integers) -> None:
-    """Refuse a time that does not increase."""
+    """Raise InputError unless the time increases from row to row."""
     back = np.flatnonzero(np.diff(time) <= 0)
     if back.size:
         i = int(back[0]) + 1
@@ -361,7 +359,7 @@ def _check_time(time: Array, name: str, rows: Integers) -> None:
             more = ' (in a test, [data] duplicates = "average" averages rows with the same stamp)'
             wrong = "repeats"
         elif len(back) > len(time) / 2:
-            more = "; as the record runs backwards, turn the order of its rows round"
+            more = "; as the record runs backwards, reverse the order of its rows"
         where = f"row {rows[i]}, column {name!r}"
         raise InputError(f"{where}: time {wrong}; it must increase from row to row{more}.")
 
@@ -369,7 +367,7 @@ def _check_time(time: Array, name: str, rows: Integers) -> None:
 def _one_of(
     numbers: dict[str, Array], first: str, second: str, ratio: float, by: str, notes: list[str]
 ) -> Array | None:
-    """`first` if it is there, else `second` divided by `ratio`; both must agree to 3 %."""
+    """Return `first`, or else `second` divided by `ratio`; note whether both agree to 3 %."""
     one, two = numbers.get(first), numbers.get(second)
     if two is None:
         return one
@@ -380,9 +378,9 @@ def _one_of(
     slope = float(np.dot(two, one) / np.dot(one, one)) / ratio
     apart = percent(max(1e-5, float(np.max(np.abs(two / ratio - one)) / np.ptp(one))))
     if abs(slope - 1) > 0.03:
-        agree = f"{slope:.3g} times what it gives with {by} of the specimen; they are inconsistent"
+        agree = f"{slope:.3g} times its equivalent with {by} of the specimen; they are inconsistent"
         notes.append(f"Check: the {first} is used, but the {second} is {agree}.")
     else:
-        told = f"The {first} is used rather than the {second}, and they agree to"
-        notes.append(f"{told} {apart} of the range.")
+        used = f"The {first} is used rather than the {second}"
+        notes.append(f"{used}, and they agree to {apart} of the range.")
     return one

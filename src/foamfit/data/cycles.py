@@ -1,4 +1,4 @@
-"""The cycles of a slow test: where its motion turns round, and which of them are used."""
+"""Find the cycles of a slow test from the turns of its motion, and select those to use."""
 
 from __future__ import annotations
 
@@ -12,26 +12,30 @@ from foamfit.data.noise import noise_level, smooth
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
-# Shares of the largest displacement: the least way back of a reversal, the most that is left at
-# rest, the least that counts as unloading, and the peak below which a cycle is called small.
-_TURN, _REST, _UNLOADED, _SMALLER = 0.05, 0.35, 0.1, 0.9
-# Lowest share of the displacement between cycles; shares of the peak stress that count as a load,
-# and from which a later cycle is said to start under load.
-_LOWEST, _LOADED, _STILL_LOADED = 0.02, 0.01, 0.05
-# Share of its peak stress up to which the rise of a later cycle is straight, the fewest samples of
-# it, and the number of places that are tried for its foot.
-_EARLY, _FEWEST, _PLACES = 0.1, 5, 400
-_SURE = 4.0  # standard errors by which a stress is below zero
-_STRETCH = 1000  # samples in which the next turn is looked for first
-_BEGUN = 3.0  # times the least load: above it the first rise has certainly begun
+# Shares of the range of the displacement
+_TURN = 0.05  # least way back at a reversal
+_REST = 0.35  # most displacement at rest between two cycles
+_UNLOADED = 0.1  # least decrease that counts as unloading
+_SMALLER = 0.9  # a cycle with a lower peak is reported as small
+_LOWEST = 0.02  # the lowest displacements, at which the specimen is unloaded
+# Shares of the peak stress
+_LOADED = 0.01  # more counts as load
+_STILL_LOADED = 0.05  # from here a later cycle is reported to start under load
+_EARLY = 0.1  # the rise of a later cycle is straight up to here
+_FEWEST = 5  # least number of samples of that rise
+_PLACES = 400  # number of trial values for the start of that rise
+_SURE = 4.0  # standard errors for a stress significantly below zero
+_STRETCH = 1000  # samples in which the next turn is searched first
+_BEGUN = 3.0  # multiple of the least load above which the first rise has certainly started
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """One loading and unloading among the samples of a slow test: `first` up to `end`.
+    """One loading and unloading of a slow test, or several as one history: `first` to `end`.
 
-    `number` is that of the record's own column of cycles, or counts from 1; `place` counts from 0.
-    The last peak is at `turn`; several cycles as one history have a `last` number.
+    `number` comes from the column of cycles in the record, or counts from 1; `place` counts from 0.
+    The first peak is at sample `top`, the last one at `turn`. `last` is the number of the last of
+    several cycles.
     """
 
     number: int
@@ -44,20 +48,20 @@ class Cycle:
 
 
 def find_cycles(record: Record) -> list[Cycle]:
-    """List the cycles of a slow test; none if it has no displacement.
+    """List the cycles of a slow test; none without a displacement.
 
-    A cycle ends where the motion has gone back most of the way from the smaller of the peaks on
-    either side; a reversal that goes back less is part of its cycle, as is motion without load,
-    such as an approach. It runs from the last rest before its rise to its first return to rest.
+    Two cycles are separate if the motion between them goes back most of the way from the smaller of
+    the two peaks. A smaller reversal is part of its cycle, and so is motion without load, such as
+    an approach. A cycle runs from the last rest before its rise to its first return to rest.
     """
     w, stress = record.displacement, record.stress
     if w is None:
-        return []  # refused or integrated later
+        return []  # rejected or integrated later
     turns, low, size = find_turns(w), float(w.min()), float(np.ptp(w))
     free = float(np.median(stress[w <= low + _LOWEST * size]))
     least = free + _LOADED * (float(stress.max()) - free)
     peaks, rests = [int(turns[0])], [0]
-    # The way to a peak starts where the load begins; the approach before it does not count.
+    # The approach before the first load does not count as part of the way to a peak.
     first = next((int(turn) for turn in turns[::2] if stress[turn] >= least), 0)
     light = np.flatnonzero(stress[:first] <= free + _BEGUN * (least - free))
     low = max(low, float(w[light[-1]])) if light.size else low
@@ -68,8 +72,7 @@ def find_cycles(record: Record) -> list[Cycle]:
             peaks.append(int(peak))
         elif stress[peaks[-1]] < least or w[peak] > w[peaks[-1]]:
             peaks[-1] = int(peak)
-    column = record.cycle
-    found = []
+    column, found = record.cycle, list[Cycle]()
     for place, (first, top, after) in enumerate(zip(rests, peaks, [*peaks[1:], None], strict=True)):
         fall, end = w[top:after], len(record)
         if fall[0] - fall.min() > _UNLOADED * size:
@@ -80,7 +83,7 @@ def find_cycles(record: Record) -> list[Cycle]:
 
 
 def choose_cycles(cycles: list[Cycle], number: int | None, last: int | None) -> Cycle | None:
-    """Return a cycle, by default the first, or several as one history; InputError without them."""
+    """Return a cycle (default: the first, None without cycles), or several as one history."""
     first = _choose(cycles, number)
     if last is None or last == number:
         return first
@@ -102,21 +105,21 @@ def choose_cycles(cycles: list[Cycle], number: int | None, last: int | None) -> 
 def _choose(cycles: list[Cycle], number: int | None) -> Cycle | None:
     if number is None or not cycles:
         return cycles[0] if cycles else None
-    there = [cycle.number for cycle in cycles]
-    if there.count(number) == 1:
-        return cycles[there.index(number)]
-    wrong = f"has cycles {there[0]} to {there[-1]}"
-    if number in there:
-        wrong = "has it twice"
-    elif len(there) == 1:
-        wrong = f"has cycle {there[0]} alone"
-    elif there != list(range(there[0], there[0] + len(there))):
-        wrong = f"has {len(there)} of the cycles {min(there)} to {max(there)}"
-    raise InputError(f"cycle {number} cannot be taken: the file {wrong}; give one that it has.")
+    numbers = [cycle.number for cycle in cycles]
+    if numbers.count(number) == 1:
+        return cycles[numbers.index(number)]
+    wrong = f"has cycles {numbers[0]} to {numbers[-1]}"
+    if number in numbers:
+        wrong = "contains it twice"
+    elif len(numbers) == 1:
+        wrong = f"has only cycle {numbers[0]}"
+    elif numbers != list(range(numbers[0], numbers[0] + len(numbers))):
+        wrong = f"has {len(numbers)} of the cycles {min(numbers)} to {max(numbers)}"
+    raise InputError(f"cycle {number} cannot be taken: the file {wrong}; give one that exists.")
 
 
 def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
-    """Keep one loading and unloading of a slow test, or several cycles."""
+    """Keep the samples of one loading and unloading, or of several cycles."""
     w, n, number = record.displacement, len(cycles), cycle.number
     assert w is not None  # it has cycles
     size, start, top, end = float(np.ptp(w)), cycle.first, cycle.top, cycle.end
@@ -130,7 +133,7 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
             f"{named}{order} of {n} {used}: {end - start} of {len(record)} "
             f"samples, {start} before and {len(record) - end} after are cut."
         )
-    largest = max(cycles, key=lambda one: float(w[one.top])).number
+    largest = max(cycles, key=lambda c: float(w[c.top])).number
     share = (w[top] - w.min()) / size
     if share < _SMALLER and cycle.last is None:
         notes.append(
@@ -140,18 +143,18 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
         )
     last = cycle.turn
     if end == len(record) and w[last] - w[last:].min() <= _UNLOADED * size:
-        notes.append("The record has no unloading, so nothing in it determines unloading.")
+        notes.append("The record has no unloading, so the unloading is undetermined.")
     after = f"after cycle {number if cycle.last is None else cycle.last}"
     return record.noted(*notes).between(start, end, f"before cycle {number}", after)
 
 
 def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: float) -> Record:
-    """Cut a later cycle to its contact, with time, displacement and stress zero where it starts.
+    """Cut a later cycle to its contact; time, displacement and stress are zero at its start.
 
-    The specimen is free or least loaded at the lowest displacements between the cycles. Contact
-    starts where a straight line through the early rise meets the level of the stress there, and
-    ends where the stress is back at that level. A level below zero is an offset of the sensor: a
-    foam does not pull its platen for long. The strain not recovered is `origins["start_strain"]`.
+    The specimen is unloaded, or loaded least, at the lowest displacements between the cycles.
+    Contact starts where a straight line through the early rise meets the level of the stress there,
+    and ends where the stress returns to that level. A negative level is an offset of the sensor, as
+    a foam does not pull its platen for long. The strain not recovered is `origins["start_strain"]`.
     """
     w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
     turn, end_of = cycle.turn, number if cycle.last is None else cycle.last
@@ -166,13 +169,13 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     ahead = float(w[last + 1] - w[last])
     share = (contact - float(w[last])) / ahead if ahead > 0.0 else 0.0
 
-    def passed(values: Array) -> float:
+    def at_contact(values: Array) -> float:
         return float(values[last] + share * (values[last + 1] - values[last]))
 
     level, offset = free + _LOADED * rise, min(free, 0.0)
     back = np.flatnonzero(mean[turn : cycle.end] <= level)
     first, end = last + (share > 0.0), turn + int(back[0]) + 1 if back.size else cycle.end
-    time = passed(record.instants)
+    time = at_contact(record.instants)
     moment = "" if record.time is None else f" {engineering(time, 's')} in the file,"
     notes = [
         f"Contact of cycle {number} starts{moment} where the stress rises from its level between "
@@ -192,21 +195,19 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     moved = moved if record.time is None else moved.shifted("time", time)
     moved = replace(
         moved,
-        interior={node: values - passed(values) for node, values in record.interior.items()},
+        interior={node: values - at_contact(values) for node, values in record.interior.items()},
         origins=moved.origins | {"start_strain": contact / height},
         notes=(*cut_to_cycle(record, cycles, cycle).notes, *notes),
     )
-    cut = moved.without(slice(cycle.end, None), f"after cycle {end_of}")
-    cut = cut.without(slice(end, None), "after contact ends")
-    cut = cut.without(slice(cycle.first, first), "before contact starts")
-    return cut.without(slice(0, cycle.first), f"before cycle {number}")
+    cut = moved.between(cycle.first, cycle.end, f"before cycle {number}", f"after cycle {end_of}")
+    first, end = first - cycle.first, end - cycle.first
+    return cut.between(first, end, "before contact starts", "after contact ends")
 
 
 def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
-    """Take a stress below zero after the first cycle of a history for the zero of the stress.
+    """Use a stress significantly below zero after the first of several cycles as its zero.
 
-    A specimen that is pressed a little before its first contact and is free after it shows its zero
-    there.
+    A preloaded specimen may become free only after the first cycle.
     """
     if cycle.last is None:
         return record
@@ -226,7 +227,7 @@ def _offset_note(when: str, zero: float) -> str:
 
 
 def _stress_between(record: Record, cycles: list[Cycle], place: int) -> Array:
-    """Stresses at the lowest displacements between the peaks of a cycle and of the next one."""
+    """Return the stresses at the lowest displacements between the peaks of two cycles."""
     w, between = record.displacement, slice(cycles[place].top, cycles[place + 1].top)
     assert w is not None  # it has cycles
     lowest = w[between] <= w[between].min() + _LOWEST * np.ptp(w)
@@ -234,7 +235,7 @@ def _stress_between(record: Record, cycles: list[Cycle], place: int) -> Array:
 
 
 def _hinge(w: Array, stress: Array) -> float:
-    """Displacement up to which a stress is zero, and from which it rises as a straight line."""
+    """Return the displacement up to which a stress is zero and from which it rises linearly."""
     every = slice(None, None, 1 + w.size // 1000)
     w, stress = w[every], stress[every]
     places = np.linspace(float(w.min()), float(w.max()), _PLACES, endpoint=False)
@@ -245,14 +246,13 @@ def _hinge(w: Array, stress: Array) -> float:
 
 
 def find_turns(values: Array, back: float | None = None) -> Integers:
-    """Samples at which a motion turns round: peaks and valleys by turns, the first a peak.
+    """Return the samples at which a motion turns: peaks and valleys alternate, first a peak.
 
-    Only what goes back by more than `back`, by default a twentieth of the range and more than the
-    noise, turns.
+    A turn goes back by more than `back`, by default a twentieth of the range and more than noise.
     """
     if back is None:
         back = max(_TURN * float(np.ptp(values)), 8.0 * noise_level(values))
-    # From a turn on, ever longer stretches are searched for the next.
+    # Search increasingly long stretches after a turn for the next one.
     turns, first, sign, length = list[int](), 0, 1.0, _STRETCH
     while True:
         ahead = sign * values[first : first + length]
@@ -265,15 +265,15 @@ def find_turns(values: Array, back: float | None = None) -> Integers:
             length *= 2
         else:
             break
-    if sign > 0.0 or not turns:  # the record ends on its way up
+    if sign > 0.0 or not turns:  # the record ends while rising
         turns.append(first + int(np.argmax(ahead)))
     return np.array(turns, dtype=np.int64)
 
 
 def cycles_of(test: Measurement) -> dict[int, slice]:
-    """Samples of each of several cycles that are one history, by their numbers; {} of one cycle.
+    """Return the samples of each cycle, by number, of several used as one history; else {}.
 
-    They are divided where the motion turns from unloading to loading.
+    Cycles are separated where the motion turns from unloading to loading.
     """
     if test.last_cycle is None or test.displacement is None:
         return {}
@@ -285,7 +285,7 @@ def cycles_of(test: Measurement) -> dict[int, slice]:
 
 
 def _reversals(displacement: Array) -> list[tuple[int, int, bool]]:
-    """Pairs of turns between which one loading and unloading is reversed, and if while loading."""
+    """Return the turns at both ends of each inner reversal, and whether it occurs on loading."""
     turns = find_turns(displacement).tolist()
     peak = int(np.argmax(displacement[turns]))
     places = *range(0, peak, 2), *range(peak + 1, len(turns) - 1, 2)
@@ -293,19 +293,19 @@ def _reversals(displacement: Array) -> list[tuple[int, int, bool]]:
 
 
 def inner_loops(displacement: Array) -> list[tuple[int, int]]:
-    """Samples (first, past the last) from each reversal until the motion is back there."""
+    """Return the samples (first, end) from each reversal until the motion is back there."""
     out = list[tuple[int, int]]()
     for start, turn, loading in _reversals(displacement):
         ahead, level = displacement[turn:], displacement[start]
         past = ahead >= level if loading else ahead <= level
         stop = turn + int(np.argmax(past)) if past.any() else len(displacement)
-        if not out or start >= out[-1][1]:  # a loop in a loop is a part of it
+        if not out or start >= out[-1][1]:  # skip a loop within a loop
             out.append((start, stop))
     return out
 
 
 def inner_reversals(displacement: Array) -> list[str]:
-    """Say where the motion of one loading and unloading turns round below its peak."""
+    """Return a note if the motion of one loading and unloading reverses below its peak."""
     backs = [abs(displacement[a] - displacement[b]) for a, b, _ in _reversals(displacement)]
     if not backs:
         return []

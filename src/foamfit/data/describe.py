@@ -1,4 +1,4 @@
-"""What `foamfit check` prints of a test."""
+"""Text of `foamfit check` on a test."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from foamfit.data.energy import EnergyAudit, largest_motion
 from foamfit.data.measurement import Measurement, Striker, interior_node
 from foamfit.text import engineering, labelled, listed, percent
 
-# What 1 % of a quantity does: in an impact, and in a slow test (None: it does not enter there).
-# What does most stands first.
+# Effect of 1 % of a quantity in an impact and in a slow test (None: no effect), largest first.
 EFFECTS = {
     "velocity": ("2 % of the striker's energy and 1 % of its momentum", None),
     "striker_mass": ("1 % of both", None),
@@ -19,7 +18,7 @@ EFFECTS = {
 
 
 def describe(test: Measurement, audit: EnergyAudit) -> str:
-    """Write what was read of a test, what was done to it, its energy, and what has no ±."""
+    """Describe a test: its input, preparation, energy balance, and quantities without a ±."""
     lines = [
         ("test", [test.name]),
         ("file", [str(test.path or "none")]),
@@ -32,17 +31,17 @@ def describe(test: Measurement, audit: EnergyAudit) -> str:
     ]
     effects = {name.replace("_", " "): effect for name, effect in taken_for_exact(test).items()}
     if effects:
-        told = ", ".join(f"1 % of the {name} is {effect}" for name, effect in effects.items())
+        shares = ", ".join(f"1 % of the {name} is {effect}" for name, effect in effects.items())
         sentences = [
             f"The TOML states no ± of {listed(effects)}, which therefore count as exact.",
-            f"The ± of the {next(iter(effects))} would probably matter most: {told}.",
+            f"The ± of the {next(iter(effects))} would probably matter most: {shares}.",
         ]
         lines.append(("exact", sentences))
     return labelled(lines)
 
 
 def taken_for_exact(test: Measurement) -> dict[str, str]:
-    """Quantities of the TOML that have no ±, and what 1 % of each does, the most telling first."""
+    """Return the quantities without a ± in the TOML and the effect of 1 %, largest first."""
     striker, effects = test.striker or Striker(), dict[str, str]()
     impact = test.time is not None and striker.mass and striker.velocity
     for name, (of_impact, of_slow) in EFFECTS.items():
@@ -55,7 +54,7 @@ def taken_for_exact(test: Measurement) -> dict[str, str]:
 
 
 def noise_sentences(measurement: Measurement) -> list[str]:
-    """Say of each channel what its noise is, one standard deviation, and how it is known."""
+    """Return a sentence per channel: standard deviation of the noise, and its source."""
     sentences = []
     for channel, values in measurement.channels().items():
         level = measurement.noise.of(channel)
@@ -68,32 +67,32 @@ def noise_sentences(measurement: Measurement) -> list[str]:
 
 
 def _given(test: Measurement) -> list[tuple[str, list[str]]]:
-    """What the TOML says of specimen and striker, with the ± of each quantity that has one."""
+    """Return the lines on specimen and striker, with the ± of each quantity if given."""
     spread, s, striker = test.uncertainties, test.specimen, test.striker
 
-    def given(value: float, unit: str, name: str, scale: float = 1.0) -> str:
+    def with_spread(value: float, unit: str, name: str, scale: float = 1.0) -> str:
         sigma = scale * spread.get(name, 0.0)
         return engineering(scale * value, unit) + (f" ± {engineering(sigma, unit)}" * bool(sigma))
 
     area = f"{s.area * 1e6:.4g}" + (f" ± {spread['area'] * 1e6:.2g}" if "area" in spread else "")
-    specimen = f"height {given(s.height, 'm', 'height')}, area {area} mm²"
+    specimen = f"height {with_spread(s.height, 'm', 'height')}, area {area} mm²"
     if s.mass:
         density = s.mass / (s.area * s.height)
-        specimen += f", mass {given(s.mass, 'g', 'specimen_mass', 1e3)} ({density:.4g} kg/m³)"
+        specimen += f", mass {with_spread(s.mass, 'g', 'specimen_mass', 1e3)} ({density:.4g} kg/m³)"
     if s.heights:
-        springs = [given(h, "m", f"height_{i}") for i, h in enumerate(s.heights, 1)]
+        springs = [with_spread(h, "m", f"height_{i}") for i, h in enumerate(s.heights, 1)]
         specimen += f", springs from the base {' + '.join(springs)}"
     if striker is None:
         return [("specimen", [specimen]), ("striker", ["none given"])]
-    own = f" ± {spread['velocity']:.2g}" if "velocity" in spread else ""
-    own += " m/s" + ", falling" * bool(striker.gravity)
-    velocity = f"{striker.velocity:.4g}{own}" if striker.velocity else "velocity unknown"
-    mass = given(striker.mass, "g", "striker_mass", 1e3) if striker.mass else "mass unknown"
+    end = f" ± {spread['velocity']:.2g}" if "velocity" in spread else ""
+    end += " m/s" + ", falling" * bool(striker.gravity)
+    velocity = f"{striker.velocity:.4g}{end}" if striker.velocity else "velocity unknown"
+    mass = with_spread(striker.mass, "g", "striker_mass", 1e3) if striker.mass else "mass unknown"
     return [("specimen", [specimen]), ("striker", [f"{mass}, {velocity}"])]
 
 
 def _measured(test: Measurement) -> list[tuple[str, list[str]]]:
-    """How many samples there are, and the largest value of each channel, with its instant."""
+    """Return the lines on the number of samples and on the peak of each channel."""
     channels, time = test.channels(), test.time
     text = f"{max(map(len, channels.values()))} of "
     if time is None:

@@ -1,7 +1,7 @@
-"""Do mass, velocity, force and motion of a test agree?
+"""Check the balances of energy and momentum of a test.
 
-The striker brings m v²/(2 A H) per unit volume; what the stress does on the way to the largest
-strain must take it up. The impulse of the force must be the striker's change of momentum.
+The energy of the striker per volume of foam, m v²/(2 A H), must equal the work of the stress up to
+the largest strain. The impulse of the force must equal the striker's change of momentum.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from foamfit.text import engineering, percent
 
 @dataclass(frozen=True)
 class EnergyAudit:
-    """The energy and momentum of one test; None where the test lacks what it takes.
+    """Energy and momentum of one test; a value is None if the data for it are missing.
 
     Attributes
     ----------
@@ -27,13 +27,13 @@ class EnergyAudit:
     absorbed_energy, dissipated_energy
         ∫σ dε up to the largest strain, and over the whole history, J/m³.
     dissipated_fraction, absorbed_over_striker
-        Dissipated over absorbed energy, and absorbed over the striker's energy.
+        Ratios of dissipated to absorbed energy, and of absorbed energy to the striker's energy.
     rebound_velocity
-        Velocity with which the top leaves, m/s, positive away from the specimen.
+        Velocity of the top at the end of contact, m/s, positive away from the specimen.
     impulse, momentum_change, impulse_ratio
-        ∫F dt over contact and m (v_in + v_out), N·s, and the first over the second.
+        ∫F dt over contact and m (v_in + v_out), N·s, and their ratio.
     motion, missing
-        Where the displacement came from; a sentence for each thing that could not be computed.
+        Source of the displacement; one sentence for each quantity that could not be computed.
     """
 
     striker_energy: float | None = None
@@ -50,11 +50,11 @@ class EnergyAudit:
 
     def as_dict(self) -> dict[str, float | str | None]:
         """Return the audit as plain values; `missing` and `warnings` are joined to one text."""
-        told = {"missing": " ".join(self.missing), "warnings": " ".join(self.warnings())}
-        return asdict(self) | told
+        texts = {"missing": " ".join(self.missing), "warnings": " ".join(self.warnings())}
+        return asdict(self) | texts
 
     def warnings(self) -> list[str]:
-        """Return one sentence for each balance that does not close."""
+        """Return one sentence for each balance of energy or momentum that does not close."""
         return self.energy_warnings() + self.impulse_warnings()
 
     def energy_warnings(self) -> list[str]:
@@ -78,7 +78,7 @@ class EnergyAudit:
         return found
 
     def impulse_warnings(self) -> list[str]:
-        """Return a sentence if the impulse of the force is not the change of momentum."""
+        """Return a sentence if impulse and change of momentum differ by more than 10 %."""
         ratio = self.impulse_ratio
         if ratio is None or abs(ratio - 1) <= 0.1:
             return []
@@ -88,29 +88,29 @@ class EnergyAudit:
         ]
 
     def sentences(self) -> list[str]:
-        """Return what was found, what does not close, and what is missing."""
-        ratio, share, told = self.absorbed_over_striker, self.dissipated_fraction, list[str]()
+        """Return the results, the warnings and the missing quantities, one sentence each."""
+        ratio, share, results = self.absorbed_over_striker, self.dissipated_fraction, list[str]()
         if self.striker_energy is not None:
-            told.append(f"The striker brings {engineering(self.striker_energy, 'J/m³')}.")
+            results.append(f"The striker brings {engineering(self.striker_energy, 'J/m³')}.")
         if self.absorbed_energy is not None:
             more = "" if ratio is None else f", {ratio:.2f} of what the striker brings"
             taken = engineering(self.absorbed_energy, "J/m³")
-            told.append(f"The foam absorbs {taken} up to the largest strain{more}.")
+            results.append(f"The foam absorbs {taken} up to the largest strain{more}.")
         if self.dissipated_energy is not None and share is not None:
             lost = engineering(self.dissipated_energy, "J/m³")
-            told.append(f"It dissipates {lost}, {percent(share)} of that.")
+            results.append(f"It dissipates {lost}, {percent(share)} of that.")
         if self.rebound_velocity is not None:
-            told.append(f"The striker leaves at {self.rebound_velocity:.3g} m/s.")
+            results.append(f"The striker leaves at {self.rebound_velocity:.3g} m/s.")
         if self.impulse is not None and self.momentum_change is not None:
-            told.append(
+            results.append(
                 f"The impulse of the force is {self.impulse:.4g} N·s, the striker's change of "
                 f"momentum {self.momentum_change:.4g} N·s (ratio {self.impulse_ratio:.2f})."
             )
-        return [*told, *self.warnings(), *self.missing]
+        return [*results, *self.warnings(), *self.missing]
 
 
 def audit(test: Measurement) -> EnergyAudit:
-    """Compare what the striker brings with what the specimen takes; name what a test lacks."""
+    """Check the balances of energy and momentum of a test."""
     striker, specimen, missing = test.striker or Striker(), test.specimen, list[str]()
     stress, w, time = test.stress, test.displacement, test.time
     brought = absorbed = dissipated = None
@@ -122,10 +122,10 @@ def audit(test: Measurement) -> EnergyAudit:
     if stress is not None and w is not None:
         strain = w / specimen.height
         top, largest = largest_motion(w, time)
-        # What precedes the first sample is the triangle from zero at time zero.
+        # Before the first sample, stress and strain rise linearly from zero.
         before = 0.5 * float(max(stress[0], 0.0) * max(strain[0], 0.0))
         absorbed = before + float(np.trapezoid(stress[: top + 1], strain[: top + 1]))
-        # The sum ends at a noisy strain, where the stress is highest; the true end is the turn.
+        # The integral ends at a noisy strain; correct it to the smoothed largest strain.
         absorbed += float(stress[top]) * (largest / specimen.height - float(strain[top]))
         if brought is not None and striker.mass:
             weight = striker.mass * (striker.gravity or 0.0)
@@ -137,7 +137,9 @@ def audit(test: Measurement) -> EnergyAudit:
         missing.append("The dissipated energy needs the unloading.")
     impulse, rebound, change = _momentum(test, unloaded)
     if test.motion == INTEGRATED:
-        missing.append("The motion comes from the force, so the balances check nothing here.")
+        missing.append(
+            "The motion was integrated from the force, so the balances are not independent."
+        )
     elif change is None:
         missing.append("The balance of momentum needs an impact of known mass with its rebound.")
     return EnergyAudit(
@@ -156,9 +158,9 @@ def audit(test: Measurement) -> EnergyAudit:
 
 
 def _momentum(test: Measurement, unloaded: bool) -> tuple[float | None, float | None, float | None]:
-    """Impulse of the force, N·s, velocity of the rebound, m/s, and the change of momentum, N·s.
+    """Return impulse of the force, N·s, rebound velocity, m/s, and change of momentum, N·s.
 
-    The change is what force and motion must agree in; the weight of a falling striker adds to it.
+    The change of momentum includes the impulse of the weight of a falling striker.
     """
     striker, stress, w, time = test.striker, test.stress, test.displacement, test.time
     if striker is None or time is None or stress is None:
@@ -167,7 +169,7 @@ def _momentum(test: Measurement, unloaded: bool) -> tuple[float | None, float | 
     impulse = test.specimen.area * float(np.trapezoid(stress, time) + lead)
     if w is None or not unloaded:
         return impulse, None, None
-    # A gauge that rests again after contact does not show the striker any more.
+    # A gauge at rest again after contact no longer follows the striker.
     shown = np.flatnonzero(test.sampled.get("displacement", np.ones(len(w), dtype=bool)))
     last = shown[-max(5, len(shown) // 20) :]
     rebound = -line_at(time[last], w[last], time[last[-1]])[1]
@@ -178,18 +180,18 @@ def _momentum(test: Measurement, unloaded: bool) -> tuple[float | None, float | 
 
 
 def largest_motion(displacement: Array, time: Array | None = None) -> tuple[int, float]:
-    """Find the turn of a motion: its sample and the displacement there.
+    """Return the sample of the largest displacement, and the displacement there without noise.
 
-    The largest sample has the largest noise: a quartic is fitted to those that may be the turn.
+    The largest sample is biased by noise, so a quartic is fitted to the samples near the maximum.
     """
     floor = displacement.max() - 8.0 * noise_level(displacement)
     near = np.flatnonzero(displacement >= floor)
-    about = np.arange(near[0], near[-1] + 1)
-    if len(about) < 12:
+    region = np.arange(near[0], near[-1] + 1)
+    if len(region) < 12:
         top = int(np.argmax(displacement))
         return top, float(displacement[top])
-    x = about.astype(np.float64) if time is None else time[about]
+    x = region.astype(np.float64) if time is None else time[region]
     x = 2.0 * (x - x[0]) / (x[-1] - x[0]) - 1.0
-    turn = np.polyval(np.polyfit(x, displacement[about], 4), x)
+    turn = np.polyval(np.polyfit(x, displacement[region], 4), x)
     top = int(np.argmax(turn))
-    return int(about[top]), float(turn[top])
+    return int(region[top]), float(turn[top])

@@ -1,7 +1,7 @@
-"""A motion that was recorded with a clock of its own, put on the clock of the force.
+"""Align a motion that was recorded with its own clock with the clock of the force.
 
-If it has fewer samples, like that of a camera, it is interpolated, and only the samples of the
-force that have a frame count as measured: `Record.sampled`.
+If it has fewer samples than the force, like that of a camera, it is interpolated. Only samples of
+the force with a frame then count as measured, see `Record.sampled`.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from foamfit.data.outliers import find_outliers
 from foamfit.errors import InputError
 from foamfit.text import counted, engineering
 
-_FEW = 8  # with fewer frames, straight lines are drawn and no spline
-_SEVERAL = 2.0  # usual number of frames in a block from which on they are averaged
-_PAUSE = 6.0  # usual steps of time that make a pause, across which the line is straight too
+_FEW = 8  # fewer frames are interpolated linearly
+_SEVERAL = 2.0  # median number of frames in a block from which they are averaged
+_PAUSE = 6.0  # a longer step, in usual steps, is a pause and is interpolated linearly
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Motion of a file of its own: time, s, by its own clock, and displacements, m, by channel.
+    """Motion from a separate file: time, s, of its own clock, and displacements, m, by channel.
 
-    A frame was taken at its time + `delay` (s) by the clock of the force; `spread` is the standard
+    On the clock of the force, a frame has its time + `delay` (s); `spread` is the standard
     deviation of the delay, None if it is exact.
     """
 
@@ -38,7 +38,7 @@ class Frames:
     spread: float | None = None
 
     def __str__(self) -> str:
-        """Say how many frames there are, their clock, and the delay."""
+        """Return a sentence with the number of frames, their clock, and the delay."""
         step, first, last = float(np.median(np.diff(self.time))), self.time[0], self.time[-1]
         sigma = "exactly" if self.spread is None else f"± {engineering(self.spread, 's')}"
         return (
@@ -50,15 +50,16 @@ class Frames:
 
 
 def join(record: Record, frames: Frames) -> Record:
-    """Give a record of a force the motion of frames that have a clock of their own.
+    """Add the motion of frames with their own clock to a record of a force.
 
-    If there are fewer frames than samples, a cubic spline through them gives the motion at every
-    sample; only the sample nearest to a frame counts as measured. Otherwise they are averaged or
-    interpolated for each sample, and all count. Spikes and samples outside the time of the frames
-    are left out. InputError if the two do not overlap in time, or the delay is longer than both.
+    If there are fewer frames than samples, the motion at each sample comes from a cubic spline, and
+    only the sample nearest to a frame counts as measured. Otherwise frames are averaged or
+    interpolated for each sample, and all samples count. Spikes, and samples outside the time of the
+    frames, are dropped. Raises InputError if the two hardly overlap in time, or if the delay is
+    longer than both.
     """
     time = record.time
-    assert time is not None  # a force without it is refused
+    assert time is not None  # a force without a time was rejected
     longest = max(np.ptp(time), np.ptp(frames.time))
     for size, what in ((frames.delay, "delay"), (frames.spread or 0.0, "± of delay")):
         if abs(size) > longest:
@@ -69,21 +70,21 @@ def join(record: Record, frames: Frames) -> Record:
     at = frames.time + frames.delay
     slack = 1e-9 * longest  # for rounding
     outside = (time < at[0] - slack) | (time > at[-1] + slack)
-    there = (at >= time[0] - slack) & (at <= time[-1] + slack)
+    inside = (at >= time[0] - slack) & (at <= time[-1] + slack)
     count = int(np.count_nonzero(~outside))
-    if count < MIN_ROWS or there.sum() < 2:
-        few = f"overlaps with {count} samples of the force in time, not with {MIN_ROWS} at least"
+    if count < MIN_ROWS or inside.sum() < 2:
+        few = f"overlaps in time with {count} samples of the force; at least {MIN_ROWS} are needed"
         shared = few if 0 < count < MIN_ROWS else "does not overlap in time with the force"
         spans = [" to ".join(engineering(float(t), "s") for t in c[[0, -1]]) for c in (time, at)]
         raise InputError(
-            f"[motion] {frames.name} {shared}: that is from {spans[0]}, the motion with its delay "
-            f"from {spans[1]}."
+            f"[motion] {frames.name} {shared}: the force is from {spans[0]}, the motion with its "
+            f"delay from {spans[1]}."
         )
     record = record.without(outside, f"outside the time of {frames.name}").noted(str(frames))
     time = record.instants
-    if lost := int(np.count_nonzero(~there)):
-        told = f"{counted(lost, 'frame')} of {frames.name} outside the time of the force."
-        record = record.noted(told)
+    if lost := int(np.count_nonzero(~inside)):
+        frames_lost = f"{counted(lost, 'frame')} of {frames.name}"
+        record = record.noted(f"{frames_lost} outside the time of the force.")
     slower = np.median(np.diff(at)) > 1.001 * np.median(np.diff(time))
     for channel, values in frames.motion.items():
         good = ~find_outliers(values, at)
@@ -94,7 +95,7 @@ def join(record: Record, frames: Frames) -> Record:
         if not slower:
             record = record.changed(channel, _averaged(at[good], values[good], time))
             continue
-        taken = _nearest(time, at[good & there])
+        taken = _nearest(time, at[good & inside])
         record = record.interpolated(channel, _through(at[good], values[good], time), taken).noted(
             f"{np.unique(taken).size} of {time.size} samples have a frame of the {channel}; "
             "between them it is interpolated and does not count as measured."
@@ -107,7 +108,7 @@ def _nearest(time: Array, at: Array) -> NDArray[np.intp]:
 
 
 def _through(at: Array, values: Array, time: Array) -> Array:
-    """Cubic spline through samples; straight where they are few, or across a pause."""
+    """Interpolate by a cubic spline; linearly if samples are few, or across a pause."""
     from scipy.interpolate import CubicSpline
 
     straight = np.interp(time, at, values)
@@ -120,7 +121,7 @@ def _through(at: Array, values: Array, time: Array) -> Array:
 
 
 def _averaged(at: Array, values: Array, time: Array) -> Array:
-    """Mean of the samples that are nearest to each time, led to that time by a spline."""
+    """Average the samples nearest to each time, and interpolate the means to that time."""
     if np.median(np.diff(time)) >= 2.0 * np.median(np.diff(at)):
         step = 0.5 * (time[[1, -1]] - time[[0, -2]])
         near = (at >= time[0] - step[0]) & (at <= time[-1] + step[1])
@@ -131,28 +132,28 @@ def _averaged(at: Array, values: Array, time: Array) -> Array:
 
 
 def frames_of_blocks(record: Record, thinned: Record, edges: Integers) -> Record:
-    """Put channels that were not taken at every sample into the blocks that begin at `edges`.
+    """Reduce channels that were not measured at every sample to the blocks starting at `edges`.
 
-    The value of a block is interpolated at its time, as averages over a curve are biased, or
-    averaged where each block has several frames.
+    A channel is averaged if blocks have several frames. Otherwise it is interpolated at the time of
+    the block, because averages of an interpolated curve would be biased.
     """
     middle = means(record.instants, edges)
     for name, taken in record.sampled.items():
         values = record.channel(name)
         if values is None:
             continue
-        many = np.add.reduceat(taken.astype(np.int64), edges)
-        usual = float(np.median(many))
-        whole = many >= 0.5 * usual if usual >= _SEVERAL else many > 0
+        count = np.add.reduceat(taken.astype(np.int64), edges)
+        usual = float(np.median(count))
+        measured = count >= 0.5 * usual if usual >= _SEVERAL else count > 0
         if usual < _SEVERAL:
             thinned = thinned.changed(name, np.interp(middle, record.instants, values))
-        if usual < _SEVERAL or not whole.all():
-            thinned = replace(thinned, sampled=thinned.sampled | {name: whole})
+        if usual < _SEVERAL or not measured.all():
+            thinned = replace(thinned, sampled=thinned.sampled | {name: measured})
     return thinned
 
 
 def noise_of_blocks(level: NoiseLevel, block: int, taken: Mask | None) -> NoiseLevel:
-    """Noise of blocks of samples, some of which were `taken`; see `frames_of_blocks`."""
+    """Return the noise of blocks of samples if only those `taken` were measured."""
     edges = np.arange(0, 0 if taken is None else taken.size, block)
     if taken is None or np.median(np.add.reduceat(taken.astype(np.int64), edges)) >= _SEVERAL:
         return averaged(level, block)

@@ -1,4 +1,4 @@
-"""What was measured: the samples of a file, and the test made of them, all in SI."""
+"""Measured data in SI units: the samples of a file, and the test prepared from them."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from foamfit.text import engineering
 
 MIN_ROWS = 10  # samples of a test
 
-ASKED = "Check:"  # begins a note on what is probably wrong with the input
+ASKED = "Check:"  # starts a note about a probable error in the input
 
-# Where a motion comes from; the second is no measurement of its own.
+# Sources of a displacement; an integrated one is not an independent measurement.
 MEASURED, INTEGRATED = "measured", "integrated from force"
 
 
 def interior_channel(node: int) -> str:
-    """Name of the channel that holds the displacement of an interior mass, 1 above the base."""
+    """Return the name of the displacement channel of an interior mass; 1 is next to the base."""
     return f"displacement_{node}"
 
 
 def interior_node(channel: str) -> int | None:
-    """Interior mass that a channel belongs to, None for any other channel."""
+    """Return the number of the interior mass of a channel, None for any other channel."""
     match = re.fullmatch(r"displacement_([1-9]\d{0,3})", channel, re.ASCII)
     return int(match[1]) if match else None
 
 
 @dataclass(frozen=True)
 class Specimen:
-    """Height before the test, m, cross-section, m², mass, kg; heights of springs, base first."""
+    """Height before the test, m, cross-section, m², mass, kg, and spring heights, base first."""
 
     height: float
     area: float
@@ -48,7 +48,7 @@ GRAVITY = 9.80665  # standard gravity, m/s²
 class Striker:
     """Mass, kg, and velocity at contact, m/s, of the striker; either may be unknown.
 
-    `gravity`, m/s², accelerates it; None: as its flight before contact shows.
+    `gravity` is its acceleration, m/s²; None: to be determined from the flight before contact.
     """
 
     mass: float | None = None
@@ -58,9 +58,9 @@ class Striker:
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """Standard deviation of the noise of a channel, Pa or m, `given` or estimated (`how`).
+    """Standard deviation of a channel's noise, Pa or m, `given` by the user or estimated (`how`).
 
-    `time` is its autocorrelation time, in samples (1: white).
+    `time` is the autocorrelation time in samples (1: white noise).
     """
 
     sigma: float
@@ -71,9 +71,9 @@ class NoiseLevel:
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise that the TOML states, one standard deviation each, Pa and m, or else estimated.
+    """Standard deviations of the noise from the TOML, Pa and m, and the `estimated` ones.
 
-    The displacement's holds for masses inside, too.
+    The value of the displacement also applies to interior masses.
     """
 
     stress: float | None = None
@@ -81,7 +81,7 @@ class Noise:
     estimated: dict[str, NoiseLevel] = field(default_factory=dict)
 
     def of(self, channel: str) -> NoiseLevel | None:
-        """Return the noise of a channel, stated or else estimated; None if neither is known."""
+        """Return the noise of a channel, from the TOML if given there; None if unknown."""
         stated = {"stress": self.stress, "acceleration": None}
         given = stated.get(channel, self.displacement)
         return self.estimated.get(channel) if given is None else NoiseLevel(given, True, "given")
@@ -89,10 +89,11 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class Outliers:
-    """Samples of a channel that are `left_out` of the fit (n,): spikes, short gaps, a clipped top.
+    """Samples of a channel that are `left_out` of the fit (n,): spikes, short gaps, clipped force.
 
-    Spikes and gaps are bridged by a straight line; the file has the `values` (k,), Pa or m, `at`
-    times (k,), s, or samples. The force is clipped at `clipped_at`, Pa.
+    Spikes and gaps are replaced by a straight line. Their original `values` (k,), Pa or m, belong
+    to the times `at` (k,), s, or sample numbers. The force is clipped at the stress `clipped_at`,
+    Pa.
     """
 
     left_out: Mask
@@ -103,7 +104,7 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Dropped:
-    """Number of rows not used for one reason, the `first` and the `last` (lines of the file)."""
+    """Number of rows dropped for one reason, and the first and last of them (lines of the file)."""
 
     rows: int
     first: int
@@ -112,11 +113,11 @@ class Dropped:
 
     @classmethod
     def of(cls, rows: Integers, why: str) -> Dropped:
-        """Count the rows with these numbers."""
+        """Count the rows with the given row numbers."""
         return cls(rows.size, int(rows[0]), int(rows[-1]), why)
 
     def __str__(self) -> str:
-        """Return for example "rows 2 to 200 (199): before contact starts"."""
+        """Return, for example, "rows 2 to 200 (199): before contact starts"."""
         if self.rows == 1:
             return f"row {self.first}: {self.why}"
         part = "" if self.rows == self.last - self.first + 1 else "of "
@@ -125,9 +126,9 @@ class Dropped:
 
 @dataclass(frozen=True)
 class RowCount:
-    """Rows of numbers in a file: all, used and dropped, with the reasons.
+    """Rows of numbers in a file: all, used, and dropped with the reasons.
 
-    A row is used if each of its channels is fitted or integrated, as it stands or averaged.
+    A row is used if all its channels are fitted or integrated, directly or averaged.
     """
 
     rows: int
@@ -135,24 +136,24 @@ class RowCount:
     dropped: tuple[Dropped, ...] = ()
 
     def sentences(self) -> list[str]:
-        """Say how many rows there are, and name those that are not used."""
-        told = f"{self.rows} in the file, {self.used} used."
-        return [told, *(f"Not used: {item}." for item in self.dropped)]
+        """Return sentences with the number of rows and the rows that are not used."""
+        unused = (f"Not used: {item}." for item in self.dropped)
+        return [f"{self.rows} in the file, {self.used} used.", *unused]
 
 
 @dataclass(frozen=True)
 class Window:
-    """The part of a file to use: times in s as the file counts them, and which cycle."""
+    """The part of a file to use: start and end on the file's own clock, s, and the cycle."""
 
     start: float = -np.inf
     end: float = np.inf
-    cycle: int | None = None  # the first one
-    last: int | None = None  # of several that are one history; by default none but `cycle`
+    cycle: int | None = None  # None: the first
+    last: int | None = None  # last of several cycles taken as one history; None: only `cycle`
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Samples:
-    """What a `Record` and the `Measurement` made of it both hold; see there."""
+    """Fields shared by `Record` and `Measurement`; see their docstrings."""
 
     interior: dict[int, Array] = field(default_factory=dict)
     sampled: dict[str, Mask] = field(default_factory=dict)
@@ -163,21 +164,21 @@ class Samples:
     notes: tuple[str, ...] = ()
 
     def curves(self, *more: str) -> dict[str, Array]:
-        """Stress, displacement, `more` and displacements inside, as far as they are there."""
+        """Return the available ones of stress, displacement, `more`, interior displacements."""
         names = ("stress", "displacement", *more)
-        found = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return found | {interior_channel(node): values for node, values in self.interior.items()}
+        present = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return present | {interior_channel(node): w for node, w in self.interior.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class Record(Samples):
-    """The channels of a test in SI, each of shape (n,) or None where the file lacks it.
+    """The channels of a test in SI, each of shape (n,) or None if missing from the file.
 
     Time, s, stress, Pa, displacement, m, velocity, m/s, and deceleration of the top, m/s² (positive
-    in compression). `excess` is what the file has beyond the straight line that bridges outliers, 0
-    elsewhere; `clipped` marks samples of a clipped force; `standstills` those in which the gauge
-    stood still, each with the sentence on it. `cycle` is what a column of cycle numbers says,
-    `numbers` are the rows in the file (None: from 1).
+    in compression). `excess` is the original value of an outlier minus the straight line that
+    replaces it, 0 elsewhere; `clipped` marks samples of a clipped force; `standstills` maps a note
+    on a stuck gauge to a mask of the samples affected. `cycle` is the column of cycle numbers,
+    `numbers` are the rows in the file (None: counted from 1).
     """
 
     time: Array | None
@@ -194,7 +195,7 @@ class Record(Samples):
     motion: str = MEASURED
 
     def __len__(self) -> int:
-        """Count the samples."""
+        """Return the number of samples."""
         return len(self.stress)
 
     @property
@@ -204,59 +205,58 @@ class Record(Samples):
 
     @property
     def instants(self) -> Array:
-        """Time, or the sample's number where there is none, shape (n,)."""
+        """Time, or sample numbers without a time, shape (n,)."""
         return np.arange(len(self), dtype=np.float64) if self.time is None else self.time
 
     @property
     def stood_still(self) -> Mask:
-        """Samples at which the gauge stood still, shape (n,)."""
-        none = np.zeros(len(self), dtype=bool)
-        still: Mask = np.logical_or.reduce([none, *self.standstills.values()])
-        return still
+        """Mask of the samples with a stuck gauge, shape (n,)."""
+        masks = np.zeros(len(self), dtype=bool), *self.standstills.values()
+        return np.asarray(np.logical_or.reduce(masks))
 
     def channel(self, name: str) -> Array | None:
-        """Return a channel by its name; "displacement_1" is the mass inside above spring 1."""
+        """Return a channel by its name; "displacement_1" is the interior mass above spring 1."""
         node = interior_node(name)
         values: Array | None = getattr(self, name) if node is None else self.interior.get(node)
         return values
 
     def changed(self, name: str, values: Array) -> Record:
-        """Put other values into a channel."""
+        """Return a record with new values in a channel."""
         node = interior_node(name)
         if node is None:
             return replace(self, **{name: values})  # type: ignore[arg-type]
         return replace(self, interior=self.interior | {node: values})
 
     def shifted(self, name: str, by: float) -> Record:
-        """Take a value off the time or another channel; `origins` say how much was taken off."""
+        """Subtract a value from the time or a channel, and add it to `origins`."""
         values = self.channel(name)
-        assert values is not None  # its values have shown what is to be taken off
+        assert values is not None  # the offset was determined from them
         key = "contact_time" if name == "time" else f"{name}_zero"
         origins = self.origins | {key: self.origins.get(key, 0.0) + by}
         return replace(self.changed(name, values - by), origins=origins)
 
     def interpolated(self, name: str, values: Array, taken: Any) -> Record:
-        """Put values into a channel of which only the samples `taken` count as measured."""
-        counts = np.zeros(len(self), dtype=bool)
-        counts[taken] = True
-        return replace(self.changed(name, values), sampled=self.sampled | {name: counts})
+        """Replace a channel by interpolated values; only the samples `taken` count as measured."""
+        measured = np.zeros(len(self), dtype=bool)
+        measured[taken] = True
+        return replace(self.changed(name, values), sampled=self.sampled | {name: measured})
 
     def noted(self, *notes: str) -> Record:
-        """Add sentences to what was done."""
+        """Append notes."""
         return replace(self, notes=(*self.notes, *notes))
 
     def rows(self, which: slice | Mask) -> Record:
-        """Keep some rows of every channel; those that `without` leaves out are counted, too."""
+        """Select rows of every channel, without counting the others as dropped."""
 
         def part(value: Any) -> Any:
             if isinstance(value, dict):
-                return {key: part(one) for key, one in value.items()}
+                return {key: part(item) for key, item in value.items()}
             return value[which] if isinstance(value, np.ndarray) else value
 
         return replace(self, **{item.name: part(getattr(self, item.name)) for item in fields(self)})
 
     def without(self, gone: slice | Mask, why: str) -> Record:
-        """Leave out some rows of every channel, and count them with the reason."""
+        """Drop rows of every channel and count them with the reason."""
         numbers, kept = self.row_numbers, np.ones(len(self), dtype=bool)
         kept[gone] = False
         if kept.all():
@@ -265,58 +265,58 @@ class Record(Samples):
         return replace(self, numbers=numbers, dropped=dropped).rows(kept)
 
     def between(self, first: int, end: int, before: str, after: str) -> Record:
-        """Keep the samples from `first` up to `end`; the reasons count what lies outside."""
+        """Keep samples `first` to `end` (exclusive); drop those outside with the two reasons."""
         return self.without(slice(end, None), after).without(slice(0, first), before)
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement(Samples):
-    """One test, conditioned and in SI: compression positive, time zero where contact starts.
+    """One test, prepared for the fit, in SI: compression positive, time zero at contact.
 
     Attributes
     ----------
     name, path, data_sha256
-        Its name, its file (None if from none) and the digest of that.
+        Name of the test, its file (None without one) and the digest of that file.
     time, stress, displacement, acceleration : (n,) array or None
         s, increasing; nominal base stress, Pa; displacement of the top, m; deceleration of the
-        striker, m/s², where an impact has it and no displacement.
+        striker, m/s², only for an impact without a measured displacement.
     specimen, striker, noise
-        What the TOML says, and the noise that was estimated.
+        Data from the TOML; `noise` also contains the estimated noise.
     motion
-        Where the displacement came from: "measured", "integrated from force", …
+        Source of the displacement: "measured", "integrated from force", …
     notes
-        A sentence for each thing that was done or could not be done.
+        One sentence for each step of the preparation, done or impossible.
     interior
-        Displacements of the masses inside, m: 1 is the one above spring 1.
+        Displacements of the interior masses, m: 1 is the mass above spring 1.
     outliers, sampled
-        By channel: samples left out, and those that count as measured, where not all do; others
-        are interpolated.
+        By channel: samples left out, and a mask of the measured samples if others are interpolated.
     contact
-        What set time zero: "stress" (then the displacement is zero there too), "motion" or "file".
+        What set time zero: "stress" (the displacement is then zero there too), "motion" or "file".
     count
         Rows of the file, None without one.
     cycle, cycles, last_cycle
-        Number of the cycle that is used, of all in the record, and of the last one of several that
-        are used as one history.
+        Number of the cycle in use, numbers of all cycles in the record, and number of the last
+        cycle if several are used as one history.
     start_strain
-        Strain at which the contact of a later cycle starts, from the first contact; taken off.
+        Strain at which contact of a later cycle starts, relative to first contact; subtracted.
     zeros, origins
-        Standard error of the zero of a channel where samples show it; and what was taken off:
-        "contact_time", s, "stress_zero", Pa, "acceleration_zero", m/s², "displacement_zero", m.
+        Standard error of the zero of a channel if determined from samples; and the values
+        subtracted: "contact_time", s, "stress_zero", Pa, "acceleration_zero", m/s²,
+        "displacement_zero", m.
     derived
-        Channels that were computed from others and are no measurement of their own.
+        Channels that were computed from others and are not independent measurements.
     braked
-        Whether the stress is the striker's mass over the area times its deceleration.
+        Whether the stress is the striker's mass times its deceleration over the area.
     block
-        Rows of the file that are averaged in each sample.
+        Number of rows of the file averaged in each sample.
     uncertainties
-        Standard deviations that the TOML states: "height", "height_1", … (m), "area" (m²),
+        Standard deviations from the TOML: "height", "height_1", … (m), "area" (m²),
         "specimen_mass", "striker_mass" (kg), "velocity" (m/s), "delay" (s) of a motion with its own
-        clock, and of scales, as a share: "stress_scale", "displacement_scale", ….
+        clock, and relative ones of scales: "stress_scale", "displacement_scale", ….
     standstills
-        First and last time, s (or sample), of each stretch in which the gauge stood still.
+        First and last time, s (or sample), of each interval with a stuck gauge.
     priors
-        What the TOML says of parameters before the fit, like "5.5 ± 0.1 MPa".
+        Prior knowledge of parameters from the TOML, like "5.5 ± 0.1 MPa".
     """
 
     name: str
@@ -343,17 +343,17 @@ class Measurement(Samples):
     priors: dict[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """Tell what it holds, without its samples."""
+        """Return a summary without the samples."""
         height, area = engineering(self.specimen.height, "m"), f"{self.specimen.area:.4g} m²"
-        held = f"{self.rows.used} rows of {', '.join(self.channels())}"
-        return f"Measurement {self.name!r}: {held}; height {height}, area {area}"
+        data = f"{self.rows.used} rows of {', '.join(self.channels())}"
+        return f"Measurement {self.name!r}: {data}; height {height}, area {area}"
 
     @property
     def rows(self) -> RowCount:
-        """Rows of the file, used and not used; without a file all samples are used."""
+        """Rows of the file, used and dropped; without a file all samples are used."""
         n = max((values.size for values in self.channels().values()), default=0)
         return self.count or RowCount(n, n)
 
     def channels(self) -> dict[str, Array]:
-        """Stress, displacement, acceleration and displacements inside, as far as they are there."""
+        """Return the available ones of stress, displacement, acceleration, interior motions."""
         return self.curves("acceleration")

@@ -1,10 +1,10 @@
-"""The motion behind a noisy displacement, smooth between its turns, and how sure it is.
+"""Remove the noise from a displacement, with the uncertainty of the smooth motion.
 
-A penalised spline of the fifth degree with kinks goes through the samples; the square of its third
-derivative is penalised. A kink a (x − s)+ is a jump of the velocity; neither its height nor its
-instant is penalised. Penalty and number of kinks are those of the largest marginal likelihood, in
-which the spline is a random function and each kink has a price; the final penalty is that of the
-restricted likelihood (REML).
+The motion is a penalised spline of the fifth degree with kinks; the penalty is on the square of its
+third derivative. A kink a (x − s)+ is a jump of the velocity; neither its height a nor its instant
+s is penalised. The penalty and the number of kinks maximise the marginal likelihood, with the
+spline as a random function and a fixed price per kink; the final penalty maximises the restricted
+likelihood (REML).
 """
 
 from __future__ import annotations
@@ -24,29 +24,26 @@ from foamfit.data.measurement import NoiseLevel
 from foamfit.data.noise import quantum, residual_noise
 
 _DEGREE, _ORDER = 5, 3
-# Where kinks are looked for: among so many spots, on so many samples (blocks of more are averaged).
-_SPOTS, _ENOUGH = 120, 1000
-_KINKS = 40
-# Kinks are moved first at so many times the penalty: what looks rough may be a kink out of place.
-_STIFF = 100.0
-_SETTLED = 1e-2  # gain of a step, in twice the log-likelihood, that is not worth another
-# Samples for a piece of the spline; most pieces, and most where these do not follow the data.
-_PIECE, _PIECES, _MANY = 4, 64, 256
-_SIGNIFICANT = 4.5  # standard errors by which a motion goes back where it turns
-_SHARE = 0.98  # of the mean variance that the modes hold
-# Noise that counts as rounding, as a share of the range.
-_ROUNDING = 1e-7
-# Residuals over noise from which on a spline does not follow the motion; noise, as a share of the
-# range, up to which the data are taken as they stand.
-_OFF, _LITTLE = 1.3, 1e-5
+_SPOTS = 120  # number of trial instants for a new kink
+_ENOUGH = 1000  # samples in the search for kinks; more are averaged in blocks
+_KINKS = 40  # largest number of kinks
+_STIFF = 100.0  # multiple of the penalty while kinks are moved first: roughness then moves a kink
+_SETTLED = 1e-2  # stop moving kinks if twice the log-likelihood gains less than this
+_PIECE = 4  # samples per piece of the spline
+_PIECES, _MANY = 64, 256  # most pieces, and most if these do not follow the data
+_SIGNIFICANT = 4.5  # standard errors of a significant reversal
+_SHARE = 0.98  # share of the mean variance contained in the modes
+_ROUNDING = 1e-7  # smallest noise (rounding), as a share of the range
+_OFF = 1.3  # residuals over noise at which a spline does not follow the motion
+_LITTLE = 1e-5  # noise, as a share of the range, below which the data are interpolated
 
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Samples (n,) in units of record and noise, and a basis (n, b) in which all is diagonal.
+    """Samples (n,), scaled by duration and noise, and a diagonalising basis (n, b).
 
-    A rotation takes the spline's coefficients to coordinates b, of which the fit has the normal
-    equations `data`, the penalty `rough` and the right side `y_onto`.
+    A rotation transforms the coefficients of the spline to b coordinates in which the normal
+    matrix `data` and the penalty matrix `rough` are diagonal; `y_onto` is the right-hand side.
     """
 
     x: Array
@@ -60,7 +57,7 @@ class _Samples:
 
     @classmethod
     def of(cls, x: Array, y: Array, pieces: int) -> _Samples:
-        """Put knots even in time and in samples, by halves."""
+        """Build the basis; the density of knots averages those of time and of samples."""
         level = 0.5 * (x + np.linspace(0.0, 1.0, x.size))
         inner = np.interp(np.linspace(0.0, 1.0, pieces + 1), level, x)
         knots = np.pad(inner, _DEGREE, mode="edge")
@@ -70,7 +67,7 @@ class _Samples:
         bends = BSpline(knots, np.eye(pieces + _DEGREE), _DEGREE).derivative(_ORDER)(places)
         penalty = bends.T @ (np.outer(half, weights).reshape(-1, 1) * bends)
         gram = (basis.T @ basis).toarray()
-        little = 1e-9 * np.trace(gram) / np.trace(penalty)  # for pieces without samples
+        little = 1e-9 * np.trace(gram) / np.trace(penalty)  # keeps pieces without samples regular
         rough, rotation = linalg.eigh(penalty, gram + little * penalty)
         rough[:_ORDER] = 0.0
         basis, data = basis @ rotation, 1.0 - little * rough
@@ -78,23 +75,23 @@ class _Samples:
 
     @cached_property
     def price(self) -> float:
-        """What a kink, two unknowns, has to add to twice the log-likelihood (BIC)."""
+        """Least gain of twice the log-likelihood for a kink, which has two unknowns (BIC)."""
         return 2.0 * float(np.log(self.x.size))
 
     @cached_property
     def penalties(self) -> Array:
-        """Penalties to try, from hardly any to a parabola."""
+        """Trial penalties, from almost zero to one that leaves a parabola."""
         least, most = np.log10([1.0 / self.rough[-1], 1e4 / self.rough[_ORDER]])
         return np.logspace(least, most, int(most - least) + 2)
 
 
 def _kinks(x: Array, instants: Array) -> Array:
-    """Columns (x − s)+ of kinks, (n, k)."""
+    """Return the columns (x − s)+ of kinks, (n, k)."""
     return np.maximum(x[:, None] - instants, 0.0)
 
 
 class _Fit:
-    """Normal equations of a spline and columns (n, k) beside it, by default those of kinks."""
+    """Normal equations of a spline and additional columns (n, k), by default of kinks."""
 
     def __init__(self, samples: _Samples, instants: Array, columns: Array | None = None) -> None:
         self.samples, self.instants = samples, instants
@@ -102,9 +99,9 @@ class _Fit:
         self.onto, self.gram = samples.basis.T @ self.columns, self.columns.T @ self.columns
 
     def reduced(self, penalties: Array) -> tuple[Array, Array, Array]:
-        """Weights (p, b) of the spline's coordinates, and equations of the columns without it.
+        """Return the weights (p, b) of the spline and the reduced equations of the columns.
 
-        Matrices (p, k, k) and right sides (p, k), for p penalties.
+        The spline is eliminated; matrices (p, k, k) and right-hand sides (p, k) for p penalties.
         """
         s = self.samples
         weight = 1.0 / (s.data + penalties[:, None] * s.rough)
@@ -119,7 +116,7 @@ class _Fit:
         return weight * (self.samples.y_onto - self.onto @ found), found
 
     def unlikely(self, penalties: Array, *, restricted: bool = False) -> Array:
-        """Return −2 ln of the likelihood (p,), up to a constant, the spline integrated out."""
+        """Return −2 ln of the likelihood without the spline (marginal), up to a constant, (p,)."""
         s = self.samples
         weight, left, right = self.reduced(penalties)
         found = np.linalg.solve(left, right[:, :, None])[:, :, 0]
@@ -127,7 +124,7 @@ class _Fit:
         out -= np.log(weight[:, _ORDER:] * s.rough[_ORDER:] * penalties[:, None]).sum(axis=1)
         return np.asarray(out + np.linalg.slogdet(left)[1] if restricted else out)
 
-    def left(self, penalty: float) -> float:
+    def noise(self, penalty: float) -> float:
         """Estimate the noise from the residuals."""
         s, (spline, found) = self.samples, self.solve(penalty)
         residual = s.y - s.basis @ spline - self.columns @ found
@@ -136,12 +133,12 @@ class _Fit:
 
     @property
     def apart(self) -> bool:
-        """Whether there are samples between any two kinks: without, there is no telling them."""
+        """Whether samples lie between any two kinks, so that they can be distinguished."""
         return bool(np.all(np.diff(np.searchsorted(self.samples.x, self.instants)) > 0))
 
     @cached_property
     def best(self) -> tuple[float, float]:
-        """The least −2 ln likelihood over all penalties, kinks at their price; its penalty."""
+        """Least −2 ln likelihood over all penalties, including the price of kinks; its penalty."""
         if not self.apart:
             return np.inf, float(self.samples.penalties[0])
         levels = self.unlikely(self.samples.penalties)
@@ -150,7 +147,7 @@ class _Fit:
         return priced, float(self.samples.penalties[i])
 
     def step(self, penalty: float) -> Array:
-        """How far to move the kinks, (k,), by Gauss and Newton."""
+        """Return the Gauss-Newton step of the instants of the kinks, (k,)."""
         jumps = self.solve(penalty)[1]
         delays = np.where(self.samples.x[:, None] > self.instants, -jumps, 0.0)
         moving = _Fit(self.samples, self.instants, np.hstack([self.columns, delays]))
@@ -162,7 +159,7 @@ class _Fit:
         return np.asarray(np.clip(found[jumps.size :], -room[:-1], room[1:]))
 
     def refined(self, penalty: float, steps: int) -> _Fit:
-        """Move the kinks to where they fit best at one penalty."""
+        """Optimise the instants of the kinks at one penalty."""
         fit, x, at = self, self.samples.x, np.array([penalty])
         level = fit.unlikely(at)[0]
         for _ in range(steps if self.instants.size else 0):
@@ -177,20 +174,21 @@ class _Fit:
         return fit
 
     def settled(self, penalty: float) -> _Fit:
-        """Move the kinks at a stiff spline first, then at the best penalty."""
+        """Optimise the instants of the kinks with a stiff spline, then at the best penalty."""
         fit = self.refined(_STIFF * penalty, 4)
         return fit.refined(fit.best[1], 6)
 
     def covariance(self, penalty: float, share: float) -> tuple[Array, Array, float]:
-        """Uncertainty of the spline's coordinates and of the kinks' jumps and instants.
+        """Return the uncertainty of the spline and of the jumps and instants of the kinks.
 
-        Returns changes by one standard deviation each (unknowns, m), the largest first, which hold
-        a share of the variance at the samples; standard errors of the instants; parameters in use.
+        It consists of changes by one standard deviation each (unknowns, m), largest first, which
+        contain a share of the variance at the samples; the standard errors of the instants; and the
+        effective number of parameters.
         """
         s, k, size = self.samples, self.instants.size, self.samples.rough.size
         jumps, late = self.solve(penalty)[1], s.x[:, None] - self.instants
         past, eye = np.asarray(late > 0.0, float), np.eye(size + 2 * k)
-        for _ in range(3):  # a sample is past a kink by the probability that it is
+        for _ in range(3):  # weight samples by the probability that they follow the kink
             moving = _Fit(s, self.instants, np.hstack([self.columns, -jumps * past]))
             data = np.block([[np.diag(s.data), moving.onto], [moving.onto.T, moving.gram]])
             every = data + np.diag(np.append(penalty * s.rough, np.zeros(2 * k)))
@@ -206,13 +204,13 @@ class _Fit:
 
 
 def _with_more(fit: _Fit) -> _Fit:
-    """Add the kink, or the two kinks, that raise the likelihood most."""
+    """Add the one or two kinks that increase the likelihood most."""
     s, k = fit.samples, fit.instants.size
     at = np.unique(np.linspace(2, s.x.size - 2, min(s.x.size - 3, _SPOTS)).astype(int))
     spots = 0.5 * (s.x[at] + s.x[at - 1])
     tried = _Fit(s, spots, np.hstack([fit.columns, _kinks(s.x, spots)]))
     best, more = np.inf, spots[:1]
-    penalties = s.penalties[s.penalties >= 0.1 * fit.best[1]][::2]  # a kink takes roughness away
+    penalties = s.penalties[s.penalties >= 0.1 * fit.best[1]][::2]  # a kink reduces roughness
     _, lefts, rights = tried.reduced(penalties)
     for level, left, right in zip(fit.unlikely(penalties), lefts, rights, strict=True):
         solved = np.linalg.solve(left[:k, :k], left[:k, k:])
@@ -230,7 +228,7 @@ def _with_more(fit: _Fit) -> _Fit:
 
 
 def _find_kinks(samples: _Samples) -> _Fit:
-    """Find the kinks, from those at likely turns or from none, then drop needless ones."""
+    """Find the kinks, starting from likely turns or none, then remove unnecessary ones."""
     none = _Fit(samples, np.empty(0))
     turned = _Fit(samples, _likely_turns(samples)).settled(none.best[1])
     fit = min(none, turned, key=lambda f: f.best[0])
@@ -250,7 +248,7 @@ def _find_kinks(samples: _Samples) -> _Fit:
 
 
 def _likely_turns(samples: _Samples) -> Array:
-    """Turns that running means show at eight standard errors, of the width that shows most."""
+    """Find turns of running means at eight standard errors, for the width with the most turns."""
     best = np.empty(0)
     for width in 2 ** np.arange(int(np.log2(samples.x.size / 10.0))):
         total = np.cumsum(np.append(0.0, samples.y))
@@ -262,10 +260,10 @@ def _likely_turns(samples: _Samples) -> Array:
 
 
 def _fitted(x: Array, y: Array, pieces: int) -> tuple[_Fit, float]:
-    """Return the fit to samples (n,) with noise of one, and its penalty."""
+    """Fit samples (n,) with unit noise; return the fit and its penalty."""
     block = max(1, x.size // _ENOUGH)
-    whole = x.size // block * block
-    mean_x, mean_y = (v[:whole].reshape(-1, block).mean(axis=1) for v in (x, y))
+    full = x.size // block * block
+    mean_x, mean_y = (v[:full].reshape(-1, block).mean(axis=1) for v in (x, y))
     coarse = _Samples.of(mean_x, mean_y * np.sqrt(block), pieces)
     found = _find_kinks(coarse)
     samples = coarse if block == 1 else _Samples.of(x, y, pieces)
@@ -277,10 +275,10 @@ def _fitted(x: Array, y: Array, pieces: int) -> tuple[_Fit, float]:
 
 @dataclass(frozen=True, eq=False)
 class _Modes:
-    """Changes of the motion by one standard deviation each, by parts x of the record's duration.
+    """Changes of the motion by one standard deviation each, at times x scaled by the duration.
 
-    They are those of the `spline`, and of the `jumps` (k, m) and `instants` (k, m) of its kinks.
-    `kinks` (4, k) holds instants, their standard errors, jumps, and the velocities before them.
+    They consist of changes of the `spline`, and of the `jumps` (k, m) and `instants` (k, m) of the
+    kinks. `kinks` (4, k): instants, their standard errors, jumps, and velocities before the kinks.
     """
 
     spline: BSpline
@@ -291,19 +289,19 @@ class _Modes:
     def __call__(self, x: Array) -> Array:
         where, stderr, jump, before = self.kinks
         late = x[:, None] - where
-        # A kink that may lie on either side of a sample moves it by a part of the jump.
+        # An uncertain kink changes the motion at a nearby sample by a part of the jump.
         moved = np.where(np.abs(late) < 1e-12, before, -jump * ndtr(late / stderr))
         return np.asarray(self.spline(x) + _kinks(x, where) @ self.jumps + moved @ self.instants)
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothMotion:
-    """A motion without its noise.
+    """A motion without noise.
 
     Attributes
     ----------
     turns : (k,) array
-        Instants at which the motion turns round, s.
+        Times at which the motion turns, s.
     sigma : float
         Standard deviation of the noise, m.
     dof : float
@@ -319,18 +317,18 @@ class SmoothMotion:
     _duration: float
 
     def at(self, times: Array) -> Array:
-        """Displacement (m) at times inside the record; monotone between two turns."""
+        """Return the displacement (m) at times in the record; it is monotone between turns."""
         part = (times - self._start) / self._duration
         inside = np.clip(part, 0.0, 1.0)
         past = part - inside
-        ends = self._curve(np.array([0.0, 1.0]), 1)  # it goes straight on past what was measured
+        ends = self._curve(np.array([0.0, 1.0]), 1)  # for linear extrapolation
         return np.asarray(self._curve(inside) + past * np.where(past < 0.0, ends[0], ends[1]))
 
     def modes(self, times: Array) -> Array:
-        """Changes of the motion by one standard deviation each, (n, m), m, the largest first.
+        """Return changes of the motion by one standard deviation each, (n, m), m, largest first.
 
-        The covariance of the motion at these times is `modes @ modes.T`. At a turn itself they are
-        the changes of its height, wherever its instant moves to.
+        The covariance of the motion at these times is `modes @ modes.T`. At a turn, they are the
+        changes of its height, regardless of the shift of its instant.
         """
         return self._modes(np.clip((times - self._start) / self._duration, 0.0, 1.0))
 
@@ -338,11 +336,11 @@ class SmoothMotion:
 def follow(
     time: Array | None, displacement: Array, noise: NoiseLevel, counts: Mask | None = None
 ) -> SmoothMotion:
-    """Find the motion behind a displacement (n,), m, at times (n,), s, or samples.
+    """Remove the noise from a displacement (n,), m, at times (n,), s, or samples.
 
-    `counts` marks the samples to go by, by default all. A noise that is not given, or that the
-    data contradict, is estimated again from what the motion leaves. Motions found are kept: every
-    model of a record, and every resampling of its other curves, goes by the same one.
+    `counts` marks the measured samples, by default all. The noise is estimated from the residuals
+    unless it is given and consistent with the data. Results are cached, because every model of a
+    record and every resampling of its other curves needs the same motion.
     """
     times = np.arange(displacement.size, dtype=float) if time is None else time
     taken = slice(None) if counts is None else counts
@@ -351,14 +349,14 @@ def follow(
 
 @lru_cache(maxsize=32)
 def _found(raw_times: bytes, raw_motion: bytes, noise: NoiseLevel) -> SmoothMotion:
-    """Find the motion from the bytes of the arrays of `follow`."""
+    """Run `follow` with its arrays as bytes, which can be cached."""
     times, w = np.frombuffer(raw_times), np.frombuffer(raw_motion)
     start, duration = float(times[0]), float(np.ptp(times))
     x = (times - start) / duration
     middle, size = float(np.mean(w)), max(float(np.ptp(w)), 1e-300)
     pieces, finest = max(4, min(x.size // _PIECE, _PIECES)), min(_MANY, x.size // 2)
     slow, shown, digital = np.sqrt(max(noise.time, 1.0)), residual_noise(w)[0], quantum(w) / 12**0.5
-    # Too much noise hides a kink until the next turn, too little invents many.
+    # Overestimated noise hides a kink before the next turn, underestimated noise creates many.
     sigma = max(noise.sigma, shown)
     if noise.given and not _LITTLE * size < noise.sigma < sigma / _OFF:
         sigma = noise.sigma
@@ -367,11 +365,11 @@ def _found(raw_times: bytes, raw_motion: bytes, noise: NoiseLevel) -> SmoothMoti
             return _exact(times, w, max(sigma, _ROUNDING * size))
         unit = sigma * slow
         fit, penalty = _fitted(x, (w - middle) / unit, pieces)
-        left = fit.left(penalty) * unit
+        left = fit.noise(penalty) * unit
         if left > _OFF * max(sigma, shown) and pieces < finest:
             pieces = min(2 * pieces, finest)
             continue
-        # Steps of a digitiser leave about what they are, a motion of equal steps leaves nothing.
+        # A digitiser leaves residuals of about its step, but a motion in equal steps leaves none.
         least = noise.sigma if noise.given else digital * (left > 0.2 * digital)
         if abs(max(left, least) / sigma - 1.0) < 0.1:
             break
@@ -382,7 +380,7 @@ def _found(raw_times: bytes, raw_motion: bytes, noise: NoiseLevel) -> SmoothMoti
 def _motion(
     fit: _Fit, penalty: float, sigma: float, unit: float, middle: float, span: tuple[float, float]
 ) -> SmoothMotion:
-    """Make the monotone curve, its turns and its modes."""
+    """Construct the monotone curve, its turns and its modes."""
     samples, instants = fit.samples, fit.instants
     spline, jumps = (unit * v for v in fit.solve(penalty))
     half, stderr, dof = fit.covariance(penalty, _SHARE)
@@ -401,7 +399,7 @@ def _motion(
     )
     x = np.unique(np.concatenate([[0.0, 1.0], samples.x, samples.knots, instants]))
     before, after = velocity(x)
-    back = np.flatnonzero(after[:-1] * before[1:] < 0.0)  # where the velocity passes through zero
+    back = np.flatnonzero(after[:-1] * before[1:] < 0.0)  # zeros of the velocity
     part = after[back] / (after[back] - before[back + 1])
     x = np.union1d(x, x[back] + part * np.diff(x)[back])
     values, velocities = middle + bend(x) + _kinks(x, instants) @ jumps, velocity(x)
@@ -412,7 +410,7 @@ def _motion(
 
 
 def _exact(times: Array, values: Array, sigma: float) -> SmoothMotion:
-    """Go through data without noise as they stand; sharp turns between samples are added."""
+    """Interpolate data without noise; add sharp turns between samples."""
     start, duration = float(times[0]), float(times[-1] - times[0])
     x, none = (times - start) / duration, np.empty((0, 1))
     flat = BSpline(np.array([0.0, 1.0]), np.zeros((1, 1)), 0)
@@ -428,28 +426,28 @@ def _exact(times: Array, values: Array, sigma: float) -> SmoothMotion:
     return SmoothMotion(at, sigma, float(x.size), curve, modes, start, duration)
 
 
-def _corner(x: Array, y: Array, i: int, off: float) -> tuple[float, float] | None:
-    """Return where the straight lines on both sides of a turn at or beside sample i meet."""
-    for a in (i, i - 1):  # the last sample on the way there
+def _corner(x: Array, y: Array, i: int, tolerance: float) -> tuple[float, float] | None:
+    """Return where the lines on both sides of a turn at or next to sample i intersect."""
+    for a in (i, i - 1):  # the last sample before the turn
         if a < 2 or a + 3 >= x.size:
             continue
-        there, back = ((y[j + 1] - y[j]) / (x[j + 1] - x[j]) for j in (a - 1, a + 1))
+        before, after = ((y[j + 1] - y[j]) / (x[j + 1] - x[j]) for j in (a - 1, a + 1))
         bends = (
-            y[a] + there * (x[a - 2] - x[a]) - y[a - 2],
-            y[a + 1] + back * (x[a + 3] - x[a + 1]) - y[a + 3],
+            y[a] + before * (x[a - 2] - x[a]) - y[a - 2],
+            y[a + 1] + after * (x[a + 3] - x[a + 1]) - y[a + 3],
         )
-        step = (x[a + 1] - x[a]) * max(abs(there), abs(back))
-        at = (y[a + 1] - y[a] + there * x[a] - back * x[a + 1]) / ((there - back) or np.inf)
-        straight = max(map(abs, bends)) <= 0.01 * step + off
-        if straight and there * back < 0.0 and x[a] < at < x[a + 1]:
-            return float(at), float(y[a] + there * (at - x[a]))
+        step = (x[a + 1] - x[a]) * max(abs(before), abs(after))
+        at = (y[a + 1] - y[a] + before * x[a] - after * x[a + 1]) / ((before - after) or np.inf)
+        straight = max(map(abs, bends)) <= 0.01 * step + tolerance
+        if straight and before * after < 0.0 and x[a] < at < x[a + 1]:
+            return float(at), float(y[a] + before * (at - x[a]))
     return None
 
 
 def _turns(x: Array, values: Array, modes: _Modes, bounds: tuple[float, float]) -> Integers:
-    """Return the places between which the motion goes back significantly, with both ends.
+    """Return the indices of the significant turns of the motion, with both ends.
 
-    Standard errors of differences are taken within `bounds`.
+    Standard errors of differences are clipped to `bounds`.
     """
     up = np.sign(np.diff(values))
     moves = np.flatnonzero(up)
@@ -458,14 +456,14 @@ def _turns(x: Array, values: Array, modes: _Modes, bounds: tuple[float, float]) 
     changes = modes(x[at])
     while at.size > 2:
         stderr = np.clip(np.linalg.norm(np.diff(changes, axis=0), axis=1), *bounds)
-        sure = np.abs(np.diff(values[at])) / (_SIGNIFICANT * stderr)
-        i = int(np.argmin(sure))
-        if sure[i] >= 1.0:
+        significance = np.abs(np.diff(values[at])) / (_SIGNIFICANT * stderr)
+        i = int(np.argmin(significance))
+        if significance[i] >= 1.0:
             break
-        # The first and the last stretch join their neighbours, any other goes with both its ends.
+        # Merge the first or last stretch with its neighbour; remove any other with both its ends.
         gone = [1] if i == 0 else [at.size - 2] if i == at.size - 2 else [i, i + 1]
         at, changes = np.delete(at, gone), np.delete(changes, gone, axis=0)
-    for i in range(1, at.size - 1):  # a stretch may reach further than where it was cut
+    for i in range(1, at.size - 1):  # the extremum may lie elsewhere in the merged stretch
         part = values[at[i - 1] : at[i + 1] + 1]
         high = values[at[i]] > values[at[i - 1]]
         at[i] = at[i - 1] + int(np.argmax(part) if high else np.argmin(part))
@@ -473,7 +471,7 @@ def _turns(x: Array, values: Array, modes: _Modes, bounds: tuple[float, float]) 
 
 
 def _monotone(x: Array, values: Array, velocities: tuple[Array, Array], turns: Integers) -> PPoly:
-    """Return the curve through the values, in cubic pieces that go nowhere back between turns."""
+    """Return the cubic interpolant of the values, made monotone between turns."""
     y = values.copy()
     for first, last in pairwise(turns):
         part = slice(first, last + 1)
@@ -484,7 +482,7 @@ def _monotone(x: Array, values: Array, velocities: tuple[Array, Array], turns: I
         most = v[-1] if last < x.size - 1 else np.inf
         y[part] = sign * np.clip(level, least, most)
     h, chord = np.diff(x), np.diff(y) / np.diff(x)
-    # A cubic is monotone if its velocity at the ends is at most three times that of its chord.
+    # A cubic is monotone if its slopes at the ends are at most three times that of its chord.
     over = np.where(chord, chord, np.inf)
     a, b = (chord * np.clip(v / over, 0.0, 3.0) for v in (velocities[1][:-1], velocities[0][1:]))
     return PPoly(

@@ -1,9 +1,8 @@
-"""Samples to leave out: spikes, short gaps, a clipped force, a gauge that stands still.
+"""Find and repair bad samples: spikes, short gaps, a clipped force, a stuck gauge.
 
-A sample is judged by its neighbours, not by a model. A gauge that stands still while the stress
-changes, and then jumps, has play where the motion turns round, or a display that is not renewed
-there. A true hold ends otherwise: the motion goes on smoothly from where it stood, and the stress
-follows.
+A sample is compared with its neighbours, not with a model. A gauge is stuck if it stands still
+while the stress changes, and then jumps, because of play at a reversal or missed readings. After a
+true hold, the motion continues smoothly from its level and the stress follows.
 """
 
 from __future__ import annotations
@@ -19,59 +18,62 @@ from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Outliers, Record
 from foamfit.data.noise import estimated_noise, noise_level, quantum, robust_variance
 from foamfit.text import counted, engineering, percent
 
-# An outlier is off by so many standard deviations of its leave-one-out residual, and by so many of
-# the residuals of its neighbours without it (at a kink they are off too).
-_OFF, _ALONE = 4.0, 2.5
-_LEAST = 5e-3  # of the range: what is less far off is no outlier
-_MOST = 0.02  # of the samples: if more stand out, none is an outlier
-# A gap begins and ends with a jump of so many times the median jump nearby; its longest, samples.
-_JUMP, _NEARBY, _MAX_RUN = 10.0, 31, 5
-_WIDTH, _HALF = 9, 4  # samples of a cubic, and on either side of its middle
-# Share by which the steps of even samples differ at most; usual steps that make a pause; least
-# leverage that the neighbours of a sample must have for it to be judged.
-_EVEN, _PAUSE, _OPEN = 0.02, 6.0, 0.1
-_CHUNK = 50_000
-# A force may be clipped where so many samples are equal at its top; a parabola falls by so many
-# steps of its digits within half that length on either side.
-_FLAT, _PARABOLA = 5, 3
-_STEPS, _SAMPLES = 4, 8  # a gauge stands still for at least so many of its readings, and samples
-# A jump is at least this share of the range, so many deviations of the noise and so many steps of
-# the digitiser; it takes so many samples at most; then the motion goes on by less than a share.
-_LEAP, _ABOVE_NOISE, _DIGITS, _LONGEST, _GOES_ON = 0.003, 12.0, 2.5, 3, 0.75
-# A gauge that stands moves by less than this share of its jump, and so many deviations of the
-# noise; it stands as soon as it is so near its level.
-_STANDS, _SCATTER, _NEAR = 0.1, 5.0, 0.02
-# Shares of the range of the stress: least stress of a specimen in contact, least change while the
-# gauge stands, and least change that a motion as large as the jump would cause.
-_CONTACT, _CHANGE, _FELT = 0.1, 0.005, 0.004
-# The stress follows by less than this share of that change, and what is missing is so many standard
-# errors. The stiffness is taken over so many jumps on either side.
-_FOLLOWS, _SURE, _AROUND = 0.5, 3.0, 3.0
+# Spikes
+_OFF = 4.0  # least residual of an outlier, in standard deviations of leave-one-out residuals
+_ALONE = 2.5  # the same in standard deviations of its neighbours' residuals (large at a kink)
+_LEAST = 5e-3  # least residual of an outlier, as a share of the range
+_MOST = 0.02  # share of the samples: if more stand out, none is an outlier
+_WIDTH, _HALF = 9, 4  # samples of a local cubic, and on either side of its middle
+_EVEN = 0.02  # largest relative deviation of time steps that count as equal
+_PAUSE = 6.0  # a longer step, in usual steps, is a pause
+_OPEN = 0.1  # least share of a sample's deviation that remains in its residual
+_CHUNK = 50_000  # windows processed at once
+# Short gaps
+_JUMP, _NEARBY = 10.0, 31  # least jump at both ends, in median jumps of this many samples
+_MAX_RUN = 5  # longest gap, samples
+# Clipped force
+_FLAT = 5  # least number of equal samples at the top
+_PARABOLA = 3  # digitiser steps that a parabola falls within half the flat length on either side
+# Stuck gauge
+_STEPS, _SAMPLES = 4, 8  # shortest standstill, in readings of the gauge and in samples
+_LEAP, _ABOVE_NOISE, _DIGITS = 0.003, 12.0, 2.5  # least jump: of range, noise, digitiser steps
+_LONGEST = 3  # most samples that a jump takes
+_GOES_ON = 0.75  # after the jump the motion continues by less than this share of the jump
+_STANDS, _SCATTER = 0.1, 5.0  # most motion while stuck: share of the jump plus multiple of noise
+_NEAR = 0.02  # distance from the final level, as a share of the jump, at which it is stuck
+_CONTACT = 0.1  # least stress in contact, as a share of its range
+_CHANGE = 0.005  # least change of stress while the gauge is stuck, likewise
+_FELT = 0.004  # least change of stress that a real motion like the jump would cause, likewise
+_FOLLOWS = 0.5  # share of that change: if the stress changes more, the jump is real
+_SURE = 3.0  # standard errors for a significant change of stress
+_AROUND = 3.0  # the stiffness is that over this many jumps on either side
 
 
 def find_outliers(values: Array, time: Array | None = None) -> Mask:
-    """Isolated samples that cannot belong to a smooth signal with this noise: spikes and gaps.
+    """Find spikes and short gaps: isolated samples that do not belong to a smooth noisy signal.
 
-    Gaps are up to five samples between two opposite jumps of ten times the median jump nearby,
-    before and after which the signal changes by less than half as much. A spike is off the cubic
-    through its eight neighbours by four standard deviations, while these agree among themselves and
-    the lines from either side do not lead to it. Samples across a pause are not judged, and of a
-    held channel only gaps are found. If more than 2 % stand out, none is an outlier.
+    A gap consists of up to five samples between two opposite jumps of ten times the median jump
+    nearby, if the signal changes by less than half as much before, after and across the gap. A
+    spike deviates by four standard deviations from the cubic through its eight neighbours, while
+    the neighbours are consistent and the lines through either side do not lead to the spike.
+    Samples at a pause are not tested, and in a held channel only gaps are found. If more than 2 %
+    of the samples stand out, none is an outlier.
     """
     n = values.size
     if n < 30:
         return np.zeros(n, dtype=bool)
     least = _LEAST * float(np.ptp(np.quantile(values, (0.005, 0.995))))
     even, at = True, np.arange(n, dtype=np.float64)
-    if time is not None:  # are its steps equal, or so nearly that the values hardly differ by it?
+    if time is not None:
         step = np.diff(time)
-        off = float(np.abs(step / np.median(step) - 1.0).max())
-        differ = off * float(np.quantile(np.abs(np.diff(values)), 0.99))
-        even = off <= _EVEN or differ < 0.1 * least
+        uneven = float(np.abs(step / np.median(step) - 1.0).max())
+        # Uneven steps do not matter if they hardly affect the values.
+        effect = uneven * float(np.quantile(np.abs(np.diff(values)), 0.99))
+        even = uneven <= _EVEN or effect < 0.1 * least
         at = at if even else time
     weights = _weights(at, even)
     wrong = _gaps(values, at)
-    for _ in range(4):  # beside a large spike a small one is found later
+    for _ in range(4):  # a large spike hides small ones next to it
         smooth = _bridged(values, wrong, at)
         if is_staircase(smooth):
             break
@@ -83,32 +85,32 @@ def find_outliers(values: Array, time: Array | None = None) -> Mask:
 
 
 def _bridged(values: Array, wrong: Mask, time: Array) -> Array:
-    """Replace samples by the straight line between those around them."""
+    """Replace wrong samples by linear interpolation."""
     return np.where(wrong, np.interp(time, time[~wrong], values[~wrong]), values)
 
 
 def _gaps(values: Array, time: Array) -> Mask:
-    """Short runs into which the signal jumps and out of which it jumps back."""
+    """Find short runs with opposite jumps at both ends."""
     from scipy.ndimage import median_filter
 
     out = np.zeros(values.size, dtype=bool)
     jump, step = np.diff(values), np.diff(time)
-    # In a step of time that is longer than usual the signal itself may go farther.
+    # During a longer step of time the signal itself may change more.
     usual = np.abs(jump) / np.maximum(step / median_filter(step, _NEARBY), 1.0)
     floor = float(np.median(usual[usual > 0.0])) if usual.any() else 0.0
     high = np.flatnonzero(usual > _JUMP * np.maximum(median_filter(usual, _NEARBY), floor))
     for start, end in ((i, j) for i in high for j in high[(high > i) & (high <= i + _MAX_RUN)]):
-        there, back = jump[start], jump[end]
-        # What the signal itself changes, also just before and after: a steep peak is no gap.
-        beside = *jump[start - 1 : start], *jump[end + 1 : end + 2]
-        most = max(np.abs([values[end + 1] - values[start], *beside]))
-        if there * back < 0.0 and most < 0.5 * min(abs(there), abs(back)):
+        into, back = jump[start], jump[end]
+        # Changes of the signal itself across and next to the gap: a steep peak is not a gap.
+        adjacent = *jump[start - 1 : start], *jump[end + 1 : end + 2]
+        most = max(np.abs([values[end + 1] - values[start], *adjacent]))
+        if into * back < 0.0 and most < 0.5 * min(abs(into), abs(back)):
             out[start + 1 : end + 1] = True
     return out
 
 
 def _spikes(values: Array, least: float, time: Array, weights: Array) -> Mask:
-    """Samples that the cubic through their eight neighbours does not expect; see `_weights`."""
+    """Find samples far from the cubic through their eight neighbours; see `_weights`."""
     from scipy.ndimage import maximum_filter1d
 
     out, own = np.zeros(values.size, dtype=bool), weights[:, _HALF]
@@ -116,28 +118,28 @@ def _spikes(values: Array, least: float, time: Array, weights: Array) -> Mask:
         own, own, 1.0
     )
     usual = np.sqrt(robust_variance(residual * np.sqrt(own)) / np.where(own, own, 1.0))
-    off, own = np.abs(residual), np.broadcast_to(own, residual.shape)
-    # Beside a spike the cubic is off too: only the farthest of five is one.
-    farthest = off >= maximum_filter1d(off, 5, mode="constant")
-    for i in np.flatnonzero((off > np.maximum(_OFF * usual, least)) & farthest):
+    size, own = np.abs(residual), np.broadcast_to(own, residual.shape)
+    # A spike also increases the residuals of its neighbours: only the largest of five is one.
+    largest = size >= maximum_filter1d(size, 5, mode="constant")
+    for i in np.flatnonzero((size > np.maximum(_OFF * usual, least)) & largest):
         y, t = values[i : i + _WIDTH], time[i : i + _WIDTH] - time[i + _HALF]
         rest = np.polyfit(np.delete(t, _HALF), np.delete(y, _HALF), 3, full=True)[1][0]
         alone = np.sqrt(rest / (_WIDTH - 5) / own[i])
-        # The tip of a kink is where the line from one of its sides leads.
+        # The tip of a kink lies on the line through the samples on one side.
         lines = (np.polyfit(t[side], y[side], 1)[1] for side in (slice(1, 4), slice(5, 8)))
-        beside = min((y[_HALF] - line) * np.sign(residual[i]) for line in lines)
-        out[i + _HALF] = off[i] > _ALONE * alone and beside > 0.5 * off[i]
+        above = min((y[_HALF] - line) * np.sign(residual[i]) for line in lines)
+        out[i + _HALF] = size[i] > _ALONE * alone and above > 0.5 * size[i]
     return out
 
 
 def _weights(time: Array, even: bool) -> Array:
-    """Weights (windows, samples) of "sample minus local cubic", one window if all are the same.
+    """Return the weights (windows, samples) of "sample minus local cubic", one row if `even`.
 
-    They are zero where the window spans a pause, or where only its middle sample fixes the cubic.
+    Weights are zero if the window spans a pause or the cubic depends on its middle sample alone.
     """
     windows = sliding_window_view(time, _WIDTH)[: 1 if even else None]
     weights = np.empty(windows.shape)
-    for first in range(0, len(windows), _CHUNK):  # all at once would take much memory
+    for first in range(0, len(windows), _CHUNK):  # to limit memory
         x = windows[first : first + _CHUNK] - windows[first : first + _CHUNK, [_HALF]]
         powers = (x / np.abs(x).max(axis=1, keepdims=True))[:, :, None] ** np.arange(4)
         at_middle = np.linalg.solve(powers.swapaxes(1, 2) @ powers, np.eye(4)[:, :1])
@@ -145,14 +147,14 @@ def _weights(time: Array, even: bool) -> Array:
     weights[:, _HALF] += 1.0
     step = np.diff(time)
     pause = sliding_window_view(step, _WIDTH - 1).max(axis=1) > _PAUSE * float(np.median(step))
-    unjudged = pause | (weights[:, _HALF] < _OPEN)
-    return np.where(unjudged[:, None], 0.0, weights) if unjudged.any() else weights
+    untested = pause | (weights[:, _HALF] < _OPEN)
+    return np.where(untested[:, None], 0.0, weights) if untested.any() else weights
 
 
 def bridge_outliers(record: Record) -> Record:
-    """Replace spikes and short gaps by a straight line; `excess` keeps what the file has there."""
+    """Replace spikes and short gaps by straight lines; `excess` stores the differences."""
     for name, values in record.curves("velocity", "acceleration").items():
-        if name in record.sampled:  # interpolated between frames, which have been looked through
+        if name in record.sampled:  # `frames.join` has already checked its frames
             continue
         wrong = find_outliers(values, record.time)
         if wrong.any():
@@ -163,10 +165,10 @@ def bridge_outliers(record: Record) -> Record:
 
 
 def mark_clipped(record: Record) -> Record:
-    """Find the samples at which the force is clipped: a flat top at one value, with steep flanks.
+    """Mark the samples of a clipped force: a flat top of equal values with steep flanks.
 
-    A rounded top of a smooth curve has equal samples too, but is nearly a parabola, which falls by
-    three more steps of the digits within half the length of the flat; a clipped force by more.
+    The digitised top of a smooth curve has equal samples, too. But it is nearly a parabola, which
+    falls by three more digitiser steps within half the length of the flat; a clipped force by more.
     """
     stress = record.stress
     top = float(stress.max())
@@ -185,14 +187,14 @@ def mark_clipped(record: Record) -> Record:
         return record
     lines = record.row_numbers[at_top]
     return replace(record, clipped=at_top).noted(
-        f"Check: the force is clipped: {lines.size} samples have one and the same value at its "
-        f"top, a stress of {engineering(top, 'Pa')} (rows {lines[0]} to {lines[-1]}); they are not "
-        "fitted, the true peak is not known, and energy and impulse come out too small."
+        f"Check: the force is clipped: {lines.size} samples have the same value at its top, a "
+        f"stress of {engineering(top, 'Pa')} (rows {lines[0]} to {lines[-1]}); they are not "
+        "fitted, the true peak is unknown, and energy and impulse are underestimated."
     )
 
 
 def outliers_of_blocks(record: Record, block: int) -> dict[str, Outliers]:
-    """Outliers of blocks of samples: a block of them is left out, one in a block is not."""
+    """Return the outliers after averaging: a block is left out if most of its samples are bad."""
     found, none = dict[str, Outliers](), np.zeros(len(record))
     edges = np.arange(0, len(record), block)
 
@@ -212,38 +214,38 @@ def outliers_of_blocks(record: Record, block: int) -> dict[str, Outliers]:
 
 
 def notes_on(record: Record, spikes: dict[str, int], found: dict[str, Outliers]) -> list[str]:
-    """Count the `spikes` and gaps of each channel; name those of the used part and standstills."""
+    """Return notes on spikes and gaps (`spikes`: count, `found`: in the used part), standstills."""
     notes = []
     for name, count in spikes.items():
         note = f"Check: {counted(count, 'sample')} of the {name} stood out as spikes or gaps and"
-        one = found.get(name)
-        if one is None or not one.at.size:
+        outliers = found.get(name)
+        if outliers is None or not outliers.at.size:
             notes.append(f"{note} were bridged, none of them in the part that is used.")
             continue
         unit = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}.get(name, "m")
-        told, used = list[str](), one.at.size
-        for at, value in zip(one.at[:4], one.values[:4], strict=True):
+        shown, used = list[str](), outliers.at.size
+        for at, value in zip(outliers.at[:4], outliers.values[:4], strict=True):
             where = f"sample {at:.0f}" if record.time is None else engineering(at, "s")
-            told.append(f"{engineering(value, unit)} at {where}")
+            shown.append(f"{engineering(value, unit)} at {where}")
         more = f" and {used - 4} more" if used > 4 else ""
         part = "" if used == count else f", {used} of them in the part that is used"
-        notes.append(f"{note} are not fitted{part}: {', '.join(told)}{more}.")
+        notes.append(f"{note} are not fitted{part}: {', '.join(shown)}{more}.")
     return notes + [note for note, rows in record.standstills.items() if rows.any()]
 
 
 def fresh_samples(values: Array | Mask) -> tuple[Integers, Integers]:
-    """Samples at which a value is new, and for how many samples each is held."""
+    """Return the samples with a new value, and the number of samples that each is held."""
     fresh = np.append(0, np.flatnonzero(np.diff(values) != 0) + 1)
     return fresh, np.diff(np.append(fresh, len(values)))
 
 
 def is_staircase(values: Array) -> bool:
-    """Whether most samples repeat the one before."""
+    """Return whether most samples repeat the previous one."""
     return bool(np.median(fresh_samples(values)[1]) >= 2)
 
 
 def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
-    """Noise of displacements from their fresh samples, or from the frames of their own clock."""
+    """Return the noise of held or interpolated displacements, from fresh samples or frames."""
     levels = {}
     for name, values in record.curves().items():
         if name in record.sampled:
@@ -259,10 +261,10 @@ def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
 
 
 def fill_staircase(record: Record) -> Record:
-    """Interpolate displacements that are held while the stress changes.
+    """Interpolate displacements that are updated less often than the stress.
 
-    The instants at which a value is new are kept, and only these count as measured. A hold of more
-    than three usual steps is real: it lasts until one usual step before the next new value.
+    Only samples with a new value count as measured. A value held for more than three usual steps is
+    a real hold, which lasts until one usual step before the next new value.
     """
     time = record.instants
     for name, values in record.curves().items():
@@ -271,21 +273,21 @@ def fill_staircase(record: Record) -> Record:
         if name == "stress" or name in record.sampled or len(lengths) < MIN_ROWS or step < 2:
             continue
         knots = np.union1d(fresh, (fresh + lengths - step)[lengths > 3 * step])
-        shown = "The displacement" if name == "displacement" else name
+        label = "The displacement" if name == "displacement" else name
         line = np.interp(time, time[knots], values[knots])
         record = record.interpolated(name, line, knots).noted(
-            f"{shown} is held for about {step} samples at a time; it is interpolated between the "
+            f"{label} is held for about {step} samples at a time; it is interpolated between the "
             f"{len(fresh)} instants where it is fresh."
         )
     return record
 
 
 def find_standstills(record: Record) -> list[tuple[int, int]]:
-    """Find where the gauge of a slow test stands still and then jumps.
+    """Find the intervals in which the gauge of a slow test is stuck and then jumps.
 
-    Returns the last sample before each stretch and the first after its jump. Meanwhile the specimen
-    is in contact and its stress changes, but the stress does not follow the jump, and the motion
-    does not go on with it. A displacement held at each reading must not be interpolated yet.
+    Return the last good sample before each interval and the first after its jump. The specimen is
+    in contact, the stress changes while the gauge is stuck but does not follow the jump, and the
+    motion does not continue at the speed of the jump. Call this before `fill_staircase`.
     """
     w, stress, found = record.displacement, record.stress, list[tuple[int, int]]()
     if w is None or len(w) < 4 * _SAMPLES:
@@ -301,7 +303,7 @@ def find_standstills(record: Record) -> list[tuple[int, int]]:
         level = float(np.median(w[last - _SAMPLES + 1 : last + 1]))
         near = _NEAR * abs(float(w[after]) - level) + _SCATTER * noise
         moving = np.flatnonzero(np.abs(w[: last + 1] - level) > near)
-        before = int(moving[-1]) + 1 if moving.size else 0  # there the gauge is still right
+        before = int(moving[-1]) + 1 if moving.size else 0  # last good sample
         if last + 1 - before < shortest:
             continue
         meanwhile = stress[before : last + 1]
@@ -315,16 +317,16 @@ def find_standstills(record: Record) -> list[tuple[int, int]]:
 
 
 def _jumps(w: Array, noise: float, step: int, width: int) -> dict[int, int]:
-    """First samples after jumps out of a stretch, and how many samples each jump takes."""
+    """Return the first samples after jumps from a standstill, and the length of each jump."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
     n = len(w)
-    # The window of sample i ends with it.
+    # The window of sample i ends at sample i.
     shift: Any = {"size": width, "origin": (width - 1) // 2, "mode": "nearest"}
     range_before = maximum_filter1d(w, **shift) - minimum_filter1d(w, **shift)
     least = max(_LEAP * float(np.ptp(w)), _ABOVE_NOISE * noise, _DIGITS * quantum(w))
     found = dict[int, int]()
-    for length in range(_LONGEST, 0, -1):  # the shortest counts
+    for length in range(_LONGEST, 0, -1):  # shorter jumps replace longer ones
         last = np.arange(width - 1, n - length)
         jump = w[last + length] - w[last]
         far = np.abs(jump)
@@ -337,7 +339,7 @@ def _jumps(w: Array, noise: float, step: int, width: int) -> dict[int, int]:
 
 
 def _change(stress: Array) -> tuple[float, int]:
-    """Rise of a stress from its lowest, or fall from its highest, by means of so many samples."""
+    """Return the final rise or fall of a stress, and the number of samples averaged for it."""
     part = max(stress.size // 4, _SAMPLES // 2)
     mean = np.convolve(stress, np.full(part, 1.0 / part), "valid")
     return max(float(mean[-1] - mean.min()), float(mean[-1] - mean.max()), key=abs), part
@@ -346,11 +348,11 @@ def _change(stress: Array) -> tuple[float, int]:
 def _follows(
     w: Array, stress: Array, noise: float, step: int, before: int, last: int, after: int
 ) -> bool:
-    """Whether the stress leaves its trend as if the jump were a motion, or this is unknown.
+    """Return whether the stress follows the jump like a real motion, or this cannot be decided.
 
-    A gauge that is read at steps may show a motion a step late.
+    A gauge that is read in steps may show a motion one step late.
     """
-    # As long as the displacement stays where it jumped to.
+    # Use the samples until the displacement leaves the level that it jumped to.
     rest = w[after : after + 3 * max(step, 2)]
     jump = float(rest[0] - np.median(w[before : last + 1]))
     away = np.abs(rest - rest[0]) > 0.25 * abs(jump) + _SCATTER * noise
@@ -363,7 +365,7 @@ def _follows(
     ahead = float(window.mean()) - middle
     shares = 1.0 / window.size, 1.0 / fitted.size, ahead**2 / np.sum((fitted - middle) ** 2)
     error = max(noise_level(stress[before : last + 1]), scatter) * np.sqrt(sum(shares))
-    slopes = []  # the smaller of the stiffnesses before and after counts, Pa/m
+    slopes = []  # stiffnesses before and after, Pa/m; the smaller one is used
     for sides in (slice(before, None, -1), slice(after, None)):
         motion, force = w[sides], stress[sides]
         far = int(np.argmax(np.abs(motion - motion[0]) >= _AROUND * abs(w[after] - w[before])))
@@ -380,7 +382,7 @@ def _follows(
 
 
 def bridge_standstills(record: Record, found: list[tuple[int, int]], height: float) -> Record:
-    """Draw straight lines from the last sample before each stretch to the first after its jump."""
+    """Replace a stuck displacement by the straight line to the first sample after the jump."""
     if record.displacement is None or not found:
         return record
     w, time, numbers = record.displacement.copy(), record.instants, record.row_numbers
@@ -390,12 +392,12 @@ def bridge_standstills(record: Record, found: list[tuple[int, int]], height: flo
         change = _change(stress)[0] / float(np.abs(stress).max())
         jump, inside, ends = w[after] - w[before], slice(before + 1, after), [before, after]
         w[inside] = np.interp(time[inside], time[ends], w[ends])
-        told = (
+        note = (
             f"Check: the displacement stands still in rows {numbers[before + 1]} to "
             f"{numbers[after - 1]} while the stress {'rises' if change > 0.0 else 'falls'} by "
             f"{percent(abs(change))}, then jumps by {percent(abs(jump) / height)} strain, which "
             "the stress does not follow: play of the gauge; it is bridged by a straight line."
         )
-        standstills[told] = np.zeros(len(w), dtype=bool)
-        standstills[told][inside] = True
+        standstills[note] = np.zeros(len(w), dtype=bool)
+        standstills[note][inside] = True
     return replace(record, displacement=w, standstills=standstills)

@@ -1,7 +1,6 @@
-"""From the samples of a file to one loading and unloading, with time zero where contact starts.
+"""Reduce the samples of a file to one loading and unloading, with time zero at contact.
 
-`condition` runs the steps in order. Each step returns a new `Record` with a note on everything that
-it has changed or left out.
+`condition` runs the steps in order. Each step returns a new `Record` with notes on its changes.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import numpy as np
 
 from foamfit.arrays import Array, means
 from foamfit.data import contact, cycles, frames, zeros
-from foamfit.data import outliers as spoilt
+from foamfit.data import outliers as repair
 from foamfit.data.measurement import (
     INTEGRATED,
     MEASURED,
@@ -33,7 +32,7 @@ from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, 
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
-# Usual range of each quantity, SI; beyond it a unit is probably wrong.
+# Usual range of each quantity in SI; outside it, a unit is probably wrong.
 _USUAL = {
     "height": (1e-5, 1.0, "m"),
     "area": (1e-10, 1.0, "m²"),
@@ -42,7 +41,8 @@ _USUAL = {
     "modulus (peak stress over peak strain)": (10.0, 1e11, "Pa"),
     "duration": (1e-6, 1e7, "s"),
 }
-_MAX_ROWS, _BLOCKS = 1500, 1000  # more samples than this are averaged in so many blocks
+_MAX_ROWS = 1500  # more samples than this are averaged in blocks
+_BLOCKS = 1000  # number of these blocks, at most
 
 
 def condition(
@@ -54,22 +54,23 @@ def condition(
     advice: Callable[[str], str] | None = None,
     spread: float = 0.0,
 ) -> Measurement:
-    """Turn all samples of a file into one loading and unloading, a test without a name.
+    """Reduce all samples of a file to one loading and unloading; the test has no name yet.
 
-    With a striker and a time it is an impact, else a slow test whose displacement is driven; for
-    `advice` see `check_signs`. At most 1500 samples are left; time and displacement are zero where
-    contact starts. The noise is estimated where samples before contact, or held ones, show it.
+    A record with a striker and a time is an impact, any other a slow test. For `advice` see
+    `check_signs`; `spread` is the standard deviation of the striker's velocity, m/s. The result has
+    at most 1500 samples, and time and displacement are zero at the start of contact. The noise is
+    estimated from samples before contact or from those of a held channel.
     """
-    window, known = window or Window(), striker or Striker()
+    window, given = window or Window(), striker or Striker()
     impact = striker is not None and record.time is not None
     if impact and window.cycle not in (None, 1):
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
-    record = spoilt.mark_clipped(spoilt.bridge_outliers(cut_to_window(record, window)))
+    record = repair.mark_clipped(repair.bridge_outliers(cut_to_window(record, window)))
     spikes = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
     check_signs(record, advice)
-    held = spoilt.noise_of_held(record)
-    still = [] if impact else spoilt.find_standstills(record)
-    record = spoilt.bridge_standstills(spoilt.fill_staircase(record), still, specimen.height)
+    held = repair.noise_of_held(record)
+    still = [] if impact else repair.find_standstills(record)
+    record = repair.bridge_standstills(repair.fill_staircase(record), still, specimen.height)
     found = [] if impact else cycles.find_cycles(record)
     chosen = cycles.choose_cycles(found, window.cycle, window.last)
     first = cycles.cut_to_cycle(record, found, found[0]) if found else record
@@ -78,16 +79,16 @@ def condition(
     used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record), turn=0)
     if impact:
         start = contact.start_of_impact(first, levels)
-        start = replace(start, gauge=zeros.gauge_before(first, start, levels, known))
+        start = replace(start, gauge=zeros.gauge_before(first, start, levels, given))
         span = zeros.span_of_impact(first, start, levels)
-        striker, told = zeros.flight_of(first, start, span, levels, known, spread)
-        record = record.noted(*told)
-    else:  # its first cycle shows the start
+        striker, notes = zeros.flight_of(first, start, span, levels, given, spread)
+        record = record.noted(*notes)
+    else:  # contact starts in the first cycle
         start = contact.start_of_slow_test(first, levels)
         end = len(first) if used.place else used.end - used.first
         span = zeros.Span(start.first, end, start.resting, end)
     record = zeros.take_zeros(record, first, start, span, levels, impact=impact)
-    if used.place:  # with a contact of its own
+    if used.place:  # a later cycle has its own contact
         record = cycles.cut_to_reload(record, found, used, specimen.height)
     else:
         record = cycles.zero_between(record, found, used)
@@ -95,24 +96,24 @@ def condition(
         record = cut_to_contact(record, start, span)
     if impact:
         record = zeros.mark_flight(record, start, span)
-    known = striker or known
-    record = integrate_motion(record, specimen, known)
+    given = striker or given
+    record = integrate_motion(record, specimen, given)
     if impact:
-        record = start_within_height(record, specimen, known)
-    whole = checks(record, specimen, known, several=used.last is not None)
+        record = start_within_height(record, specimen, given)
+    whole = checks(record, specimen, given, several=used.last is not None)
     record = thin(whole)
     block = -(-len(whole) // len(record))
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
-    outliers = spoilt.outliers_of_blocks(whole, block)
+    outliers = repair.outliers_of_blocks(whole, block)
     instants = whole.instants if whole.time is not None else whole.instants // block
     stood = [instants[rows] for rows in whole.standstills.values() if rows.any()]
     channels = record.time, record.stress, record.displacement
     return Measurement(
-        *("", None, "", *channels, specimen, striker),  # no name and no file
+        *("", None, "", *channels, specimen, striker),  # name, path and digest follow later
         noise=Noise(estimated=noise),
         motion=whole.motion,
-        notes=(*record.notes, *spoilt.notes_on(whole, spikes, outliers)),
+        notes=(*record.notes, *repair.notes_on(whole, spikes, outliers)),
         interior=record.interior,
         outliers=outliers,
         contact="stress" if used.place else start.by,
@@ -133,7 +134,7 @@ def condition(
 
 
 def cut_to_contact(record: Record, start: contact.Start, span: zeros.Span) -> Record:
-    """Keep the rows of contact and those just before it; time is zero where it starts."""
+    """Keep the rows in contact and a few around; shift time to zero at contact."""
     n, lead = len(record), start.first - span.first
     cut = f"; {span.first} samples before and {n - span.end} after are cut, "
     cut += f"{span.end - span.first} kept" + (f", {lead} of them before contact" if lead else "")
@@ -148,7 +149,7 @@ def cut_to_contact(record: Record, start: contact.Start, span: zeros.Span) -> Re
 
 
 def cut_to_window(record: Record, window: Window) -> Record:
-    """Keep what lies between the window's start and end, as the file counts time."""
+    """Keep the samples between the start and end of the window, on the clock of the file."""
     if (window.start, window.end) == (-np.inf, np.inf):
         return record
     if record.time is None:
@@ -170,13 +171,13 @@ def cut_to_window(record: Record, window: Window) -> Record:
 
 
 def check_signs(record: Record, advice: Callable[[str], str] | None) -> None:
-    """Refuse a channel that is negative in compression; `advice` says what would be right."""
+    """Raise InputError, with `advice` on the channel, if one is negative in compression."""
     stress, peak = record.stress, int(np.argmax(record.stress))
     first, lowest = float(np.median(stress[:5])), stress.min()
     negative = first - lowest > 2 * max(stress[peak] - first, 0) and abs(lowest) > stress[peak]
     derived = "stress" in record.derived
     wrong = ["stress"] if negative and not derived else []
-    if derived and record.displacement is not None:  # which has no turn but the deepest
+    if derived and record.displacement is not None:  # its turn shows its sign
         w, low = record.displacement, int(np.argmin(record.displacement))
         fallen, risen = w[0] - w[low], w[: low + 1].max() - w[0]
         turned = low < 0.98 * len(w) and fallen > max(2 * risen, 0.3 * np.ptp(w))
@@ -196,14 +197,14 @@ def check_signs(record: Record, advice: Callable[[str], str] | None) -> None:
 
 
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> Record:
-    """Integrate a motion that was not measured: w(0) = 0, w'(0) = v, and w'' = g − a or g − σA/m.
+    """Integrate a missing displacement: w(0) = 0, w'(0) = v, and w'' = g − a or g − σA/m.
 
-    A channel is linear between samples.
+    Channels are assumed to be linear between samples.
     """
     if record.displacement is not None:
         return replace(record, acceleration=None)
     time = record.time
-    assert time is not None  # without a time the file has been refused
+    assert time is not None  # a file without a time was rejected
     if record.clipped is not None and record.acceleration is None and record.velocity is None:
         wrong = "the force is clipped, so the motion cannot be integrated from it"
         raise InputError(f"{wrong}; give a displacement, an acceleration or a velocity.")
@@ -212,10 +213,10 @@ def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> Re
     elif record.velocity is not None:
         rate, source = record.velocity, "velocity"
     else:
-        assert striker.mass  # likewise
+        assert striker.mass  # a file without it was rejected
         rate, source = -record.stress * specimen.area / striker.mass, "force"
     gravity = striker.gravity or 0.0
-    # Time zero, which may lie between two samples or before the first, is a point of its own.
+    # Insert time zero, which may lie between two samples or before the first.
     at = int(np.searchsorted(time, 0.0))
     if source == "velocity":
         start = float(np.interp(0.0, time, rate))
@@ -236,10 +237,10 @@ def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> Re
 def stress_of_motion(
     time: Array, displacement: Array | None, velocity: Array | None, ratio: float, gravity: float
 ) -> Array:
-    """Stress that brakes a striker, `ratio` (mass over area, kg/m²) times g − w''.
+    """Return the stress that decelerates a striker: `ratio` (mass over area, kg/m²) times g − w''.
 
-    The second derivative w'' is that of a smoothing spline, as close to the motion as the noise
-    demands. A gauge that rests before contact, and perhaps after it, is followed in between.
+    The second derivative w'' is that of a smoothing spline whose residuals equal the noise.
+    Intervals in which the gauge is at rest before and after contact are excluded.
     """
     from scipy.interpolate import make_smoothing_spline
 
@@ -248,17 +249,17 @@ def stress_of_motion(
     noise, first, end = estimated_noise(values), 0, len(time)
     if velocity is None:
         top = int(np.argmax(values))
-        there, back = (time[: top + 1], values[: top + 1]), (-time[top:][::-1], values[top:][::-1])
-        if found := contact.leave_rest(*there, noise, contact.STILL_MOTION):
+        rise, fall = (time[: top + 1], values[: top + 1]), (-time[top:][::-1], values[top:][::-1])
+        if found := contact.leave_rest(*rise, noise, contact.STILL_MOTION):
             first = int(np.searchsorted(time, found[0]))
-        if found := contact.leave_rest(*back, noise, contact.STILL_MOTION):
+        if found := contact.leave_rest(*fall, noise, contact.STILL_MOTION):
             end = int(np.searchsorted(time, -found[0]))
     n = end - first
     block = max(1, min(round(noise.time), n // 50), n // 1000)
     edges = np.arange(first, end, block)
     t, y = (means(x[:end], edges) for x in (time, values))
     t, step = t - t[0], (t[-1] - t[0]) / len(t)
-    # With an estimate that is a little too small the curve would follow the noise.
+    # With a slightly underestimated noise, the curve would follow the noise.
     sigma, low, high = 1.1 * averaged(noise, block).sigma, -6.0, 14.0
     for _ in range(24):
         middle = 0.5 * (low + high)
@@ -273,28 +274,28 @@ def stress_of_motion(
 
 
 def start_within_height(record: Record, specimen: Specimen, striker: Striker) -> Record:
-    """Move the start of an impact that was too early: its motion goes farther than the height."""
+    """Delay the contact of an impact if the displacement would otherwise exceed the height."""
     w, most = record.displacement, 0.97 * specimen.height
     assert w is not None  # measured or integrated by now
-    over, rough = float(w.max()) - most, 0.5 if "stress" in record.derived else 0.2
-    if not striker.velocity or not 0.03 * specimen.height <= over < rough * specimen.height:
+    over, limit = float(w.max()) - most, 0.5 if "stress" in record.derived else 0.2
+    if not striker.velocity or not 0.03 * specimen.height <= over < limit * specimen.height:
         return record
     late = over / striker.velocity
     record = record.shifted("time", late)
     if record.motion == MEASURED:
         record = record.shifted("displacement", over)
-    else:  # it has no zero in the file
+    else:  # an integrated motion has no zero in the file
         record = record.changed("displacement", w - over)
     return record.noted(
-        f"Contact is taken to be {engineering(late, 's')} later, where the motion does not go "
-        "farther than the height."
+        f"Contact is assumed {engineering(late, 's')} later, so that the displacement does not "
+        "exceed the height."
     )
 
 
 def checks(
     record: Record, specimen: Specimen, striker: Striker, *, several: bool = False
 ) -> Record:
-    """Refuse strains beyond one; say what is not plausible, of `several` cycles less."""
+    """Reject strains beyond one, note implausible data (no reversals of `several` cycles)."""
     displacement, height = record.displacement, specimen.height
     assert displacement is not None  # measured or integrated by now
     notes, motion = list[str](), record.motion
@@ -314,15 +315,15 @@ def checks(
         if not low <= value <= high:
             shown, least, most = (f"{v:.4g} {unit}".strip() for v in (value, low, high))
             notes.append(
-                f"Check: the {name} is {shown}, but tests of specimens have {least} to {most}; "
+                f"Check: the {name} is {shown}, but {least} to {most} is usual in tests; "
                 "check the units (mm or Mm, mN or MN)."
             )
     for node, values in record.interior.items():
-        name, far = interior_channel(node), float(values.max())
-        if far >= height:
-            reached = f"{engineering(far, 'm')}, the height {engineering(height, 'm')}"
+        name, largest = interior_channel(node), float(values.max())
+        if largest >= height:
+            reached = f"{engineering(largest, 'm')}, the height {engineering(height, 'm')}"
             raise InputError(f"{name} reaches {reached}; check its unit.")
-        if far > 1.05 * displacement.max():
+        if largest > 1.05 * displacement.max():
             notes.append(f"Check: {name} goes farther than the top; check its unit and its node.")
     stress, width, first = record.stress, max(1, len(record) // 100), record.stress[:3].mean()
     if first > 0.05 * peak:
@@ -350,7 +351,7 @@ def checks(
 
 
 def thin(record: Record) -> Record:
-    """Average blocks of samples where there are many more than a fit needs; noise falls with it."""
+    """Average a long record in blocks, which also reduces its noise."""
     n = len(record)
     if n <= _MAX_ROWS:
         return record
@@ -365,19 +366,19 @@ def thin(record: Record) -> Record:
 
 
 def count_rows(record: Record, outliers: dict[str, Outliers], block: int) -> RowCount:
-    """Count the rows of the file: those in `record`, whose blocks are fitted, and those dropped."""
+    """Count the rows of the file that are used, and those dropped with the reasons."""
     dropped, used = list(record.dropped), np.ones(len(record), dtype=bool)
     of_blocks = {c: np.repeat(o.left_out, block)[: len(record)] for c, o in outliers.items()}
-    wrong = {
+    reasons = {
         f"a spike or gap of the {name}, bridged by a straight line": excess != 0.0
         for name, excess in record.excess.items()
     }
-    wrong["the displacement stands still, bridged by a straight line"] = record.stood_still
+    reasons["the displacement stands still, bridged by a straight line"] = record.stood_still
     if record.clipped is not None:
-        wrong["the force is clipped"] = of_blocks["stress"] & record.clipped
+        reasons["the force is clipped"] = of_blocks["stress"] & record.clipped
     for name, left_out in of_blocks.items():
-        wrong[f"in a block of {block} samples of the {name} that is not fitted"] = left_out
-    for why, rows in wrong.items():
+        reasons[f"in a block of {block} samples of the {name} that is not fitted"] = left_out
+    for why, rows in reasons.items():
         lost = record.row_numbers[rows & used]
         used[rows] = False
         dropped += [Dropped.of(lost, why)] if lost.size else []

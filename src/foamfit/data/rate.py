@@ -1,4 +1,4 @@
-"""The rate of a test: its mean strain rate on loading."""
+"""Mean strain rate of a test on loading."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 
-# Samples within so many standard deviations of the noise below the largest may be the peak.
-_SURE = 3.0
-_CLOSE = 0.95  # of its peak: a motion that takes longer from there than to there is held
-_COPIES, _NORMAL = 30, 0.6745  # copies with other noise; median of the size of a normal deviate
+_SURE = 3.0  # samples within this many standard deviations below the largest may be the peak
+_CLOSE = 0.95  # share of the peak; a motion is held if it takes longer from there than up to there
+_COPIES = 30  # number of copies with additional noise
+_NORMAL = 0.6745  # median magnitude of a standard normal variable
 
 
 def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None:
-    """Mean strain rate on loading, from contact to the largest strain, 1/s; None without time.
+    """Return the mean strain rate from contact to the largest strain, 1/s; None without a time.
 
-    The peak is in the middle of the samples that noise alone may keep from being the largest, or at
-    the start of a hold. A displacement that was `fitted` (m) has no noise and is taken instead.
+    The peak is the middle of the samples that may be the largest in view of the noise, or the start
+    of a hold. If given, the `fitted` displacement (m) is used instead; it has no noise.
     """
     if test.time is None or test.displacement is None:
         return None
@@ -40,10 +40,10 @@ def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None
 
 
 def rate_error(test: Measurement) -> float:
-    """Standard error of the logarithm of the rate by the noise of the measured displacement.
+    """Return the standard error of the logarithm of the rate due to noise of the displacement.
 
-    From the rates of copies of the record to which as much noise is added again. Noise that is
-    estimated is no larger than the samples differ from a parabola through their neighbours.
+    It is the scatter over copies of the record with added noise of the same size. Estimated noise
+    is limited to the deviation of samples from a parabola through their neighbours.
     """
     w, sigma = test.displacement, _sigma(test)
     if test.time is None or w is None or w.size < 5 or sigma <= 0.0:
@@ -51,9 +51,9 @@ def rate_error(test: Measurement) -> float:
     third = float(np.median(np.abs(np.diff(w, 3)))) / (_NORMAL * math.sqrt(20.0))
     scatter = min(sigma, third) if test.noise.displacement is None else sigma
     noise = scatter * np.random.default_rng(0).standard_normal((_COPIES, w.size))
-    rates = [_velocity(test.time - test.time[0], w + one, sigma) for one in noise]
-    known = [rate for rate in rates if rate is not None]
-    return float(np.std(np.log(known), ddof=1)) if len(known) > 1 else 0.0
+    copies = [_velocity(test.time - test.time[0], w + added, sigma) for added in noise]
+    rates = [rate for rate in copies if rate is not None]
+    return float(np.std(np.log(rates), ddof=1)) if len(rates) > 1 else 0.0
 
 
 def _sigma(test: Measurement) -> float:
@@ -62,7 +62,7 @@ def _sigma(test: Measurement) -> float:
 
 
 def _velocity(time: Array, motion: Array, sigma: float) -> float | None:
-    """Mean velocity up to the peak of a measured motion; None where it does not go up."""
+    """Return the mean velocity up to the peak of a measured motion; None if it never rises."""
     motion = motion - motion[0]
     most = float(motion.max())
     if most <= 0.0 or time[np.argmax(motion)] <= 0.0:

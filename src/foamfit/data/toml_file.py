@@ -1,13 +1,13 @@
-"""The TOML beside a test: specimen, striker, columns, noise, window and data, checked and in SI.
+"""Read and check the TOML of a test and convert its quantities to SI.
 
-[columns] names the column of a channel where its header does not: ``column`` (its header or its
-number), ``unit``, ``scale`` (a number, or a quantity such as "4444.4 N/V"; a negative one changes
-the sign) and, for displacements, ``counts_down = true`` (a gap or a position that gets smaller in
-compression). [data] ``duplicates`` is "average" (neighbouring rows with one time stamp make one
-sample) or "refuse", ``sheet`` that of a workbook. A quantity may have a standard deviation, "1.75 ±
-0.01 m/s"; `Measurement.uncertainties` lists those that are used. [motion] names a ``file`` with a
-clock of its own, relative to the TOML, the ``delay`` of that clock, and in [motion.columns] its
-columns. [priors] gives what is known of parameters before the fit, "5.5 ± 0.1 MPa".
+[columns] describes a channel that is not clear from its header: ``column`` (header or number),
+``unit``, ``scale`` (a number, or a quantity such as "4444.4 N/V"; a negative one changes the sign)
+and, for displacements, ``counts_down = true`` (a gap or a position that decreases in compression).
+[data] ``duplicates`` is "average" (consecutive rows with the same time stamp become one sample) or
+"refuse", ``sheet`` the name of a sheet in a workbook. A quantity may have a standard deviation,
+"1.75 ± 0.01 m/s"; see `Measurement.uncertainties`. [motion] names a ``file``, relative to the TOML,
+with its own clock, the ``delay`` of that clock, and in [motion.columns] its columns. [priors]
+contains prior knowledge of parameters, "5.5 ± 0.1 MPa".
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ LONGEST = 200  # characters of a name
 
 
 class _Quantity(NamedTuple):
-    """SI unit, an example, and the name of its ± in `Settings.uncertainties` (none: no ±)."""
+    """SI unit, an example, and the name of its ± in `Settings.uncertainties` ("": no ±)."""
 
     si: str
     example: str
@@ -45,23 +45,21 @@ class _Quantity(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """Which values a key without a unit may have, and how a message states them."""
+    """Check of a value without a unit, and description of the valid values for messages."""
 
     valid: Callable[[Any], bool]
     right: str
 
 
 def is_range(cycles: Any) -> bool:
-    """Whether a value has the numbers of a first and a last cycle."""
+    """Return whether a value is a pair of cycle numbers."""
     pair = isinstance(cycles, tuple | list) and len(cycles) == 2
-    return pair and all(type(one) is int and one > 0 for one in cycles)
+    return pair and all(type(number) is int and number > 0 for number in cycles)
 
 
 COUNT = Rule(lambda v: type(v) is int and v > 0, "a whole number from 1 up")
 RANGE = Rule(is_range, "the numbers of the first and the last one, like [1, 3]")
 FLAG = Rule(lambda v: type(v) is bool, "true or false")
-
-
 _SECTIONS: dict[str, dict[str, _Quantity | Rule]] = {
     "specimen": {
         "height": _Quantity("m", "1.19 mm", "height"),
@@ -88,16 +86,16 @@ _SECTIONS: dict[str, dict[str, _Quantity | Rule]] = {
     },
 }
 _SCALE = "4444.4 N/V"
-# What is read from the file of [motion], beside displacements of masses inside.
+# Channels of a [motion] file, in addition to displacements of interior masses.
 MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
 
 
 @dataclass(frozen=True)
 class Column:
-    """What [columns] says of one channel: its header, or number from 1, its unit and its scale.
+    """Entry of [columns] for one channel: header or number (from 1), unit and scale.
 
-    `spread` is the relative standard deviation of the scale; a column that `counts_down` gets
-    smaller in compression.
+    `spread` is the relative standard deviation of the scale; the values of a column that
+    `counts_down` decrease in compression.
     """
 
     column: str | int
@@ -119,7 +117,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Settings:
-    """What the TOML says, in SI; `uncertainties` are those of `Measurement`, without the scales."""
+    """Contents of the TOML in SI; `uncertainties` as in `Measurement`, without the scales."""
 
     name: str
     specimen: Specimen
@@ -135,13 +133,13 @@ class Settings:
 
 
 def toml_beside(test: Path) -> Path:
-    """Return the TOML beside a test, which shares its name: that of a.csv.gz is a.toml."""
+    """Return the path of the TOML next to a test file: a.toml for a.csv or a.csv.gz."""
     plain = test.with_suffix("") if test.suffix.lower() == ".gz" else test
     return plain.parent / f"{plain.stem}.toml"
 
 
 def read_bytes(path: Path, otherwise: str) -> bytes:
-    """Read a file; `otherwise` says what would be right."""
+    """Read a file; `otherwise` ends the message of an error with what would be right."""
     try:
         return read_whole(path)
     except FileNotFoundError:
@@ -151,7 +149,7 @@ def read_bytes(path: Path, otherwise: str) -> bytes:
 
 
 def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
-    """Load a TOML file; `otherwise` says what it is needed for where there is none."""
+    """Load a TOML file; `otherwise` ends the message if the file is missing or unreadable."""
     raw = read_bytes(path, otherwise)
     if len(raw) > _LARGEST:
         raise InputError(f"{path}: has {len(raw)} characters; a TOML must have {_LARGEST} at most.")
@@ -160,13 +158,13 @@ def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
     except RecursionError:
         raise InputError(f"{path}: is nested too deeply; write a TOML of few levels.") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: is no UTF-8 text; a TOML file must be.") from None
+        raise InputError(f"{path}: is not UTF-8 text; a TOML file must be.") from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: is no valid TOML: {error}.") from None
+        raise InputError(f"{path}: is not valid TOML: {error}.") from None
 
 
 def check_keys(where: str, given: Iterable[str], valid: Iterable[str]) -> None:
-    """Refuse a key that is not valid, and name those that may be meant."""
+    """Raise InputError for an invalid key, and suggest similar valid ones."""
     valid = list(valid)
     for key in given:
         if key not in valid:
@@ -178,8 +176,8 @@ def check_keys(where: str, given: Iterable[str], valid: Iterable[str]) -> None:
 def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Settings:
     """Read and check the TOML at `path` that describes the file `test`.
 
-    [columns] may name `channels`, displacement_1, displacement_2, … InputError names the file and
-    the key that is wrong or missing.
+    [columns] may contain `channels`, displacement_1, displacement_2, … InputError names the file
+    and the invalid or missing key.
     """
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
     check_keys(f"{path}:", document, ["name", "columns", "motion", "priors", *_SECTIONS])
@@ -196,7 +194,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         if len(name) > LONGEST:
             raise InputError(f"name has {len(name)} characters; it must have {LONGEST} at most.")
         priors, window, striker = _table(document, "priors"), values["window"], values["striker"]
-        for key, value in priors.items():  # which keys there are depends on the model
+        for key, value in priors.items():  # the keys depend on the model; the fit checks them
             if not isinstance(value, str):
                 raise InputError(f'[priors] {key} = {value!r} must be like "5.5 ± 0.1 MPa".')
         if {"cycle", "cycles"} <= window.keys():
@@ -227,7 +225,7 @@ def _table(document: dict[str, Any], name: str, within: str = "") -> dict[str, A
 
 
 def _value(section: str, key: str, value: Any, spreads: dict[str, float]) -> Any:
-    """Check and return what a key says, in SI, and put its ± into `spreads`."""
+    """Check a value and return it in SI; its ± is stored in `spreads`."""
     where, several, kind = f"[{section}] {key}", key == "heights", _SECTIONS[section][key]
     if isinstance(kind, Rule):
         if not kind.valid(value):
@@ -268,15 +266,15 @@ def _specimen(values: dict[str, Any], spreads: dict[str, float]) -> Specimen:
 
 
 def motion_file(toml: Path) -> Path | None:
-    """Return the file that [motion] of a TOML names; None if it names none or cannot be read."""
+    """Return the file named in [motion]; None if none is named or the TOML cannot be read."""
     try:
         return _file(toml, load_toml(toml, "").get("motion"))
-    except InputError:  # `read_settings` says what is wrong
+    except InputError:  # `read_settings` reports the error
         return None
 
 
 def _file(toml: Path, table: Any) -> Path | None:
-    """Path of the file that a table [motion] names, which is relative to its TOML."""
+    """Resolve the file of the table [motion] relative to the TOML."""
     name = table.get("file") if isinstance(table, dict) else None
     named = isinstance(name, str) and name.strip() and "\0" not in name
     return toml.parent / str(name) if named else None
@@ -285,7 +283,8 @@ def _file(toml: Path, table: Any) -> Path | None:
 def _motion(path: Path, document: dict[str, Any], spreads: dict[str, float]) -> Motion | None:
     if "motion" not in document:
         return None
-    table, file = document["motion"], _file(path, document["motion"])
+    table = document["motion"]
+    file = _file(path, table)
     if isinstance(table, dict):
         check_keys("[motion]", table, ["file", "delay", "columns"])
     if file is None:
@@ -308,8 +307,8 @@ def _columns(
         if not (isinstance(column, str) or (type(column) is int and column > 0)):
             right = '{ column = "Load", unit = "V" }, or with a number, column = 2'
             raise InputError(f"{where} must be like {right}.")
-        turned = ["counts_down"] if inside or channel == "displacement" else []
-        check_keys(where, spec, ["column", "unit", "scale", *turned])
+        more = ["counts_down"] if inside or channel == "displacement" else []
+        check_keys(where, spec, ["column", "unit", "scale", *more])
         down, unit, scale = (spec.get(key) for key in ("counts_down", "unit", "scale"))
         if not isinstance(down, bool | None):
             raise InputError(f"{where}: counts_down = {down!r} must be true or false.")
@@ -319,9 +318,9 @@ def _columns(
         parts = split_quantity(split_uncertain(text)[0])
         if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not is_unit(parts[1]):
             raise InputError(f'{where}: scale = {scale!r} must be like -1 or "{_SCALE}".')
-        sigma, exact = 0.0, inside or channel in ("time", "cycle")  # a ± has no meaning there
-        if exact:
+        if inside or channel in ("time", "cycle"):  # a ± has no meaning there
             parse_quantity(text, parts[1], f"{where}: scale", _SCALE)
+            sigma = 0.0
         else:
             sigma = parse_uncertain(text, parts[1], f"{where}: scale", _SCALE)[1] or 0.0
         columns[channel] = Column(column, unit, *parts, bool(down), sigma / abs(parts[0]))

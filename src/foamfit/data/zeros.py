@@ -1,4 +1,4 @@
-"""What the rows around contact show: zeros of the channels, and the flight of the striker."""
+"""Evaluate the rows around contact: zeros of the channels, and the flight of the striker."""
 
 from __future__ import annotations
 
@@ -12,19 +12,21 @@ from foamfit.data.measurement import GRAVITY, NoiseLevel, Record, Striker
 from foamfit.data.noise import MIN_REST, NOTHING, Level, level_on_line, line_at, mean_level, smooth
 from foamfit.text import engineering, percent
 
-_LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
-_FEW = 20  # with fewer rows before contact, a flat end of the record shows the zero better
-_TAIL, _HIGHEST = 0.04, 0.1  # share of a record that is its end; of the range, its highest level
-_MATTERS = 0.01  # share of a striker's velocity from which on its gain by gravity is asked for
-# Part of a note on a velocity that the motion contradicts.
+_LEAST_LEAD = 8  # least number of rows kept before contact
+_FEWEST = 3  # least number of rows for a zero
+_FEW = 20  # with fewer rows before contact, a flat end of the record gives a better zero
+_TAIL = 0.04  # share of a record taken as its end
+_HIGHEST = 0.1  # highest level of the end, as a share of the range
+_MATTERS = 0.01  # relative gain of velocity in a fall above which gravity must be specified
+# Part of a note if motion and given velocity are inconsistent; the checklist searches for it.
 CONTRADICTED = "but the striker's velocity is given as"
 
 
 @dataclass(frozen=True)
 class Span:
-    """Rows around contact: `first` up to `end` are kept, those before `rest` show zeros.
+    """Rows around contact: `first` to `end` are kept, those before `rest` determine the zeros.
 
-    Contact ends at the row `leaves`; `returned` says whether the stress is back at zero there.
+    Contact ends at the row `leaves`; `returned` is whether the stress has returned to zero there.
     """
 
     first: int
@@ -35,10 +37,10 @@ class Span:
 
 
 def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
-    """Keep a tenth of the rows of contact before it, a fiftieth after it.
+    """Find the rows to keep: contact, a tenth of its rows before it, and a fiftieth after it.
 
-    The rows kept from before contact show no zeros: the estimate of contact may be late. A derived
-    stress shows its end less well: a quarter is kept after it.
+    The rows kept before contact do not determine zeros, as the estimate of contact may be late.
+    After contact, a quarter is kept if the stress is derived, because its end is less certain.
     """
     first, stress = start.first, record.stress
     before = stress[: max(0, first - 2)]
@@ -48,7 +50,7 @@ def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
     found, returned = contact_end(stress[first:] - zero, levels["stress"])
     after = found // (4 if "stress" in record.derived else 50)
     end = min(len(record), first + found + max(3, after)) if returned else len(record)
-    # Of few rows before contact half are kept and half show the zeros.
+    # If few rows precede contact, half of them are kept and the others determine the zeros.
     lead = min(max(_LEAST_LEAD, found // 10), first // 2 if first >= 2 * _FEWEST else first)
     late = int(3 * start.error / float(np.median(np.diff(record.instants))))
     rest = first - max(lead, min(late, 2 * first // 3))
@@ -56,11 +58,11 @@ def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
 
 
 def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
-    """Level of a force at the end of an impact's record, if it is flat there: the striker has left.
+    """Return the level of a force at the end of an impact, if flat, as after the rebound.
 
-    The end grows backwards as long as the rows before it lie at its level within a standard error:
-    a soft end of contact stays below the noise for long. The correlation of few rows is unknown:
-    their mean counts as one row.
+    The end is extended backwards as long as the preceding rows agree with its level within one
+    standard error, a strict limit because a soft end of contact stays below the noise for long. The
+    correlation of few rows is unknown, so their mean gets the standard error of one row.
     """
     size = max(8, int(_TAIL * len(values)))
     step, n = max(4, size // 2), size
@@ -86,10 +88,10 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
 def take_zeros(
     record: Record, first: Record, start: Start, span: Span, levels: Levels, *, impact: bool
 ) -> Record:
-    """Take off what the channels of `first` show before contact, or a motion at contact.
+    """Subtract the zeros of the channels, found in `first` before contact, or at contact.
 
-    With too few rows before the contact of an impact, the end of the record shows the zero of the
-    force; without those, the file's own zero of the channel stands.
+    If too few rows precede the contact of an impact, the zero of the force is taken from the end of
+    the record. If that is impossible, the zero of the file remains.
     """
     errors, n = dict[str, float](), span.rest
     for name, values in first.curves("acceleration").items():
@@ -109,8 +111,8 @@ def take_zeros(
             elif n >= _FEWEST:
                 zero, note = _zero_at_rest(name, values[:n], unit, np.ptp(values), noise)
             elif start.first:
-                note = f"Only {n} rows certainly lie before contact: the file's own zero of the "
-                note += f"{name} stands."
+                note = f"Only {n} rows are certainly before contact: the zero of the {name} in the "
+                note += "file is kept."
             if zero.samples:
                 errors[name] = zero.error
         else:
@@ -128,36 +130,36 @@ def take_zeros(
 def _zero_at_rest(
     name: str, rest: Array, unit: str, size: float, noise: NoiseLevel
 ) -> tuple[Level, str]:
-    """Zero of a stress or acceleration at rest; none is taken off if it drifts by more."""
-    n, zero, scatter, told = len(rest), mean_level(rest, noise), float(rest.std()), ""
+    """Return the zero of a stress or acceleration at rest; 0 if its drift is larger."""
+    n, zero, scatter, note = len(rest), mean_level(rest, noise), float(rest.std()), ""
     slope = level_on_line(np.arange(n, dtype=np.float64), rest, 0.0, noise)[1]
     rise = slope.value * n
     if abs(rise) > max(0.01 * size, 4 * slope.error * n):
         kept = abs(zero.value) <= abs(rise)
-        done = "no offset is taken off" if kept else "its zero is known no better"
+        done = "no offset is taken off" if kept else "its zero is as uncertain"
         drift = engineering(rise, unit)
-        told = f"The {name} drifts by {drift} in the {n} samples before contact, so {done}. "
+        note = f"The {name} drifts by {drift} in the {n} samples before contact, so {done}. "
         zero = Level(0.0 if kept else zero.value, float(np.hypot(zero.error, rise)), n)
     if zero.value:
         ratio = f", {abs(zero.value) / scatter:.2g} times that" if scatter > 0 else ""
         value, sigma, error = (engineering(v, unit) for v in (zero.value, scatter, zero.error))
-        told += (
+        note += (
             f"The {name} before contact, {value}, is taken off as the sensor's offset ({n} samples "
             f"at rest with a standard deviation of {sigma}{ratio}; standard error {error})."
         )
-    return zero, told.strip()
+    return zero, note.strip()
 
 
 def _zero_of_motion(
     name: str, record: Record, start: Start, n: int, noise: NoiseLevel, *, impact: bool
 ) -> tuple[Level, str]:
-    """Value of a motion at contact: the mean of its rest, or else that of a line there.
+    """Return the value of a motion at contact: its mean at rest, or else from a line.
 
-    Where nothing was recorded before contact, the file's zero stands unless it is clearly wrong;
-    it also stands in a slow test whose record starts under load.
+    The zero of the file is kept if nothing was recorded before contact, unless it is clearly wrong,
+    and in a slow test whose record starts under load.
     """
     time, values, first = record.instants, record.channel(name), start.first
-    assert values is not None  # asked for by its name
+    assert values is not None  # the channel exists
     top = name == "displacement"
     rows = n if n >= _FEWEST else max(0, first - 2)
     if rows >= _FEWEST and (not top or start.gauge == "rest"):
@@ -171,12 +173,12 @@ def _zero_of_motion(
     size, stress = float(np.ptp(values)), record.stress
     loaded = not impact and stress[:3].mean() > 0.05 * stress.max() and 0.0 < zero.value < size
     least = max(ELSEWHERE * zero.error, ((0.1 if impact else 0.02) if top else 2e-3) * size)
-    own = not flies and (loaded or abs(zero.value) <= least)
-    return NOTHING if own else zero, source
+    keep = not flies and (loaded or abs(zero.value) <= least)
+    return NOTHING if keep else zero, source
 
 
 def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker) -> str:
-    """Say what the motion of an impact was before contact; see `Start.gauge`."""
+    """Classify the motion of an impact before contact; see `Start.gauge`."""
     time, w, before = record.instants, record.displacement, start.first - 2
     if w is None or not start.free or start.first == 0:
         return ""
@@ -193,7 +195,7 @@ def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker)
 
 
 def mark_flight(record: Record, start: Start, span: Span) -> Record:
-    """Mark rows in which the motion is not, or perhaps not yet, the striker's as not measured."""
+    """Mark rows in which the gauge does not follow the striker as not measured."""
     if record.displacement is None or start.gauge in ("flight", ""):
         return record
     step = float(np.median(np.diff(record.instants)))
@@ -207,9 +209,9 @@ def mark_flight(record: Record, start: Start, span: Span) -> Record:
 def flight_of(
     record: Record, start: Start, span: Span, levels: Levels, striker: Striker, spread: float
 ) -> tuple[Striker, list[str]]:
-    """Compare the striker's flight with its velocity ± `spread`, m/s, and find whether it falls.
+    """Compare the striker's flight with its velocity ± `spread`, m/s, and detect free fall.
 
-    Returns the striker, with gravity from its flight if the TOML does not state it, and the notes.
+    Return the striker, with gravity from its flight if the TOML does not give it, and notes.
     """
     n, w, given, notes = start.first - 2, record.displacement, striker.velocity, list[str]()
     if not given:
@@ -219,61 +221,62 @@ def flight_of(
         noise, t = levels["displacement"], record.instants[:n] - start.time
         (half, speed, _), variance = np.polyfit(t, w[:n], 2, cov="unscaled")
         sigma = noise.sigma * float(np.sqrt(noise.time))
-        shown, error = 2.0 * float(half), 2.0 * sigma * float(np.sqrt(variance[0, 0]))
+        gravity, error = 2.0 * float(half), 2.0 * sigma * float(np.sqrt(variance[0, 0]))
         none = start.gauge == "flight" and 4.0 * error < GRAVITY
-        if falls := shown > 4.0 * error and abs(shown - GRAVITY) < 0.2 * GRAVITY + 2.0 * error:
+        if falls := gravity > 4.0 * error and abs(gravity - GRAVITY) < 0.2 * GRAVITY + 2.0 * error:
             error = sigma * float(np.sqrt(variance[1, 1]))
-            told = (
-                f"before contact the striker accelerates by {engineering(shown, 'm/s²')}: it "
+            text = (
+                f"before contact the striker accelerates by {engineering(gravity, 'm/s²')}: it "
                 f"falls, and gains {gain} of its velocity over the contact"
             )
             if striker.gravity == 0.0:
-                notes.append(f"Check: {told}, but [striker] gravity is false.")
+                notes.append(f"Check: {text}, but [striker] gravity is false.")
             else:
-                notes.append(f"{told[0].upper()}{told[1:]}. The fit includes gravity.")
+                notes.append(f"{text[0].upper()}{text[1:]}. The fit includes gravity.")
         else:
             speed, error = level_on_line(t, w[:n], 0.0, noise)[1][:2]
         if striker.gravity is None and (falls or none):
             striker = replace(striker, gravity=GRAVITY if falls else 0.0)
-        off, error = abs(speed - given), float(np.hypot(error, spread))
-        if off > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
+        deviation, error = abs(speed - given), float(np.hypot(error, spread))
+        if deviation > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
             notes.append(
                 f"Check: before contact the displacement moves at {speed:.4g} ± {error:.2g} m/s, "
                 f"{CONTRADICTED} {given:.4g} m/s."
             )
     if striker.gravity is None and share > _MATTERS:
         notes.append(
-            f"Check: a striker that falls gains {gain} of its velocity over the contact, and the "
-            "record does not show whether this one does; write gravity = true or false under "
+            f"Check: a falling striker gains {gain} of its velocity over the contact, but the "
+            "record does not show whether this one falls; write gravity = true or false under "
             "[striker]."
         )
     return striker, notes
 
 
 def contact_end(stress: Array, noise: NoiseLevel) -> tuple[int, bool]:
-    """Index after the last sample of the contact with the highest stress, and if it was reached.
+    """Return the index after the end of contact, and whether the record contains the end.
 
-    The end is the last return to zero of a moving mean, whose noise is half a percent of the peak
-    if the pulse is long enough. Contact goes on if the stress soon rises again, or if its mean over
-    the next quarter of the time since the peak is not zero within its error.
+    Contact is the one with the highest stress. It ends at the last return to zero of a moving mean,
+    wide enough for a noise of half a percent of the peak if the pulse is long enough. Contact
+    continues if the stress soon rises again, or if its mean over the next quarter of the time since
+    the peak is significantly above zero.
     """
     top = int(np.argmax(stress))
     peak = float(stress[top])
     loaded = int(np.count_nonzero(stress > 0.1 * peak))
     needed = noise.time * (2 * noise.sigma / (0.005 * peak)) ** 2
-    steep = int(np.argmax(stress[top:] < 0.5 * peak))  # 0 if it never falls so far
+    steep = int(np.argmax(stress[top:] < 0.5 * peak))  # 0 if it stays above
     width = max(1, steep // 12, int(min(needed, loaded // 24)))
     mean = smooth(stress, width)
 
     def zero(samples: int) -> float:
-        """Level that the mean of so many samples stays below at zero stress."""
+        """Return the largest mean of a number of samples that is consistent with zero stress."""
         error = noise.sigma * np.sqrt(min(1.0, noise.time / samples))
         return min(0.0025 * peak + 2 * float(error), 0.04 * peak)
 
     level, end = zero(width), top
     while True:
         quiet = np.flatnonzero(mean[end:] <= level)
-        if not quiet.size:  # a record cut right at the end of contact has returned
+        if not quiet.size:  # the record may be cut just at the end of contact
             return len(stress), bool(stress[-1] <= 0.02 * peak + level)
         end += int(quiet[0])
         ahead = end + max(1, (end - top) // 5)

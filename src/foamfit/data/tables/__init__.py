@@ -1,1 +1,1 @@
-"""From a file to a table: its text, the numbers in it, and which column is which channel."""
+"""Read a file as a table, and identify the columns of the channels."""

@@ -1,4 +1,4 @@
-"""Which column of a table is which channel, and what its numbers are multiplied by to be in SI."""
+"""Assign the columns of a table to channels, and find their factors to SI."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from foamfit.text import listed, percent
 _NONE = Column("")
 _MOTIONS = "displacement", "strain"
 TWINS = {"stress": "force", "force": "stress", "displacement": "strain", "strain": "displacement"}
-# What stress and displacement are read from, the first that there is.
+# Channels that stress and displacement are read from, the preferred one first.
 _SOURCES = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
 
 
 @dataclass(frozen=True)
 class Source:
-    """A table, the column that each channel is in, and what [columns] of the TOML says of them."""
+    """A table, the column number of each channel, and the entries of [columns] in the TOML."""
 
     table: Table
     columns: dict[str, int]
@@ -33,20 +33,20 @@ class Source:
 
     @classmethod
     def of(cls, text: Text, given: dict[str, Column]) -> Source:
-        """Find the table of a file, and which column each channel is in."""
+        """Find the table in the text of a file and the columns of the channels."""
         table = find_table(text, {column.column for column in given.values()})
         return cls(table, assign_columns(table, given), given)
 
     def factor(self, channel: str) -> float:
-        """Return what the numbers of a channel are multiplied by to be SI."""
+        """Return the factor from the numbers of a channel to SI."""
         return si_factor(self.table, channel, self.columns[channel], self.given.get(channel))
 
     def only(self, channels: Iterable[str]) -> Source:
-        """Read no other channels."""
+        """Return a source with these channels only."""
         return replace(self, columns={c: k for c, k in self.columns.items() if c in channels})
 
     def needed(self, settings: Settings) -> Source:
-        """Choose the channels worth reading; refuse a file that lacks one nothing can replace."""
+        """Select the channels to read; raise InputError if an indispensable one is missing."""
         table, has, motion = self.table, set(self.columns), settings.motion
         striker = settings.striker or Striker()
         forced, moved = bool(has & {"stress", "force"}), bool(has & set(_MOTIONS))
@@ -54,48 +54,46 @@ class Source:
         if not forced and not ("time" in has and braked and striker.mass):
             more = "with a time and the [striker] mass an acceleration or a velocity will do, and "
             wanted, others = ("stress", "force"), ("displacement", "time")
-            raise self._lacks(wanted, others, f"; {more}with its velocity a displacement")
+            raise self._missing(wanted, others, f"; {more}with its velocity a displacement")
         if motion is not None:
             own = [c for c in self.columns if c in _MOTIONS or interior_node(c)]
             if own:
                 header = table.headers[self.columns[own[0]]].text
                 raise InputError(
                     f"column {header!r} is a {own[0]}, but [motion] file = {motion.file.name!r} "
-                    "has the motion; leave one of them out."
+                    "contains the motion; leave one of them out."
                 )
             if "time" not in has:
-                told = f"no column is a time (there are {table.listed})"
-                raise InputError(f"{told}; with [motion] it needs one like 'time (ms)'.")
-        helping = {"velocity"} if moved or "acceleration" in has else set[str]()
-        helping = {"velocity", "acceleration"} if forced else helping
+                wrong = f"no column is a time (there are {table.listed})"
+                raise InputError(f"{wrong}; with [motion] it needs one like 'time (ms)'.")
+        optional = {"velocity"} if moved or "acceleration" in has else set[str]()
+        optional = {"velocity", "acceleration"} if forced else optional
         if moved or motion is not None:
-            return self.only(has - helping)
-        for channel in has & helping - set(self.given):
-            try:  # these only help, so one whose unit does not say what it is can be left
+            return self.only(has - optional)
+        for channel in has & optional - set(self.given):
+            try:  # ignore an optional channel without a usable unit
                 self.factor(channel)
             except InputError:
                 has.remove(channel)
-        sources = "velocity" in has or (
-            striker.velocity and (striker.mass or "acceleration" in has)
-        )
-        if "time" not in has or not sources:
+        integrable = striker.velocity and (striker.mass or "acceleration" in has)
+        if "time" not in has or not ("velocity" in has or integrable):
             timed = "" if "time" in has else f"{entries_of(table, has, 'time')} there, and "
             more = f", or give {timed}the [striker] mass and velocity to integrate the motion"
-            raise self._lacks(_MOTIONS, (), more)
+            raise self._missing(_MOTIONS, (), more)
         return self.only(has)
 
     def of_motion(self) -> Source:
-        """Choose time and displacements of a file of [motion]; refuse one that lacks them."""
-        there = {c for c in self.columns if c in ("time", *_MOTIONS) or interior_node(c)}
+        """Select time and displacements of a [motion] file; raise InputError if one is missing."""
+        present = {c for c in self.columns if c in ("time", *_MOTIONS) or interior_node(c)}
         for wanted in (("time",), _MOTIONS):
-            if not there & set(wanted):
-                raise self._lacks(wanted)
-        return self.only(there)
+            if not present & set(wanted):
+                raise self._missing(wanted)
+        return self.only(present)
 
-    def _lacks(
+    def _missing(
         self, wanted: tuple[str, ...], others: tuple[str, ...] = (), more: str = ""
     ) -> InputError:
-        """Say that no column is one of the `wanted` channels, and how to name one."""
+        """Return the error for a file without any of the `wanted` channels."""
         entry = "force" if "force" in wanted else wanted[0]
         entries = entries_of(self.table, set(self.columns), entry, *others)
         return InputError(
@@ -104,7 +102,7 @@ class Source:
         )
 
     def left_out(self) -> dict[str, int]:
-        """Columns that could be read instead of those that are: the twins and other times."""
+        """Return unused columns that duplicate a channel: its twin, or another time."""
         found = dict[str, int]()
         for channel in (c for c in self.columns if c in {"time", *TWINS}):
             twin = TWINS.get(channel, channel)
@@ -115,18 +113,16 @@ class Source:
         return found
 
     def scale_spreads(self) -> dict[str, float]:
-        """Standard deviations of the scales of the channels that are read, each over its scale."""
+        """Return the relative standard deviations of the scales of the channels in use."""
         sources = _SOURCES | {c: (c,) for c in ("velocity", "acceleration")}
-        used = {
-            name: next((c for c in cs if c in self.columns), "") for name, cs in sources.items()
-        }
-        if used["stress"] == "acceleration":  # then it is no channel of its own
+        used = {n: next((c for c in cs if c in self.columns), "") for n, cs in sources.items()}
+        if used["stress"] == "acceleration":  # then acceleration is not a separate channel
             del used["acceleration"]
         spreads = {f"{name}_scale": self.given.get(c, _NONE).spread for name, c in used.items()}
         return {name: spread for name, spread in spreads.items() if spread}
 
     def note(self) -> str:
-        """Say what is read from which column, and which columns are not used."""
+        """Return a note with the column of each channel and the unused columns."""
         parts, table = [], self.table
         for channel, k in self.columns.items():
             given, header = self.given.get(channel, _NONE), table.headers[k]
@@ -145,7 +141,7 @@ class Source:
         return f"Read {', '.join(parts)}" + (f"; not used: {', '.join(rest)}." if rest else ".")
 
     def sign_advice(self, channel: str) -> str:
-        """Say what makes a channel positive that is negative in compression."""
+        """Return how to correct a channel that is negative in compression."""
         channel = next(c for c in _SOURCES.get(channel, (channel,)) if c in self.columns)
         given = self.given.get(channel, _NONE)
         entry = f"{channel} = {{ column = {quoted(self.table, self.columns[channel])}"
@@ -153,9 +149,9 @@ class Source:
         wrong = "is negative in compression; it must be positive"
         right = f"write {entry}, scale = {by} }}"
         if channel.startswith("displacement"):
-            wrong = "is negative or gets smaller in compression; it must get larger"
+            wrong = "is negative or decreases in compression; it must increase"
             right = (
-                f"write {entry}, counts_down = true }} (of a gap or a position; else scale = {by})"
+                f"write {entry}, counts_down = true }} (for a gap or position, else scale = {by})"
             )
         if given.counts_down:
             right = "leave counts_down = true out"
@@ -165,7 +161,7 @@ class Source:
 
 
 def assign_columns(table: Table, given: dict[str, Column]) -> dict[str, int]:
-    """Which column each channel is in: as [columns] of the TOML says, else as the headers do."""
+    """Return the column number of each channel, from [columns] or else from the headers."""
     found: dict[str, int] = {}
     strained = "strain" in given or any(h.rank("strain") is not None for h in table.headers)
     for channel in _channels(table, given):
@@ -173,7 +169,7 @@ def assign_columns(table: Table, given: dict[str, Column]) -> dict[str, int]:
             found[channel] = _place(table, channel, given[channel].column)
             continue
         ranks = {k: r for k, h in enumerate(table.headers) if (r := h.rank(channel)) is not None}
-        if interior_node(channel):  # a column that the TOML calls the top is not inside
+        if interior_node(channel):  # the TOML may assign this column to the top
             taken = {found[c] for c in given if c in found}
             ranks = {k: r for k, r in ranks.items() if k not in taken}
         best = [k for k, r in ranks.items() if r == min(ranks.values())]
@@ -190,11 +186,11 @@ def assign_columns(table: Table, given: dict[str, Column]) -> dict[str, int]:
             )
         if best and not (ranks[best[0]] == WEAK and strained):
             found[channel] = best[0]
-    # A channel that the TOML names replaces its twin that only a header names.
+    # A channel given in the TOML takes precedence over a twin found by its header.
     for named, twin in TWINS.items():
         if named in given and twin not in given:
             found.pop(twin, None)
-    # A true stress needs the cross-section that no file has.
+    # A true stress cannot be converted: the current cross-section is unknown.
     true = "stress" in found and table.headers[found["stress"]].measure("stress")
     if true and "stress" not in given and "force" in found:
         del found["stress"]
@@ -202,14 +198,14 @@ def assign_columns(table: Table, given: dict[str, Column]) -> dict[str, int]:
 
 
 def _channels(table: Table, given: dict[str, Column]) -> list[str]:
-    """List the channels to look for: the usual ones, then the masses inside that are named."""
+    """List the channels to look for: the usual ones, then those of interior masses."""
     numbers = {int(w) for h in table.headers for w in h.words if w.isdecimal()}
     inside = {c for c in (*map(interior_channel, numbers), *given) if interior_node(c)}
     return [*CHANNELS, *sorted(inside, key=lambda c: (c not in given, interior_node(c) or 0))]
 
 
 def _place(table: Table, channel: str, column: str | int) -> int:
-    """Place of a column that the TOML gives by its header or its number."""
+    """Return the index of a column given in the TOML by its header or number."""
     if isinstance(column, int):
         places = [column - 1] if column <= len(table.headers) else []
     else:
@@ -224,27 +220,27 @@ def _place(table: Table, channel: str, column: str | int) -> int:
 
 
 def quoted(table: Table, k: int) -> str:
-    """A column as [columns] names it: by its header, or by its number where others are equal."""
+    """Return a column as written in [columns]: its header, or its number if not unique."""
     text = table.headers[k].text
-    alone = table.header_row and [h.text for h in table.headers].count(text) == 1
-    return json.dumps(text, ensure_ascii=False) if alone else str(k + 1)
+    unique = table.header_row and [h.text for h in table.headers].count(text) == 1
+    return json.dumps(text, ensure_ascii=False) if unique else str(k + 1)
 
 
 def _clear_time(table: Table, columns: list[int]) -> list[int]:
-    """Of several columns that could be the time keep the one that never goes back, if it is one."""
+    """Reduce several possible time columns to the only one that never decreases, if any."""
     try:
         numbers = read_numbers(table, {str(k): k for k in columns})[0]
-    except InputError:  # tests of different lengths, side by side
+    except InputError:  # for example tests of different lengths side by side
         return columns
     steps = {k: np.diff(numbers[str(k)]) for k in columns}
-    onward = [k for k, step in steps.items() if step.size and step.min() >= 0.0 < step.max()]
-    return onward if len(onward) == 1 else columns
+    rising = [k for k, step in steps.items() if step.size and step.min() >= 0.0 < step.max()]
+    return rising if len(rising) == 1 else columns
 
 
 def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float:
-    """Return what the numbers of column `k` are multiplied by to be SI."""
+    """Return the factor from the numbers of column `k` to SI."""
     header, given = table.headers[k], given or _NONE
-    if channel == "cycle":  # counted; pint takes "Cycles" in a header for a unit of angle
+    if channel == "cycle":  # a count; pint would read "Cycles" in a header as a unit of angle
         return 1.0
     right, where = example(channel), f"column {table.name(k)}"
     if header.measure(channel) and channel == "stress":
@@ -253,14 +249,14 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
             "instant; give the force or the nominal (engineering) stress."
         )
     unit = given.unit if given.unit is not None else header.unit
-    over = header.text.partition("/")[2].strip()  # Weg/mm, which only the TOML calls displacement
+    over = header.text.partition("/")[2].strip()  # Weg/mm, if assigned in the TOML only
     if unit is None and over and in_si(channel, over, given.scale_unit) is not None:
         unit = over
     if unit is None and in_si(channel, "", given.scale_unit) is None:
         usual, more = channel_of(channel).unit, ""
         if given.scale_unit:
             over, _, under = given.scale_unit.rpartition("/")
-            usual = under if in_si(channel, under) is None else over  # N/mV, or mV/N of a sensor
+            usual = under if in_si(channel, under) is None else over  # of N/mV or mV/N
             more = f', scale = "{given.scale:g} {given.scale_unit}"'
         raise InputError(
             f"{where} has no unit; write it in the header like '{right}' or in [columns] like "
@@ -271,34 +267,34 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
         raise InputError(f"{where} has an unknown unit {unit!r}; write it like '{right}'.")
     own = header.unit
     if given.unit is not None and own is not None and is_unit(own, any_case=True):
-        stated, there = in_si(channel, given.unit), in_si(channel, own)
-        # The last word of a name may only look like a unit.
-        bracketed = there is not None or header.text.endswith((")", "]", "}"))
+        stated, in_header = in_si(channel, given.unit), in_si(channel, own)
+        # Without brackets, the last word of a name may only look like a unit.
+        bracketed = in_header is not None or header.text.endswith((")", "]", "}"))
         other = stated is None and given.unit.casefold() != own.casefold()
-        if bracketed and (stated != there or other):
+        if bracketed and (stated != in_header or other):
             raise InputError(
                 f"{where} has the unit {own!r} in its header, but [columns] {channel} says "
                 f"{given.unit!r}; leave unit out, or, if the header is wrong, correct it by scale."
             )
-    one, inverse = in_si(channel, unit, given.scale_unit), _inverse(channel, unit, given)
-    one = inverse / given.scale**2 if inverse is not None else one
-    if one is None:
+    si, inverse = in_si(channel, unit, given.scale_unit), _inverse(channel, unit, given)
+    si = inverse / given.scale**2 if inverse is not None else si
+    if si is None:
         raise InputError(
-            f"{where} cannot be read as {channel}: its unit {unit!r} is of another kind; "
+            f"{where} cannot be read as {channel}: its unit {unit!r} has the wrong dimension; "
             f"write it like '{right}' or give a scale in [columns]."
         )
-    return given.scale * one * (-1.0 if given.counts_down else 1.0)
+    return given.scale * si * (-1.0 if given.counts_down else 1.0)
 
 
 def _inverse(channel: str, unit: str, given: Column) -> float | None:
-    """SI value of a unit over that of a scale which is a sensor's sensitivity, as "4 mV/N"."""
+    """Return the factor to SI if the scale is a sensitivity such as "4 mV/N", else None."""
     if not given.scale_unit or in_si(channel, unit, given.scale_unit) is not None:
         return None
     return in_si(channel, unit, f"1/({given.scale_unit})")
 
 
 def entries_of(table: Table, has: set[str], *channels: str) -> str:
-    """Entries of [columns] for channels that the file seems to lack, by units of its headers."""
+    """Suggest entries of [columns] for missing channels, using the units in the headers."""
     entries = []
     unnamed = [
         k

@@ -1,4 +1,4 @@
-"""A text file as a table: its encoding, separator, decimal sign and headers, and its numbers."""
+"""Read a text file as a table: encoding, separator, decimal sign, headers and numbers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from foamfit.errors import InputError, naming
 
 _HEAD_ROWS = 400
 _SEPARATORS = "\t", ";", "|", ","
-_ABOVE = 40  # rows that a last row is compared with
+_ABOVE = 40  # number of rows compared with the last row
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII
 )
@@ -33,7 +33,7 @@ _NUMBER = re.compile(
 
 @dataclass(frozen=True)
 class Text:
-    """The text of a file, and the digest of its bytes."""
+    """Text of a file, and the digest of its bytes."""
 
     path: Path
     content: str
@@ -42,29 +42,29 @@ class Text:
 
 @dataclass(frozen=True)
 class Table(Text):
-    """The text of a file, and where its numbers are, before they are read.
+    """Layout of the table in a file, before its numbers are read.
 
-    A file without headers has the `header_row` 0. `clock` is that of `layouts.Scope`.
+    `header_row` is 0 in a file without headers. For `clock` see `layouts.Scope`.
     """
 
     separator: str
     decimal: str
     header_row: int
-    header_cells: tuple[str, ...]  # as they stand in the file
+    header_cells: tuple[str, ...]  # unchanged from the file
     first_row: int  # rows above the numbers
     headers: tuple[Header, ...]
     clock: tuple[float, float] | None = None
 
     @property
     def listed(self) -> str:
-        """The headers, in quotation marks."""
+        """Quoted headers, separated by commas."""
         return ", ".join(repr(h.text) for h in self.headers if h.text)
 
     def name(self, column: int) -> str:
-        """A header in quotation marks, with its number where others are equal."""
+        """Return a quoted header, with its number if it is not unique."""
         text = self.headers[column].text
-        alone = sum(header.text == text for header in self.headers) == 1
-        return repr(text) if alone else f"{text!r} (number {column + 1})"
+        unique = sum(header.text == text for header in self.headers) == 1
+        return repr(text) if unique else f"{text!r} (number {column + 1})"
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield (row number in the file, cells) of the lines that are not blank."""
@@ -78,13 +78,13 @@ class Table(Text):
 
 
 def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
-    """Read a file as text; `wanted` says what the path must be, `sheet` which of a workbook."""
+    """Read a file or a `sheet` of a workbook as text; `wanted` describes it for messages."""
     raw = read_bytes(path, f"give {wanted}")
     sha256 = hashlib.sha256(raw).hexdigest()
     with naming(path):
         raw = unpacked(raw, sheet)
         if not raw.strip():
-            raise InputError("the file is empty; it must hold a header and rows of numbers.")
+            raise InputError("the file is empty; it must contain a header and rows of numbers.")
         try:
             wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
             text = raw.decode("utf-16", "replace") if wide else raw.decode("utf-8-sig")
@@ -96,7 +96,7 @@ def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
 
 
 def find_table(text: Text, names: set[str | int]) -> Table:
-    """Find separator, header row and decimal sign; `names` are the columns given in the TOML."""
+    """Find separator, header row and decimal sign; `names` are the columns in the TOML."""
     lines = io.StringIO(text.content, newline=None)
     head = [line.rstrip("\r\n") for line, _ in zip(lines, range(_HEAD_ROWS), strict=False)]
     grids = {s: [[c.strip() for c in cells] for _, cells in _cells(head, s)] for s in _SEPARATORS}
@@ -122,12 +122,12 @@ def find_table(text: Text, names: set[str | int]) -> Table:
     above = [k for k, cells in enumerate(grid[:i], 1) if _holds_numbers(cells)]
     if len(above) >= MIN_ROWS:
         raise InputError(
-            f"rows {above[0]} to {above[-1]} hold numbers above the header in row {i + 1}; a file "
-            "must hold one table with one header."
+            f"rows {above[0]} to {above[-1]} contain numbers above the header in row {i + 1}; a "
+            "file must contain one table with one header."
         )
     if (longest := max(map(len, grid[i]))) > LONGEST:
-        told = f"row {i + 1}: the name of a column has {longest} characters"
-        raise InputError(f"{told}; it must have {LONGEST} at most.")
+        wrong = f"row {i + 1}: the name of a column has {longest} characters"
+        raise InputError(f"{wrong}; it must have {LONGEST} at most.")
     first, texts = _unit_row(grid, i)
     body = [cells for cells in grid[first:] if any(cells)]
     if not body:
@@ -137,7 +137,7 @@ def find_table(text: Text, names: set[str | int]) -> Table:
 
 
 def _cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number of the last line of each row, and its cells."""
+    """Yield the last line number and the cells of each row."""
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
     try:
         for cells in reader:
@@ -148,13 +148,13 @@ def _cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str
 
 
 def _header_row(grids: dict[str, list[list[str]]], names: set[str]) -> tuple[str, int] | None:
-    """Separator and place of the row that names most channels, if one names any."""
+    """Return separator and index of the row that names most channels, None if none does."""
     best, found = 0, None
     for separator, grid in grids.items():
         numbers = False
         for i, cells in enumerate(grid):
-            # On a tie the last row wins: titles and instrument settings stand above the header.
-            # Below rows of numbers it is another header, which `read_numbers` refuses.
+            # On a tie the last row wins, as titles and instrument settings precede the header.
+            # Below rows of numbers it would be a second header, which `read_numbers` rejects.
             score = _score(cells, names)
             if score > best or (score and score == best and not numbers):
                 best, found, numbers = score, (separator, i), False
@@ -163,9 +163,9 @@ def _header_row(grids: dict[str, list[list[str]]], names: set[str]) -> tuple[str
 
 
 def _above_numbers(grids: dict[str, list[list[str]]], names: set[str | int]) -> tuple[str, int]:
-    """Separator and place of the row above the numbers, -1 where that names no columns.
+    """Return separator and index of the row above the numbers, -1 if that is not a header.
 
-    Without it the TOML must give the columns by their numbers.
+    Without a header, the TOML must refer to the columns by number.
     """
     for separator, grid in grids.items():
         rows = [k for k, cells in enumerate(grid) if _is_sample(cells)]
@@ -192,7 +192,7 @@ def _above_numbers(grids: dict[str, list[list[str]]], names: set[str | int]) -> 
 
 
 def _score(cells: list[str], names: set[str]) -> int:
-    """How many channels and given names a row holds; 0 for a row with numbers."""
+    """Count the channels and the given names in a row; 0 for a row with numbers."""
     if len(cells) < 2 or any(map(_is_number, cells)):
         return 0
     headers = list(map(parse_header, filter(None, cells)))
@@ -205,18 +205,18 @@ def _is_number(cell: str) -> bool:
 
 
 def _holds_numbers(cells: list[str]) -> bool:
-    """Whether a row is one of numbers: two at least, and nothing else."""
-    full = list(filter(None, cells))
-    return len(full) > 1 and all(map(_is_number, full))
+    """Return whether a row contains at least two numbers and nothing else."""
+    filled = list(filter(None, cells))
+    return len(filled) > 1 and all(map(_is_number, filled))
 
 
 def _is_sample(cells: list[str]) -> bool:
-    """Whether a row may be a sample: two numbers at least, and less of anything else."""
+    """Return whether a row may be a sample: at least two numbers, and fewer other cells."""
     return 2 * sum(map(_is_number, cells)) > max(sum(map(bool, cells)), 3)
 
 
 def _decimal_sign(body: list[list[str]], width: int, separator: str) -> str:
-    """Comma or point; where the comma separates cells too, the numbers stand in quotation marks."""
+    """Return the decimal sign; if commas also separate cells, such numbers are quoted."""
     values = [value for row in body for value in row[:width]]
     commas = [v for v in values if re.fullmatch(r"[+-]?\d*(?:,\d+)+(?:[eE][+-]?\d+)?", v)]
     if not commas or separator != ",":
@@ -224,7 +224,7 @@ def _decimal_sign(body: list[list[str]], width: int, separator: str) -> str:
     thousands = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
     if all(thousands.fullmatch(v) for v in commas):
         raise InputError(
-            f"{commas[0]!r} may have a decimal comma or a separator of thousands; "
+            f"{commas[0]!r} may have a decimal comma or a thousands separator; "
             "write the numbers with a decimal point and without separators."
         )
     points = sum("." in v and _is_number(v) for v in values)
@@ -232,11 +232,11 @@ def _decimal_sign(body: list[list[str]], width: int, separator: str) -> str:
 
 
 def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
-    """First row of numbers, and the headers with the units of the row beneath, if there is one."""
+    """Return the first row of numbers, and the headers with the units from a row of units."""
     texts = list(grid[i])
-    said = {cells[0].casefold(): cells[1:] for cells in grid[:i] if len(cells) > 1}
-    above = [*said.get("horizontal units", [])[:1], *said.get("vertical units", [])]
-    for k, unit in enumerate(above[: len(texts)]):  # of a Tektronix MSO
+    entries = {cells[0].casefold(): cells[1:] for cells in grid[:i] if len(cells) > 1}
+    above = [*entries.get("horizontal units", [])[:1], *entries.get("vertical units", [])]
+    for k, unit in enumerate(above[: len(texts)]):  # from the preamble of a Tektronix MSO
         if unit and parse_header(texts[k]).unit is None:
             texts[k] = f"{texts[k]} ({unit})"
     first = _below_rule(grid, i + 1)
@@ -253,7 +253,7 @@ def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
 
 
 def _below_rule(grid: list[list[str]], i: int) -> int:
-    """Skip a row of dashes."""
+    """Return the index after a row of dashes, if there is one."""
     rule = i < len(grid) and re.fullmatch(r"[-=+:|\s]*[-=]{3}[-=+:|\s]*", "".join(grid[i]))
     return i + 1 if rule else i
 
@@ -261,9 +261,9 @@ def _below_rule(grid: list[list[str]], i: int) -> int:
 def read_numbers(
     table: Table, columns: dict[str, int]
 ) -> tuple[dict[str, Array], Integers, Integers]:
-    """Read columns as they stand in the file: numbers, their rows, and rows without any of them.
+    """Read columns without conversion; return numbers, row numbers, and rows without numbers.
 
-    InputError names the first cell that is no number.
+    InputError names the first cell that is not a number.
     """
     places, empty = list(columns.values()), list[int]()
     read = _plain_numbers(table, places)
@@ -271,15 +271,15 @@ def read_numbers(
         read, rows, empty = _checked_numbers(table, places)
     else:
         rows = np.arange(table.first_row + 1, table.first_row + 1 + read.shape[1])
-    for k, one in zip(places, read, strict=True):
-        _refuse_thousands(table, k, one)
+    for k, values in zip(places, read, strict=True):
+        _refuse_thousands(table, k, values)
         if table.clock is not None and k == 0:
-            one[:] = table.clock[0] + table.clock[1] * one
+            values[:] = table.clock[0] + table.clock[1] * values
     return dict(zip(columns, read, strict=True)), rows, np.array(empty, dtype=np.int64)
 
 
 def _plain_numbers(table: Table, places: list[int]) -> Array | None:
-    """Read the columns (k, n) at once; None unless each row has finite numbers in them."""
+    """Read the columns (k, n) fast; None unless every row contains finite numbers."""
     text = table.body().rstrip("\r\n")
     comma = table.decimal == ","
     if not text or (comma and ("." in text or table.separator == ",")):
@@ -292,22 +292,22 @@ def _plain_numbers(table: Table, places: list[int]) -> Array | None:
     except ValueError:
         return None
     numbers = np.array([read[str(k)] for k in places])
-    # A line that is blank, or a cell that spans several, would shift the numbers of the rows.
-    whole = read.size == text.count("\n") + 1 and np.isfinite(numbers).all()
-    return numbers if whole else None
+    # A blank line, or a cell with line breaks, would shift the row numbers.
+    complete = read.size == text.count("\n") + 1 and np.isfinite(numbers).all()
+    return numbers if complete else None
 
 
 def _checked_numbers(table: Table, places: list[int]) -> tuple[Array, Integers, list[int]]:
-    """Read the columns (k, n) cell by cell, as `read_numbers`."""
+    """Read the columns (k, n) cell by cell; see `read_numbers`."""
     numbers, rows, empty, count = array("d"), array("q"), list[int](), len(table.headers)
     for row, cells in table.rows():
         cells = [cell.strip() for cell in cells] + [""] * (count - len(cells))
         if tuple(cells) == table.header_cells:
             again = f"row {row} repeats the header of row {table.header_row}"
-            raise InputError(f"{again}; a file must hold one table with one header.")
+            raise InputError(f"{again}; a file must contain one table with one header.")
         if any(cells[count:]):
-            many = f"row {row} has {len(cells)} cells, but the header has {count}"
-            raise InputError(f"{many}; every row must have as many as the header.")
+            wrong = f"row {row} has {len(cells)} cells, but the header has {count}"
+            raise InputError(f"{wrong}; every row must have as many as the header.")
         texts = [cells[k] for k in places]
         if not any(texts):
             empty.append(row)
@@ -321,26 +321,26 @@ def _checked_numbers(table: Table, places: list[int]) -> tuple[Array, Integers, 
 
 
 def _refuse_thousands(table: Table, column: int, values: Array) -> None:
-    """Refuse numbers whose decimal sign may separate thousands: 998 is followed by 1.002."""
+    """Raise InputError if the decimal sign seems to separate thousands: 998, then 1.002."""
     size, sign = np.abs(values), table.decimal
-    part = size[size != np.round(size)]
-    if not part.size or part.min() < 1 or size.max() >= 1000:
+    fractions = size[size != np.round(size)]
+    if not fractions.size or fractions.min() < 1 or size.max() >= 1000:
         return
     cells = [cells[column].strip() for _, cells in table.rows() if column < len(cells)]
     whole = [cell for cell in cells if re.fullmatch(r"[+-]?[1-9]\d{1,2}", cell)]
-    parted = [cell for cell in cells if sign in cell]
-    if whole and all(re.fullmatch(rf"[+-]?[1-9]\d{{0,2}}\{sign}\d{{3}}", cell) for cell in parted):
+    signed = [cell for cell in cells if sign in cell]
+    if whole and all(re.fullmatch(rf"[+-]?[1-9]\d{{0,2}}\{sign}\d{{3}}", cell) for cell in signed):
         raise InputError(
-            f"column {table.name(column)}: {parted[0]!r} beside numbers like {whole[-1]!r} seems "
+            f"column {table.name(column)}: {signed[0]!r} with numbers like {whole[-1]!r} seems "
             "to separate thousands; write the numbers with a decimal point and without separators."
         )
 
 
 def without_cut_row(table: Table) -> tuple[Table, list[Dropped]]:
-    """Leave out the last row if the file ends within it, as where writing was interrupted.
+    """Drop an incomplete last row, as left when writing was interrupted.
 
-    It has no line end, and fewer cells than the rows above, or a last number that ends in the
-    decimal sign, or has fewer digits behind it where `_ABOVE` rows have equally many.
+    Such a row has no line end. It has fewer cells than the rows above, or its last number ends in
+    the decimal sign, or has fewer decimals while the `_ABOVE` rows above all have the same number.
     """
     above = table.body().rsplit("\n", _ABOVE)[1:]
     if len(above) < MIN_ROWS or not above[-1].strip() or '"' in above[-1]:
@@ -359,7 +359,7 @@ def without_cut_row(table: Table) -> tuple[Table, list[Dropped]]:
 
 
 def _wrong(cell: str, decimal: str) -> str:
-    """Say what is wrong with a cell, and what would be right; nothing if it is a number."""
+    """Return the error of a cell and what would be right; "" for a valid number."""
     if not cell:
         return "empty; every sample must have a number there"
     if decimal == "," and "." in cell and _is_number(cell):

@@ -1,4 +1,4 @@
-"""The first TOML of a test: what its headers say, and questions about the rest."""
+"""Draft the TOML of a test from its headers, with questions about the missing entries."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from foamfit.errors import InputError
 from foamfit.terminal import printable
 from foamfit.text import listed
 
-# What every test needs, what an impact needs, and what helps.
+# Entries for every test, entries for an impact, and optional entries.
 _NEEDED = (
     "[specimen]",
-    'height = "10 mm"          # before the test; with its ± where it is known: "10 ± 0.02 mm"',
+    'height = "10 mm"          # before the test; with its ± if known: "10 ± 0.02 mm"',
     'diameter = "5 mm"         # or area = "19.6 mm^2"',
 )
 _IMPACT = (
-    "[striker]                 # of an impact; a slow test has none",
+    "[striker]                 # only for an impact",
     'mass = "7 g"',
     'velocity = "1.75 m/s"     # at contact',
 )
 _HELPS = (
-    "[noise]                   # one standard deviation each; else it is estimated",
+    "[noise]                   # standard deviations; estimated if not given",
     'stress = "20 kPa"',
     'displacement = "2 um"',
 )
-# Channels one of which must be there, or that are worth asking for, each with its question.
+# Groups of channels of which one is needed or useful, each with a question to the user.
 _WANTED = {
     ("stress", "force"): "needed: a force (N) or a stress (MPa)",
     ("displacement", "strain"): "needed: a displacement (mm) or strain (%), or else the [striker]",
@@ -38,11 +38,11 @@ _WANTED = {
 
 
 def draft(text: Text) -> tuple[str, list[str]]:
-    """Return the text of a TOML with questions behind "# ", and those that must be answered."""
+    """Return the text of a TOML with questions after "# ", and the entries still needed."""
     columns, name = _columns(text), printable(toml_beside(text.path).stem[:LONGEST])
     head = (
-        f"# {printable(text.path.name)}: what foamfit needs to know of this test.",
-        '# A line behind "# " is a question: give your value and take the "# " away.',
+        f"# {printable(text.path.name)}: the data that foamfit needs for this test.",
+        '# Lines that start with "# " are questions: enter your value and remove the "# ".',
         f"name = {json.dumps(name, ensure_ascii=False)}",
     )
     needed, impact, helps = (
@@ -55,19 +55,19 @@ def draft(text: Text) -> tuple[str, list[str]]:
 
 
 def without_toml(toml: Path, text: Text) -> InputError:
-    """Say that a test has no TOML, what it must hold, and what writes it."""
+    """Return the error for a test without a TOML: its entries, and the command to draft it."""
     asked = draft(text)[1]
     keys = [line.partition(" = ")[0] for line in asked[: -len(_IMPACT)] if line[0] != "["]
     name = text.path.name
     return InputError(
-        f"{toml}: no such file; {name} needs a TOML with {listed(keys)}, and of an impact with the "
-        f"striker's mass and velocity; write it by: foamfit init {text.path}",
+        f"{toml}: no such file; {name} needs a TOML with {listed(keys)}, and for an impact the "
+        f"striker's mass and velocity; create it with: foamfit init {text.path}",
         asked,
     )
 
 
 def _columns(text: Text) -> list[str]:
-    """Lines of [columns]: those that the headers answer, and the others as questions."""
+    """Return the lines of [columns]: known from the headers, or as questions."""
     try:
         source = Source.of(text, {})
     except InputError as error:
@@ -76,8 +76,8 @@ def _columns(text: Text) -> list[str]:
             f'# {c} = {{ column = "…", unit = "{unit}" }}  # {what}' for c, unit, what in units
         )
         return [f"# {printable(' '.join(str(error).split()))}", *asked]
-    lines, table, found = [], source.table, source.columns
-    for channel, k in found.items():
+    lines, table = [], source.table
+    for channel, k in source.columns.items():
         name = f"{channel} = {{ column = {quoted(table, k)}"
         try:
             source.factor(channel)
@@ -85,9 +85,9 @@ def _columns(text: Text) -> list[str]:
         except InputError as error:
             why = str(error).removeprefix("column ").partition(";")[0]
             lines.append(f'# {name}, unit = "{channel_of(channel).unit}" }}  # needed: {why}')
-    others = [k for k in range(len(table.headers)) if k not in found.values()]
+    others = [k for k in range(len(table.headers)) if k not in source.columns.values()]
     for names, what in _WANTED.items():
-        if not found.keys() & set(names):
+        if not source.columns.keys() & set(names):
             first = quoted(table, others[0]) if others else '"…"'
             entry = entries_of(table, set(), names[0]).replace('"…"', first)
             lines.append(f"# {entry}  # {what}")

@@ -1,4 +1,4 @@
-"""What the header of a column says: the channel that it names, and the unit of its numbers."""
+"""Parse the header of a column: the channel it names and the unit of its numbers."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from foamfit.data.measurement import interior_node
 from foamfit.data.toml_file import LONGEST
 from foamfit.data.units import factor, is_unit
 
-WEAK = 3  # rank of a header that may name the displacement
+WEAK = 3  # rank of a header that only suggests a displacement
 
 
 class Channel(NamedTuple):
-    """SI unit of a channel, a usual unit for examples, and the words for it."""
+    """SI unit of a channel, a unit for examples, and its names in headers."""
 
     si: str
     unit: str
@@ -22,7 +22,7 @@ class Channel(NamedTuple):
 
     @property
     def words(self) -> list[str]:
-        """The words, the best one first."""
+        """Names of the channel in headers, the best one first."""
         return self.named.split()
 
 
@@ -35,50 +35,50 @@ CHANNELS = {
     "strain": Channel("", "%", "strain eps epsilon dehnung stauchung compression"),
     "acceleration": Channel("m/s**2", "m/s^2", "acceleration accel deceleration beschleunigung"),
     "velocity": Channel("m/s", "m/s", "velocity speed geschwindigkeit"),
-    "cycle": Channel("", "", ""),  # its number, where [columns] names such a column
+    "cycle": Channel("", "", ""),  # assigned in [columns] only
 }
 _WORDS = {word for channel in CHANNELS.values() for word in channel.words}
-# Words that several quantities go by: the unit decides which it is.
+# Ambiguous words: the unit decides which quantity is meant.
 _BY_UNIT = {"spannung", "stauchung", "compression"}
-# Words that name the displacement where nothing better does: a machine's travel, or a gap.
+# Words for a displacement if no better name is present: travel of a machine, or a gap.
 _MOTION = {"extension", "gap", "travel", "stroke", "deflection", "crosshead", "position"}
 _MOTION |= {"traversenweg", "kolbenweg"}
-# With one of these beside it a channel's name means something else.
+# Words that change the meaning of a channel's name.
 _OTHER = {"std", "sd", "dev", "error", "err", "noise", "uncertainty", "rate", "specific", "energy"}
 _OTHER |= {"transverse", "transversal", "lateral", "radial", "hoop", "circumferential", "poisson"}
 _OTHER |= {"width", "diameter", "volumetric", "shear", "quer", "almansi", "kirchhoff"}
-# Words for strains and stresses that are not those of engineers.
+# Words for strains and stresses other than engineering ones.
 _LOGARITHMIC = {"true", "logarithmic", "log", "ln", "hencky", "wahre", "wahr", "logarithmische"}
 _MEASURES = {
     "strain": {"logarithmic": _LOGARITHMIC | {"natural"}, "Green–Lagrange": {"green", "lagrange"}},
     "stress": {"true (Cauchy)": _LOGARITHMIC | {"cauchy"}},
 }
-# What in brackets is no unit.
+# Words in brackets that are not units.
 _ASIDE = _WORDS | _OTHER | _LOGARITHMIC | {"green", "lagrange", "cauchy", "natural"}
-# Units of mass that as those of a force mean a weight.
+# Units of mass that mean a weight if used for a force.
 WEIGHTS = {"lb": "lbf", "lbs": "lbf", "kg": "kgf", "kgs": "kgf"}
 
 
 @dataclass(frozen=True)
 class Header:
-    """One column's header: its text, the words of its name, its unit if it has one."""
+    """Header of a column: text, words of the name, and unit if present."""
 
     text: str
     words: tuple[str, ...] = ()
     unit: str | None = None
 
     def measure(self, channel: str) -> str:
-        """Which strain or stress it names, "" for that of engineers."""
+        """Return the measure of strain or stress named, "" for engineering measures."""
         named = _MEASURES.get(channel, {}).items()
         return next((measure for measure, words in named if words & set(self.words)), "")
 
     def rank(self, channel: str) -> int | None:
-        """How well it names a channel: 0 is best, None not at all."""
+        """Return how well the header names a channel: 0 is best, None not at all."""
         words, node = channel_of(channel).words, interior_node(channel)
         poor = 4 if self.measure(channel) else 0
         numbers = [word for word in self.words if word.isdecimal()]
         if [int(number) for number in numbers] != ([] if node is None else [node]):
-            return None  # displacement_1 is inside the specimen
+            return None  # displacement_1 is the channel of an interior mass
         rest = [word for word in self.words if word not in numbers]
         named = [w for w in rest if w in _WORDS and len(w) > 1]
         named = [w for w in named if w not in _BY_UNIT] or named
@@ -93,7 +93,7 @@ class Header:
         return poor + WEAK if channel == "displacement" and _MOTION & set(rest) else None
 
     def is_named(self, name: str) -> bool:
-        """Whether a column name in the TOML means it: with its unit or without."""
+        """Return whether a name in the TOML equals the header, with or without its unit."""
         bare = self.text.split("(")[0].split("[")[0]
         most = re.sub(r"[(\[][^(\[]*$", "", self.text)
         return name.casefold().split() in (t.casefold().split() for t in (self.text, bare, most))
@@ -122,20 +122,20 @@ def parse_header(text: str) -> Header:
         unit = "/".join(token for token in rest if token.lower() != "per")  # m_s2, N_per_kg
         over = Header(text, _words(" ".join(tokens[:i])), unit)
         if is_unit(unit, any_case=True) and (len(unit) > 1 or unit == "V" or _fits(over)):
-            return over  # the A of "Channel A" is no ampere
+            return over  # but the A of "Channel A" is not ampere
     name, _, unit = (part.strip() for part in text.partition("/"))
     over = Header(text, _words(name), unit)
     return over if unit and _fits(over) else Header(text, _words(text))
 
 
 def _fits(header: Header) -> bool:
-    """Whether the unit is one of a channel that the words name."""
+    """Return whether the unit is valid for a channel named by the words."""
     unit = header.unit or ""
     return any(header.rank(c) is not None and in_si(c, unit) is not None for c in CHANNELS)
 
 
 def _words(name: str) -> tuple[str, ...]:
-    """Words of a name, in small letters; in brackets a channel only says where another is from."""
+    """Return the words of a name in lower case, without names of channels in brackets."""
     outside, inside = (re.split(r"[(\[{]([^()\[\]{}]*)[)\]}]", name)[i::2] for i in (0, 1))
     aside = [[word for word in _split(text) if word not in _WORDS] for text in [*inside, ""]]
     return tuple(w for text, more in zip(outside, aside, strict=True) for w in _split(text) + more)
@@ -146,7 +146,7 @@ def _split(name: str) -> list[str]:
 
 
 def channel_of(name: str) -> Channel:
-    """Return a channel by its name; displacement_1 of a mass inside is a displacement."""
+    """Return a channel by its name; "displacement_1" is a displacement."""
     return CHANNELS["displacement" if interior_node(name) else name]
 
 
@@ -156,7 +156,7 @@ def example(name: str) -> str:
 
 
 def in_si(channel: str, unit: str, times: str = "") -> float | None:
-    """SI value of one `unit` · `times` of a channel; a mass or gram can only mean a weight or g."""
+    """Return the factor from `unit` · `times` to SI; a mass means its weight, g means gravity."""
     if channel == "acceleration" and unit in {"g", "G"}:
         unit = "standard_gravity"
     if channel == "force":

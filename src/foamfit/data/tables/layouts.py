@@ -1,4 +1,4 @@
-"""Laboratory files beyond plain CSV: compressed, workbooks, blank-separated, oscilloscopes."""
+"""Laboratory files other than plain CSV: gzip, workbooks, blank-separated, oscilloscopes."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from foamfit.data.measurement import MIN_ROWS
 from foamfit.errors import InputError
 from foamfit.text import listed
 
-_LARGEST = 1 << 30  # bytes that a .gz may unpack to
-_FEW = 20  # lines of numbers that show where the columns of a table stand
+_LARGEST = 1 << 30  # most bytes of an unpacked .gz
+_FEW = 20  # number of lines used to find the positions of the columns
 _TOKEN = re.compile(r"\S+")
 _NAME = re.compile(r"[^\s(\[]+(?:\s?[(\[][^)\]]*[)\]])?")  # a word, with its unit in brackets
 _NUMBERS = re.compile(r"\s*(?:[+-]?[\d.,]*\d[.,]?(?:e[+-]?\d+)?(?:\s+|$)){2,}", re.I | re.A)
 
 
 class Scope(NamedTuple):
-    """Headers and number of rows of an oscilloscope's preamble.
+    """Headers and number of rows in the preamble of an oscilloscope file.
 
-    `clock` is start and step, s, where the first column counts samples.
+    `clock` is start and step, s, if the first column contains sample numbers.
     """
 
     headers: list[str]
@@ -33,23 +33,23 @@ class Scope(NamedTuple):
 
 
 def unpacked(raw: bytes, sheet: str | None) -> bytes:
-    """Return the text in the bytes of a file: of a .gz what it holds, of an .xlsx one sheet."""
+    """Return the table in the bytes of a file: unpack a .gz, convert a sheet of an .xlsx."""
     if raw.startswith(b"\x1f\x8b"):
         try:
             raw = gzip.GzipFile(fileobj=io.BytesIO(raw)).read(_LARGEST + 1)
         except (OSError, EOFError, zlib.error) as error:
-            raise InputError(f"is no whole gzip file ({error}); pack it again.") from None
+            raise InputError(f"is not a complete gzip file ({error}); compress it again.") from None
         if len(raw) > _LARGEST:
             raise InputError(f"unpacks to more than {_LARGEST >> 20} MB; cut it to the test.")
     if raw.startswith(b"PK\x03\x04"):
         return _sheet(raw, sheet)
     if sheet is not None:
-        raise InputError("is no Excel workbook; leave [data] sheet out.")
+        raise InputError("is not an Excel workbook; leave [data] sheet out.")
     return raw
 
 
 def _sheet(raw: bytes, sheet: str | None) -> bytes:
-    """Return one sheet of a workbook, its cells separated by tabs."""
+    """Return a sheet of a workbook as tab-separated text."""
     import pandas as pd
 
     try:
@@ -57,10 +57,10 @@ def _sheet(raw: bytes, sheet: str | None) -> bytes:
             warnings.simplefilter("ignore")  # openpyxl on styles
             sheets = pd.read_excel(io.BytesIO(raw), sheet_name=None, header=None, dtype=object)
     except ImportError:
-        needs = 'reading .xlsx needs openpyxl, which is not installed: pip install "foamfit[excel]"'
-        raise InputError(needs) from None
-    except Exception as error:  # many kinds are raised for a ZIP that is not a workbook
-        raise InputError(f"is no Excel workbook that can be read ({error}).") from None
+        wrong = 'reading .xlsx needs openpyxl, which is not installed: pip install "foamfit[excel]"'
+        raise InputError(wrong) from None
+    except Exception as error:  # pandas raises many kinds for a ZIP that is not a workbook
+        raise InputError(f"is not a readable Excel workbook ({error}).") from None
     tables = [
         str(name)
         for name, frame in sheets.items()
@@ -72,14 +72,14 @@ def _sheet(raw: bytes, sheet: str | None) -> bytes:
         raise InputError(f"has {found or 'no sheet of numbers'}; choose one by {entry}.")
     name = tables[0] if sheet is None else sheet
     if name not in sheets:
-        there = listed(repr(str(one)) for one in sheets)
-        raise InputError(f"has no sheet {name!r} ([data] sheet); it has {there}.")
+        present = listed(repr(str(sheet_name)) for sheet_name in sheets)
+        raise InputError(f"has no sheet {name!r} ([data] sheet); it has {present}.")
     frame = sheets[name].map(lambda cell: " ".join(cell.split()) if type(cell) is str else cell)
     return frame.to_csv(sep="\t", header=False, index=False).encode()
 
 
 def scope_of(grid: list[list[str]]) -> Scope | None:
-    """Return what the preamble of a Keysight, Rigol or Tektronix TDS scope says, if it is one."""
+    """Parse the preamble of a Keysight, Rigol or Tektronix TDS oscilloscope; None without one."""
     rows = [cells for cells in grid[:20] if cells]
     first, second = (*rows, [], [])[:2]
     words = [cell.casefold() for cell in first]
@@ -87,13 +87,12 @@ def scope_of(grid: list[list[str]]) -> Scope | None:
         return Scope(_with_units(["Time", *first[1:]], second), 2)
     if words[:1] == ["x"] and "start" in words and len(second) == len(first):
         start, step = (float(second[words.index(name)]) for name in ("start", "increment"))
-        names = ["Time", *first[1:]]
         units = ["s", *second[1 : words.index("start")]]
-        return Scope(_with_units(names, units), 2, (start, step))
+        return Scope(_with_units(["Time", *first[1:]], units), 2, (start, step))
     if words[:1] == ["record length"] and len(first) > 4:
-        said = {cells[0].casefold(): cells[1] for cells in rows if len(cells) > 1}
-        units = [said.get(f"{axis} units", "") for axis in ("horizontal", "vertical")]
-        named = _with_units(["Time", said.get("source", "")], units)
+        entries = {cells[0].casefold(): cells[1] for cells in rows if len(cells) > 1}
+        units = [entries.get(f"{axis} units", "") for axis in ("horizontal", "vertical")]
+        named = _with_units(["Time", entries.get("source", "")], units)
         return Scope(["", "", "", *named, *first[5:]], 0)
     return None
 
@@ -104,10 +103,10 @@ def _with_units(names: list[str], units: list[str]) -> list[str]:
 
 
 def blanks_as_tabs(text: str) -> str | None:
-    """Put tabs between columns that blanks separate; None if there are no such rows of numbers.
+    """Replace blanks between columns by tabs; None if the text has too few rows of numbers.
 
-    Words of the header go to the column of numbers below them; in a row that lacks a number, the
-    others keep their columns.
+    Words of the header are assigned to the column of numbers below them. If a number is missing in
+    a row, the others keep their columns.
     """
     lines = text.splitlines()
     at = [k for k, line in enumerate(lines) if _NUMBERS.fullmatch(line)]
@@ -122,8 +121,8 @@ def blanks_as_tabs(text: str) -> str | None:
         cells = line.split()
         if k < at[0]:
             names = line.lstrip(" \t#%")
-            ways = re.split(r"\s{2,}|\t", names.strip()), names.split(), _NAME.findall(names)
-            cells = next((way for way in ways if len(way) == count), _placed(line, places))
+            splits = re.split(r"\s{2,}|\t", names.strip()), names.split(), _NAME.findall(names)
+            cells = next((cut for cut in splits if len(cut) == count), _placed(line, places))
         elif 0 < len(cells) < count and _NUMBERS.fullmatch(f"{line} 0 0"):
             cells = _placed(line, places)
         out.append("\t".join(cells))
@@ -131,7 +130,7 @@ def blanks_as_tabs(text: str) -> str | None:
 
 
 def _placed(line: str, places: list[tuple[int, int]]) -> list[str]:
-    """Sort the words of a line into the columns that they stand in or next to."""
+    """Assign each word of a line to the nearest column."""
     cells: list[list[str]] = [[] for _ in places]
     for word in _TOKEN.finditer(line):
         gaps = [max(start - word.end(), word.start() - end, 0) for start, end in places]
