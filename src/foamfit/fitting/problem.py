@@ -301,6 +301,8 @@ class Problem:
     def moves(self, values: Array, names: tuple[str, ...]) -> Array:
         """Moves (n_values, n_names) of all parameters with each of these, those that hang on it."""
         moves = np.eye(values.size)[:, [self.index[name] for name in names]]
+        if self.tied() is None:
+            return moves
         return self.space().follow(values, moves, 1e-5 * self.sizes(names, values))
 
 
