@@ -119,7 +119,7 @@ def test_one_test_alone_has_the_covariance_of_its_own_fit():
 
 def test_four_tests_of_one_foam_have_half_the_error_of_one():
     ratios = []
-    for seed in range(8):
+    for seed in range(20):
         problems, vectors = loops_of([{}] * 4, 2e4, seed)
         kinds = dict.fromkeys(problems[0].free(), "shared")
         four = fit_jointly(problems, Links(kinds), [vectors]).point
