@@ -16,10 +16,11 @@ from click.testing import CliRunner
 from scipy import stats
 
 import foamfit as ff
-from conftest import without_pictures
+from conftest import few_bytes, without_pictures
 from foamfit.cli import main
 from foamfit.fitting.together import fit_linked
 from foamfit.report.folder import save_somewhere
+from foamfit.report.studies import joint as joint_report
 from foamfit.study import joint_fit, study_file
 from foamfit.study.identified import read_source
 from foamfit.study.joint_fit import open_slope
@@ -52,7 +53,7 @@ def write_study(folder: Path, parameters: str, more: str = "") -> Path:
     (folder / "foam.toml").write_text(specimen)
     (folder / "study.toml").write_text(
         f'name = "a family"\ntests = ["t*.csv"]\nmodel = "microscale"\ndrive = "displacement"\n'
-        f'specimen = "foam.toml"\nstarts = 4\n{more}\n[parameters]\n{parameters}\n'
+        f'specimen = "foam.toml"\nstarts = 2\n{more}\n[parameters]\n{parameters}\n'
     )
     return folder / "study.toml"
 
@@ -106,8 +107,14 @@ def test_values_are_found_with_their_intervals(found):
     assert set(scatter.tests) == {"t0", "t1", "t2"}
 
 
+def coarse(figure, place, *_):
+    """What a page shows of a picture, at a fifth of the resolution."""
+    return joint_report.figures.image(figure, "png", 36)
+
+
 def test_linked_values_are_one_value_bit_for_bit(found, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
+    monkeypatch.setattr(joint_report.figures, "write_both", coarse)
     found.save(tmp_path / "out", jobs=1)
     content = json.loads((tmp_path / "out" / "joint.json").read_text())
     value = content["parameters"]["s1_k0"]["value"]
@@ -375,7 +382,7 @@ def test_drives_and_noise_mix(tmp_path):
     names = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
     study = tmp_path / "study.toml"
     study.write_text(
-        'tests = ["*.csv"]\nmodel = "bistable"\nstarts = 6\n[parameters]\n'
+        'tests = ["*.csv"]\nmodel = "bistable"\nstarts = 2\n[parameters]\n'
         + "\n".join(f's1_{name} = "shared"' for name in (*names, "eta"))
     )
     result = ff.joint(study, jobs=1)
@@ -399,6 +406,7 @@ def run(*words):
 
 def test_the_command_writes_and_prints(folder, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
+    monkeypatch.setattr(joint_report.figures, "write_both", few_bytes)
     study = write_study(folder, 's1_k0 = "shared"\ns1_kc = 4e5' + SHARED)
     result = run("joint", study, "--out", tmp_path / "out", "--jobs", 1)
     assert result.exit_code == 0
@@ -562,4 +570,5 @@ def test_a_report_that_fails_leaves_the_numbers(found, tmp_path, monkeypatch):
     assert content["parameters"]["s1_kc"]["scatter"] == found.parameters["s1_kc"].scatter
     monkeypatch.undo()
     without_pictures(monkeypatch)
+    monkeypatch.setattr(joint_report.figures, "write_both", few_bytes)
     found.save(tmp_path / "out", jobs=1)  # and may be replaced

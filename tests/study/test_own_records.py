@@ -55,7 +55,7 @@ def fit_together(folder: Path, seed: int):
     records = write_impacts(folder, seed)
     shared = "\n".join(f'{name} = "shared"' for name in SPRING)
     (folder / "study.toml").write_text(
-        f'tests = ["t*.csv"]\nmodel = "bistable"\nstarts = 4\n[parameters]\n{shared}\n'
+        f'tests = ["t*.csv"]\nmodel = "bistable"\nstarts = 2\n[parameters]\n{shared}\n'
     )
     return records, ff.joint(folder / "study.toml", jobs=1)
 
@@ -105,18 +105,14 @@ def test_the_folder_of_each_test_has_its_own_numbers(together, tmp_path, monkeyp
 
 
 def test_intervals_of_shared_values_hold_the_truth(together, tmp_path):
-    """Over 20 draws 93 % do (147 of 158)."""
-    every = [together[1:]]
-    for seed in (1, 2):
-        (tmp_path / str(seed)).mkdir()
-        every.append(fit_together(tmp_path / str(seed), seed))
+    """Over 20 draws 93 % do (147 of 158). Of the 16 of two draws one may fail to."""
     inside, off = [], []
-    for records, found in every:
+    for records, found in (together[1:], fit_together(tmp_path, 1)):
         for name in SPRING:
             one, truth = found.parameters[name], records[0].truth[name]
             inside.append(one.ci95[0] <= truth <= one.ci95[1])
             off.append(abs(one.value - truth) / one.stderr)
-    assert np.mean(inside) > 0.85
+    assert np.mean(inside) > 0.9
     assert max(off) < 4.0
 
 
@@ -139,7 +135,7 @@ def test_a_value_that_the_study_holds_is_that_of_each_file(together):
 @pytest.fixture(scope="module")
 def fitted(together):
     folder, _, _ = together
-    return ff.fit(ff.read_test(folder / "t0.csv"), starts=4, intervals="local")
+    return ff.fit(ff.read_test(folder / "t0.csv"), starts=2, intervals="local")
 
 
 def test_an_unseen_impact_is_aligned_before_it_is_compared(together, fitted):
@@ -183,7 +179,7 @@ def write_slow(folder: Path, seeds, law="microscale", rows=400):
 def test_the_band_holds_what_a_noisy_motion_leaves_uncertain(tmp_path):
     """Over 20 springs, each predicted from one fit, 94 to 96 % of the samples lie inside."""
     first, *others = write_slow(tmp_path, range(10, 15))
-    result = ff.fit(ff.read_test(first), model="microscale", starts=4, intervals="local")
+    result = ff.fit(ff.read_test(first), model="microscale", starts=2, intervals="local")
     made = [ff.predict(result, path, draws=60) for path in others]
     assert 0.93 < np.mean([one.inside["stress_strain"] for one in made]) < 0.99
     for one in made:
@@ -199,7 +195,7 @@ def test_a_joint_fit_weighs_each_driving_motion(tmp_path, monkeypatch):
     write_slow(tmp_path, (20, 21, 22))
     shared = '\ns1_k0 = "shared"\ns1_kc = "shared"\ns1_sigma_plus = "shared"'
     (tmp_path / "study.toml").write_text(
-        'tests = ["t*.csv"]\nmodel = "microscale"\ndrive = "displacement"\nstarts = 4\n'
+        'tests = ["t*.csv"]\nmodel = "microscale"\ndrive = "displacement"\nstarts = 2\n'
         f"[parameters]{shared}\n"
     )
     found = ff.joint(tmp_path / "study.toml", jobs=1)
@@ -217,8 +213,8 @@ def test_profiles_agree_with_the_local_intervals(together, tmp_path):
     (slow,) = write_slow(tmp_path, (30,), law="bistable", rows=300)
     for path in (folder / "t2.csv", slow):
         test = ff.read_test(path)
-        local = ff.fit(test, intervals="local", starts=4).parameters
-        other = ff.fit(test, intervals="profile", starts=4).parameters
+        local = ff.fit(test, intervals="local", starts=2).parameters
+        other = ff.fit(test, intervals="profile", starts=2).parameters
         wider = [
             np.ptp(other[name].ci95) / np.ptp(local[name].ci95)
             for name in local
@@ -318,7 +314,7 @@ def test_a_delay_with_a_spread_is_fitted_as_a_time_shift(tmp_path):
     truth = write_two_clocks(tmp_path, 0, 30e-6)
     test = ff.read_test(tmp_path / "test.csv")
     assert "time_shift" in ff.make_params(test)
-    result = ff.fit(test, starts=4, intervals="local")
+    result = ff.fit(test, starts=2, intervals="local")
     shift = result.parameters["time_shift"]
     # time of the force = time of the motion + 30 µs, so that the motion is that much early
     assert abs(shift.value + 30e-6) < 2.0 * shift.stderr

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from matplotlib.figure import Figure
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 from scipy.stats import binom
@@ -28,6 +29,7 @@ from foamfit.errors import InputError
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord, Tracker
 from foamfit.one_model import Found, judge
+from foamfit.report import result_figures
 from foamfit.report.result_figures import plot_profiles
 from foamfit.results import Profile
 from foamfit.trust import intervals, markov_chain
@@ -541,10 +543,11 @@ def test_says_in_one_sentence_that_emcee_is_missing(monkeypatch):
 # ---------------------------------------------------------------- in the result
 
 
-def test_the_result_says_what_made_each_interval(tmp_path: Path):
+def test_the_result_says_what_made_each_interval(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(result_figures, "plot_fit", lambda *_, **__: Figure())
     _, measurement = synthetic_impact(samples=201)
     told: list[str] = []
-    result = ff.fit(measurement, starts=3, intervals="profile", tell=told.append)
+    result = ff.fit(measurement, starts=1, intervals="profile", tell=told.append)
     assert "simulations" in told[0]
     assert " s" in told[0]
     varied = [p for p in result.parameters.values() if p.ci95 is not None]
@@ -565,7 +568,7 @@ def test_the_result_says_what_made_each_interval(tmp_path: Path):
 
 def test_local_intervals_are_told_apart():
     _, measurement = synthetic_impact(samples=201)
-    result = ff.fit(measurement, starts=3, intervals="local")
+    result = ff.fit(measurement, starts=1, intervals="local")
     methods = {p.ci95_method for p in result.parameters.values() if p.ci95 is not None}
     assert methods == {"local covariance"}
     assert result.intervals.profiles == ()
@@ -697,14 +700,16 @@ def test_the_ends_of_a_profile_do_not_depend_on_rounding():
 
 
 def test_nine_of_ten_intervals_hold(tmp_path):
-    """25 synthetic impacts in white noise, their best point found from the truth.
+    """16 synthetic impacts in white noise, their best point found from the truth.
 
     Of the intervals of k_c (one of each test, so independent): a method that holds in 95 % of cases
-    holds in 18 of 25 or less with a probability below 1e-4. Of all parameters together, which are
-    not independent, a method that holds in 70 % of cases is far below the bound.
+    holds in 12 of 16 or less with a probability below 1 %, one that holds in 70 % of cases in 13 or
+    more in one of four. Of all parameters together, which are not independent, a method that holds
+    in 70 % of cases is far below the bound.
     """
-    tests, least = 25, 19
-    assert binom.cdf(least - 1, tests, 0.95) < 1e-3
+    tests, least = 16, 13
+    assert binom.cdf(least - 1, tests, 0.95) < 0.01
+    assert binom.sf(least - 1, tests, 0.7) < 0.25
     held: dict[str, list[bool]] = {}
     for seed in range(tests):
         record = rig.impact(rig.Impact(trimmed=True, samples=300), 7700 + seed)
@@ -729,5 +734,5 @@ def test_nine_of_ten_intervals_hold(tmp_path):
                 held.setdefault(name, []).append(bool(low <= at <= high))
     assert sum(held["s1_kc"]) >= least
     everything = [one for values in held.values() for one in values]
-    assert len(everything) > 150
-    assert np.mean(everything) > 0.86
+    assert len(everything) > 100
+    assert np.mean(everything) > 0.88

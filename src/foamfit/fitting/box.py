@@ -274,8 +274,8 @@ class Space:
         """
         for one in self.coordinates:
             if one.of and one.place not in held:
-                ends = [one.value(u, values) for u in one.limits]
-                values[one.place] = np.clip(values[one.place], min(ends), max(ends))
+                low, high = sorted(one.value(u, values) for u in one.limits)
+                values[one.place] = min(max(values[one.place], low), high)
         return self.complete(values)
 
     def complete(self, values: Array) -> Array:

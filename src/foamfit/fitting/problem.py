@@ -302,6 +302,8 @@ class Problem:
     def moves(self, values: Array, names: tuple[str, ...]) -> Array:
         """Return how all parameters move with each of these, (n_values, n_names)."""
         moves = np.eye(values.size)[:, [self.index[name] for name in names]]
+        if self.tied() is None:
+            return moves
         return self.space().follow(values, moves, 1e-5 * self.sizes(names, values))
 
 
