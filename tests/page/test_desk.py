@@ -4,6 +4,7 @@ import io
 import json
 import os
 import signal
+import sys
 import time
 import tomllib
 import zipfile
@@ -25,7 +26,7 @@ from foamfit.page import desk as desk_module
 from foamfit.page import worker as worker_module
 from foamfit.page.desk import Desk, join_toml, safe_name, split_toml, wrong_quantity
 from foamfit.page.turning import INSTANTS, Turning
-from foamfit.page.worker import Worker
+from foamfit.page.worker import News, Worker
 from foamfit.report.folder import load_result
 from foamfit.report.studies import cycles as cycles_report
 
@@ -51,6 +52,31 @@ def ready(desk):
     desk.take(TEST)
     desk.check(*desk.dropped_toml())
     return desk
+
+
+class Here(Worker):
+    """A worker without a process: to start one, and to draw its report, takes seconds."""
+
+    def __init__(self, job):
+        self.job, self.news, self.told, self.stopping = job, News(), "", False
+        self._errors = io.BytesIO()
+        given, told = io.StringIO(json.dumps(vars(job)) + "\n"), io.StringIO()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "stdin", given)
+            patch.setattr(sys, "stdout", told)
+            worker_module.main()
+        told.seek(0)
+        self.process = SimpleNamespace(stdout=told, wait=lambda: 0, poll=lambda: 0)
+        self._listen()
+
+
+@pytest.fixture
+def without_process(monkeypatch):
+    """What a window fits is fitted at once, in this process, and its pictures are a few bytes."""
+    monkeypatch.setattr(desk_module, "Worker", Here)
+    without_pictures(monkeypatch)
+    monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
+    monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
 
 
 def wait(worker, until=lambda worker: worker.ended is not None):
@@ -160,9 +186,9 @@ def test_a_wrong_quantity_is_named(desk, quantity, value, told):
 # --------------------------------------------------------------------------------------- fits
 
 
+@pytest.mark.usefixtures("without_process")
 def test_a_fit_is_that_of_the_command(ready):
     worker = ready.fit(["--starts", "2", "--seed", "3"])
-    wait(worker)
     assert worker.ended == ""
     measurement = ff.read_test(TEST)
     there = ff.fit(measurement, model="bistable", starts=2, seed=3)
@@ -170,23 +196,19 @@ def test_a_fit_is_that_of_the_command(ready):
     assert saved == there.params["s1_k0"].value
     # What was told last is what was found.
     assert worker.news.misfit["stress_time"] == pytest.approx(there.misfit["stress_time"], rel=0.02)
-    assert "report.html" in {path.name for path in ready.result.iterdir()}
-    assert ready.zipped().startswith(b"PK")
 
 
-def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkeypatch):
+@pytest.mark.usefixtures("without_process")
+def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path):
     record = write_record(tmp_path)
     desk.take(record)
     desk.check(*desk.dropped_toml(), ["--cycle", "3,2"])
     assert (desk.measurement.cycle, desk.measurement.cycles) == (3, (1, 2, 3))
     asked = ["--cycle", "3,2", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "2"]
-    wait(desk.fit(asked))
+    desk.fit(asked)
     assert desk.ending() == ""
     assert desk.command == f"foamfit fit synthetic.csv {' '.join(asked)}"
     assert "2 of 3 cycles fitted" in desk.worker.told
-    without_pictures(monkeypatch)
-    monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
-    monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
     told = CliRunner().invoke(main, ["fit", str(record), *asked, "--json", f"--out={tmp_path}/r"])
     command = json.loads(told.stdout)["cycles"]
     assert sorted(desk.fits) == [2, 3]
@@ -201,6 +223,7 @@ def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkey
         assert {"cycles.csv", "cycles.png", "cycle-3/fit.json"} <= {*archive.namelist()}
 
 
+@pytest.mark.usefixtures("without_process")
 def test_several_cycles_are_one_history(desk, tmp_path):
     desk.take(write_record(tmp_path))
     quantities, rest = desk.dropped_toml()
@@ -209,7 +232,7 @@ def test_several_cycles_are_one_history(desk, tmp_path):
     assert (record.cycle, record.last_cycle) == (1, 3)
     assert desk.measured(1, 3) is record
     assert desk.measured(2, 3).last_cycle == 3
-    wait(desk.fit(["--cycles", "1-3", "--starts", "2", "--max-time", "2"]))
+    desk.fit(["--cycles", "1-3", "--starts", "2", "--max-time", "2"])
     assert desk.ending() == ""
     assert (desk.worker.news.cycle, desk.worker.news.last_cycle) == (1, 3)
     assert [*desk.fits] == [0]
@@ -250,6 +273,8 @@ def test_a_fit_that_is_stopped_keeps_the_best(ready):
     wait(worker)
     assert worker.ended == ""
     assert load_result(ready.result)["stopped"] == "Ctrl-C"
+    assert "report.html" in {path.name for path in ready.result.iterdir()}
+    assert ready.zipped().startswith(b"PK")
 
 
 def test_a_worker_that_dies_says_so(ready):
@@ -289,11 +314,11 @@ def test_what_compiles_at_first_use_is_waited_for_and_ends_with_the_page(monkeyp
     assert integrator.result(timeout=30.0) is memory.result(timeout=30.0) is None
 
 
+@pytest.mark.usefixtures("without_process")
 def test_a_fit_that_cannot_be_says_why(ready):
     with pytest.raises(InputError, match="'--relaxation': -1 is not in the range"):
         ready.fit(["--relaxation", "-1"])
     worker = ready.fit(["--fix", "s1_k1=1"])
-    wait(worker)
     assert "parameter 's1_k1' is not one of the model bistable" in worker.ended
     assert "\n" not in worker.ended
 

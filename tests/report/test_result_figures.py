@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import closing
 from pathlib import Path
@@ -14,10 +14,11 @@ import pytest
 
 import fabricated
 import foamfit.study.processes
-from conftest import EXPERIMENTS
+from conftest import EXPERIMENTS, small_pictures
 from foamfit.cli.options import Drawers
 from foamfit.errors import InputError
-from foamfit.report.result_figures import Images, draw_all
+from foamfit.report.figures import TWO
+from foamfit.report.result_figures import Images, _draw, draw_all
 from foamfit.study.processes import EndedError
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
@@ -38,11 +39,17 @@ def test_other_processes_draw_the_same(drawn_here: dict[str, Images | None]) -> 
     assert fit.pdf is not None
 
 
-def test_all_figures_of_the_report_are_pdf_where_that_is_asked_for(tmp_path: Path) -> None:
+def test_all_figures_of_the_report_are_pdf_where_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     result = fabricated.microscale_result()
     folder = result.save(tmp_path / "r", figure_width="one, untitled, pdf")
     assert {path.name for path in folder.glob("*.pdf")} == {"fit.pdf", "snapping.pdf"}
     assert (folder / "snapping.pdf").read_bytes().startswith(b"%PDF")
+    snapping = _draw(result, TWO, "snapping")
+    assert snapping is not None
+    assert snapping.pdf is None
+    small_pictures(monkeypatch)
     result.save(folder)  # and may be replaced
     assert {path.name for path in folder.glob("*.pdf")} == {"fit.pdf"}
     with pytest.raises(InputError, match="behind a comma may stand untitled or pdf"):
@@ -53,7 +60,7 @@ def test_all_figures_of_the_report_are_pdf_where_that_is_asked_for(tmp_path: Pat
     "error", [EndedError("its process ended 2 times"), ImportError("no functioning sem_open")]
 )
 def test_where_processes_end_this_one_draws(
-    drawn_here: dict[str, Images | None], monkeypatch: pytest.MonkeyPatch, error: Exception
+    monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     def ended(*_: Any) -> Future[Any]:
         told: Future[Any] = Future()
@@ -64,7 +71,7 @@ def test_where_processes_end_this_one_draws(
     monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
     with closing(Drawers()) as drawers:
         drawers.begin()
-        assert dict(draw_all(fabricated.result(), mapped=drawers.map)) == drawn_here
+        assert list(drawers.map(str.upper, ["fit", "shown"])) == ["FIT", "SHOWN"]
 
 
 def test_where_no_process_can_be_had_this_one_draws(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,26 +93,28 @@ def test_one_core_draws_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
         assert list(drawers.map(str.upper, ["fit", "shown"])) == ["FIT", "SHOWN"]
 
 
-def modules_after(code: str, *arguments: str) -> Iterator[str]:
-    """Modules that a new process has imported after some code."""
-    told = "\nimport sys; print('modules', *sys.modules)"
+def a_process(code: str, *arguments: str) -> tuple[str, set[str]]:
+    """What a new process prints that runs some code, and the modules that it has imported."""
+    at_the_end = "import atexit, sys\natexit.register(lambda: print('modules', *sys.modules))\n"
     run = subprocess.run(
-        [sys.executable, "-c", code + told, *arguments], capture_output=True, text=True, check=True
+        [sys.executable, "-c", at_the_end + code, *arguments], capture_output=True, text=True
     )
-    yield from run.stdout.rpartition("modules")[2].split()
+    assert (run.returncode, run.stderr) == (0, "")
+    printed, _, modules = run.stdout.rpartition("modules ")
+    return printed, set(modules.split())
 
 
 def test_drawing_imports_no_fit() -> None:
-    there = set(modules_after("import foamfit.report.result_figures"))
+    _, there = a_process("import foamfit.report.result_figures")
     assert not there & {"lmfit", "pandas", "scipy.stats", "scipy.optimize", "numba"}
 
 
-def test_the_command_imports_what_a_fit_uses(tmp_path: Any) -> None:
-    code = (
-        "import sys, contextlib\nfrom foamfit.cli import main\n"
-        "with contextlib.suppress(SystemExit): main(['fit', *sys.argv[1:]])"
-    )
-    call = [str(RECONSTRUCTION), "--out", str(tmp_path / "r"), "--starts", "1"]
-    there = set(modules_after(code, *call, "--max-time", "0.1", "--quiet"))
+def test_the_command_imports_what_a_fit_uses_and_prints_nothing_else(tmp_path: Any) -> None:
+    call = ["fit", str(RECONSTRUCTION), "--out", str(tmp_path / "r"), "--starts", "2", "--json"]
+    code = "from foamfit.cli import main\nmain(sys.argv[1:])"
+    printed, there = a_process(code, *call, "--max-time", "5")
+    assert json.loads(printed)["test"].endswith("(reconstruction)")
+    assert (tmp_path / "r" / "fit.png").stat().st_size > 10_000
+    assert (tmp_path / "r" / "fit.pdf").read_bytes().startswith(b"%PDF")
     assert "lmfit" in there
     assert not there & {"matplotlib.figure", "fontTools", "unittest.mock"}
