@@ -112,6 +112,7 @@ def opened(browser, served):
     context = browser.new_context(viewport={"width": 1280, "height": 900}, accept_downloads=True)
     page, wrong, hosts = context.new_page(), [], set()
     page.set_default_timeout(SOON)
+    api.expect.set_options(timeout=SOON)  # whose own default is 5 s
     page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.on(
