@@ -241,11 +241,11 @@ def two_springs(*springs, noise=0.005):
     )
 
 
-@pytest.mark.parametrize("springs", [(STIFF, SOFT), (SOFT, STIFF)])
-def test_a_mass_inside_shows_which_spring_is_at_the_base(springs):
-    measurement = two_springs(*springs)
-    result = ff.fit(measurement, model="bistable+bistable", starts=3, intervals="local")
-    for spring, true in zip(result.chain.springs, springs, strict=True):
+def test_a_mass_inside_shows_which_spring_is_at_the_base():
+    """Also where that is the stiffer one, which would be put on top without this motion."""
+    measurement = two_springs(STIFF, SOFT)
+    result = ff.fit(measurement, model="bistable+bistable", starts=2, intervals="local")
+    for spring, true in zip(result.chain.springs, (STIFF, SOFT), strict=True):
         assert spring.sigma_a == pytest.approx(true.sigma_a, rel=0.05)
         assert spring.kc == pytest.approx(true.kc, rel=0.05)
     assert result.misfit["displacement_1_time"] == pytest.approx(0.005, rel=0.15)
