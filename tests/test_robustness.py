@@ -69,7 +69,7 @@ def test_what_stands_at_an_outlier_does_not_matter():
 def test_outliers_are_in_the_result_and_crossed_in_the_figure(tmp_path, monkeypatch):
     small_pictures(monkeypatch)
     _, test, at = spoilt_impact()
-    result = ff.fit(test, starts=4)
+    result = ff.fit(test, starts=2, intervals="local")
     content = result.to_json_dict()
     assert content["statistics"]["n_left_out"] == at.size
     assert content["outliers"]["stress"]["values"] == [9e6] * 4
@@ -108,7 +108,7 @@ def test_a_file_with_spikes_and_gaps_gives_the_parameters_of_the_spring(tmp_path
     said = [note for note in read.notes if "spikes or gaps" in note]
     assert any(note.startswith("Check: 5 samples of the stress") for note in said)
     assert any(note.startswith("Check: 1 sample of the displacement") for note in said)
-    result = ff.fit(read, starts=8)
+    result = ff.fit(read, starts=4, intervals="local")
     assert worst_deviation(result, spring) < 4.0
     assert result.noise["stress_time"]["given"] is False
     assert result.noise["stress_time"]["residual_over_noise"] == pytest.approx(1.0, abs=0.15)
@@ -120,7 +120,7 @@ def test_a_file_with_spikes_and_gaps_gives_the_parameters_of_the_spring(tmp_path
 
 def shifted_impact(late: float, **changed: object) -> tuple[ff.BistableSpring, Measurement]:
     """The impact of conftest, its motion written down `late` seconds too late."""
-    spring, test = synthetic_impact()
+    spring, test = synthetic_impact(samples=201)
     chain = ff.Chain([spring], [HEIGHT], AREA)
     dense = np.linspace(0.0, 0.9e-3, 20_001)
     motion = ff.simulate(chain, ff.Impact(7e-3, 2.0), dense).displacement[-1]
@@ -133,11 +133,11 @@ def shifted_impact(late: float, **changed: object) -> tuple[ff.BistableSpring, M
 @pytest.mark.parametrize("late", [15e-6, -10e-6])
 def test_a_shift_between_force_and_motion_is_warned_of_and_fitted(late):
     spring, test = shifted_impact(late)
-    plain = ff.fit(test, starts=4, intervals="local")
+    plain = ff.fit(test, starts=2, intervals="local")
     word = "late" if late > 0 else "early"
     (warning,) = [w for w in plain.warnings if "--time-shift" in w]
     assert f"{word} by" in warning
-    result = ff.fit(test, time_shift=True, starts=4, intervals="local")
+    result = ff.fit(test, time_shift=True, starts=2, intervals="local")
     item = result.parameters["time_shift"]
     assert item.unit == "s"
     assert item.state == "determined"
@@ -150,9 +150,12 @@ def test_a_shift_between_force_and_motion_is_warned_of_and_fitted(late):
 
 
 def test_no_shift_is_warned_of_where_there_is_none():
-    result = ff.fit(synthetic_impact()[1], starts=4)
-    assert not [w for w in result.warnings if "--time-shift" in w]
-    shifted = ff.fit(synthetic_impact()[1], time_shift=True, starts=4).parameters["time_shift"]
+    _, test = synthetic_impact(samples=201)
+    plain, shifted = (
+        ff.fit(test, time_shift=shift, starts=2, intervals="local") for shift in (False, True)
+    )
+    assert not [w for w in plain.warnings if "--time-shift" in w]
+    shifted = shifted.parameters["time_shift"]
     assert abs(shifted.value) < 3 * shifted.stderr
 
 
@@ -191,7 +194,8 @@ def test_a_slow_test_in_time_has_a_shift_too():
     time = np.linspace(0.0, 4.0, loop.stress.size)
     late = 0.05
     seen = np.interp(time - late, time, loop.displacement)
-    result = ff.fit(replace(loop, time=time, displacement=seen), time_shift=True, starts=8)
+    test = replace(loop, time=time, displacement=seen)
+    result = ff.fit(test, time_shift=True, starts=4, intervals="local")
     item = result.parameters["time_shift"]
     assert item.value == pytest.approx(late, abs=max(3 * item.stderr, 2e-3))
     assert result.drive == "displacement"
@@ -213,7 +217,7 @@ def test_the_command_fits_a_shift_and_refuses_it_without_time(tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     test = fabricated_csv(tmp_path)
     monkeypatch.setattr("foamfit.api.FitResult.save", lambda *_, **__: None)
-    call = ["fit", str(test), "--starts", "4", "--json", "--time-shift"]
+    call = ["fit", str(test), "--starts", "2", "--json", "--time-shift"]
     out = CliRunner().invoke(main, call)
     assert out.exit_code == 0
     content = json.loads(out.stdout)
@@ -232,6 +236,7 @@ def test_the_command_fits_a_shift_and_refuses_it_without_time(tmp_path, monkeypa
 
 def test_a_stopped_fit_is_marked_everywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    small_pictures(monkeypatch)
     test = fabricated_csv(tmp_path)
     out = CliRunner().invoke(main, ["fit", str(test), "--max-time", "0.02", "--out", "stopped"])
     assert out.exit_code in (0, 2)
@@ -277,13 +282,13 @@ def test_a_stopped_fit_is_never_ok(monkeypatch):
         raise SearchStoppedError
 
     monkeypatch.setattr(lmfit, "minimize", stop)  # the refinement
-    result = ff.fit(synthetic_impact()[1], starts=4)
+    result = ff.fit(synthetic_impact(samples=201)[1], starts=2)
     assert result.stopped == "the time limit"
     assert result.status == "warnings"
 
 
 def fabricated_csv(folder):
-    _, test = synthetic_impact()
+    _, test = synthetic_impact(samples=201)
     path = folder / "foam-1-model-1.csv"
     table = np.column_stack([test.time, test.stress, test.displacement])
     np.savetxt(path, table, delimiter=",", header="time_s,stress_Pa,displacement_m", comments="")
