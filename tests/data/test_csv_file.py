@@ -202,7 +202,7 @@ def test_the_toml_is_read_in_si(tmp_path):
     assert len(test.data_sha256) == 64
 
 
-def test_a_million_rows_would_take_seconds(tmp_path):
+def test_many_rows_are_read_in_time(tmp_path):
     n = 200_000
     t = np.linspace(0, 1, n)
     y = np.sin(np.pi * t)
