@@ -353,7 +353,10 @@ class Course:
         """States at times within the course, shape (k, n)."""
         which = np.searchsorted([end for end, _ in self.pieces], time)
         which = np.minimum(which, len(self.pieces) - 1)
-        return np.stack([self.pieces[i][1](t) for i, t in zip(which, time, strict=True)], axis=1)
+        out = np.empty((len(self.state), len(time)))
+        for i in np.unique(which):
+            out[:, which == i] = self.pieces[i][1](time[which == i])
+        return out
 
     def stress(self, time: Array) -> Array:
         """Stress at the base, zero outside contact."""

@@ -81,9 +81,10 @@ ZEROS = [(0.0, 0.0, 0.0), (-0.9, 0.7, 0.4), (0.8, -1.0, -0.6)]
 @pytest.mark.parametrize("tau", [1, 8])
 @pytest.mark.parametrize(("n", "before"), [(80, 40), (500, 150), (500, 2000), (8000, 3000)])
 def test_the_start_is_found_within_samples_or_a_few_percent(channels, gauge, tau, n, before):
-    for seed, (level, zeros) in enumerate(
-        (level, zeros) for level in (5e-4, 5e-3, 0.02) for zeros in ZEROS
-    ):
+    # Each level of noise with each zero; with one zero where rows are many and reading takes long.
+    pairs = [(i, j) for i in range(3) for j in range(3) if n < 8000 or i == j]
+    for i, j in pairs:
+        level, zeros, seed = (5e-4, 5e-3, 0.02)[i], ZEROS[j], 3 * i + j
         clock = (0.0, 12.5, -3.0)[seed % 3]
         given = record(channels, n, before, 0.37, level, tau, gauge, seed, clock, zeros)
         done = run(given)

@@ -202,8 +202,8 @@ def test_the_toml_is_read_in_si(tmp_path):
     assert len(test.data_sha256) == 64
 
 
-def test_a_million_rows_take_seconds(tmp_path):
-    n = 1_000_000
+def test_many_rows_are_read_in_time(tmp_path):
+    n = 200_000
     t = np.linspace(0, 1, n)
     y = np.sin(np.pi * t)
     path = write(tmp_path, toml=SPECIMEN + STRIKER)
@@ -212,7 +212,7 @@ def test_a_million_rows_take_seconds(tmp_path):
     path.write_text("time (ms),stress (MPa),displacement (mm)\n" + block)
     begin = time.process_time()
     test = read_test(path)
-    assert time.process_time() - begin < 10  # about 1 s; the rest is for slow machines
+    assert time.process_time() - begin < 2  # about 0.2 s; the rest is for slow machines
     assert len(test.stress) <= 1000
     assert test.stress.max() == pytest.approx(2e6, rel=1e-3)
 

@@ -247,7 +247,8 @@ def test_the_digest_covers_both_files(tmp_path):
 
 
 @pytest.mark.parametrize("file", ["camera.csv", "film/1.csv"])
-def test_a_task_takes_both_files_to_another_machine(tmp_path, file):
+def test_a_task_takes_both_files_to_another_machine(tmp_path, monkeypatch, file):
+    without_pictures(monkeypatch)
     path = written(tmp_path, MOTION.replace("camera.csv", file))
     camera = tmp_path / file
     camera.parent.mkdir(exist_ok=True)

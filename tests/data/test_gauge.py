@@ -10,6 +10,8 @@ from matplotlib.colors import to_hex
 import fabricated
 from conftest import DATA
 from foamfit.data.csv_file import read_test
+from foamfit.data.measurement import Record, Specimen
+from foamfit.data.prepare import condition
 from foamfit.report.plots import STOOD, plot_fit
 
 HEIGHT = 10.0  # mm
@@ -57,6 +59,13 @@ def recorded(folder, shown, stress, *, noise=(0.0, 0.0), timed=True, seed=0):
     )  # fmt: skip
     path.with_suffix(".toml").write_text(SPECIMEN)
     return read_test(path)
+
+
+def conditioned(shown, stress, noise):
+    """The same without its file, with noise of the stress."""
+    noisy = stress + noise * np.ptp(stress) * np.random.default_rng(0).standard_normal(stress.size)
+    record = Record(STEP * np.arange(shown.size), 1e3 * noisy, 1e-3 * shown)
+    return condition(record, Specimen(height=1e-3 * HEIGHT, area=1e-4))
 
 
 def notes(test):
@@ -148,31 +157,31 @@ def test_only_the_stretches_of_the_cycle_that_is_used_are_named(tmp_path):
     ],
     ids=["turn", "1 s", "10 s", "twice", "steps", "dwell", "few"],
 )
-def test_a_true_hold_is_no_standstill(tmp_path, ramps, every, digit, noise):
+def test_a_true_hold_is_no_standstill(ramps, every, digit, noise):
     w = motion(*ramps)
     stress = relaxing_stress(w)
     shown = held(w + noise * TOP * np.random.default_rng(5).standard_normal(w.size), every)
     shown = np.round(shown / digit) * digit if digit else shown
-    assert not notes(recorded(tmp_path, shown, stress, noise=(0.0, noise)))
+    assert not notes(conditioned(shown, stress, noise))
 
 
 @pytest.mark.parametrize("late", [-8, -3, 3, 8])
 @pytest.mark.parametrize("every", [1, 5])
-def test_a_hold_with_a_force_beside_its_time_is_no_standstill(tmp_path, late, every):
+def test_a_hold_with_a_force_beside_its_time_is_no_standstill(late, every):
     w = motion((TOP, 600), (TOP, 250), (0.0, 613))
     stress = relaxing_stress(w)
     at = np.clip(np.arange(w.size) - late, 0, w.size - 1)
-    assert not notes(recorded(tmp_path, held(w, every), stress[at], noise=(0.0, 0.001)))
+    assert not notes(conditioned(held(w, every), stress[at], 0.001))
 
 
 @pytest.mark.parametrize("digit", [0.0, 0.03, 0.3])
 @pytest.mark.parametrize("samples", [60, 400, 4000])
 @pytest.mark.parametrize("every", [1, 5])
-def test_a_smooth_turn_is_no_standstill(tmp_path, samples, digit, every):
+def test_a_smooth_turn_is_no_standstill(samples, digit, every):
     w = TOP * np.sin(np.linspace(0.0, np.pi, samples)) ** 2
     shown = held(w, every)
     shown = np.round(shown / digit) * digit if digit else shown
-    assert not notes(recorded(tmp_path, shown, relaxing_stress(w), noise=(0.0, 0.001)))
+    assert not notes(conditioned(shown, relaxing_stress(w), 0.001))
 
 
 # --------------------------------------------------------------------------------------- in figures

@@ -116,7 +116,7 @@ def test_a_drifting_sensor_is_left_alone_and_noted():
 # Records of the study of recovery: random springs, 1 % noise, contact at the first sample. Where
 # branch a is soft, as with these seeds, its stress is lost in the noise. Correlation time, samples.
 SOFT = (12, 27, 32, 8, 57, 6)
-CLASSES = [(1.0, 300), (8.0, 300), (1.0, 1000), (8.0, 1000), (1.0, 5000), (8.0, 5000)]
+CLASSES = [(1.0, 300), (8.0, 300), (1.0, 5000), (8.0, 5000)]
 
 
 @functools.cache
@@ -129,6 +129,16 @@ def at_contact(tau, samples, seed):
     record = in_white_noise(samples, seed)
     channels, _ = rig.noisy(record.clean, record.noise, 1.0, tau, seed)
     return replace(record, setup=replace(record.setup, tau=tau), channels=channels)
+
+
+def in_memory(record):
+    """What is read of the files of a record, without writing them."""
+    own = record.rig
+    given = Record(
+        record.time, record.channels["force"] / own.area, record.channels["displacement"]
+    )
+    specimen = Specimen(height=own.heights[0], area=own.area)
+    return condition(given, specimen, striker=Striker(mass=own.mass, velocity=own.velocity))
 
 
 @pytest.mark.parametrize(("tau", "samples"), CLASSES)
@@ -153,11 +163,11 @@ def test_nothing_is_cut_or_taken_off_where_contact_is_the_first_sample(tmp_path,
 
 
 @pytest.mark.parametrize(("tau", "samples"), CLASSES)
-def test_the_zero_at_the_end_of_a_record_is_as_far_off_as_it_says(tmp_path, tau, samples):
+def test_the_zero_at_the_end_of_a_record_is_as_far_off_as_it_says(tau, samples):
     """Impacts whose contact ends softly, in white and correlated noise; the true zero is 0."""
     off = []
     for seed in range(1, 21):
-        test = read_test(rig.write(at_contact(tau, samples, seed), tmp_path))
+        test = in_memory(at_contact(tau, samples, seed))
         if "stress" in test.zeros:
             off.append(test.origins["stress_zero"] / test.zeros["stress"])
     assert len(off) > 12

@@ -310,7 +310,7 @@ def test_a_motion_is_not_integrated_from_a_clipped_force(tmp_path):
 
 
 def test_a_clipped_force_is_no_shift_of_the_clocks():
-    _, test = synthetic_impact()
+    _, test = synthetic_impact(samples=201)
     top = 0.5 * test.stress.max()
     at_top = test.stress > top
     none = np.zeros(0)

@@ -52,7 +52,9 @@ def test_slow_tests_are_those_of_foamfit(setup: rig.Slow, seed: int) -> None:
     course = rig.slow(setup, seed).course
     assert course.rig.motion is not None
     turns = [t for t in course.rig.motion.times if course.start < t < course.end]
-    time = np.union1d(np.linspace(course.start, course.end, 20_001), turns)
+    # Between samples the motion is simulated as straight, which a sine and a ramp are not.
+    samples = 20_001 if setup.motion in ("sine", "ramp") else 1_001
+    time = np.union1d(np.linspace(course.start, course.end, samples), turns)
     drive = ff.DisplacementDrive(course.top(time, gauge=False))
     found = ff.simulate(rigs.chain_of(course.rig), drive, time - course.start, rtol=1e-9)
     smooth = ~np.isin(time, [*turns, course.start])  # at a turn a dashpot's stress has two values

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import re
 import zlib
-from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,7 +12,6 @@ import pytest
 
 import fabricated
 from drawn import figures
-from foamfit.report.comparison import compare, plot_comparison
 from foamfit.report.figures import image
 from foamfit.report.plots import plot_fit
 
@@ -57,24 +56,25 @@ def letters(pdf: bytes) -> set[str]:
     return found
 
 
+@functools.cache
+def pictures(form: str) -> dict[str, bytes]:
+    """Two of the figures, with all kinds of letters, as files."""
+    given = dict(figures())
+    return {name: image(given[name], form) for name in ("microscale, relaxing", "comparison")}
+
+
 def test_every_letter_is_that_of_an_embedded_truetype_font() -> None:
-    for name, figure in figures():
-        if name in ("microscale, relaxing", "comparison"):
-            pdf = image(figure, "pdf")
-            kinds = fonts(pdf)
-            assert kinds, name
-            assert all(kind in ("TrueType", "Type0") and whole for kind, whole in kinds), name
-            assert b"/Type3" not in pdf, name
+    for name, pdf in pictures("pdf").items():
+        kinds = fonts(pdf)
+        assert kinds, name
+        assert all(kind in ("TrueType", "Type0") and whole for kind, whole in kinds), name
+        assert b"/Type3" not in pdf, name
 
 
 @pytest.mark.parametrize("form", ["pdf", "svg"])
 def test_greek_letters_indices_and_minus_signs_are_characters(form: str) -> None:
-    one = fabricated.result()
-    named = replace(one, measurement=replace(one.measurement, name="foam-1/model-1"))
     text = set[str]()
-    pictures = (plot_fit(fabricated.microscale_result()), plot_comparison(compare([named])))
-    for figure in pictures:
-        content = image(figure, form)
+    for content in pictures(form).values():
         if form == "pdf":
             text |= letters(content)
         else:

@@ -170,7 +170,7 @@ def test_a_point_that_does_not_exist_is_said() -> None:
 def test_the_page_is_made_of_little() -> None:
     result = fabricated.result(energy={}, statistics={}, weights={}, warnings=(), status="ok")
     bare = replace(result.measurement, notes=(), motion=None, data_sha256="")
-    whole = Page(render_report(replace(result, measurement=bare)))
+    whole = Page(render_report(replace(result, measurement=bare), fabricated.no_figures()))
     assert "not read from a file" in whole.words
     assert "Energy audit" not in whole.words
 
