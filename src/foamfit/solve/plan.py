@@ -165,8 +165,8 @@ class Plan(NamedTuple):
         tol = max(margin * rtol, LEAST_IMPLICIT)
         most = min(self.max_steps, MOST_IMPLICIT)
         samples = scenes.Samples(time, out[0], out[1:])
-        *ending, lost = steps.integrate_implicit(scene, tol, most, directions, start, samples, log)
-        return _motion(RADAU, ending, out, log, lost)
+        *result, lost = steps.integrate_implicit(scene, tol, most, directions, start, samples, log)
+        return _motion(RADAU, result, out, log, lost)
 
     def _with_memory(
         self, scene: scenes.SceneTuple, rtol: float, directions: Directions, out: Array, log: Array
@@ -319,7 +319,7 @@ def _on_one_plateau(rows: Array, branches: NDArray[np.int64], directions: Direct
     flat |= (branches == kernels.E) & (rows[:, kernels.KH_MINUS] == 0.0)[:, None]
     together = (flat & (flat.sum(axis=0) > 1)).any(axis=1)
     marked = np.isin(directions[:, 1], (0, 2, 3)) & (directions[:, 0] >= 0)  # k0, dsigma, eps_a
-    return (marked & together[directions[:, 0]]).astype(float)
+    return np.where(marked, together[directions[:, 0]], 0.0)
 
 
 def _motion(

@@ -50,7 +50,7 @@ from foamfit.springs.kernels import (
 )
 from foamfit.springs.law import LEAST_RANK
 
-# The state: strain, stress, branch, rank w, p, 1 - p; strains and stresses at the ends of the branch;
+# The state: strain, stress, branch, rank w, p, 1 - p; strains and stresses at its branch's ends;
 # dε/dσ and d²ε/dσ² where the stress was last computed; rank W, 1 - P, and the strain below which no
 # micro-spring snaps.
 EPS, SIGMA, BRANCH, RANK, SNAPPED, REST, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH = range(10)

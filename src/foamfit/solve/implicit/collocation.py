@@ -209,8 +209,8 @@ class Step:
         right[:, :, 1] = (residual / unit).reshape(columns, count, STAGES)
         if self.held:
             right[:, -1] = 0.0
-        matrix, right = band.reshape(-1, _ROWS).T, right.reshape(columns, -1).T
-        x, info = lapack.dgbsv(_BAND, _BAND, matrix, right, overwrite_ab=1, overwrite_b=1)[2:]
+        matrix, sides = band.reshape(-1, _ROWS).T, right.reshape(columns, -1).T
+        x, info = lapack.dgbsv(_BAND, _BAND, matrix, sides, overwrite_ab=1, overwrite_b=1)[2:]
         if info != 0:
             return None
         out: Array = x.T.reshape(columns, count, 2, STAGES)[:, :, 1].reshape(residual.shape)

@@ -298,7 +298,7 @@ class _Run:
             step.enter(int(i), entered)
         return opened
 
-    # ---------------------------------------------------------------- what is recorded
+    # ---------------------------------------------------------------- samples
 
     def _record(self, done: slice, span: float) -> bool:
         """Write the samples and derivatives of a step; return false if there are no derivatives."""
