@@ -661,7 +661,7 @@ OF_STRESSES = 1e-14  # rounding error of the logarithm of a stress after a few s
 REASONS = {
     "step underflow": "shrank to nothing",
     "vibration": "masses vibrate too fast",
-    "errors grow": "let the least error grow",
+    "errors grow": "amplify the smallest error",
     "end of a branch": "of the end of its branch",
     "not finite": "no longer finite",
     "flat branch under stress": "flat branch",

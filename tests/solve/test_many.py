@@ -113,7 +113,7 @@ def effort(count: int, rtol: float = 1e-6) -> tuple[int, int, int, int]:
     scene = plan(chain, ff.Impact(STRIKER, 2.1), TIME)
     spent = np.zeros(2, np.int64)
     _, contact_end, steps, switches = many.integrate_aggregate(
-        scene.given(chain.arrays.rows, chain.arrays.heights), 1e-4 * rtol / count, 10**6,
+        scene.packed(chain.arrays.rows, chain.arrays.heights), 1e-4 * rtol / count, 10**6,
         np.empty((2, TIME.size)), np.empty((0, 5)), spent,
     )  # fmt: skip
     assert contact_end > 0.0

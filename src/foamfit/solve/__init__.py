@@ -1,6 +1,6 @@
-"""From a chain, a drive and samples to a response, by the least solver that the scene needs.
+"""Simulation: the response of a chain to a drive, by the simplest solver that suffices.
 
-`simulation` is the public call, which checks its answer; `plan` chooses the solver.
-A newcomer may skip `explicit`, `many`, `rates` and `polynomial`, the compiled loops, with what they
-share (`scene`), their first use (`precompile`, `cache`), and `implicit`, the steps of stiff scenes.
+`simulation` holds the public call and verifies its answer; `plan` chooses the solver.
+Newcomers may skip the compiled loops (`explicit`, `many`, `rates`, `polynomial`), their shared
+types (`scene`) and compilation (`precompile`, `cache`), and the solver of stiff scenes, `implicit`.
 """

@@ -1,10 +1,10 @@
-"""Scenes with a spring of a registered law: steps in time that need nothing but the law itself.
+"""Scenes with springs of registered laws: a time stepper that needs only the law's own functions.
 
-Between samples a drive is linear, and each step takes every spring to a new strain by the functions
-of its law (`springs.laws.followed`). Springs in series carry one stress, which is sought at each
-step. A striker of areal mass M follows M dv/dt = -(Σ + η_site v/H) by the velocity Verlet method
-(gravity, where it acts, adds to dv/dt).
-Every part is of second order in the step: where time counts, steps are halved until two runs agree.
+A drive is linear between samples, and each step takes every spring to a new strain by the functions
+of its law (`springs.laws.followed`). Springs in series carry one stress, which each step solves
+for. A striker of areal mass M follows M dv/dt = -(Σ + η_site v/H), plus gravity if any, by the
+velocity Verlet method. The scheme is of second order: for rate-dependent scenes, steps are halved
+until two runs agree.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
 METHOD = "steps of any law"
 FIRST_STEPS, MOST_STEPS = 400, 4_000_000
-# Steps of differences over the value, and of what may be zero.
-RELATIVE, ABSOLUTE = 1e-5, 1e-6
+RELATIVE = 1e-5  # step of finite differences over the value of a parameter
+ABSOLUTE = 1e-6  # the same at zero, over the scale of the parameter
 
 
 @cache
 def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
-    """Loops that begin with springs of these laws, stretch and elongate them, and note a sample."""
+    """Return loops for springs in series: start, impose a stress or elongation, write a sample."""
     loops, count = followed.loops_of(laws), len(laws)
     start, step, to_stress = loops.start, loops.step, loops.to_stress
 
@@ -47,7 +47,7 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
 
     @compiled
     def stretch(springs: Springs, sigma: float, h: float) -> float:
-        """Take all springs to a stress; returns the elongation, m."""
+        """Take all springs to a stress; return their elongation, m."""
         out = 0.0
         for i in range(count):
             out += springs.heights[i] * to_stress(i, springs, sigma, h)
@@ -55,14 +55,14 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
 
     @compiled
     def beside(given: tuple[Springs, float], sigma: float) -> float:
-        """Elongation under a stress; the springs stay where they are."""
+        """Return the elongation under a stress, without moving the springs."""
         return stretch(followed.trial_of(given[0]), sigma, given[1])
 
     find = followed.inverse(beside)
 
     @compiled
     def elongate(springs: Springs, sigma: float, moved: float, h: float) -> float:
-        """Take springs to an elongation, m; returns their stress, sought about `sigma`."""
+        """Take springs to an elongation, m; return their stress, found from the guess `sigma`."""
         if count == 1:
             return step(0, springs, moved / springs.heights[0], h)
         common = find((springs, h), sigma, 1e-3 * max(abs(sigma), 1.0), 0.0, moved)
@@ -72,7 +72,7 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
 
     @compiled
     def note(springs: Springs, j: int, nodes: Array, branches: NDArray[np.int64]) -> None:
-        """Write displacements and branches of a sample."""
+        """Write the displacements and branches of a sample."""
         top = 0.0
         for i in range(count):
             top += springs.heights[i] * springs.states[i, EPS]
@@ -84,21 +84,21 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
 
 @cache
 def driven(laws: tuple[Law, ...], top: int) -> Callable[..., tuple[float, bool]]:
-    """Loop along a prescribed stress (Pa) or motion (m), for springs of these laws."""
+    """Return the loop along a prescribed stress (Pa) or motion (m) for springs of these laws."""
     begin, stretch, elongate, note = in_series(laws)
 
     @compiled
     def press(springs: Springs, sigma: float, value: float, h: float) -> float:
         return value if math.isfinite(stretch(springs, value, h)) else math.nan
 
-    follow = press if top == STRESS else elongate  # the other one is not compiled
+    follow = press if top == STRESS else elongate  # the other is then not compiled
 
     @compiled
     def drive(
         springs: Springs, t: Array, values: Array, parts: int,
         nodes: Array, stress: Array, branches: NDArray[np.int64],
     ) -> tuple[float, bool]:  # fmt: skip
-        """Follow a drive in so many parts from sample to sample."""
+        """Follow a drive with a number of steps (`parts`) between samples."""
         sigma = 0.0
         begin(springs)
         for j in range(t.size):
@@ -119,7 +119,7 @@ def driven(laws: tuple[Law, ...], top: int) -> Callable[..., tuple[float, bool]]
 
 @cache
 def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
-    """Loop through an impact, for springs of these laws."""
+    """Return the loop through an impact for springs of these laws."""
     begin, _, elongate, note = in_series(laws)
     count, delayed = len(laws), followed.loops_of(laws).delayed
 
@@ -129,12 +129,12 @@ def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
         parts: int,
         nodes: Array, stress: Array, branches: NDArray[np.int64],
     ) -> tuple[float, bool]:  # fmt: skip
-        """Follow a striker from contact, at t = 0; returns when contact ends."""
+        """Follow a striker from contact at t = 0; return the end of contact, s."""
         w, v, now, end, soft = 0.0, speed, 0.0, math.nan, 0.0
         begin(springs)
         for i in range(count):
             soft += springs.heights[i] / springs.eta[i]
-        sigma = speed / soft  # what the dashpots bear at contact; 0 where a spring has none
+        sigma = speed / soft  # stress of the dashpots at contact; 0 if a spring has none
         if count == 1:
             pace = speed / springs.heights[0], 0.0
             sigma += delayed(0, springs.rows[0], springs.states[0], pace)
@@ -152,7 +152,7 @@ def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
                 if after <= 0.0 and half < 0.0:
                     share = sigma / (sigma - after) if sigma > after else 0.0
                     end = now + share * h
-                    w += share * h * half  # the velocity is that of half of the step
+                    w += share * h * half  # the velocity at the middle of the step
                     v = half + (share - 0.5) * h * (gravity - drag * half / mass)
                     break
                 w += h * half
@@ -176,7 +176,7 @@ def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
 
 
 class Followed(NamedTuple):
-    """One run: displacements (springs, n_t), base stress and branches; the end of contact."""
+    """Result of one run; displacements and branches are (springs, n_t)."""
 
     nodes: Array
     stress: Array
@@ -186,10 +186,7 @@ class Followed(NamedTuple):
 
 
 class AnyLawPlan(NamedTuple):
-    """A scene made ready for springs of any laws; it runs as a `solve.plan.Plan` does.
-
-    The fields are those of a `Plan`; mass (1,) is that of the striker.
-    """
+    """A scene prepared for springs of any laws, with the interface of a `solve.plan.Plan`."""
 
     laws: tuple[Law, ...]
     height: float
@@ -197,21 +194,21 @@ class AnyLawPlan(NamedTuple):
     values: Array
     time: Array
     speed: float
-    mass: Array
+    mass: Array  #: of the striker, (1,)
     drag: float
 
     @property
     def moves_one(self) -> bool:
-        """See `solve.plan.Plan`: there is no derivative by a motion."""
+        """See `solve.plan.Plan`: there is no derivative by the motion."""
         return False
 
     @property
     def solver(self) -> str:
-        """The least solver that the scene needs, as `Response.solver` says it."""
+        """See `solve.simulation.Response`."""
         return "second order" if self.speed > 0.0 else "first order"
 
     def springs(self, rows: Array, heights: Array) -> Springs:
-        """Springs of rows that hold own parameters, eta and relaxation terms, filled with zeros."""
+        """Return springs from rows of own parameters, eta and relaxation terms, zero-padded."""
         sizes = [followed.sizes_of(law) for law in self.laws]
         counts = [len(law.names) for law in self.laws]
         room = max((rows.shape[1] - min(counts)) // 2, 0)
@@ -223,20 +220,20 @@ class AnyLawPlan(NamedTuple):
             if row is None:
                 raise SimulationError(f"the parameters of spring {i + 1} are not admissible")
             own[i, : row.size] = row
-            given = rows[i, count:]
-            for k in range(given.size // 2 if law.hysteretic else 0):
-                if given[2 * k] > 0.0:
-                    terms[i, k, :2] = given[2 * k : 2 * k + 2]
+            relaxation = rows[i, count:]
+            for k in range(relaxation.size // 2 if law.hysteretic else 0):
+                if relaxation[2 * k] > 0.0:
+                    terms[i, k, :2] = relaxation[2 * k : 2 * k + 2]
         used = terms[:, terms[:, :, STRENGTH].any(axis=0)] if room else terms
         eta = np.array([rows[i, count - 1] for i, count in enumerate(counts)])
         states = np.zeros((len(rows), max(states for _, states in sizes)))
         return Springs(own, states, np.ascontiguousarray(used), np.array(heights), eta)
 
     def follow(self, rows: Array, heights: Array, drag: float, parts: int) -> Followed:
-        """Run once, with so many steps between samples; refuses what is not finite."""
+        """Run once with `parts` steps between samples; raise SimulationError if not finite."""
         springs, shape = self.springs(rows, heights), (len(rows), self.time.size)
         rate, eta = None, springs.eta
-        if self.top == MOTION and len(rows) == 1 and eta[0] > 0.0:  # the rate is that of the motion
+        if self.top == MOTION and len(rows) == 1 and eta[0] > 0.0:  # rate prescribed
             rate = np.gradient(self.values / heights[0], self.time)
             springs = springs._replace(eta=np.zeros(1))
         nodes, stress, branches = np.empty(shape), np.empty(shape[1]), np.empty(shape, np.int64)
@@ -250,14 +247,14 @@ class AnyLawPlan(NamedTuple):
             end, fine = loop(springs, self.time, self.values, *filled)
         if not fine:
             raise SimulationError(
-                "a stress or strain is no longer finite: the drive goes past what the law can bear"
+                "a stress or strain is no longer finite: the drive exceeds the range of the law"
             )
         if rate is not None:
             stress += eta[0] * rate
         return Followed(nodes, stress, branches, end, parts)
 
     def resolve(self, rows: Array, heights: Array, drag: float, rtol: float) -> Followed:
-        """Run with steps so short that base stress and displacement are within `rtol`."""
+        """Halve steps until base stress and displacement are accurate within `rtol`."""
         count, springs = self.time.size, self.springs(rows, heights)
         alone = self.top == MOTION and len(rows) == 1
         timed = bool(springs.terms.size) or (springs.eta.any() and not alone)
@@ -274,7 +271,7 @@ class AnyLawPlan(NamedTuple):
             if miss <= 2.0 * rtol:
                 return run
         raise SimulationError(
-            f"{MOST_STEPS} steps leave an error above rtol = {rtol:g}: ask for a larger rtol"
+            f"{MOST_STEPS} steps leave an error above rtol = {rtol:g}: use a larger rtol"
         )
 
     def run(
@@ -287,15 +284,14 @@ class AnyLawPlan(NamedTuple):
         everything: bool = True,
         directions: NDArray[np.int64] | None = None,
     ) -> Motion:
-        """Run the scene; see `solve.plan.Plan.run`. Derivatives are differences."""
+        """Run the scene as `solve.plan.Plan.run` does; derivatives are finite differences."""
         drag = self.drag if drag is None else drag
         found = self.resolve(rows, heights, drag, rtol)
         slopes = None
         if directions is not None and len(directions):
-            sides = [self._slope(rows, heights, drag, found, way) for way in directions]
-            slopes = Slopes(
-                np.array([nodes for nodes, _ in sides]), np.array([stress for _, stress in sides])
-            )
+            pairs = [self._slope(rows, heights, drag, found, way) for way in directions]
+            displacement, stress = zip(*pairs, strict=True)
+            slopes = Slopes(np.array(displacement), np.array(stress))
         strain = np.diff(found.nodes, axis=0, prepend=0.0) / np.array(heights)[:, None]
         switches = kernels.list_switches(self.time, strain, found.branches)
         nodes = found.nodes if everything else found.nodes[-1:]
@@ -307,9 +303,9 @@ class AnyLawPlan(NamedTuple):
     def _slope(
         self, rows: Array, heights: Array, drag: float, found: Followed, way: Sequence[int]
     ) -> tuple[Array, Array]:
-        """Difference of displacements and base stress over a step of one direction.
+        """Return finite differences of displacements and base stress in one direction.
 
-        It is one-sided at zero and at a limit of the law; without either side it is refused.
+        They are one-sided at zero and at a limit of the law; SimulationError without either side.
         """
         spring, what = way
         count = len(self.laws[spring].names)
@@ -319,11 +315,12 @@ class AnyLawPlan(NamedTuple):
         own = self.laws[spring].params
         peak = max(float(np.abs(found.stress).max()), 1.0)
         size = peak if what < len(own) and own[what].unit == "Pa" else 1.0
-        damping = peak * (float(self.time[-1] - self.time[0]) or 1.0)  # it carries all the stress
+        # The scale of a dashpot carries all the stress.
+        damping = peak * (float(self.time[-1] - self.time[0]) or 1.0)
         zero = {OWN_ETA: damping, DRAG: damping / self.height}
         step = RELATIVE * abs(value) or ABSOLUTE * zero.get(what, size)
 
-        def beside(by: float) -> Followed | None:
+        def shifted(by: float) -> Followed | None:
             moved, higher = rows.copy(), np.array(heights, dtype=float)
             if what == OWN_HEIGHT:
                 higher[spring] += by
@@ -334,11 +331,13 @@ class AnyLawPlan(NamedTuple):
             except SimulationError:
                 return None
 
-        above = beside(step)
-        below = beside(-step) if value or above is None else None
+        above = shifted(step)
+        below = shifted(-step) if value or above is None else None
         width = step * ((above is not None) + (below is not None))
         if width == 0.0:
-            raise SimulationError("the law admits no value beside this one")
+            raise SimulationError(
+                "a parameter of the law admits no nearby value: it has no derivative"
+            )
         above, below = above or found, below or found
         return (above.nodes - below.nodes) / width, (above.stress - below.stress) / width
 
@@ -346,19 +345,19 @@ class AnyLawPlan(NamedTuple):
 def plan_of(
     chain: Chain, time: Array, top: int, values: Array, speed: float, above: float
 ) -> AnyLawPlan:
-    """Make a scene ready; `above` is the mass on top, kg, the others are those of a `Plan`.
+    """Prepare a scene; `above` is the mass on top, kg, the other arguments are those of a `Plan`.
 
-    Refused (InputError) are masses between the springs, and a damper under a prescribed stress.
+    Raise InputError for masses between springs, or a mass or damper under a prescribed stress.
     """
     if chain.arrays.heavy:
         raise InputError(
-            "masses between springs go with the paper's laws only: leave them out beside a "
+            "masses between springs require the paper's laws: leave them out in a chain with a "
             "registered law"
         )
     if speed == 0.0 and top not in (MOTION, STRESS):
         raise InputError(
-            "a prescribed stress on a mass or an onsite damper goes with the paper's laws "
-            "only: leave them out beside a registered law"
+            "a prescribed stress on a mass or an onsite damper requires the paper's laws: leave "
+            "them out in a chain with a registered law"
         )
     laws = tuple(known.law(kind) for kind in chain.kinds)
     drag, mass = chain.site_damping / chain.height, np.array([above / chain.area])

@@ -1,4 +1,4 @@
-"""What an earlier run left compiled, and an announcement of what has to be compiled yet."""
+"""Which compiled loops numba's cache contains, and an announcement before others are compiled."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 _LOG = logging.getLogger(__name__)
-# The package, and its folders in which compiled loops are written.
 PACKAGE = Path(__file__).parents[1]
-FOLDERS = ("springs", "solve")
+FOLDERS = ("springs", "solve")  # subfolders with compiled loops
 
 
 def _caches() -> set[Path]:
-    """Folders in which numba keeps what it compiled of this package: one beside each of its own."""
+    """Return numba's cache folders of this package, one for each folder with compiled loops."""
     from foamfit.solve import polynomial, rates
     from foamfit.solve.explicit import taylor
     from foamfit.springs import kernels
@@ -36,13 +35,13 @@ def _caches() -> set[Path]:
 @functools.cache
 def announce(function: Any, what: str) -> None:
     """Log, once in a process, that `function` is about to be compiled, unless it has been."""
-    made = getattr(function, "signatures", True)  # where numba is switched off there are none
-    if not made and not compiled(function.__name__):
+    in_process = getattr(function, "signatures", True)  # True: numba is disabled
+    if not in_process and not compiled(function.__name__):
         warn(what)
 
 
 def warn(what: str) -> None:
-    """Log that something is compiled."""
+    """Log the message of `compiling`."""
     _LOG.warning("foamfit: %s", compiling(what))
 
 
@@ -52,24 +51,24 @@ def _first() -> str:
 
 
 def compiling(what: str) -> str:
-    """Say that something is compiled, and to the first who asks that it is only done once."""
+    """Return the message that `what` is compiled; the first says that this happens only once."""
     once = "" if _first.cache_info().currsize else _first()
     return f"compiling {what}{once}"
 
 
 def compiled(name: str = "integrate") -> bool:
-    """Whether an earlier run left a loop, compiled of this very source, in the cache.
+    """Whether the cache contains a loop compiled from the current source.
 
-    What is older than any module in these folders is removed: numba itself compares it with the
-    module of the outermost loop alone.
+    Files older than any module in `FOLDERS` are removed, because numba itself checks only the
+    module of the outermost loop.
     """
     times = [path.stat().st_mtime for name in FOLDERS for path in (PACKAGE / name).rglob("*.py")]
-    written = max((at for at in times if at <= time.time()), default=0.0)  # some clocks are wrong
+    written = max((at for at in times if at <= time.time()), default=0.0)  # a clock may be wrong
     fresh = False
-    for made in (path for cache in _caches() for path in cache.glob("*.nb[ci]")):
-        if made.stat().st_mtime < written:
-            with suppress(OSError):  # not ours to remove
-                made.unlink(missing_ok=True)
-        elif f".{name}-" in made.name:
-            fresh = fresh or made.suffix == ".nbc"
+    for file in (path for cache in _caches() for path in cache.glob("*.nb[ci]")):
+        if file.stat().st_mtime < written:
+            with suppress(OSError):  # no permission
+                file.unlink(missing_ok=True)
+        elif f".{name}-" in file.name:
+            fresh = fresh or file.suffix == ".nbc"
     return fresh

@@ -1,19 +1,19 @@
-"""The compiled integrator of an impact on many undamped, massless springs: as one spring.
+"""The compiled integrator of an impact on many undamped, massless springs, treated as one spring.
 
-Such springs carry one stress S, and on its branch the strain of each is known in closed form. Their
-common elongation is therefore a function of the stress alone,
+Such springs carry one stress S, and the strain of each on its branch is known in closed form. Their
+total elongation is therefore a function of the stress alone,
 
     w = F(S) = Σ h_i ε_i(S),        μ w'' = -S - drag w',
 
-analytic as far as the nearest pole of a curved branch (-k). Its Taylor polynomial about an anchor
-stress stands for all springs: a spring that switches takes its terms out and puts others in, which
-costs the same in a chain of ten springs and of a thousand. The whole sum is made anew only where
-the stress nears the end of the polynomial's reach. The next spring to switch is found in a
-binary tree of the switching stresses. So a run costs little more than in proportion to its springs,
-where following every spring through every step costs their number squared.
+analytic up to the nearest pole of a curved branch (-k). Its Taylor polynomial about an anchor
+stress represents all springs. A switch of one spring replaces the terms of that spring only, at a
+cost independent of the length of the chain; the full sum is recomputed only where the stress leaves
+the range of the polynomial. The next spring to switch is found in a binary tree of the switching
+stresses. The cost of a run grows little faster than the number of springs, where following every
+spring through every step would cost the square of that number.
 
-In time a step is a Taylor series again, with powers of the series of S put into the polynomial.
-It goes regularly through the turning point of the motion and through any damping of the top.
+In time, a step is a Taylor series too, obtained by inserting the powers of the series of S into the
+polynomial. It is regular at the turning point of the motion and with any damping of the top.
 """
 
 from __future__ import annotations
@@ -53,52 +53,45 @@ from foamfit.springs.kernels import (
 )
 from foamfit.springs.law import BISTABLE, UNILATERAL
 
-# Degree of the polynomial of the elongation, and how far from its anchor it is used, in distances
-# to the nearest pole: what it leaves out is below 0.125**17 < 1e-15 of the elongation.
-DEGREE, REACH = 16, 0.125
-# Springs whose switching stresses differ by less than this share switch together.
-CLOSE = 1e-13
-# Orders by which the time of the next event is guessed.
-GUESS = 3
+DEGREE = 16  # of the polynomial of the elongation
+# Range of the polynomial about its anchor, as a share of the distance to the nearest pole. The
+# relative truncation error of the elongation is below 0.125**17 < 1e-15.
+REACH = 0.125
+CLOSE = 1e-13  # relative difference of switching stresses below which springs switch together
+GUESS = 3  # order of the series that estimates the time of the next event
 # Columns of `Group.place`.
 ANCHOR, UNIT, LEAST, N_PLACE = range(4)
 
 
 class Group(NamedTuple):
-    """Springs in series under one stress, on the branches that they are on.
+    """Springs in series under one stress.
 
-    The second halves of `upper` and `lower` hold the stresses at which each spring leaves its
-    branch upwards and, negative, downwards; every entry before is the lesser of its two children:
-    the first is the next. `sum` (DEGREE + 1,) is the elongation as a polynomial of (S -
-    anchor)/unit, with both, Pa, in `place`, and the least first slope of a branch.
+    `upper` and `lower` are binary trees: the second half of the array holds the leaves, every entry
+    before is the lesser of its two children, and entry 1 is the least of all.
     """
 
     rows: Array
     heights: Array
-    branches: Branches
-    upper: Array
-    lower: Array
-    sum: Array
-    place: Array
+    branches: Branches  #: current branches
+    upper: Array  #: stresses at which the springs leave their branches upwards
+    lower: Array  #: negative stresses at which they leave them downwards
+    sum: Array  #: elongation as a polynomial of (S - anchor)/unit, (DEGREE + 1,)
+    place: Array  #: anchor and unit, Pa, and the least initial slope k of a branch
 
 
 class Step(NamedTuple):
-    """Series in time of stress s, displacement w and velocity v of the top; order 0 is the state.
+    """Series in time of a step; order 0 is the state."""
 
-    `powers` (order + 1, order + 1) are those of the series of (S - S(0))/unit, `shifted` (DEGREE +
-    1,) is the polynomial of the elongation about S(0).
-    """
-
-    s: Array
-    w: Array
-    v: Array
-    powers: Array
-    shifted: Array
+    s: Array  #: stress
+    w: Array  #: displacement of the top
+    v: Array  #: velocity of the top
+    powers: Array  #: powers of the series of (S - S(0))/unit, (order + 1, order + 1)
+    shifted: Array  #: polynomial of the elongation about S(0), (DEGREE + 1,)
 
 
 @compiled
 def holds(rows: Array) -> bool:
-    """Whether every spring has one strain at each stress on its branch, and no dashpot."""
+    """Whether an aggregate can represent the springs: no dashpot, and no flat branch or gap."""
     for i in range(rows.shape[0]):
         if rows[i, ETA] > 0.0 or rows[i, KIND] == UNILATERAL:
             return False
@@ -107,12 +100,12 @@ def holds(rows: Array) -> bool:
     return True
 
 
-# ---------------------------------------------------------------- the springs as one
+# ---------------------------------------------------------------- the aggregate
 
 
 @inner
 def _set(tree: Array, i: int, value: float) -> None:
-    """Set a leaf of a tree in which every node is the lesser of its children."""
+    """Set a leaf of a tree (see `Group`) and update the nodes above it."""
     at = tree.size // 2 + i
     tree[at] = value
     while at > 1:
@@ -151,7 +144,7 @@ def _add(group: Group, i: int, share: float) -> None:
 
 @inner
 def _anchor(group: Group, stress: float, rising: bool) -> None:
-    """Make the sum anew about an anchor ahead of the stress, which is then within its reach."""
+    """Recompute the sum about an anchor ahead of the stress, which stays within its reach."""
     least = group.place[LEAST]
     ahead = REACH if rising else -REACH
     group.place[ANCHOR] = (stress + ahead * least) / (1.0 - ahead)
@@ -164,7 +157,7 @@ def _anchor(group: Group, stress: float, rising: bool) -> None:
 
 @maker
 def _make_group(rows: Array, heights: Array) -> Group:
-    """Springs as one, all on their first branches, free of stress."""
+    """Return the group of springs at zero stress, each on its first branch."""
     count, leaves = heights.size, 1
     while leaves < count:
         leaves *= 2
@@ -179,13 +172,13 @@ def _make_group(rows: Array, heights: Array) -> Group:
         if rows[i, KIND] == BISTABLE:
             least = min(least, rows[i, KC])
     group.place[LEAST] = least
-    _anchor(group, 0.0, least > 0.0)  # not the literal, which is a type
+    _anchor(group, 0.0, least > 0.0)  # a literal would be another type
     return group
 
 
 @inner
 def _strain(group: Group, i: int, stress: float) -> float:
-    """Strain of a spring on its branch."""
+    """Return the strain of a spring on its branch."""
     curved, k, x0, s0 = branch_shape(group.rows[i], group.branches[i])
     return x0 + (stress / (k + stress) if curved else (stress - s0) / k)
 
@@ -194,11 +187,11 @@ def _strain(group: Group, i: int, stress: float) -> float:
 def _switch(
     group: Group, stress: float, rising: bool, now: float, log: Array, switches: int
 ) -> int:
-    """Change the branches of all springs that leave theirs at this stress; counts them."""
+    """Switch all springs that leave their branch at this stress; return the number of switches."""
     tree = group.upper if rising else group.lower
     met = (stress if rising else -stress) + CLOSE * abs(stress)
     while tree[1] <= met:
-        i = 1  # the leaf that is the least
+        i = 1  # descend to the least leaf
         while i < tree.size // 2:
             i = 2 * i if tree[2 * i] == tree[i] else 2 * i + 1
         i -= tree.size // 2
@@ -217,10 +210,9 @@ def _switch(
 
 @inner
 def _next_order(group: Group, now: Step, n: int, mass: float, drag: float) -> None:
-    """Find the coefficients n > 0 of a step from the lower ones.
+    """Compute the coefficients n > 0 of a step from the lower ones.
 
-    The stress follows from w_n = Σ_m g_m [S^m]_n, in which its own coefficient stands with g_1
-    alone.
+    The stress follows from w_n = Σ_m g_m [S^m]_n, where its coefficient n appears only with g_1.
     """
     g, x = now.shifted, now.powers
     now.w[n] = now.v[n - 1] / n
@@ -241,7 +233,7 @@ def _next_order(group: Group, now: Step, n: int, mass: float, drag: float) -> No
 
 @inner
 def _longest(c: Array, n: int, limit: float, span: float) -> float:
-    """Step within `span` at which the terms n - 1 and n of a series are below a limit."""
+    """Return the longest step within `span` with terms n - 1 and n of a series below a limit."""
     for m in (n - 1, n):
         if abs(c[m]) * span**m > limit:
             span = (limit / abs(c[m])) ** (1.0 / m)
@@ -260,9 +252,9 @@ def _expand(
     s_limit: float,
     w_limit: float,
 ) -> tuple[int, float]:
-    """Expand a step until its terms fall below the limits: orders found, and the longest step.
+    """Expand a step until its terms fall below the limits; return the order and longest step.
 
-    The first orders estimate the next event; the step is a little longer than that.
+    The lowest orders estimate the time of the next event; the step extends a little beyond it.
     """
     step = (now.s[0] - group.place[ANCHOR]) / group.place[UNIT]
     now.shifted[DEGREE] = group.sum[DEGREE]
@@ -288,7 +280,7 @@ def _sample(
     group: Group, now: Step, order: int, t: Array, first: int, last: int, begin: float,
     curves: Array
 ) -> None:  # fmt: skip
-    """Write base stress and displacements at the samples first … last-1 of a step."""
+    """Write base stress and displacements at samples first … last-1 of a step."""
     if first == last:
         return
     fill_values(now.s, order, t, first, last, begin, curves[0])
@@ -301,7 +293,7 @@ def _sample(
 
 @inner
 def _shape(group: Group, stress: float, nodes: Array) -> None:
-    """Write the displacement above each spring, or of the top alone."""
+    """Write the displacement above each spring, or of the top only."""
     place = 0.0
     for i in range(group.heights.size):
         place += group.heights[i] * _strain(group, i, stress)
@@ -312,10 +304,10 @@ def _shape(group: Group, stress: float, nodes: Array) -> None:
 def integrate_aggregate(
     given: SceneTuple, tol: float, max_steps: int, curves: Array, log: Array, effort: Branches
 ) -> tuple[int, float, int, int]:
-    """Integrate an impact on springs without dashpots or masses between them, over the samples.
+    """Integrate an impact on springs that satisfy `holds`, without masses between them.
 
-    Arguments and results are those of `explicit.taylor.integrate`, of springs as `holds` wants
-    them; `effort` (2,) is added to: sums over all springs, and orders of all steps.
+    Arguments and results are those of `explicit.taylor.integrate`. The numbers of sums over all
+    springs and of orders of all steps are added to `effort` (2,).
     """
     scene = Scene(*given)
     heights, mass, drag, speed, t = scene.heights, scene.mass[0], scene.drag, scene.speed, scene.t
@@ -326,7 +318,7 @@ def integrate_aggregate(
         np.zeros((order + 1, order + 1)), np.zeros(DEGREE + 1),
     )  # fmt: skip
     compliance = group.sum[1] / group.place[UNIT]
-    w_scale = speed * math.sqrt(mass * compliance)  # least ranges to be expected
+    w_scale = speed * math.sqrt(mass * compliance)  # lower bounds of the ranges
     if drag > 0.0:
         w_scale = min(w_scale, speed * mass / drag)
     s_scale = min(w_scale / compliance, group.upper[1])

@@ -1,4 +1,4 @@
-"""Compiled polynomials c[0] + c[1] τ + … of a step in time: values, slopes, first crossings."""
+"""Compiled functions of the polynomial c[0] + c[1] τ + … of a time step: values, slopes, roots."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ import math
 
 from foamfit.springs.kernels import Array, inner, piece
 
-# Least truncation of a step: less is rounding.
-LEAST_TRUNCATION = 1e-16
+LEAST_TRUNCATION = 1e-16  # of a step; rounding errors are larger
 
 
 @inner
 def order_for(tol: float, most: int) -> int:
-    """Order at which the series of steps of truncation `tol` costs least; from 6 to `most`."""
+    """Return the cheapest order, from 6 to `most`, of series with truncation `tol` per step."""
     return min(max(round(4.0 - 0.5 * math.log(tol)), 6), most)
 
 
 @inner
 def value_at(c: Array, order: int, tau: float) -> float:
-    """Value of a polynomial."""
+    """Return the value of a polynomial."""
     total = c[order]
     for n in range(order - 1, -1, -1):
         total = total * tau + c[n]
@@ -27,7 +26,7 @@ def value_at(c: Array, order: int, tau: float) -> float:
 
 @inner
 def value_and_slope(c: Array, order: int, tau: float) -> tuple[float, float]:
-    """Value and derivative of a polynomial."""
+    """Return the value and derivative of a polynomial."""
     total, slope = c[order], 0.0
     for n in range(order - 1, -1, -1):
         slope = slope * tau + total
@@ -45,10 +44,10 @@ def slope_at(c: Array, order: int, tau: float) -> float:
 def fill_values(
     c: Array, order: int, t: Array, first: int, last: int, now: float, out: Array
 ) -> None:
-    """Write the polynomial at the times t[first:last] - now to `out`, a block at a time.
+    """Write the polynomial at the times t[first:last] - now into `out`, block by block.
 
-    Loops without dependence from sample to sample, over slices, are done four samples at once; six
-    coefficients a pass save reading and writing the block.
+    The inner loops have no dependence between samples, so that they vectorise; six coefficients per
+    pass reduce reads and writes of the block.
     """
     while first < last:
         end = min(first + 512, last)
@@ -79,10 +78,10 @@ def fill_values(
 def _root(
     c: Array, order: int, level: float, lo: float, f_lo: float, hi: float, f_hi: float
 ) -> float:
-    """Root of polynomial - level in [lo, hi], where the polynomial goes from f_lo to f_hi.
+    """Return the root of polynomial - level in [lo, hi], where the polynomial is f_lo and f_hi.
 
-    Guarded Newton, from where the chord ends; its error is squared in every step, so that one of
-    1e-9 is the last.
+    Newton's method with bisection as safeguard, from the root of the chord. Convergence is
+    quadratic: a step below 1e-9 of the interval is the last.
     """
     rising, close = f_hi > f_lo, 1e-9 * (hi - lo)
     tau = lo + (level - f_lo) / (f_hi - f_lo) * (hi - lo)
@@ -112,7 +111,7 @@ def _root(
 def _turn(c: Array, order: int, lo: float, hi: float) -> float:
     """Bisect for the turning point of a polynomial whose slope changes sign in [lo, hi].
 
-    Half the digits are enough: near it the value changes with their square.
+    Half the digits suffice, because the value near it varies with the square of the distance.
     """
     rising = slope_at(c, order, lo) > 0.0
     for _ in range(27):
@@ -126,9 +125,10 @@ def _turn(c: Array, order: int, lo: float, hi: float) -> float:
 
 @piece
 def first_crossing(c: Array, order: int, low: float, high: float, span: float) -> tuple[float, int]:
-    """First time in [0, span] at which a polynomial leaves [low, high], and the side (-1, 0, 1).
+    """Return the first time in [0, span] at which a polynomial leaves [low, high], and the side.
 
-    A start outside by rounding, or on an end, counts as inside until it moves outwards.
+    The side is -1 or 1, or 0 if it stays inside. A start on an end, or outside by rounding, counts
+    as inside until the polynomial moves outwards.
     """
     reach, bend = 0.0, 0.0
     power = 1.0
@@ -141,7 +141,7 @@ def first_crossing(c: Array, order: int, low: float, high: float, span: float) -
     if c[0] - reach > low and c[0] + reach < high:
         return span, 0
     low, high = min(low, c[0]), max(high, c[0])
-    parts = 1 if bend < abs(c[1]) * span else 8  # one way all along, or perhaps there and back
+    parts = 1 if bend < abs(c[1]) * span else 8  # 1 if monotonic
     lo, value_lo = 0.0, c[0]
     slope_lo = c[1]
     for part in range(1, parts + 1):

@@ -1,7 +1,7 @@
-"""First use: what is compiled is made by two processes side by side, and kept in the cache.
+"""Compilation at first use by two processes in parallel, into numba's cache.
 
-Compiling in one process takes twice as long. Nothing else depends on it: what is not in the cache
-is compiled where it is first needed, and said so.
+One process would take twice as long. Nothing depends on this module: a loop missing from the cache
+is compiled, and announced, where it is first needed.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import numpy as np
 from foamfit.solve import cache
 from foamfit.solve.cache import PACKAGE
 
-_open: list[subprocess.Popen[bytes]] = []  # processes that compile beside this one
+_open: list[subprocess.Popen[bytes]] = []  # other processes that compile
 
 
 def _scene(drive: str, count: int = 1, eta: float = 0.0) -> Callable[[], object]:
-    """Prepare a few samples of a small chain, and a derivative, by explicit steps."""
+    """Return a run of a small chain over four samples, with a derivative, by explicit steps."""
     from foamfit.solve.plan import Plan, plan
     from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
     from foamfit.springs.laws import BistableSpring
@@ -43,7 +43,7 @@ def _scene(drive: str, count: int = 1, eta: float = 0.0) -> Callable[[], object]
 
 
 def _calls() -> dict[Any, tuple[Any, ...]]:
-    """The explicit integrator and its loops with their argument types, seen in uncompiled runs."""
+    """Return the explicit integrator and its loops with argument types, from uncompiled runs."""
     from unittest.mock import patch
 
     from numba import typeof
@@ -69,7 +69,7 @@ def _calls() -> dict[Any, tuple[Any, ...]]:
             names = {name: loop for name, loop in vars(module).items() if hasattr(loop, "py_func")}
             called = {}
             for name, loop in names.items():
-                own = loop.targetoptions.get("inline") != "always"  # else a part of another
+                own = loop.targetoptions.get("inline") != "always"  # else part of its caller
                 called[name] = plain(loop, own and module is taylor)
             uncompiled.enter_context(patch.dict(vars(module), called))
         for run in small:
@@ -78,14 +78,14 @@ def _calls() -> dict[Any, tuple[Any, ...]]:
 
 
 def _compile(calls: dict[Any, tuple[Any, ...]], cached: bool) -> None:
-    """Compile the loops that have, or have not, a file of their own in the cache."""
+    """Compile the loops that have their own file in the cache, or those that do not."""
     for loop, types in calls.items():
         if (loop.stats.cache_path is not None) == cached:
             loop.compile(types)
 
 
 def _memory(relaxed: bool) -> None:
-    """Call what a fit of springs with memory needs: the `relaxed` law, or all but that."""
+    """Call the loops of a fit of springs with memory: `relaxed_along`, or all others."""
     from foamfit.solve import relaxation
     from foamfit.springs import microscale_kernels as micro
     from foamfit.springs.model import Model
@@ -101,7 +101,7 @@ def _memory(relaxed: bool) -> None:
 
 
 def _rest() -> None:
-    """Call what else a fit calls; last what an impact on one spring does not need."""
+    """Call the other loops of a fit, last those that an impact on one spring does not need."""
     from foamfit.solve import rates, scene
     from foamfit.springs import kernels
     from foamfit.springs.model import Model
@@ -118,25 +118,24 @@ def _rest() -> None:
 def at_first_use(
     model: str, relaxation: int, tell: Callable[[], None] | None = None
 ) -> Iterator[Callable[[], None]]:
-    """Compile beside the body what the fit of a model needs and is not in the cache.
+    """Compile missing loops of a model's fit in parallel with the body of the `with` statement.
 
-    The body calls what is given before it simulates; `tell` is called if there is anything to do.
-    Without `tell` the log says so, and loops that this process has compiled count as done.
+    The body must call the yielded function before it simulates. `tell` is called if anything has to
+    be compiled. Without `tell` a message is logged, and loops already compiled in this process do
+    not count as missing.
     """
     from foamfit.solve.explicit.taylor import integrate
     from foamfit.solve.relaxation import relaxed_along
     from foamfit.springs.laws import is_registered
 
     def is_new(loop: Any) -> bool:
-        known = tell is None and getattr(loop, "signatures", True)  # True: numba is switched off
-        return not (known or cache.compiled(loop.__name__))
+        in_process = tell is None and getattr(loop, "signatures", True)  # True: numba is disabled
+        return not (in_process or cache.compiled(loop.__name__))
 
     memory = model == "auto" or "microscale" in model or relaxation > 0
     integrator = (model == "auto" or not memory) and is_new(integrate)
     memory = memory and is_new(relaxed_along)
-    registered = any(
-        is_registered(kind.strip()) for kind in model.split("+")
-    )  # has loops of its own
+    registered = any(is_registered(kind.strip()) for kind in model.split("+"))  # has its own loops
     if _open or registered or not (integrator or memory):
         yield lambda: None
         return
@@ -150,27 +149,28 @@ def at_first_use(
 
 @contextmanager
 def side_by_side(integrator: bool = True, memory: bool = False) -> Iterator[Callable[[], None]]:
-    """Let another process compile beside the body, which calls what is given before it simulates.
+    """Compile in another process, in parallel with the body of the `with` statement.
 
-    At the end all that a fit needs is in the cache: with `integrator` of springs without memory,
-    with `memory` of others. The other process is stopped if the body fails.
+    The body must call the yielded function before it simulates. At the end the cache contains all
+    loops of a fit of springs without memory (`integrator`) or with memory (`memory`). If the body
+    fails, the other process is stopped.
     """
     path = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}".rstrip(os.pathsep)
-    parts = [part for part, asked in (("integrator", integrator), ("memory", memory)) if asked]
+    parts = [part for part, wanted in (("integrator", integrator), ("memory", memory)) if wanted]
     with subprocess.Popen(
         [sys.executable, "-m", "foamfit.solve.precompile", *parts],
         stdout=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": path},
-        process_group=0,  # Ctrl-C is for the process that starts this one
+        process_group=0,  # Ctrl-C must reach only the process that starts this one
     ) as other:
 
         def finish() -> None:
-            gc.disable()  # what compiling makes stays
+            gc.disable()  # compiled objects live until exit
             if integrator:
                 loop, *calls = _calls().items()
                 _compile(dict(calls), cached=False)
                 if other.stdout is not None:
-                    other.stdout.readline()  # the pieces are there, or the other process has failed
+                    other.stdout.readline()  # pieces are ready, or it failed
                 _compile(dict([loop]), cached=True)
             else:
                 _memory(relaxed=True)
@@ -188,7 +188,7 @@ def side_by_side(integrator: bool = True, memory: bool = False) -> Iterator[Call
 
 
 def _main(parts: list[str]) -> None:
-    """Compile what the process that starts this one does not."""
+    """Compile the loops that the parent process does not."""
     gc.disable()
     if "integrator" in parts:
         _, *pieces = _calls().items()

@@ -1,7 +1,4 @@
-"""How fast a chain vibrates and relaxes: what explicit steps must follow.
-
-Implicit steps damp out what is too fast for them.
-"""
+"""Estimated rates of vibration and relaxation of a chain, which explicit steps must resolve."""
 
 from __future__ import annotations
 
@@ -10,14 +7,14 @@ import math
 from foamfit.solve.scene import FREE, VISCOUS
 from foamfit.springs.kernels import ETA, K0, KC, KH_PLUS, Array, Branches, compiled, inner
 
-# (Rate of stopping)/(rate of creep) from which dashpots stop a striker long before it is thrown
-# back.
+# Ratio of the rates of stopping and of creep above which dashpots stop a striker long before the
+# springs throw it back.
 OVERDAMPED = 1e3
 
 
 @inner
 def contact_time(rows: Array, heights: Array, mass: float, drag: float) -> float:
-    """Time, roughly, for which the mass on top stays on the chain that it strikes."""
+    """Return a rough estimate of the duration of contact of a striker with the chain, s."""
     soft, slow = 0.0, 0.0
     for i in range(heights.size):
         soft += heights[i] / rows[i, K0]
@@ -29,8 +26,8 @@ def contact_time(rows: Array, heights: Array, mass: float, drag: float) -> float
 def is_overdamped(rows: Array, heights: Array, mass: float) -> bool:
     """Whether dashpots stop a striker of that mass long before the springs throw it back.
 
-    With the rates a = k/c of creep and b = c/m of stopping, contact ends where the base stress has
-    fallen to (a/b)² of its peak: explicit steps, whose error is relative to the peak, lose it.
+    With the rates a = k/c of creep and b = c/m of stopping, contact ends when the base stress has
+    fallen to (a/b)² of its peak, which explicit steps, with errors relative to the peak, miss.
     """
     soft, flow = 0.0, 0.0
     for i in range(heights.size):
@@ -52,9 +49,9 @@ def fastest_rates(
     struck: bool,
     duration: float,
 ) -> tuple[float, float]:
-    """Fastest vibration and relaxation of a scene, as rates times its duration (radians).
+    """Estimate the fastest vibration and relaxation of a scene, as rate times duration (radians).
 
-    They are estimated from the masses, dashpots and slopes of the springs. Infinite where a scene
+    The estimates use the masses, dashpots and slopes of the springs; both are infinite if the scene
     `is_overdamped`.
     """
     if struck and is_overdamped(rows, heights, mass[-1]):
@@ -63,7 +60,7 @@ def fastest_rates(
     below_stiff, below_damp = 0.0, 0.0
     i0 = 0
     for g in range(ends.size):
-        soft = 0.0  # compliance of the springs without dashpot; the others start as rigid
+        soft = 0.0  # compliance of the springs without dashpot; the others are rigid at first
         flow = 0.0
         for i in range(i0, ends[g]):
             slope = max(rows[i, K0], rows[i, KC], rows[i, KH_PLUS])
@@ -90,7 +87,7 @@ def fastest_rates(
         vibration = max(vibration, math.sqrt(below_stiff / mass[-1]))
     elif top == VISCOUS:
         relaxation = max(relaxation, below_stiff / drag)
-        if below_damp > 1e4 * drag:  # explicit steps take the velocity from what little is left
+        if below_damp > 1e4 * drag:  # v = (push - Σ)/drag loses its digits
             relaxation = math.inf
     if struck:
         duration = min(duration, contact_time(rows, heights, mass[-1], drag))

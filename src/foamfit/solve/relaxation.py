@@ -1,16 +1,15 @@
-"""Springs that remember more than their branch, in closed form: microscale ones, and relaxation.
+"""One spring under a known motion, with relaxation or the memory of the microscale law.
 
-Under a known motion one spring may relax, too. Term k adds q_k to the stress σ of equilibrium,
-dq_k/dt = -q_k/τ_k + g_k dσ/dt, from q_k = 0. With q_k = g_k (σ + y_k) no derivative of σ is needed:
-dy/dt = -(y + σ)/τ, or over a time h
+Term k adds q_k to the equilibrium stress σ, with dq_k/dt = -q_k/τ_k + g_k dσ/dt from q_k = 0.
+Setting q_k = g_k (σ + y_k) avoids the derivative of σ: dy/dt = -(y + σ)/τ, or over a time h
 
     y(h) = exp(-x) y(0) - x ∫₀¹ exp(-x (1-r)) σ(r h) dr,        x = h/τ.
 
-The strain is linear between samples, so that the spring goes through pieces of one branch each, on
-which σ is a smooth function of time. There it is taken for the cubic through its values at the four
-Lobatto nodes, and the integral of that is exact for any x. Derivatives by parameters follow from
-those of σ at the same nodes. A step on which the cubic bends too much is halved; where it hardly
-bends and no derivative is wanted, the cubic is that through values and slopes at both ends.
+The strain is linear between samples, so σ is a smooth function of time on each branch. A step
+approximates it by the cubic through its values at the four Lobatto nodes and integrates the cubic
+exactly for any x. Derivatives by parameters follow from those of σ at the same nodes. Steps that
+the cubic does not fit are halved; on nearly straight ones it is the cubic through values and slopes
+at both ends.
 """
 
 from __future__ import annotations
@@ -42,49 +41,42 @@ from foamfit.springs.microscale_kernels import BRANCH, CURVATURE, EPS, FLEXIBILI
 from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 from foamfit.springs.sensitivities import branch_tangents, stress_tangents_along
 
-# The nodes on [0, 1], and the coefficients of 1, r, r², r³ in the Lagrange polynomials on them.
+# The Lobatto nodes on [0, 1], and the coefficients of 1, r, r², r³ of their Lagrange polynomials.
 _NODES = (0.0, 0.5 - math.sqrt(0.05), 0.5 + math.sqrt(0.05), 1.0)
 NODES = np.array(_NODES)
 LAGRANGE = np.linalg.inv(np.vander(NODES, increasing=True))
 # The slopes of these polynomials at both ends.
 SLOPES = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 1.0, 2.0, 3.0]]) @ LAGRANGE
 _BEND = 0.25 * math.sqrt(5.0)
-# What the estimated error of a step is multiplied by; the cubic does better than it says.
-MARGIN = 2.0
-# The least step, as a share of the time between two samples.
-LEAST_PACE = 1e-9
-# Where the cubic at four nodes has an error below this share of the wanted one, and the slope of
-# the stress changes by less than the share EVEN over a step, the next steps take the cubic through
-# values and slopes at both ends, which needs one stress and not three, if the second derivatives
-# there say that it is as exact; after so many of them the four nodes are looked at again.
-PLAIN, EVEN, CHECKED = 1e-2, 0.1, 16
-# Columns of the table of a term: its step h, exp(-x), the weights of the four nodes, their
-# derivatives by x, what the cubic leaves out of higher polynomials, and r²(1 - r)² as these;
-# and g, or less where the term lasts longer than the motion; and the moments J_0 … J_4.
+MARGIN = 2.0  # safety factor of the error estimate; the cubic is more accurate than estimated
+LEAST_PACE = 1e-9  # least step, as a share of the time between two samples
+# The cubic through values and slopes at both ends needs one stress instead of three. It is used
+# where the second derivatives confirm its accuracy, and:
+PLAIN = 1e-2  # the last four-node step had an error below this share of the requested error
+EVEN = 0.1  # the slope of the stress changes by less than this share over the step
+CHECKED = 16  # no more than this number of steps have used it since
+# Columns of the table of a term: step h; exp(-x); weights of the four nodes; their derivatives by
+# x; error of the cubic for the Legendre polynomials of degree 4, 5, 6 and for r²(1 - r)²; g, times
+# duration/τ if that is below 1; moments J_0 … J_4.
 STEP, DECAY, WEIGHT, BY_X, OF_FOURTH, OF_FIFTH, OF_SIXTH = 0, 1, 2, 6, 10, 11, 12
 OF_BUMP, LASTING, MOMENTS, TABLE = 13, 14, 15, 20
 
 
 class Work(NamedTuple):
-    """What a run works with.
+    """Working arrays of a run."""
 
-    nodes (4,) and d_nodes (4, carried) are the stresses of a step and their derivatives, d_ranks
-    (2, CARRIED) those of the ranks; table (terms, TABLE). Of what terms remember, y (terms,) are
-    the values, by (terms, carried) their derivatives, and by_tau (terms or 0,) those by τ.
-    """
-
-    nodes: Array
-    d_nodes: Array
-    d_ranks: Array
-    table: Array
-    y: Array
-    by: Array
-    by_tau: Array
+    nodes: Array  #: stresses at the nodes of a step, (4,)
+    d_nodes: Array  #: their derivatives, (4, carried)
+    d_ranks: Array  #: derivatives of the ranks, (2, CARRIED)
+    table: Array  #: (terms, TABLE)
+    y: Array  #: state of the relaxation terms, (terms,)
+    by: Array  #: its derivatives, (terms, carried)
+    by_tau: Array  #: its derivatives by τ, (terms or 0,)
 
 
 @maker
 def _make_work(terms: int, count: int, derived: int) -> Work:
-    """Make what a run works with, derivatives of `derived` terms by τ among it."""
+    """Return working arrays, with derivatives by τ of `derived` terms."""
     table, by = np.zeros((terms, TABLE)), np.zeros((terms, count))
     nodes, d_nodes, d_ranks = np.empty(4), np.zeros((4, count)), np.zeros((2, micro.CARRIED))
     return Work(nodes, d_nodes, d_ranks, table, np.zeros(terms), by, np.zeros(derived))
@@ -95,26 +87,28 @@ _, _begin, _leaves, _switch_law, _settle_law = followed.functions_of("microscale
 
 @inner
 def _settle(row: Row, state: Array, eps: float) -> None:
-    """Bring a spring to a strain that lies on its branch, and find its slope there."""
+    """Bring a spring to a strain on its branch, and compute its slope there."""
     _settle_law(row, state, eps)
     closed = state[BRANCH] == A or (state[BRANCH] == HELD and row[REMEMBERS] == 0.0)
     if row[KIND] == MICROSCALE and closed and state[SIGMA] < math.inf:
-        micro.at_stress(row, state, state[SIGMA])  # on others it comes with the stress
+        micro.at_stress(
+            row, state, state[SIGMA]
+        )  # the search for the stress gives the slope of others
 
 
 @inner
 def _switch(row: Row, state: Array, up: bool) -> None:
-    """Go over to the next branch, at the end of this one or where the strain turns."""
+    """Change to the next branch, at the end of this one or where the strain reverses."""
     _switch_law(row, state, up)
     if row[KIND] == MICROSCALE:
         sigma = state[SIGMA]
-        _settle(row, state, state[EPS])  # the slope that it starts with
+        _settle(row, state, state[EPS])  # initial slope
         state[SIGMA] = sigma
 
 
 @inner
 def _tangents(row: Row, state: Array, seed: Array, d_ranks: Array, out: Array) -> None:
-    """Fill the derivatives of the stress; the last is by what moves ε by seed · (1, ε)."""
+    """Fill the derivatives of the stress; that by the strain is in the direction seed · (1, ε)."""
     branch, eps = int(state[BRANCH]), state[EPS]
     moved = seed[0] + seed[1] * eps
     if row[KIND] == MICROSCALE:
@@ -146,7 +140,7 @@ def _moments(x: float, out: Array) -> None:
 
 @inner
 def _tabulate(h: float, tau: float, table: Array) -> None:
-    """Fill the table of a term for steps of the length h."""
+    """Fill the table of a term for steps of length h."""
     x, moments = h / tau, table[MOMENTS:]
     _moments(x, moments)
     table[STEP], table[DECAY] = h, math.exp(-x)
@@ -156,9 +150,9 @@ def _tabulate(h: float, tau: float, table: Array) -> None:
             value += LAGRANGE[m, i] * moments[m]
             change += LAGRANGE[m, i] * (moments[m + 1] - moments[m])
         table[WEIGHT + i], table[BY_X + i] = value, change
-    # The Legendre polynomials P4, P5, P6 look on the nodes like P2, like 0.72 P1 + 0.28 P3, like
-    # 0.44 P0 + 0.56 P2. The difference in the integral, as it adds up while an error lasts:
-    # through 1/(1 - exp(-x)) steps.
+    # At the nodes the Legendre polynomials P4, P5, P6 equal P2, 0.72 P1 + 0.28 P3 and
+    # 0.44 P0 + 0.56 P2. The error is the difference of the integrals, accumulated over the
+    # 1/(1 - exp(-x)) steps for which it lasts.
     linear = 2.0 * moments[1] - moments[0]
     fourth = 70.0 * moments[4] - 140.0 * moments[3] + 84.0 * moments[2] - 14.0 * moments[1]
     table[OF_FOURTH] = abs(fourth) / moments[0]
@@ -169,10 +163,10 @@ def _tabulate(h: float, tau: float, table: Array) -> None:
 
 @inner
 def _truncation(nodes: Array, table: Array, begins: float, ends_with: float) -> float:
-    """Estimate what the cubic through four nodes does to the stress of all terms in the end.
+    """Estimate the error of the stress of all terms due to the cubic through four nodes.
 
-    Its Legendre coefficients are taken to fall on as they have begun; slopes at the ends, where
-    known (not 0), bound the fourth from below.
+    The Legendre coefficients are assumed to keep decreasing at the rate of the first ones; slopes
+    at the ends, where known (not 0), bound the fourth from below.
     """
     ends, inside = 0.25 * (nodes[3] - nodes[0]), _BEND * (nodes[2] - nodes[1])
     one, three = abs(ends + inside), abs(ends - inside)
@@ -201,10 +195,10 @@ def _truncation(nodes: Array, table: Array, begins: float, ends_with: float) -> 
 def _try_slopes(
     row: Row, state: Array, nodes: Array, table: Array, end: float, bar: float, largest: float
 ) -> bool:
-    """Take a step to a strain by the cubic through values and slopes at its ends.
+    """Try a step to a strain by the cubic through values and slopes at its ends.
 
-    False, and not taken, if it is too long by the second derivatives, which show what r²(1 - r)²
-    adds to the cubic. `bar` is the wanted error over the `largest` stress.
+    Return false, with the state unchanged, if the step is too long: the second derivatives give the
+    size of the next term, r²(1 - r)². `bar` is the requested error over the `largest` stress.
     """
     origin, flexibility, curvature = state[EPS], state[FLEXIBILITY], state[CURVATURE]
     _settle(row, state, end)
@@ -236,7 +230,7 @@ def _try_slopes(
 def _try_nodes(
     row: Row, state: Array, nodes: Array, table: Array, goal: float, rough: bool
 ) -> tuple[float, bool]:
-    """Step to a strain by the four nodes; its error (0 if `rough`), whether slopes are known."""
+    """Step to a strain by four nodes; return its error (0 if `rough`) and if slopes are known."""
     origin, flexibility, begins, ends_with = state[EPS], state[FLEXIBILITY], 0.0, 0.0
     for i in range(1, 4):
         _settle(row, state, goal if i == 3 else origin + NODES[i] * (goal - origin))
@@ -251,9 +245,9 @@ def _try_nodes(
 
 @inlined
 def _derive(row: Row, state: Array, seed: Array, work: Work, first: float, short: bool) -> None:
-    """Fill the derivatives of the stress at the nodes of a step, from a strain to where it is.
+    """Fill the derivatives of the stress at the nodes of a step from a strain to the present one.
 
-    On a `short` one they are those of the parabola through both ends and the middle.
+    For a `short` step they are those of the parabola through both ends and the middle.
     """
     nodes, d_nodes, d_ranks = work.nodes, work.d_nodes, work.d_ranks
     here = state[SIGMA], state[EPS]
@@ -278,7 +272,7 @@ def _derive(row: Row, state: Array, seed: Array, work: Work, first: float, short
 
 @inlined
 def _relax(row: Row, h: float, work: Work) -> None:
-    """Let all terms relax over a step."""
+    """Advance all terms, and their derivatives, over a step of length h."""
     nodes, d_nodes, y, by = work.nodes, work.d_nodes, work.y, work.by
     for k in range(y.size):
         table, tau = work.table[k], row[N_COLUMNS + 2 * k + 1]
@@ -302,11 +296,11 @@ def _follow(
     row: Row, state: Array, seed: Array, work: Work, part: tuple[float, float, float, float],
     rtol: float, largest: float, plain: int,
 ) -> tuple[float, int]:  # fmt: skip
-    """Follow a branch to a strain by steps that are exact enough.
+    """Follow a branch to a strain by steps of sufficient accuracy.
 
-    `part` is that strain, the time between the samples (s), and where between them, from 0 to 1,
-    the branch begins and ends. Returns the largest stress so far, and how many of the next steps
-    may take values and slopes at both ends.
+    `part` contains that strain, the time between two samples (s), and the positions between them,
+    from 0 to 1, at which the branch begins and ends. Return the largest stress so far and the
+    number of next steps that may use values and slopes at both ends.
     """
     (end, between, begun, until), nodes, table = part, work.nodes, work.table
     first, done, pace = state[EPS], begun, until - begun
@@ -347,7 +341,7 @@ def _follow(
 
 @inlined
 def _sum_up(row: Row, sigma: float, work: Work, by: Array, by_g: Array, by_tau: Array) -> float:
-    """Fill the derivatives of the stress at a sample; returns the stress with all terms."""
+    """Fill the derivatives of the stress at a sample; return the stress with all terms."""
     total, d_sigma = sigma, work.d_nodes[3]
     for c in range(by.size):
         by[c] = d_sigma[c]
@@ -366,15 +360,15 @@ def _sum_up(row: Row, sigma: float, work: Work, by: Array, by_g: Array, by_tau: 
 def relaxed_along(
     row: Row, eps: Array, t: Array, rtol: float, derive: bool, seeds: Array
 ) -> tuple[Array, Branches, Array, Array, Array]:
-    """Stress of a spring and of its relaxation terms along a history of its strain.
+    """Compute the stress of a spring with relaxation terms along a strain history.
 
-    `eps` and `t` (n,) are strains and times, s, `rtol` the wanted error over the largest stress.
-    With `derive`, on the way to each sample the derivative by the strain is by what moves it by
-    seed · (1, ε), of seeds (n, 2): (0, 1) is the logarithm of the strain.
+    `eps` and `t` (n,) are strains and times, s, `rtol` the requested error over the largest stress.
+    With `derive`, derivatives are computed too. The derivative by the strain is in the direction
+    seed · (1, ε) on the way to each sample, with seeds (n, 2); (0, 1) is the logarithm of strain.
 
-    Returned are the stress (n,), Pa, infinite from the end of a branch on; branches (n,);
-    derivatives of the stress (8, 11 or 0, n) by k0 … kh_minus or spread_minus, by the strain, and
-    by what a spring remembers; by the g of every term (terms, n), and by its τ (terms or 0, n).
+    Return the stress (n,), Pa, infinite beyond the end of a branch; branches (n,); derivatives of
+    the stress (8, 11 or 0, n) by k0 … kh_minus or spread_minus, by the strain, and by stiffening,
+    softening and weakening; by the g (terms, n); and by the τ of the terms (terms or 0, n).
     """
     n, terms, wanted, count = eps.size, (row.size - N_COLUMNS) // 2, int(derive), micro.carried(row)
     sigma, branches, by = np.empty(n), np.empty(n, np.int64), np.empty((wanted * count, n))
@@ -395,7 +389,7 @@ def relaxed_along(
                 if leaving:
                     end = state[micro.HIGH] if up else state[micro.LOW]
                     until = min(max((end - before) / (eps[j] - before), done), 1.0)
-                if j == 0:  # from rest to the first sample in no time
+                if j == 0:  # the first sample is reached instantaneously
                     _settle(row, state, end)
                     done, entered = until, True
                 if derive and entered:
@@ -408,7 +402,7 @@ def relaxed_along(
                 if not abs(state[SIGMA]) < math.inf:
                     sigma[j:], branches[j:] = math.inf, int(state[BRANCH])
                     return sigma, branches, by, by_g, by_tau
-                if not leaving and state[EPS] != end:  # no time is left on the way to it
+                if not leaving and state[EPS] != end:  # the rest of the way takes no time
                     _settle(row, state, end)
                     if derive:
                         _tangents(row, state, seeds[j], work.d_ranks, work.d_nodes[3])
@@ -425,26 +419,26 @@ def relaxed_along(
 
 
 def _seeds(eps: Array, *, moved: bool) -> Array:
-    """Seeds of the derivative by the logarithm of the strain, or by all strains in contact."""
+    """Return seeds of the derivative by the log strain or, if `moved`, by strains in contact."""
     seeds = np.zeros((eps.size, 2))
     if not moved:
         seeds[:, 1] = 1.0
         return seeds
-    touched = (eps > 0.0).astype(float)
-    seeds[:, 0] = touched
-    for j in np.flatnonzero(np.diff(touched)) + 1:  # it comes or goes on the way there
-        seeds[j] = 0.0, 1.0 / (eps[j] - eps[j - 1]) * (touched[j] - touched[j - 1])
+    contact = (eps > 0.0).astype(float)
+    seeds[:, 0] = contact
+    for j in np.flatnonzero(np.diff(contact)) + 1:  # contact begins or ends before this sample
+        seeds[j] = 0.0, 1.0 / (eps[j] - eps[j - 1]) * (contact[j] - contact[j - 1])
     return seeds
 
 
 def stress_along(
     row: Row, eps: Array, t: Array, height: float, rtol: float, directions: Branches
 ) -> tuple[Array, Branches, Array]:
-    """Stress of one spring (without its dashpot) along a history of its strain.
+    """Compute the stress of one spring, without its dashpot, along a strain history.
 
-    `eps` and `t` (n,) are strains and times, s, `height` is in m, `rtol` the wanted error over the
-    largest stress, for directions (p, 2) see `springs.parameters`. Returned are the stress (n,),
-    Pa, branches (n,), and derivatives of the stress at a fixed elongation (p, n).
+    `eps` and `t` (n,) are strains and times, s, `height` is in m, `rtol` the requested error over
+    the largest stress; for directions (p, 2) see `springs.parameters`. Return the stress (n,), Pa,
+    branches (n,), and derivatives of the stress at fixed elongation (p, n).
     """
     own = directions[:, 1]
     by = by_g = by_tau = out = np.zeros((len(own), eps.size))

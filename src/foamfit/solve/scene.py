@@ -1,4 +1,4 @@
-"""What all integrators share: the scene, its samples, how a run can end and what it finds."""
+"""Types and helpers shared by all integrators: scene, samples, outcomes and results of a run."""
 
 from __future__ import annotations
 
@@ -8,69 +8,56 @@ import numpy as np
 
 from foamfit.springs.kernels import Array, Branches, inner
 
-# What is known of the top: it has a mass, no mass but the onsite damper, its stress, its motion.
+# Top of the chain: with a mass, with an onsite damper only, under known stress, in known motion.
 FREE, VISCOUS, STRESS, MOTION = range(4)
-# Outcomes.
+# Outcomes of a run.
 DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE = range(5)
-# The base stress is followed to its own size where that is at least so much of the springs'
-# stresses: what has not come through to the base yet is not worth a step.
+# Errors of the base stress are relative to its own size, or to this share of the largest stress in
+# a spring if that is more: a pulse that has not reached the base yet must not shorten steps.
 LEAST_BASE = 1e-6
 
 CLOSED_FORM = "closed form"
 NO_SWITCHES, _NONE = np.empty((0, 5)), np.zeros(0)
 
-# A `Scene` as integrators are given it: a named tuple would cost each call a microsecond more.
+# The fields of a `Scene`, as compiled integrators take them: a named tuple costs 1 µs more a call.
 SceneTuple = tuple[Array, Array, Branches, Array, float, int, Array, float, Array]
 
 
 class Scene(NamedTuple):
-    """A chain under a drive.
+    """A chain under a drive. Above each group of springs lies a node with a mass."""
 
-    rows (springs, columns) are the springs, base first (see `springs.kernels`), heights (springs,)
-    is in m. ends (groups,) is one past the last spring of each group; above each lies a node of
-    areal mass m/A, mass (groups,), kg/m². `drag` is the onsite damping of the top, η_site/H,
-    Pa·s/m, and `top` what is known of it. values (n,) is the prescribed stress (Pa) or, for MOTION,
-    displacement (m) of the top at the samples t (n,), s. `speed` is the velocity of a striker, m/s,
-    at the time 0, and values (1,) its weight over the area, Pa; 0 = no impact, and every other
-    drive starts at t[0].
-    """
-
-    rows: Array
-    heights: Array
-    ends: Branches
-    mass: Array
-    drag: float
-    top: int
+    rows: Array  #: springs, base first, (springs, columns); see `springs.kernels`
+    heights: Array  #: m, (springs,)
+    ends: Branches  #: one past the last spring of each group, (groups,)
+    mass: Array  #: areal masses of the nodes, m/A, kg/m², (groups,)
+    drag: float  #: onsite damping of the top, η_site/H, Pa·s/m
+    top: int  #: FREE, VISCOUS, STRESS or MOTION
+    #: stress (Pa) or, for MOTION, displacement (m) of the top at t, (n,); for an impact the weight
+    #: of the striker over the area, Pa, (1,)
     values: Array
-    speed: float
-    t: Array
+    speed: float  #: velocity of a striker at time 0, m/s; 0 for other drives, which start at t[0]
+    t: Array  #: sample times, s, (n,)
 
 
 class Samples(NamedTuple):
-    """The curves to fill, over the samples t (n,), counted each from the one before it in a drive.
+    """The curves that a run fills."""
 
-    curves (1 + springs or 1, n): base stress, Pa, then displacements above each spring or of the
-    top alone, m; slopes (p, …) are their derivatives.
-    """
-
-    t: Array
+    t: Array  #: sample times, s, (n,); for explicit steps along a drive, since the previous sample
+    #: base stress, Pa, then displacements above each spring or of the top only, m, (1 + nodes, n)
     curves: Array
-    slopes: Array
+    slopes: Array  #: derivatives of the curves, (p, 1 + nodes, n)
 
 
 class Slopes(NamedTuple):
-    """Derivatives of displacement (p, nodes, n_t) and base stress (p, n_t) in p directions.
+    """Derivatives of a motion in p directions."""
 
-    Of those marked in `one_sided` (p,), there are two.
-    """
-
-    displacement: Array
-    base_stress: Array
-    one_sided: Array = _NONE
+    displacement: Array  #: (p, nodes, n_t)
+    base_stress: Array  #: (p, n_t)
+    one_sided: Array = _NONE  #: 1 where left and right derivatives differ, (p,)
 
 
 class Motion(NamedTuple):
-    """The bare outcome of a run; see `Response`. `slopes` is None where none were asked for."""
+    """Result of a run before verification; for the fields see `Response`."""
 
     displacement: Array
     base_stress: Array
@@ -78,12 +65,12 @@ class Motion(NamedTuple):
     switches: Array
     steps: int
     method: str = CLOSED_FORM
-    slopes: Slopes | None = None
-    unresolved: float = 0.0  # vibrations that were damped out, relative to the ranges
+    slopes: Slopes | None = None  #: None if no derivatives were requested
+    unresolved: float = 0.0  #: size of damped-out vibrations, relative to the ranges
 
 
 def difference(one: Array, other: Array) -> float:
-    """Largest difference of two motions over the range of the first, rest included."""
+    """Return the largest difference of two curves over the range (0 included) of the first."""
     span = max(float(one.max()), 0.0) - min(float(one.min()), 0.0)
     return float(np.abs(one - other).max()) / span if span > 0.0 else 0.0
 
@@ -92,7 +79,7 @@ def difference(one: Array, other: Array) -> float:
 def log_switch(
     log: Array, switches: int, now: float, i: int, left: int, entered: int, eps: float
 ) -> int:
-    """Note a change of branch where the log has place for it; returns how many there are now."""
+    """Log a change of branch if there is room; return the number of changes so far."""
     if switches < log.shape[0]:
         log[switches, 0], log[switches, 1], log[switches, 2] = now, i, left
         log[switches, 3], log[switches, 4] = entered, eps
@@ -101,7 +88,7 @@ def log_switch(
 
 @inner
 def first_past(t: Array, first: int, end: float, last: bool) -> int:
-    """First sample from `first` on at the time `end` or later; where it is the `last`, later."""
+    """Return the first sample from `first` on at or after `end`; strictly after it if `last`."""
     low, high, step = first, first, 1
     while high < t.size and (t[high] < end or (last and t[high] == end)):
         low, high = high + 1, high + step
@@ -118,19 +105,16 @@ def first_past(t: Array, first: int, end: float, last: bool) -> int:
 
 @inner
 def fill_flight(at: float, rate: float, gravity: float, t: Array, now: float, out: Array) -> None:
-    """Write at + rate (t - now) + gravity (t - now)²/2 to `out`."""
+    """Write at + rate (t - now) + gravity (t - now)²/2 into `out`."""
     for j in range(t.size):
         out[j] = at + (rate + 0.5 * gravity * (t[j] - now)) * (t[j] - now)
 
 
 @inner
 def before_contact(curves: Array, t: Array, speed: float, gravity: float) -> int:
-    """Fill the samples before contact, at time 0, and return how many these are.
-
-    Nothing presses and only the striker moves.
-    """
+    """Fill the samples before contact, when only the striker moves; return their number."""
     rows = curves.shape[0]
-    none = rows - rows  # not the literals, which are types: compiled anew
+    none = rows - rows  # a literal would be another type and compile again
     done = first_past(t, none, 0.0, none > 0)
     for i in range(rows):
         for j in range(done):
@@ -143,7 +127,7 @@ def before_contact(curves: Array, t: Array, speed: float, gravity: float) -> int
 def fly(
     curves: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float, gravity: float
 ) -> None:
-    """After contact the chain keeps its shape and moves with the striker; nothing presses."""
+    """Fill the samples after contact: no base stress, and the chain moves with the striker."""
     for j in range(first, t.size):
         curves[0, j] = 0.0
     for i in range(curves.shape[0] - 1):

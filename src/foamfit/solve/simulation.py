@@ -1,4 +1,4 @@
-"""Forward simulation: a chain under a drive, by the least solver that the scene needs."""
+"""Forward simulation of a chain under a drive, with a check of its accuracy."""
 
 from __future__ import annotations
 
@@ -33,37 +33,37 @@ from foamfit.springs.parameters import DRAG, OWN_HEIGHT, OWN_RELAXATION, directi
 from foamfit.springs.spring import as_number
 
 _UNRESOLVED = (
-    "masses vibrate too fast to be followed, by up to {size:.1g} of the range: ask for no smaller "
-    "rtol than that, give the springs heavier dashpots, or leave the masses out"
+    "masses vibrate too fast to be resolved, with up to {size:.1g} of the range: use an rtol no "
+    "smaller than that, give the springs heavier dashpots, or leave the masses out"
 )
-# From so many steps on, or switches under masses, and where steps are implicit, several masses are
-# inside, or dashpots below a mass, a motion is run again to check it; so it is where a strain comes
-# so close to the end of its branch.
-FEW_STEPS, FEW_SWITCHES, CLOSE = 1000, 32, 1e-3
-# Vibrations that took more implicit steps than this are followed by explicit ones, if at all.
-MOST_FOLLOWED = 10_000
-ROUNDING = 1e-12  # of a sum of elongations
-LOST = 0.03  # so large a difference is not mended by still shorter steps
+# A motion is verified by a second run where steps are implicit, several masses are inside, a
+# dashpot acts below a mass, or one of these limits is passed.
+FEW_STEPS = 1000
+FEW_SWITCHES = 32  # switches of branch under masses
+CLOSE = 1e-3  # distance of a strain from the end of its branch
+MOST_FOLLOWED = 10_000  # a motion of more implicit steps is not repeated with shorter ones
+ROUNDING = 1e-12  # relative error of a sum of elongations
+LOST = 0.03  # shorter steps do not help where two runs differ by more than this
 
 
-@dataclass(eq=False)  # to freeze it would take a twentieth of the time of a short run
+@dataclass(eq=False)  # freezing it would cost 5 % of a short run
 class Response:
-    """What a chain does under a drive."""
+    """Response of a chain to a drive."""
 
     time: Array  #: times of the samples, s, (n_t,)
     displacement: Array  #: of the node above each spring, downward, m, (n_springs, n_t)
     base_stress: Array  #: stress at the sensor, Pa, (n_t,); zero outside contact
     height: float  #: overall height H, m
-    #: when the base stress of an impact was back at zero, s; None if it was not, or other drives
+    #: time at which the base stress of an impact returned to zero, s; None if it did not
     contact_end: float | None
-    solver: str  #: "closed form", "first order" or "second order": the simplest that is needed
-    #: "closed form", "Taylor series" (explicit steps), "aggregate" (the same, of many springs under
-    #: one stress) or "Radau IIA" (implicit steps, where light masses or dashpots make the scene
-    #: stiff; a vibration too fast to be followed is damped out, and refused if it exceeds rtol)
+    solver: str  #: "closed form", "first order" or "second order": the simplest that suffices
+    #: "closed form", "Taylor series" (explicit steps), "aggregate" (explicit steps of many springs
+    #: under one stress), "Radau IIA" (implicit steps, where light masses or dashpots make the scene
+    #: stiff; they damp unresolved vibrations) or "steps of any law" (registered laws)
     method: str
-    #: time (s), spring (0 at the base), branch left, branch entered, its strain, (m, 5)
+    #: time (s), spring (0 at the base), branch left, branch entered, and strain, (m, 5)
     switches: Array
-    steps: int  #: of the integrator; 0 for the closed form
+    steps: int  #: number of integration steps; 0 for the closed form
     #: derivatives by the requested parameters
     sensitivities: dict[str, Sensitivity] = field(default_factory=dict)
 
@@ -77,9 +77,9 @@ class Response:
 def _verified(
     scene: Plan, arrays: ChainArrays, rtol: float, directions: Directions = NO_DIRECTIONS
 ) -> Motion:
-    """Run a scene; where masses make its errors grow, follow it again by shorter steps and compare.
+    """Run a scene and, where its errors may grow, compare it with a run of shorter steps.
 
-    What has no answer within `rtol` is refused (SimulationError).
+    Raise SimulationError if the error exceeds `rtol`.
     """
     rows, heights = arrays.rows, arrays.heights
     motion = scene.run(rows, heights, rtol, directions=directions)
@@ -96,20 +96,20 @@ def _verified(
 
     lost = motion.unresolved
     if lost > 0.7 * rtol:  # the comparison below leaves 0.3
-        # An explicit step goes through some 3 radians, and takes a hundredth of an implicit one.
+        # An explicit step covers about 3 radians and costs 1 % of an implicit step.
         rates = scene.fastest_rates(rows, heights, scene.drag)
         explicit = max(rates) / 3.0 <= MOST_WORK / len(heights)
-        motion, scene = _followed(scene, motion, rtol, explicit, run)
+        motion, scene = _resolve_vibrations(scene, motion, rtol, explicit, run)
     distance = _distance_at_peak(scene, arrays, motion, rtol)
     if 0.3 * rtol * distance < 1e-15:
         raise SimulationError(
-            f"a strain comes within {distance:.1g} of the end of its branch, 1 + eps_star: there "
-            f"rounding alone makes errors above rtol = {rtol:g}"
+            f"a strain comes within {distance:.1g} of the end of its branch, 1 + eps_star, where "
+            f"rounding errors exceed rtol = {rtol:g}"
         )
     forced = 0 if scene.speed > 0.0 else scene.time.size
     long = _is_long(scene, motion, FEW_STEPS + 2 * forced) or inside or distance < CLOSE
     long = long and scene.solver == SECOND_ORDER
-    if not (long or motion.method == RADAU) or rtol < 1e-12:  # a finer run is rounding
+    if not (long or motion.method == RADAU) or rtol < 1e-12:  # a finer run would only round
         return motion
     miss = math.inf
     for factor in (1e-2, 1e-4, 1e-6):
@@ -118,7 +118,7 @@ def _verified(
         try:
             finer = run(scene, rtol * factor)
         except SimulationError:
-            if scene.implicit is False:  # these steps follow what implicit ones lost
+            if scene.implicit is False:  # the last resort, see `_resolve_vibrations`
                 raise SimulationError(_UNRESOLVED.format(size=lost)) from None
             raise
         miss = max(
@@ -131,34 +131,34 @@ def _verified(
             break
         motion = finer
     raise SimulationError(
-        "vibrations let the least error grow: two runs with shorter steps each differ by "
-        f"{miss:.1g} of the range; ask for a larger rtol, give the springs heavier dashpots, or "
-        "leave the masses out"
+        "vibrations amplify the smallest error: two runs with successively shorter steps differ by "
+        f"{miss:.1g} of the range; use a larger rtol, give the springs heavier dashpots, or leave "
+        "the masses out"
     )
 
 
-def _followed(
+def _resolve_vibrations(
     scene: Plan, motion: Motion, rtol: float, explicit: bool, run: Callable[[Plan, float], Motion]
 ) -> tuple[Motion, Plan]:
-    """Follow the vibrations that implicit steps lost, by shorter ones or by explicit ones."""
-    lost = SimulationError(_UNRESOLVED.format(size=motion.unresolved))
+    """Resolve vibrations that implicit steps damped out, by explicit or shorter implicit steps."""
+    error = SimulationError(_UNRESOLVED.format(size=motion.unresolved))
     if explicit:
         try:
             scene = scene._replace(implicit=False)
             return run(scene, rtol), scene
         except SimulationError:
-            raise lost from None
+            raise error from None
     for factor in (1e-2, 1e-4):
         if motion.steps < MOST_FOLLOWED and rtol * factor >= 1e-14:
             with suppress(SimulationError):
                 finer = run(scene._replace(implicit=True), rtol * factor)
                 if finer.unresolved <= 0.7 * rtol:
                     return finer, scene
-    raise lost
+    raise error
 
 
 def _is_long(scene: Plan, motion: Motion, few: int) -> bool:
-    """Whether a motion took many steps (those of springs under one stress are but switches)."""
+    """Whether a motion took many steps or switches (the steps of an aggregate are switches)."""
     vibrates = len(scene.ends) > 1 and len(motion.switches) > FEW_SWITCHES
     return (motion.steps > few or vibrates) and motion.method != AGGREGATE
 
@@ -169,15 +169,15 @@ def _hard(scene: Plan, arrays: ChainArrays) -> bool:
 
 
 def _distance_at_peak(scene: Plan, arrays: ChainArrays, motion: Motion, rtol: float) -> float:
-    """Least distance, at the peak of an impact, of a spring from the end of its branch.
+    """Return the least distance of a strain from the end of its branch, peak of an impact included.
 
-    The peak of a fast impact is so short that no sample need lie in it: it is bracketed.
+    The peak of a fast impact may lie between two samples, so it is bracketed.
     """
     rows, heights = arrays.rows, arrays.heights
     distance = kernels.distance_to_pole(rows, heights, motion.displacement)
     if scene.solver == CLOSED_FORM:
         return distance
-    # Where a microscale spring turns between two samples is among its switches.
+    # The switches of a microscale spring include its turning points between samples.
     turned = motion.switches[rows[motion.switches[:, 1].astype(int), kernels.KIND] == MICROSCALE]
     beyond = turned[:, 4] - rows[turned[:, 1].astype(int), kernels.EPS_STAR]
     distance = min(distance, 1.0 - float(beyond.max(initial=0.0)))
@@ -198,33 +198,36 @@ def _distance_at_peak(scene: Plan, arrays: ChainArrays, motion: Motion, rtol: fl
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Derivative of a response by one parameter, in SI, at fixed times."""
+    """Derivative of a response with respect to one parameter, in SI units, at fixed times."""
 
     displacement: Array  #: m per unit of the parameter, (n_springs, n_t)
-    #: Pa per unit of the parameter, (n_t,). At a switch of branch its slope jumps, not its value,
-    #: which jumps where contact ends.
+    #: Pa per unit of the parameter, (n_t,); its slope jumps at switches of branch, its value at
+    #: the end of contact
     base_stress: Array
-    #: whether there are two derivatives, from above and from below, and this may be neither: where
-    #: like springs that snap stand still together, or share a flat branch, the least change
-    #: decides which goes on
+    #: whether the derivatives from above and below differ, so that this may be neither: where equal
+    #: springs stop while they snap or share a flat branch, the smallest change decides which of
+    #: them continues
     one_sided: bool = False
 
 
 def _sensitivities(
     chain: Chain, names: Sequence[str], directions: Directions, slopes: Slopes
 ) -> dict[str, Sensitivity]:
-    """Name the derivatives of a run; η_site acts through η_site/H, and so does every height."""
+    """Return the derivatives of a run by parameter name.
+
+    The solver differentiates by η_site/H, on which η_site and every height act.
+    """
     out = {}
     drag = chain.site_damping / chain.height
     for p, name in enumerate(names):
-        moved, pressed = slopes.displacement[p], slopes.base_stress[p]
+        motion, stress = slopes.displacement[p], slopes.base_stress[p]
         if directions[p, 1] == DRAG:
-            moved, pressed = moved / chain.height, pressed / chain.height
+            motion, stress = motion / chain.height, stress / chain.height
         elif directions[p, 1] == OWN_HEIGHT and drag > 0.0:
-            moved = moved - drag / chain.height * slopes.displacement[-1]
-            pressed = pressed - drag / chain.height * slopes.base_stress[-1]
-        sided = slopes.one_sided.size > 0 and slopes.one_sided[p] > 0.0
-        out[name] = Sensitivity(moved, pressed, bool(sided))
+            motion = motion - drag / chain.height * slopes.displacement[-1]
+            stress = stress - drag / chain.height * slopes.base_stress[-1]
+        one_sided = slopes.one_sided.size > 0 and slopes.one_sided[p] > 0.0
+        out[name] = Sensitivity(motion, stress, bool(one_sided))
     return out
 
 
@@ -243,10 +246,10 @@ def simulate(
     chain : Chain
         Springs, heights, area, masses, onsite damper.
     drive : Impact, StressDrive or DisplacementDrive
-        An impact starts at t = 0 (before that, the striker approaches). The sampled drives start
-        from rest at t[0] and are linear between samples; a dashpot feels the mean rate.
+        An impact starts at t = 0; before that, the striker approaches. Sampled drives start from
+        rest at t[0] and are linear between samples, where dashpots feel the mean of both rates.
     t : (n_t,) array
-        Samples, s, increasing.
+        Sample times, s, increasing.
     rtol : float
         Allowed error of displacement and base stress, relative to their range.
     sensitivities : sequence of str
@@ -256,14 +259,14 @@ def simulate(
     Returns
     -------
     Response
-        After the end of contact the base stress is zero and the chain flies with the striker.
+        After contact the base stress is zero and the chain moves with the striker.
 
     Raises
     ------
     ValueError
-        If something is not admissible; the message names it.
+        If an argument is not admissible; the message names it.
     SimulationError
-        If the scene has no finite solution, or none within `rtol`; the message says why.
+        If the scene has no finite solution, or none within `rtol`; the message gives the reason.
     """
     check_scene(chain, drive)
     if not 1e-14 <= as_number(rtol, "rtol") <= 1e-1:
@@ -271,8 +274,8 @@ def simulate(
     directions, dashpots, relaxing = NO_DIRECTIONS, False, False
     if sensitivities:
         wanted = [direction(chain.kinds, name, chain.relaxation) for name in sensitivities]
-        longer = any(what == OWN_HEIGHT for _, what in wanted)
-        if longer and chain.site_damping > 0.0:  # the onsite damper acts over the whole height
+        by_height = any(what == OWN_HEIGHT for _, what in wanted)
+        if by_height and chain.site_damping > 0.0:  # which changes η_site/H
             wanted.append((-1, DRAG))
         directions = np.array(wanted)
         dashpots = any(name.endswith("_eta") for name in sensitivities)
@@ -288,13 +291,13 @@ def simulate(
         if not miss <= max(rtol, ROUNDING):
             raise SimulationError(
                 f"the springs' elongations miss the prescribed displacement by {miss:.1g} of its "
-                f"range, more than rtol = {rtol:g}: ask for a larger rtol, or give more samples"
+                f"range, more than rtol = {rtol:g}: use a larger rtol or more samples"
             )
     end = None if math.isnan(motion.contact_end) else motion.contact_end
     slopes: dict[str, Sensitivity] = {}
     if motion.slopes is not None:
         slopes = _sensitivities(chain, sensitivities, directions, motion.slopes)
-    return Response(  # without names, which take time
+    return Response(  # positional, as keywords are slower
         scene.time, motion.displacement, motion.base_stress, chain.height, end,
         scene.solver, motion.method, motion.switches, motion.steps, slopes,
     )  # fmt: skip

@@ -1,19 +1,19 @@
-"""The compiled microscale law: one spring followed along a history, and its derivatives.
+"""The compiled microscale law: the response of one spring along a history, and its derivatives.
 
-With p the fraction that has snapped and P the largest it has ever been (model, section 8),
+With p the snapped fraction of micro-springs and P its largest value so far (model, section 8),
 
     ε = (1-P) a(σ; k0) + (P-p) a(σ; k0 e^-d) + p (eps_star + σ/(kc+σ)),
     a(σ; k) = 1 - (1 + nσ/k)^(-1/n).
 
-The memory of a spring is two ranks w and W in standard normal scores, p = Φ(w) and P = Φ(W). So Φ
-is never inverted, and 1 - p = Φ(-w) keeps all its digits. On first loading w = W = u₊ with
-u₊ = (ln σ - ln sigma_plus)/spread_plus. What has snapped before snaps through once more at
-w = u₊ + s/spread_plus up to W, is held there until u₊ = W, and then first loading goes on. It snaps
-back at w = u₋. A spring without softening, weakening and stiffening forgets W, which it does not
-need: for it P = 0.
+The memory of a spring consists of two ranks w and W as standard normal scores, p = Φ(w) and
+P = Φ(W), so that Φ is never inverted and 1 - p = Φ(-w) keeps all its digits. On first loading
+w = W = u₊ = (ln σ - ln sigma_plus)/spread_plus. Micro-springs that have snapped before snap through
+again at w = u₊ + s/spread_plus up to W; then p is held until u₊ = W, where first loading continues.
+They snap back at w = u₋. Without softening, weakening and stiffening W has no effect and is not
+stored: P = 0.
 
-Stress and strain grow together along any history, so that a branch ends at a strain as well as at a
-stress: the path of a spring is walked from end to end of its branches.
+Stress and strain grow together along any history, so a branch ends at a strain as well as at a
+stress, and a history is followed from one end of a branch to the next.
 """
 
 from __future__ import annotations
@@ -50,34 +50,32 @@ from foamfit.springs.kernels import (
 )
 from foamfit.springs.law import LEAST_RANK
 
-# The state: strain, stress, branch, rank w, p, 1 - p, the strains and stresses at which the branch
-# ends, and dε/dσ, d²ε/dσ² where the stress was last sought; the rank W, 1 - P, and the strain below
-# which no micro-spring is taken to snap.
+# The state: strain, stress, branch, rank w, p, 1 - p; strains and stresses at its branch's ends;
+# dε/dσ and d²ε/dσ² where the stress was last computed; rank W, 1 - P, and the strain below which no
+# micro-spring snaps.
 EPS, SIGMA, BRANCH, RANK, SNAPPED, REST, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH = range(10)
 FLEXIBILITY, CURVATURE, EVER, NEVER, LEAST_AT, STATE = range(10, 16)
-# Derivatives that are carried: by k0 … spread_minus, by (the logarithm of) the strain itself, and,
-# of a spring that remembers, by stiffening, softening, weakening; so many of them where it does
-# not.
+# Derivatives by k0 … spread_minus, by (the logarithm of) the strain, and by stiffening, softening
+# and weakening if the spring remembers: CARRIED in total, or PLAIN_CARRIED if it does not.
 OF_STRAIN, OF_STIFFENING, OF_SOFTENING, OF_WEAKENING, CARRIED, PLAIN_CARRIED = 7, 8, 9, 10, 11, 8
-# A step of Halley's method so small, in widths over which the law bends, is the last: what it
-# leaves is about its cube.
+# Relative step of Halley's method, per width of the snap, below which the step is the last: the
+# remaining error is about its cube.
 NEAR = 3e-6
-ROUNDED = 1e-8  # Largest such correction of a share, which rounding alone can explain.
-# The least stress that is sought: the least normal number.
-LEAST = 2.0**-1022
+ROUNDED = 1e-8  # largest correction of a share that rounding errors can explain
+LEAST = 2.0**-1022  # least stress of a search: the least normal number
 _ROOT_HALF, _ROOT_TURN = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @inner
 def shares(rank: float) -> tuple[float, float]:
-    """Φ and 1 - Φ, the shares of all ranks below and above one; the small one is exact."""
+    """Return Φ and 1 - Φ, the shares below and above a rank; the smaller one has all digits."""
     least = 0.5 * math.erfc(_ROOT_HALF * abs(rank))
     return (1.0 - least, least) if rank > 0.0 else (least, 1.0 - least)
 
 
 @inner
 def density(rank: float) -> float:
-    """Φ', the density of ranks."""
+    """Return Φ', the density of ranks."""
     return _ROOT_TURN * math.exp(-0.5 * rank * rank)
 
 
@@ -86,7 +84,7 @@ def density(rank: float) -> float:
 
 @inlined
 def _root(n: float, x: float) -> tuple[float, float]:
-    """Return a = 1 - (1 + nx)^(-1/n), and -ln(1 - a); `log1p` and `expm1` are the slow ones."""
+    """Return a = 1 - (1 + nx)^(-1/n), and -ln(1 - a); avoid the slower `log1p` if possible."""
     y = 1.0 + n * x
     if y > 1.25:
         log = math.log(y) / n
@@ -97,7 +95,7 @@ def _root(n: float, x: float) -> tuple[float, float]:
 
 @inlined
 def on_a(n: float, k: float, sigma: float) -> tuple[float, float, float]:
-    """Strain a(σ; k) of the stiffening branch and its two derivatives; -inf if it has none."""
+    """Return strain a(σ; k) of the stiffening branch (-inf past its pole) and two derivatives."""
     if n == 1.0:
         one = 1.0 / (k + sigma)
         slope = k * one * one
@@ -113,7 +111,7 @@ def on_a(n: float, k: float, sigma: float) -> tuple[float, float, float]:
 
 @inner
 def stress_on_a(n: float, k: float, eps: float) -> float:
-    """Stress at a strain of that branch; infinite from its end on."""
+    """Return the stress at a strain of branch a; infinite from its end on."""
     if not eps < 1.0:
         return math.inf
     return k * eps / (1.0 - eps) if n == 1.0 else k * math.expm1(-n * math.log1p(-eps)) / n
@@ -121,7 +119,7 @@ def stress_on_a(n: float, k: float, eps: float) -> float:
 
 @inlined
 def changes_on_a(n: float, k: float, sigma: float) -> tuple[float, float, float]:
-    """Strain a(σ; k), and its derivatives by σ and by n; σ is above the pole."""
+    """Return the strain a(σ; k) and its derivatives by σ and n; σ must be above the pole."""
     strain, log = _root(n, sigma / k)
     left, per = 1.0 - strain if strain < 0.9 else math.exp(-log), 1.0 / (k + n * sigma)
     return strain, left * per, left * (sigma * per - log) / n
@@ -132,7 +130,7 @@ def changes_on_a(n: float, k: float, sigma: float) -> tuple[float, float, float]
 
 @inner
 def line(row: Row, branch: int) -> tuple[float, float]:
-    """Place and scale of the normal distribution of ln σ that the rank follows on a branch."""
+    """Return mean and standard deviation of the normal distribution of ln σ on a branch."""
     if branch == BACK:
         return row[LOG_MINUS], row[SPREAD_MINUS]
     return row[LOG_PLUS] if branch == SNAP else row[LOG_AGAIN], row[SPREAD_PLUS]
@@ -140,7 +138,7 @@ def line(row: Row, branch: int) -> tuple[float, float]:
 
 @inner
 def moves(branch: int) -> bool:
-    """Whether micro-springs snap on a branch."""
+    """Whether micro-springs snap or snap back on a branch."""
     return branch != A and branch != HELD
 
 
@@ -148,14 +146,14 @@ def moves(branch: int) -> bool:
 def mixture(
     row: Row, branch: int, p: float, rest: float, never: float, sigma: float
 ) -> tuple[float, float, float, float, float]:
-    """Strain at a stress where p, 1 - p and 1 - P are these, and two derivatives at fixed p, P.
+    """Return the strain at a stress, given p, 1 - p and 1 - P, and two derivatives at fixed p, P.
 
-    Then strain and slope of the branch a that snaps.
+    The last two values are strain and slope of the branch a that snaps.
     """
     n, k = row[STIFFENING], row[K_SNAPPED]
     two = 1.0 / (row[KC] + sigma)
     on_c = row[KC] * two * two
-    if branch == SNAP or never == 1.0:  # none that has snapped is on branch a
+    if branch == SNAP or never == 1.0:  # nothing on branch a has ever snapped
         k, never = row[K0], 0.0
     one, slope, bend = on_a(n, k, sigma)
     strain = rest * one + p * (row[EPS_STAR] + sigma * two)
@@ -170,7 +168,7 @@ def mixture(
 
 @inlined
 def at_stress(row: Row, state: Array, sigma: float) -> float:
-    """Strain at a stress on the branch that the spring is on; fills dε/dσ and d²ε/dσ²."""
+    """Return the strain at a stress on the current branch; fill dε/dσ and d²ε/dσ²."""
     branch = int(state[BRANCH])
     if not moves(branch):
         p, rest = state[SNAPPED], state[REST]
@@ -193,7 +191,7 @@ def at_stress(row: Row, state: Array, sigma: float) -> float:
 
 @inner
 def _ends_of_stress(row: Row, state: Array, eps: float) -> tuple[float, float]:
-    """Stresses between which the spring has a strain: those of the stiffest and softest branch."""
+    """Return bounds of the stress at a strain, from the stiffest and the softest branch."""
     n, star, stiff = row[STIFFENING], row[EPS_STAR], stress_on_a(row[STIFFENING], row[K0], eps)
     if eps < 0.0 or (not moves(int(state[BRANCH])) and state[SNAPPED] == 0.0):
         soft = stress_on_a(n, row[K_SNAPPED], eps)
@@ -208,7 +206,7 @@ def _ends_of_stress(row: Row, state: Array, eps: float) -> tuple[float, float]:
 
 @inner
 def held_stress(row: Row, p: float, rest: float, eps: float) -> float:
-    """Stress at which so many have snapped, of a spring that forgets: one root of a quadratic."""
+    """Return the stress at a strain for fixed p without memory: the root of a quadratic."""
     k0, kc, beyond = row[K0], row[KC], eps - p * row[EPS_STAR]
     a, product = 1.0 - beyond, beyond * k0 * kc
     if not a > 0.0:
@@ -220,9 +218,9 @@ def held_stress(row: Row, p: float, rest: float, eps: float) -> float:
 
 @inner
 def stress_in(row: Row, state: Array, eps: float) -> float:
-    """Stress at a strain on the branch that the spring is on; infinite past its end.
+    """Return the stress at a strain on the current branch; infinite past its end.
 
-    Halley's method from the parabola through the point before, inside a bracket.
+    The method is Halley's inside a bracket, from a parabola at the previous point.
     """
     branch = int(state[BRANCH])
     if branch == HELD and row[REMEMBERS] == 0.0:
@@ -253,7 +251,7 @@ def stress_in(row: Row, state: Array, eps: float) -> float:
         if abs(step) <= NEAR * abs(sigma) * narrow and low <= new <= high:
             state[FLEXIBILITY] += bend * (new - sigma)
             return new
-        if not bounded:  # the guess was not good enough
+        if not bounded:  # the initial guess did not suffice
             low, high = _ends_of_stress(row, state, eps)
             bounded = True
             if not low < sigma < high:
@@ -265,7 +263,7 @@ def stress_in(row: Row, state: Array, eps: float) -> float:
             low = sigma
         if not low < new < high:
             new = _halfway(low, high, sigma)
-            if not low < new < high:  # neighbouring numbers: nothing lies between them
+            if not low < new < high:  # neighbouring floating-point numbers
                 return sigma
         sigma = new
     return sigma
@@ -273,13 +271,13 @@ def stress_in(row: Row, state: Array, eps: float) -> float:
 
 @inner
 def _inside(row: Row, low: float, high: float) -> float:
-    """Return a stress between two, of which the second may be infinite."""
+    """Return a stress between two bounds, the upper of which may be infinite."""
     return 0.5 * (low + high) if high < math.inf else max(2.0 * low, row[K0])
 
 
 @inner
 def _halfway(low: float, high: float, sigma: float) -> float:
-    """Return a stress between two, halfway in its logarithm where that can be."""
+    """Return a stress between two bounds, halfway in the logarithm if possible."""
     if high == math.inf:
         return 2.0 * max(sigma, LEAST)
     if low > 0.0:
@@ -294,7 +292,7 @@ def _halfway(low: float, high: float, sigma: float) -> float:
 
 @inner
 def begin(row: Row, state: Array, least: float) -> None:
-    """Set the state of a spring that never bore anything, and snaps nothing below a strain."""
+    """Set the state of a virgin spring in which nothing snaps below the strain `least`."""
     state[:] = 0.0
     state[RANK], state[EVER], state[REST], state[NEVER] = -math.inf, -math.inf, 1.0, 1.0
     state[LEAST_AT] = least
@@ -303,7 +301,7 @@ def begin(row: Row, state: Array, least: float) -> None:
 
 @inner
 def _ends(row: Row, state: Array, end: int, sigma: float) -> None:
-    """Let the branch end at a stress: upwards (HIGH) or downwards (LOW)."""
+    """Set the upper (HIGH) or lower (LOW) end of the branch to a stress."""
     kept = state[FLEXIBILITY], state[CURVATURE]
     eps = at_stress(row, state, sigma)
     state[FLEXIBILITY], state[CURVATURE] = kept
@@ -314,7 +312,7 @@ def _ends(row: Row, state: Array, end: int, sigma: float) -> None:
 
 @inner
 def _no_less(row: Row, state: Array, end: int) -> None:
-    """Move the end of a branch up to the least strain at which a micro-spring may snap."""
+    """Raise the end of a branch to the least strain at which a micro-spring may snap."""
     least = state[LEAST_AT]
     if state[end] < least:
         kept = state[FLEXIBILITY], state[CURVATURE]
@@ -324,7 +322,7 @@ def _no_less(row: Row, state: Array, end: int) -> None:
 
 @inner
 def _has_loop(row: Row, sigma: float, up: bool) -> bool:
-    """Whether snap-back lies below snap-through just above, or just below, a stress."""
+    """Whether snap-back lies below snap-through just above (`up`) or just below a stress."""
     below = row[SPREAD_MINUS] >= row[SPREAD_PLUS]
     log = math.log(sigma)
     if below:
@@ -334,14 +332,14 @@ def _has_loop(row: Row, sigma: float, up: bool) -> bool:
 
 @inner
 def _last_stress(row: Row) -> float:
-    """Stress at which the last micro-spring has snapped back."""
+    """Return the stress at which the last micro-spring has snapped back."""
     through = row[LOG_AGAIN] + row[SPREAD_PLUS] * LEAST_RANK
     return math.exp(min(through, row[LOG_MINUS] + row[SPREAD_MINUS] * LEAST_RANK))
 
 
 @inner
 def _enter(row: Row, state: Array, branch: int) -> None:
-    """Enter a branch at the strain and stress where the spring is."""
+    """Enter a branch at the current strain and stress."""
     state[BRANCH], state[FLEXIBILITY] = branch, 0.0
     state[LOW], state[SIGMA_LOW] = -math.inf, -math.inf
     state[HIGH], state[SIGMA_HIGH] = math.inf, math.inf
@@ -359,7 +357,7 @@ def _enter(row: Row, state: Array, branch: int) -> None:
         high = math.inf
         if row[REMEMBERS] > 0.0:
             high = math.exp(row[LOG_AGAIN] + row[SPREAD_PLUS] * state[EVER])
-        if (branch != BOTH) == below:  # where both lines meet, the other one begins
+        if (branch != BOTH) == below:  # the other branch begins where both laws of snapping meet
             high = min(high, cross)
         if high < math.inf:
             _ends(row, state, HIGH, high)
@@ -371,10 +369,10 @@ def _enter(row: Row, state: Array, branch: int) -> None:
 
 @inner
 def _hold(row: Row, state: Array, rank: float) -> None:
-    """Hold a rank that has been reached.
+    """Hold the current rank.
 
-    In a narrow snap the last digit of the stress covers many ranks, so the share that has snapped
-    is corrected to agree with the strain.
+    In a narrow snap the last digit of the stress covers many ranks, so the snapped share is
+    corrected to match the strain.
     """
     (p, rest), sigma, never = shares(rank), state[SIGMA], state[NEVER]
     eps, _, _, on_main, _ = mixture(row, HELD, p, rest, never, sigma)
@@ -392,7 +390,7 @@ def _hold(row: Row, state: Array, rank: float) -> None:
 
 @inner
 def turned(state: Array, up: bool) -> bool:
-    """Whether a spring that snaps, or snaps back, is now moved the other way."""
+    """Whether the motion of a spring that snaps or snaps back has reversed."""
     branch = state[BRANCH]
     return branch == BACK if up else branch in (SNAP, AGAIN)
 
@@ -408,7 +406,7 @@ def leaves(state: Array, eps: float) -> bool:
 
 @inner
 def _snap(row: Row, state: Array) -> None:
-    """Snap through: once more what has snapped before, or on first loading."""
+    """Enter the branch of snap-through, on first loading or again."""
     if row[REMEMBERS] > 0.0 and (state[RANK] >= state[EVER] or state[NEVER] == 1.0):
         _enter(row, state, SNAP)
     elif _has_loop(row, state[SIGMA], True):
@@ -419,7 +417,7 @@ def _snap(row: Row, state: Array) -> None:
 
 @inner
 def switch(row: Row, state: Array, up: bool) -> None:
-    """Go over from the end of a branch, or from where the strain turns, to the next branch."""
+    """Change to the next branch, at the end of a branch or where the strain reverses."""
     branch, remembers = int(state[BRANCH]), row[REMEMBERS] > 0.0
     if turned(state, up):
         rank = rank_now(row, state)
@@ -442,7 +440,7 @@ def switch(row: Row, state: Array, up: bool) -> None:
             _enter(row, state, SNAP if branch == BOTH else BOTH)
         elif math.log(sigma) < log - 1e-14 * max(abs(log), 1.0):
             _enter(row, state, AGAIN if branch == BOTH else BOTH)
-        else:  # all that ever snapped has snapped again
+        else:  # all micro-springs that ever snapped have snapped again
             state[RANK] = state[EVER]
             if row[LOG_AGAIN] == row[LOG_PLUS]:
                 _enter(row, state, SNAP)
@@ -456,14 +454,14 @@ def switch(row: Row, state: Array, up: bool) -> None:
 
 @inner
 def settle(row: Row, state: Array, eps: float) -> None:
-    """Bring a spring to a strain that lies on its branch."""
+    """Bring a spring to a strain on its branch."""
     sigma = stress_in(row, state, eps)
     state[EPS], state[SIGMA] = eps, sigma
 
 
 @inner
 def rank_now(row: Row, state: Array) -> float:
-    """The rank up to which micro-springs have snapped."""
+    """Return the rank up to which micro-springs have snapped."""
     branch = int(state[BRANCH])
     if not moves(branch):
         return state[RANK]
@@ -473,13 +471,13 @@ def rank_now(row: Row, state: Array) -> float:
 
 @inner
 def ever_now(state: Array, rank: float) -> float:
-    """The rank up to which micro-springs have ever snapped, where they have up to `rank` now."""
+    """Return the rank up to which micro-springs have ever snapped; `rank` is the current one."""
     return rank if state[BRANCH] == SNAP else state[EVER]
 
 
 @compiled
 def stress_along(row: Row, eps: Array) -> tuple[Array, Array, Branches]:
-    """Stress, ranks of what has and has ever snapped (2, n) and branch along strains, from rest."""
+    """Return stress, ranks w and W (2, n), and branch along a strain history from rest."""
     sigma, rank = np.empty(eps.size), np.empty((2, eps.size))
     branches, state = np.empty(eps.size, np.int64), np.empty(STATE)
     begin(row, state, 0.0)
@@ -490,7 +488,7 @@ def stress_along(row: Row, eps: Array) -> tuple[Array, Array, Branches]:
         sigma[j], rank[0, j] = state[SIGMA], rank_now(row, state)
         rank[1, j] = ever_now(state, rank[0, j])
         branches[j] = int(state[BRANCH])
-        if not sigma[j] < math.inf:  # past the end of branch c: nothing follows
+        if not sigma[j] < math.inf:  # past the end of branch c: stop
             sigma[j:] = math.inf
             branches[j:], rank[0, j:], rank[1, j:] = branches[j], rank[0, j], rank[1, j]
             break
@@ -504,7 +502,7 @@ def stress_along(row: Row, eps: Array) -> tuple[Array, Array, Branches]:
 def rank_at(
     row: Row, rank: float, ever: float, branch: int, sigma: float
 ) -> tuple[float, float, int]:
-    """Ranks w and W and branch at a stress of a spring that was last seen at others."""
+    """Return ranks w and W and branch at a stress, from those at the previous stress."""
     remembers = row[REMEMBERS] > 0.0
     first = again = back = -math.inf
     if sigma > 0.0:
@@ -514,7 +512,7 @@ def rank_at(
         back = (log - row[LOG_MINUS]) / row[SPREAD_MINUS]
     least = max(first, min(again, ever))
     most = max(least, back)
-    if remembers and first > max(ever, LEAST_RANK):  # first loading, of a virgin spring too
+    if remembers and first > max(ever, LEAST_RANK):  # first loading, also of a virgin spring
         return first, first, SNAP
     if rank < least:
         rank, branch = least, BOTH
@@ -527,7 +525,7 @@ def rank_at(
     elif least < rank < most or rank == ever:
         branch = HELD
     elif (rank == least and branch == BACK) or (rank == most and branch in (SNAP, AGAIN)):
-        branch = HELD  # also at an end of the held stresses that it has not passed
+        branch = HELD  # also at an end of the held branch, if not passed
     if rank < LEAST_RANK:
         rank, branch = -math.inf, A
     return rank, ever, branch
@@ -537,7 +535,7 @@ def rank_at(
 def strain_under(
     row: Row, branch: int, rank: float, ever: float, sigma: float
 ) -> tuple[float, float]:
-    """Strain at a stress and its slope dε/dσ; -inf where the spring cannot carry the tension."""
+    """Return strain (-inf if the spring cannot carry the tension) and dε/dσ at a stress."""
     p, rest = shares(rank) if branch != A else (0.0, 1.0)
     strain, soft, _, one, _ = mixture(row, branch, p, rest, shares(ever)[1], sigma)
     if moves(branch):
@@ -548,7 +546,7 @@ def strain_under(
 
 @compiled
 def strain_along(row: Row, sigma: Array) -> tuple[Array, Array, Branches]:
-    """Strain (-inf: no such tension), ranks (2, n) and branch along a stress history, from rest."""
+    """Return strain (-inf: no such tension), ranks (2, n), branch along stresses, from rest."""
     eps, ranks = np.empty(sigma.size), np.empty((2, sigma.size))
     branches, branch, rank, ever = np.empty(sigma.size, np.int64), A, -math.inf, -math.inf
     for j in range(sigma.size):
@@ -563,7 +561,7 @@ def strain_along(row: Row, sigma: Array) -> tuple[Array, Array, Branches]:
 
 @inner
 def carried(row: Row) -> int:
-    """How many derivatives are carried along."""
+    """Return the number of derivatives of a spring."""
     return CARRIED if row[REMEMBERS] > 0.0 else PLAIN_CARRIED
 
 
@@ -571,10 +569,10 @@ def carried(row: Row) -> int:
 def strain_tangents(
     row: Row, branch: int, rank: float, ever: float, sigma: float, out: Array
 ) -> tuple[float, float, float, float]:
-    """Fill the derivatives of the strain at fixed stress and ranks, of w by the snap stresses.
+    """Fill the derivatives of the strain at fixed stress and ranks.
 
-    Returns those of the strain by stress, w and W, and that of w by the stress; on first loading w
-    and W are one.
+    Those of w are filled instead for the parameters of the snap stresses. Return the derivatives of
+    the strain by stress, w and W, and that of w by the stress; on first loading W = w.
     """
     k0, two = row[K0], 1.0 / (row[KC] + sigma)
     p, rest, weight = 0.0, 1.0, 0.0
@@ -592,7 +590,7 @@ def strain_tangents(
         if rank != ever:
             never, weight_ever = shares(ever)[1], density(ever)
         if branch != SNAP and never != 1.0:
-            fresh = never  # on branch a, and never snapped
+            fresh = never  # the share on branch a that has never snapped
             worn = max(rest - fresh, 0.0)
         a, slope, by_n = changes_on_a(n, k0, sigma)
         one, softer, by_n_softer = a, slope, by_n
@@ -628,10 +626,10 @@ def tangents(
     d_ranks: Array,
     out: Array,
 ) -> float:
-    """Fill the derivatives of the stress at a strain; returns the slope dσ/dε.
+    """Fill the derivatives of the stress at a strain; return the slope dσ/dε.
 
-    They are by k0 … spread_minus, the logarithm of the strain, stiffening, softening, weakening.
-    `d_ranks` (2, CARRIED), the same of w and W, is brought up to date where the spring moves.
+    They are by k0 … spread_minus, the logarithm of the strain, stiffening, softening and weakening.
+    `d_ranks` (2, CARRIED), those of w and W, is updated if the branch changes the ranks.
     """
     d_rank, d_ever, count = d_ranks[0], d_ranks[1], carried(row)
     soft, by_rank, by_ever, pace = strain_tangents(row, branch, rank, ever, sigma, out)
@@ -667,7 +665,7 @@ def tangents(
 def stress_tangents_along(
     row: Row, eps: Array, sigma: Array, ranks: Array, branches: Branches
 ) -> tuple[Array, Array]:
-    """Derivatives of the stress (8 or 11, n) along strains, see `tangents`, and its slope."""
+    """Return derivatives of the stress (8 or 11, n) along strains, see `tangents`, and slope."""
     count = carried(row)
     out, slope = np.empty((count, eps.size)), np.empty(eps.size)
     now, d_ranks = np.empty(CARRIED), np.zeros((2, CARRIED))

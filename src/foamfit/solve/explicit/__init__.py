@@ -1,5 +1,5 @@
-"""Explicit steps: Taylor series in time, from switch of branch to switch of branch.
+"""Explicit steps: Taylor series in time between switches of branch. Newcomers may skip them.
 
-`series` are the recurrences of motion and derivatives, `taylor` goes from step to step.
-A newcomer may skip all of it.
+`series`, `memory` and `tangents` hold the recurrences of motion and derivatives, `taylor` the loop
+over steps, `samples` its output.
 """

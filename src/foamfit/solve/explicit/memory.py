@@ -1,20 +1,20 @@
-"""The Taylor series in time of springs with memory: the microscale law, and relaxation.
+"""Taylor series in time of springs with memory: the microscale law, and relaxation.
 
-The stress of such a spring is that of its law in equilibrium, s, and what relaxes:
+The stress of such a spring consists of the equilibrium stress s of its law and relaxation terms:
 
     Σ = (1 + Σ g_k) s + Σ z_k,      dz_k/dt = -(z_k + g_k s)/τ_k,      z_k = q_k - g_k s.
 
-A microscale spring that is neither virgin (then it is on branch a) nor held follows P = Φ(u) with
-u = (ln s - l)/w. Its strain is a + P (c - a), a = s/(k0 + s), c = eps_star + s/(kc + s), and with
-h = u φ(u) all that is in it has a short recurrence,
+A microscale spring that is neither virgin (on branch a) nor held follows P = Φ(u) with
+u = (ln s - l)/w. Its strain is a + P (c - a), a = s/(k0 + s), c = eps_star + s/(kc + s). With
+h = u φ(u) every part has a short recurrence,
 
     w s u' = s',   φ' = -u' h,   P' = u' φ,   (k0 + s) (1 - a) = k0,
 
-in each of which the last coefficient of s enters linearly: one division finds it from that of the
-strain. Held, P is a constant. A spring that remembers (model, section 8) has (k + ns) (1-a)' =
--s' (1-a) for the third, with the softer k of what has snapped once, and adds for the share N that
-never has the difference N (a(s; k0) - a(s; k)) of both branches. The rank of a spring is kept as a
-normal score w = Φ⁻¹(p). It moves with the parameters like all that is in the state.
+in which the last coefficient of s enters linearly, so that one division gives it from that of the
+strain. While the spring is held, P is constant. For a spring that remembers (model, section 8) the
+last equation becomes (k + ns) (1-a)' = -s' (1-a), with the softened k of micro-springs that have
+snapped before; those that have never snapped, a share N, add N (a(s; k0) - a(s; k)). The rank of a
+spring is stored as a normal score w = Φ⁻¹(p); like the rest of the state it depends on parameters.
 """
 
 from __future__ import annotations
@@ -59,69 +59,60 @@ from foamfit.springs.law import BISTABLE, MICROSCALE
 from foamfit.springs.microscale_kernels import CARRIED, OF_STRAIN, density, shares
 from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 
-# Columns of `Memory.series`, which stand side by side at each order since the recurrences read them
-# all: equilibrium stress s; Σ z_k; 1 - a, 1 + eps_star - c; their difference; P; n u_n, u_n, φ, h;
-# 1 - a of what has never snapped. Then follow the z of the relaxation terms.
+# Columns of `Memory.series`, contiguous at each order because the recurrences read them together:
+# equilibrium stress s; Σ z_k; 1 - a, 1 + eps_star - c; their difference; P; n u_n, u_n, φ, h;
+# 1 - a of micro-springs that have never snapped. The z of the relaxation terms follow.
 EQ, RELAXED, BELOW_A, BELOW_C, BETWEEN, SNAPPED, PACE, SCORE, DENSITY, BEND = range(10)
 FRESH, N_MEMORY = 10, 11
-# Rows of `Memory.partials`: the derivatives of the strain at fixed stress by the parameters of the
-# law (see `microscale_kernels`), by both ranks, and by the stress; then what these are made of.
+# Rows of `Memory.partials`: derivatives of the strain at fixed stress by the parameters of the law
+# (see `microscale_kernels`), by both ranks, and by the stress; then intermediate results.
 BY_RANK, BY_EVER, BY_STRESS, SQUARE_A, SQUARE_C, WIDTH, STEEP = range(CARRIED, CARRIED + 7)
 SQUARE_FRESH, BY_N, BY_N_FRESH, LOG, N_PARTIALS = range(CARRIED + 7, CARRIED + 12)
 # Rows of `Memory.tangents`: the derivatives of s, and those of the z of the terms.
 D_EQ, N_TANGENTS = range(2)
-# Columns of `Memory.now`: place and scale of the normal distribution that is followed, p and 1 - p
-# where the step starts, 1 + Σ g and its inverse; dε/ds there, its inverse, and dε/dΣ; what of a
-# derivative of Σ is not of s. Then what the orders of a step share: 1/(k0 + s) (on a curved branch
-# of another spring that of its k), 1/(kc + s), 1/s; the derivatives of a, c and u by s; c - a. Of a
-# spring that remembers n, k of branch a, the share that is on a harder one (0: none), and of that
-# 1/(k0 + ns) and the derivative.
+# Columns of `Memory.now`. Mean and standard deviation of the normal distribution of ln s on this
+# branch; p and 1 - p at the start of the step; 1 + Σ g and its inverse; dε/ds at the start, its
+# inverse, and dε/dΣ; the part of a derivative of Σ that does not depend on that of s. Common
+# factors of all orders of a step: 1/(k0 + s) (on a curved branch of another spring 1/(k + s)),
+# 1/(kc + s), 1/s; derivatives of a, c and u by s; c - a. For a spring that remembers: n and k of
+# branch a, the share that has never snapped (0 if all are on one branch a), and for that share
+# 1/(k0 + ns) and the derivative of a.
 PLACE, SCALE, FRACTION, LEFT, GAIN, PER_GAIN, GIVE, PER_GIVE, SOFT, BASE = range(10)
 PER_A, PER_C, PER_S, RATE_A, RATE_C, RATE_U, GAP = range(10, 17)
 STIFF, K_MAIN, UNSNAPPED, PER_FRESH, RATE_FRESH, N_NOW = range(17, 23)
-# A held spring is past where it turned if its strain is, by so much of itself.
-MARGIN = 1e-14
-# A strain that changes in a step by so little of itself stands still.
-STILL = 1e-14
-# A spring that turns within so small a part of a step turns at its start.
-NOW = 1e-8
-# Strain below which no micro-spring counts: the stress, whose logarithm is followed, is 0 at 0.
-LEAST_STRAIN = 1e-14
-# Beyond the normal score FAR, P is 0 or 1 to rounding; it is from somewhere beyond NEAR on where
-# what it adds to a strain is below the share NEGLIGIBLE (a tenth of it: P is about exp(-u²/2)/10)
-# of the truncation. Within, the score u may change in a step by so much over u as its series have
-# orders, times a share (they are those of exp(-u²/2), whose terms fall only from the order u δu
-# on), and by so much at most; a stress by so much of itself. How exactly these bounds are met.
+MARGIN = 1e-14  # relative strain by which a held spring must exceed its turning point to leave
+STILL = 1e-14  # relative change of strain in a step below which a spring stands still
+NOW = 1e-8  # a spring that turns within this share of a step turns at its start
+LEAST_STRAIN = 1e-14  # no micro-spring snaps below this strain, where ln s is singular
+# P counts as 0 or 1 beyond a normal score u, between NEAR and FAR, where its effect on the strain
+# falls below the share NEGLIGIBLE of the truncation (in fact a tenth: P is about exp(-u²/2)/10).
 NEAR, FAR, NEGLIGIBLE = 4.0, 8.0, 0.1
-SHARE_OF_ORDER, MOST_SCORE, MOST_GROWTH, LOOSE = 0.7, 3.0, 0.8, 0.05
+# Limits of a step elsewhere. The series of exp(-u²/2) decrease only from the order u δu on.
+SHARE_OF_ORDER = 0.7  # largest u δu, over the order of the series
+MOST_SCORE = 3.0  # largest δu
+MOST_GROWTH = 0.8  # largest relative change of the stress
+LOOSE = 0.05  # relative tolerance of these limits
 
 
 class Memory(NamedTuple):
-    """What springs remember, and its series and derivatives.
+    """Memory of the springs, its series, and its derivatives in p directions."""
 
-    rows (springs, columns) are the springs, state (springs, STATE) that of the microscale ones, now
-    (springs, N_NOW) the numbers above, series (springs, order + 2, N_MEMORY + terms). For
-    derivatives in p `directions` (p, 2): `partials` (N_PARTIALS, springs, order + 2), `ranks` and
-    `evers` (p, springs) of what is held and has ever snapped, `tangents` (p, springs, N_TANGENTS +
-    terms, order + 2); `one_sided` (p,) marks those that do not exist. `scratch` is (3, CARRIED).
-    """
-
-    rows: Array
-    state: Array
-    now: Array
-    series: Array
-    partials: Array
-    directions: Branches
-    ranks: Array
-    evers: Array
-    tangents: Array
-    one_sided: Array
-    scratch: Array
+    rows: Array  #: the springs, (springs, columns)
+    state: Array  #: state of microscale springs, (springs, STATE)
+    now: Array  #: (springs, N_NOW)
+    series: Array  #: (springs, order + 2, N_MEMORY + terms)
+    partials: Array  #: (N_PARTIALS, springs, order + 2)
+    directions: Branches  #: (p, 2)
+    ranks: Array  #: derivatives of the ranks of held springs, (p, springs)
+    evers: Array  #: derivatives of the largest ranks ever reached, (p, springs)
+    tangents: Array  #: (p, springs, N_TANGENTS + terms, order + 2)
+    one_sided: Array  #: 1 where left and right derivatives differ, (p,)
+    scratch: Array  #: (3, CARRIED)
 
 
 @maker
 def make_memory(rows: Array, order: int, directions: Branches, one_sided: Array) -> Memory:
-    """Make the memory of springs at rest."""
+    """Return the memory of springs at rest."""
     count, terms, size = rows.shape[0], (rows.shape[1] - N_COLUMNS) // 2, directions.shape[0]
     memory = Memory(
         rows,
@@ -151,7 +142,7 @@ def make_memory(rows: Array, order: int, directions: Branches, one_sided: Array)
 
 @inner
 def load(memory: Memory, i: int, eps: float) -> int:
-    """Load a microscale spring from rest to a strain in one go; returns its branch."""
+    """Load a microscale spring monotonically from rest to a strain; return its branch."""
     row, state = memory.rows[i], memory.state[i]
     while micro.leaves(state, eps):
         micro.switch(row, state, eps > state[micro.EPS])
@@ -161,11 +152,11 @@ def load(memory: Memory, i: int, eps: float) -> int:
 
 @inner
 def enter_mixture(memory: Memory, i: int) -> tuple[float, float]:
-    """Prepare for the branch that a microscale spring has entered; the strains of its ends."""
+    """Prepare for the new branch of a microscale spring; return the strains at its ends."""
     row, state, now = memory.rows[i], memory.state[i], memory.now[i]
     branch, low, high = int(state[micro.BRANCH]), state[micro.LOW], state[micro.HIGH]
     now[PLACE], now[SCALE] = micro.line(row, branch)
-    hard = branch == SNAP or state[micro.NEVER] == 1.0  # none that has snapped is on branch a
+    hard = branch == SNAP or state[micro.NEVER] == 1.0  # nothing on branch a has ever snapped
     now[STIFF], now[K_MAIN] = row[STIFFENING], row[K0] if hard else row[K_SNAPPED]
     now[UNSNAPPED] = 0.0 if hard else state[micro.NEVER]
     for own in range(3, CARRIED):
@@ -178,10 +169,10 @@ def enter_mixture(memory: Memory, i: int) -> tuple[float, float]:
 
 @inner
 def leave(memory: Memory, i: int, eps: float, up: bool, turning: bool, d_eps: Array) -> int:
-    """Let a microscale spring leave its branch, at an end or where it turns; returns the next.
+    """Move a microscale spring to its next branch, at an end or a turning point; return that.
 
-    d_eps (p, springs) are the derivatives of the strain. What is held from a turn on does not feel
-    when the stress turns.
+    d_eps (p, springs) are the derivatives of the strain. The rank held from a turning point on does
+    not depend to first order on the time of the turn.
     """
     row, state, now = memory.rows[i], memory.state[i], memory.now[i]
     if turning:
@@ -209,7 +200,7 @@ def leave(memory: Memory, i: int, eps: float, up: bool, turning: bool, d_eps: Ar
 
 @inner
 def stands(c: Array, order: int, span: float) -> bool:
-    """Whether a strain stands still over a step, but for rounding."""
+    """Whether a strain stands still over a step, except for rounding."""
     change = 0.0
     for n in range(order, 0, -1):
         change = (change + abs(c[n])) * span
@@ -220,9 +211,10 @@ def stands(c: Array, order: int, span: float) -> bool:
 def first_turn(
     branches: Branches, eps: Array, order: int, span: float, c: Array
 ) -> tuple[float, int]:
-    """First time within `span` at which a spring that snaps turns, and which; c is scratch.
+    """Return the first time within `span` at which a snapping spring turns, and which spring.
 
-    After a kink it may have turned already. While the motion holds, rounding turns no spring.
+    After a kink it may have turned already. Rounding errors turn no spring that stands still. c is
+    scratch.
     """
     spring, whole = -1, span
     for i in range(branches.size):
@@ -245,7 +237,7 @@ def first_turn(
 
 @inner
 def start_mixture(memory: Memory, i: int, moving: bool, eps: float) -> float:
-    """Order 0 of a microscale spring: the stress at a strain, and all that follows from it."""
+    """Fill order 0 of a microscale spring; return the stress at its strain."""
     row, state, now, m = memory.rows[i], memory.state[i], memory.now[i], memory.series[i, 0]
     micro.settle(row, state, eps)
     s = state[micro.SIGMA]
@@ -281,7 +273,7 @@ def start_mixture(memory: Memory, i: int, moving: bool, eps: float) -> float:
 
 @inner
 def _bent(m: Array, column: int, n: int, stiff: float) -> float:
-    """Order n of 1 - a, but for its factor -1/(k + ns) and what the stress of that order adds."""
+    """Return order n of 1 - a, without the factor -1/(k + ns) and the term of s_n."""
     total = 0.0
     for j in range(1, n):
         total += (j + stiff * (n - j)) * m[j, EQ] * m[n - j, column]
@@ -290,16 +282,17 @@ def _bent(m: Array, column: int, n: int, stiff: float) -> float:
 
 @inner
 def _unsnapped(now: Array, m: Array, n: int) -> float:
-    """Order n of what the share that never snapped adds to the strain, on its harder branch a."""
+    """Return order n of the extra strain of the share that never snapped, on a stiffer branch a."""
     m[n, FRESH] = -_bent(m, FRESH, n, now[STIFF]) * now[PER_FRESH]
     return now[UNSNAPPED] * (m[n, BELOW_A] - m[n, FRESH])
 
 
 @inlined
 def strain_of_mixture(now: Array, m: Array, moving: bool, n: int) -> float:
-    """Order n >= 1 of the strain of a microscale spring, but for what that of its stress adds.
+    """Return order n >= 1 of the strain of a microscale spring, without the term of s_n.
 
-    `now` and `m`, which is filled as if that were zero, are the spring's own of a `Memory`.
+    `now` and `m` are the spring's rows of `Memory.now` and `Memory.series`; order n of `m` is
+    filled for s_n = 0.
     """
     by_a = by_c = 0.0
     if not moving:
@@ -338,7 +331,7 @@ def strain_of_mixture(now: Array, m: Array, moving: bool, n: int) -> float:
 
 @inlined
 def finish_mixture(now: Array, m: Array, moving: bool, n: int, s_n: float) -> None:
-    """Add to the series what order n >= 1 of the stress adds; see `strain_of_mixture`."""
+    """Add the terms of order n >= 1 of the stress to the series; see `strain_of_mixture`."""
     on_a, on_c = s_n * now[RATE_A], s_n * now[RATE_C]
     m[n, BELOW_A] -= on_a
     m[n, BELOW_C] -= on_c
@@ -356,7 +349,7 @@ def finish_mixture(now: Array, m: Array, moving: bool, n: int, s_n: float) -> No
 
 @inlined
 def keep(row: Row, m: Array, n: int, s_n: float) -> None:
-    """Write order n of a spring's equilibrium stress, and what relaxes in the next."""
+    """Write order n of a spring's equilibrium stress, and order n + 1 of its relaxation terms."""
     m[n, EQ], total = s_n, 0.0
     for k in range(m.shape[1] - N_MEMORY):
         g, tau = row[N_COLUMNS + 2 * k], row[N_COLUMNS + 2 * k + 1]
@@ -368,10 +361,10 @@ def keep(row: Row, m: Array, n: int, s_n: float) -> None:
 
 @inner
 def longest(m: Array, now: Array, order: int, tol: float, span: float) -> float:
-    """Longest step, within `span`, over which the logarithm of a stress has a good series.
+    """Return the longest step within `span` over which the series of ln s converges well.
 
-    Where nearly none, or all, have snapped, the series do not show how soon the others do: a step
-    from there ends where these begin to count, at the truncation `tol`.
+    Where almost none or almost all micro-springs have snapped, the series do not show when the
+    others will: such a step ends where their effect on the strain reaches the truncation `tol`.
     """
     s, u, scale = m[0, EQ], abs(m[0, SCORE]), now[SCALE]
     change = min(MOST_SCORE, SHARE_OF_ORDER * order / u) if u > 0.0 else MOST_SCORE
@@ -380,8 +373,8 @@ def longest(m: Array, now: Array, order: int, tol: float, span: float) -> float:
         change = max(change, u - math.sqrt(min(max(few, NEAR * NEAR), FAR * FAR)))
     rise = s * min(MOST_GROWTH, math.exp(scale * change) - 1.0)
     fall = s * min(MOST_GROWTH, 1.0 - math.exp(-scale * change))
-    least = LOOSE * MOST_SCORE * scale * s  # far from a narrow snap a share of the way is too loose
-    for _ in range(40):  # Newton's method from above, for what grows faster than in proportion
+    least = LOOSE * MOST_SCORE * scale * s  # a relative tolerance is too loose far from a snap
+    for _ in range(40):  # Newton's method from above on convex functions
         up = down = up_slope = down_slope = 0.0
         for n in range(order, 0, -1):
             up_slope, down_slope = up_slope * span + up, down_slope * span + down
@@ -395,7 +388,7 @@ def longest(m: Array, now: Array, order: int, tol: float, span: float) -> float:
 
 @inner
 def strain_at(row: Row, state: Array, now: Array, moving: bool, s: float) -> tuple[float, float]:
-    """Strain of a mixture at a stress (NaN where its law ends), and its slope dε/ds."""
+    """Return the strain of a mixture at a stress (NaN past the law's end), and its slope dε/ds."""
     branch, p, q, steep = int(state[micro.BRANCH]), state[micro.SNAPPED], state[micro.REST], 0.0
     if moving:
         if not s > 0.0:
@@ -408,7 +401,7 @@ def strain_at(row: Row, state: Array, now: Array, moving: bool, s: float) -> tup
 
 @inner
 def advance_memory(state: Array, series: Array, order: int, span: float) -> None:
-    """Carry what relaxes over a step, and where the search for the stress starts."""
+    """Advance the relaxation terms, and the initial guesses of the stress, over a step."""
     for i in range(state.shape[0]):
         if state[i, micro.BRANCH] >= HELD:
             reached = value_at(series[i, :, EQ], order, span)
@@ -422,8 +415,7 @@ def advance_memory(state: Array, series: Array, order: int, span: float) -> None
         series[i, 0, RELAXED] = total
 
 
-# ---------------------------------------------------------------- derivatives by parameters: those
-# of the strain at a fixed stress; the recurrences above, linearised
+# ---------------------------------------------------------------- derivatives by parameters
 
 
 @inner
@@ -448,7 +440,7 @@ def _fill_of_a(
 
 @inner
 def fill_partials(memory: Memory, i: int, moving: bool, eps: Array, order: int) -> float:
-    """Fill the derivatives of a spring's strain at fixed stress; returns the slope dΣ/dε now."""
+    """Fill derivatives of a spring's strain at fixed stress; return the slope dΣ/dε (order 0)."""
     row, state, now, m = memory.rows[i], memory.state[i], memory.now[i], memory.series[i]
     out, remembers, branch = memory.partials, row[REMEMBERS] > 0.0, int(state[micro.BRANCH])
     n, star, k, never, p = (
@@ -458,7 +450,7 @@ def fill_partials(memory: Memory, i: int, moving: bool, eps: Array, order: int) 
         now[UNSNAPPED],
         now[FRACTION],
     )
-    first_loading = branch == SNAP or state[micro.NEVER] == 1.0  # not so where all have snapped
+    first_loading = branch == SNAP or state[micro.NEVER] == 1.0  # not if all have snapped
     s, below, below_c, fresh = m[:, EQ], m[:, BELOW_A], m[:, BELOW_C], m[:, FRESH]
     snapped, score, dense = m[:, SNAPPED], m[:, SCORE], m[:, DENSITY]
     square, square_c, hard = out[SQUARE_A, i], out[SQUARE_C, i], out[SQUARE_FRESH, i]
@@ -498,7 +490,7 @@ def fill_partials(memory: Memory, i: int, moving: bool, eps: Array, order: int) 
                 qaa -= snapped[j] * square[o - j]
                 pcc += snapped[j] * square_c[o - j]
                 wide += gap[j] * dense[o - j]
-            if o > 0:  # all of the strain is in these parts
+            if o > 0:  # from the strain, the sum of all parts
                 pc = star * snapped[o] - qa - eps[o] - (never * fresh[o] if never > 0.0 else 0.0)
             width[o] = wide
             by_score, by_s = wide * score[0], wide
@@ -530,10 +522,10 @@ def fill_partials(memory: Memory, i: int, moving: bool, eps: Array, order: int) 
 
 @inlined
 def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, slope: float, n: int) -> float:
-    """Order n of the derivative of (1 + Σ g) s in direction k, but for what δε_n adds."""
+    """Return order n of the derivative of (1 + Σ g) s in direction k, without the term of δε_n."""
     d_s = memory.tangents[k, i, D_EQ]
     soft, own = memory.partials[BY_STRESS, i], memory.directions[k, 1]
-    even = odd = 0.0  # two sums at once
+    even = odd = 0.0  # two independent sums run in parallel
     if memory.directions[k, 0] == i and own < OWN_ETA:
         even = memory.partials[own, i, n]
     if not moving:
@@ -550,7 +542,7 @@ def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, slope: floa
 
 @inlined
 def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
-    """Order n of the derivative of Σ z_k, and of g s at fixed s, in direction k."""
+    """Return order n of the derivative of Σ z_k, and of g s at fixed s, in direction k."""
     total = 0.0
     for term in range(memory.series.shape[2] - N_MEMORY):
         total += memory.tangents[k, i, N_TANGENTS + term, n]
@@ -562,7 +554,7 @@ def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
 
 @inlined
 def keep_tangent(memory: Memory, k: int, i: int, n: int, d_sig: float) -> None:
-    """Write order n of the derivative of the equilibrium stress, and the next of what relaxes."""
+    """Write order n of the derivative of s, and order n + 1 of those of the relaxation terms."""
     d_s = (d_sig - memory.now[i, BASE]) * memory.now[i, PER_GAIN]
     memory.tangents[k, i, D_EQ, n] = d_s
     for term in range(memory.series.shape[2] - N_MEMORY):
@@ -579,7 +571,7 @@ def keep_tangent(memory: Memory, k: int, i: int, n: int, d_sig: float) -> None:
 
 @inner
 def _is_flat(row: Row, branch: int) -> bool:
-    """Whether a spring is on a flat branch that nothing slows."""
+    """Whether a spring is on a flat branch without dashpot."""
     slope = row[KH_PLUS] if branch == D else row[KH_MINUS] if branch == E else 1.0
     return row[KIND] == BISTABLE and slope == 0.0 and row[ETA] == 0.0
 
@@ -588,10 +580,10 @@ def _is_flat(row: Row, branch: int) -> bool:
 def mark_one_sided(
     memory: Memory, branches: Branches, eps: Array, series: Array, order: int, span: float
 ) -> None:
-    """Mark the directions that would move a spring that snaps and stands still, or a plateau.
+    """Mark the directions in which left and right derivatives differ.
 
-    One way of the parameter the spring snaps on, the other way it is held; of several springs on
-    flat branches one goes first: there are two derivatives.
+    A snapping spring that stands still continues for one sign of the change of a parameter and is
+    held for the other; of several springs on flat branches, the sign decides which moves first.
     """
     flat = 0
     for i in range(branches.size):

@@ -1,4 +1,4 @@
-"""What a step of the explicit integrator writes: samples, their derivatives, the end of contact."""
+"""Output of the explicit integrator: samples, their derivatives, and the end of contact."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _write(
 ) -> None:
     """Write base stress and displacements of a series at some samples of a step; c is scratch.
 
-    A `change` of heights acts through the strains: (derivatives of `Links.law`, the strains).
+    Derivatives by heights need a `change`: the derivatives of `Links.law`, and the strains.
     """
     law, t, nodes, count = links.law, samples.t, curves.shape[0] - 1, links.law.shape[0]
     fill_values(s[GROUP, 0], order, t, first, last, now, curves[0])
@@ -74,8 +74,8 @@ def sample_tangents(
 
 @inner
 def mend_kink(out: Samples, s: Array, d: SeriesTangents, knot: int) -> None:
-    """A dashpot feels the mean rate where the prescribed motion has a kink."""
-    before, after = out.t[knot], out.t[knot + 1]  # each counted from the sample before it
+    """Give dashpots the mean rate at a sample where the prescribed motion has a kink."""
+    before, after = out.t[knot], out.t[knot + 1]  # each since the previous sample
     share = before / (before + after)
     out.curves[0, knot] += share * (s[GROUP, 0, 0] - out.curves[0, knot])
     for p in range(d.drag.size):
@@ -87,9 +87,9 @@ def mend_kink(out: Samples, s: Array, d: SeriesTangents, knot: int) -> None:
 
 @inner
 def delay(s: Array, d: SeriesTangents, order: int, span: float, late: Array) -> None:
-    """Derivative of the time at which the base stress meets zero at the end of a step.
+    """Fill the derivatives of the time at which the base stress vanishes at the end of a step.
 
-    Where a unilateral spring has just opened, that of the step before stays.
+    If a unilateral spring has just opened, those of the previous step are kept.
     """
     fall = slope_at(s[GROUP, 0], order, span)
     for p in range(d.drag.size if fall != 0.0 else 0):
@@ -110,10 +110,10 @@ def depart(
     done: int,
     scratch: Array,
 ) -> None:
-    """Fill the samples after contact, which ends with this step, at the time `now`.
+    """Fill the samples after contact, which ends with this step at time `now`.
 
-    If contact ends later (by scratch[0], for each direction), the nodes move on until then, and the
-    top keeps the velocity that it has then. The rest of `scratch` (3, …) is scratch.
+    scratch[0] contains the derivatives of that time: if contact ends later, the nodes move on until
+    then, and the top keeps its velocity from then on. The rest of `scratch` (3, …) is free.
     """
     late, rate, place = scratch[0], scratch[1], scratch[2]
     law, nodes, groups = links.law, out.curves.shape[0] - 1, links.ends.size

@@ -1,12 +1,12 @@
-"""The Taylor series in time of a chain on fixed branches.
+"""Taylor series in time of a chain on fixed branches.
 
-On one branch the law is either a straight line or σ (1 - x) = k x, so every coefficient of strains,
+On each branch the law is a straight line or σ (1 - x) = k x, so every coefficient of strains,
 stresses and motion follows from the lower ones by a short recurrence. Springs with memory have
-recurrences of their own (`explicit.memory`), derivatives theirs (`explicit.tangents`).
+their own recurrences (`explicit.memory`), and so have the derivatives (`explicit.tangents`).
 
-The nodes are those masses that are there. Between two of them lies a group of springs in series,
-which carry one stress: massless nodes have no state. In a group of several springs those without
-dashpot share the elongation by their compliances, at every order of the series.
+Only masses are nodes. Between two nodes lies a group of springs in series, which carry one stress;
+massless nodes have no state. In a group, the springs without dashpot share the elongation according
+to their compliances, at every order of the series.
 """
 
 from __future__ import annotations
@@ -58,50 +58,41 @@ from foamfit.springs.sensitivities import branch_derivative
 # Rows of the series of a chain: displacement and velocity of the nodes above the groups, strain and
 # stress of the springs, common stress of the groups, slope T = dσ/dε of the springs.
 W, V, EPS, SIG, GROUP, TILT, N_SERIES = range(7)
-# Columns of `Links.law`: slope k of the branch that a spring is on, its origins x0 and s0, the
-# spring's dashpot and height: what parameters move; then whether the branch is curved (0 or 1; or
-# which one it is of those on which a microscale spring is a mixture of both), the strains between
-# which the spring stays on it, and what a step keeps of a curved one: 1/(1 - x) at its start.
+# Columns of `Links.law`. Those that depend on parameters: slope k and origins x0 and s0 of the
+# current branch, dashpot and height of the spring. Then whether the branch is curved (0 or 1, or
+# the branch of a microscale spring that is a mixture), the strains at which it ends, and 1/(1 - x)
+# on a curved branch at the start of the step.
 SLOPE, ORIGIN, OFFSET, DASHPOT, HEIGHT, N_MOVES = range(6)
 CURVED, LOW, HIGH, INVERSE, N_LAW = range(N_MOVES, 10)
 
 
 class Links(NamedTuple):
-    """A chain on the branches that its springs are on.
-
-    `law` (springs, N_LAW) is what `enter` writes; `ends` (groups,) is one past the last spring of
-    each group, `mass` (groups,) the areal mass of the node above, kg/m², `drag` is η_site/H,
-    Pa·s/m, `top` what is known of the top.
+    """A chain with its springs on their current branches.
 
     The series of a chain are an array (N_SERIES, springs, order + 2); order 0 of W, V and EPS is
-    the state. W, V and GROUP have a column for each group; the last order of SIG, GROUP and TILT is
-    not used.
+    the state. W, V and GROUP have one column per group; the last order of SIG, GROUP and TILT is
+    unused.
     """
 
-    law: Array
-    ends: Branches
-    mass: Array
-    drag: float
-    top: int
+    law: Array  #: the branches, as `enter` writes them, (springs, N_LAW)
+    ends: Branches  #: one past the last spring of each group, (groups,)
+    mass: Array  #: areal mass of the node above each group, kg/m², (groups,)
+    drag: float  #: η_site/H, Pa·s/m
+    top: int  #: see `solve.scene.Scene`
 
 
 class SeriesTangents(NamedTuple):
-    """Derivatives of a chain in p directions.
+    """Derivatives of a chain in p directions."""
 
-    law (p, springs, N_MOVES) are those of the first columns of `Links.law`, `drag` (p,) of the
-    onsite damping, series (p, N_SERIES, springs, order + 2) of the series but for TILT; `live` (p,)
-    is 1 where one has left zero.
-    """
-
-    law: Array
-    drag: Array
-    live: Array
-    series: Array
+    law: Array  #: of the first columns of `Links.law`, (p, springs, N_MOVES)
+    drag: Array  #: of the onsite damping, (p,)
+    live: Array  #: 1 where any derivative is nonzero, (p,)
+    series: Array  #: of the series except TILT, (p, N_SERIES, springs, order + 2)
 
 
 @inner
 def is_mixture(row: Row, branch: int) -> bool:
-    """Whether `Memory` follows a spring: all but branch a of one that remembers nothing."""
+    """Whether `Memory` follows a spring: off branch a, and on it too if the spring remembers."""
     return branch >= HELD or (row[KIND] == MICROSCALE and row[REMEMBERS] > 0.0)
 
 
@@ -121,7 +112,7 @@ def enter(rows: Array, i: int, branch: int, law: Array, memory: Memory | None) -
 
 @inner
 def slope_now(law: Array, i: int, eps: float, memory: Memory | None) -> float:
-    """Slope dΣ/dε on the branch that spring i is on; of a mixture, where the step started."""
+    """Return the slope dΣ/dε of spring i; for a mixture, at the start of the step."""
     k, y = law[i, SLOPE], 1.0 - (eps - law[i, ORIGIN])
     slope = k / (y * y) if law[i, CURVED] != 0.0 else k
     if memory is not None:
@@ -141,13 +132,13 @@ def enter_tangents(
             d.law[p, i, SLOPE], d.law[p, i, ORIGIN], d.law[p, i, OFFSET] = dk, dx0, ds0
             if dk != 0.0 or dx0 != 0.0 or ds0 != 0.0:
                 d.live[p] = 1.0
-            if is_mixture(rows[i], branch):  # of a mixture, `Memory` has them
+            if is_mixture(rows[i], branch):  # `Memory` has the derivatives
                 d.live[p] = 1.0
 
 
 @maker
 def make_series(count: int, order: int, directions: Branches) -> tuple[Array, SeriesTangents]:
-    """Make the series of a chain at rest, and derivatives, zero but for what the directions say."""
+    """Return the series of a chain at rest, and derivatives with the directions set."""
     p = directions.shape[0]
     series, ways = np.zeros((1 + p, N_SERIES, count, order + 2)), np.zeros((2, p))
     d = SeriesTangents(np.zeros((p, count, N_MOVES)), ways[0], ways[1], series[1:])
@@ -169,15 +160,15 @@ def make_series(count: int, order: int, directions: Branches) -> tuple[Array, Se
 
 @inner
 def springs_of(ends: Branches, g: int) -> tuple[np.int64, np.int64]:
-    """First spring of a group, and one past its last."""
+    """Return the first spring of a group, and one past its last."""
     first = ends[g - 1] if g > 0 else ends[0] - ends[0]
     return first, ends[g]
 
 
 @inlined
 def product(x: Array, y: Array, i: int, n: int) -> float:
-    """Σ x_j y_{n-j} of spring i for j from 1 to n - 1."""
-    even = odd = 0.0  # two sums at once
+    """Return Σ x_j y_{n-j} of spring i for j from 1 to n - 1."""
+    even = odd = 0.0  # two independent sums run in parallel
     for j in range(1, n - 1, 2):
         even += x[i, j] * y[i, n - j]
         odd += x[i, j + 1] * y[i, n - j - 1]
@@ -188,7 +179,7 @@ def product(x: Array, y: Array, i: int, n: int) -> float:
 
 @inlined
 def _law_stress(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
-    """Order n of the stress of a spring's law from its strain up to order n."""
+    """Return order n of the stress of a spring's law from its strain up to order n."""
     k = law[i, SLOPE]
     if n > 0:
         if law[i, CURVED] == 0.0:
@@ -206,7 +197,7 @@ def _law_stress(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
 def _stress_term(
     law: Array, i: int, eps: Array, sig: Array, n: int, memory: Memory | None
 ) -> float:
-    """Order n of a spring's stress from its strain up to order n."""
+    """Return order n of a spring's stress from its strain up to order n."""
     if memory is None:
         return _law_stress(law, i, eps, sig, n)
     moving, now, m = law[i, CURVED] > HELD, memory.now[i], memory.series[i]
@@ -229,7 +220,7 @@ def _stress_term(
 
 @inlined
 def _softness(law: Array, i: int, eps: Array, sig: Array, memory: Memory | None) -> float:
-    """Compliance dε/dΣ of a spring where the step starts; infinite on a flat branch."""
+    """Return the compliance dε/dΣ at the start of the step; infinite on a flat branch."""
     if memory is not None:
         return memory.now[i, SOFT]
     if law[i, CURVED] == 0.0:
@@ -241,7 +232,7 @@ def _softness(law: Array, i: int, eps: Array, sig: Array, memory: Memory | None)
 def _strain_term(
     law: Array, i: int, eps: Array, sig: Array, n: int, memory: Memory | None
 ) -> tuple[float, float]:
-    """Order n >= 1 of a strain, known + compliance · σ_n; a flat one is infinitely compliant."""
+    """Return known part and compliance of order n >= 1 of a strain, known + compliance · σ_n."""
     soft = _softness(law, i, eps, sig, memory)
     if memory is None:
         if law[i, CURVED] == 0.0:
@@ -257,7 +248,7 @@ def _strain_term(
 
 @inlined
 def _settle_stress(law: Array, i: int, n: int, s_n: float, memory: Memory) -> None:
-    """Take down order n >= 1 of the stress of a spring whose strain came from `_strain_term`."""
+    """Store order n >= 1 of the stress of a spring whose strain came from `_strain_term`."""
     now, m = memory.now[i], memory.series[i]
     own = (s_n - m[n, RELAXED]) * now[PER_GAIN]
     if law[i, CURVED] >= HELD:
@@ -269,9 +260,9 @@ def _settle_stress(law: Array, i: int, n: int, s_n: float, memory: Memory) -> No
 def _share_elongation(
     law: Array, i0: int, i1: int, eps: Array, sig: Array, u_n: float, n: int, memory: Memory | None
 ) -> float:
-    """Order n >= 1 of the common stress of a group that has springs without dashpot.
+    """Return order n >= 1 of the common stress of a group with springs without dashpot.
 
-    Fills their strains; a flat branch takes up all that the others leave.
+    Their strains are filled; a flat branch takes up the remaining elongation.
     """
     compliance, rest, flat = 0.0, u_n, -1
     for i in range(i0, i1):
@@ -279,7 +270,7 @@ def _share_elongation(
             rest -= law[i, HEIGHT] * eps[i, n]
             continue
         known, soft = _strain_term(law, i, eps, sig, n, memory)
-        eps[i, n] = known  # so far
+        eps[i, n] = known  # the compliant part follows
         rest -= law[i, HEIGHT] * known
         if soft < math.inf:
             compliance += law[i, HEIGHT] * soft
@@ -306,10 +297,10 @@ def _share_elongation(
 def _damped_term(
     law: Array, i0: int, i1: int, sig: Array, rate_n: float, push_n: float, drag: float, n: int
 ) -> float:
-    """Order n of the common stress of a group in which every spring has a dashpot.
+    """Return order n of the common stress of a group in which every spring has a dashpot.
 
-    Σ = (rate + Σ h_i σ_i/η_i) / Σ h_i/η_i; under a viscous top (drag > 0), whose rate is (push -
-    Σ)/drag, `rate_n` leaves that node out.
+    Σ = (rate + Σ h_i σ_i/η_i) / Σ h_i/η_i. A viscous top (drag > 0) has the rate (push - Σ)/drag,
+    which `rate_n` excludes.
     """
     total, weight = rate_n, 0.0
     for i in range(i0, i1):
@@ -325,7 +316,7 @@ def _damped_term(
 def _group_term(
     links: Links, s: Array, g: int, push_n: float, n: int, memory: Memory | None
 ) -> float:
-    """Order n of the common stress of a group between nodes whose motion is known so far."""
+    """Return order n of the common stress of a group from the motion of its nodes."""
     law, (i0, i1), eps, sig = links.law, springs_of(links.ends, g), s[EPS], s[SIG]
     viscous = g == links.ends.size - 1 and links.top == VISCOUS
     drag, u_n, rate_n = links.drag if viscous else 0.0, s[W, g, n], 0.0 if viscous else s[V, g, n]
@@ -333,7 +324,7 @@ def _group_term(
         u_n -= s[W, g - 1, n]
         rate_n -= s[V, g - 1, n]
     if i1 - i0 == 1:
-        eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])  # the quotient waits for nothing
+        eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])  # the quotient depends on no result
         sig[i0, n] = _stress_term(law, i0, eps, sig, n, memory)
         if law[i0, DASHPOT] == 0.0:
             return sig[i0, n]
@@ -343,7 +334,7 @@ def _group_term(
         if law[i, DASHPOT] > 0.0:
             damped += 1
         elif first < 0 or (law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0):
-            first = i  # a flat branch knows the common stress without rounding (0 in an open gap)
+            first = i  # on a flat branch the stress is exact (0 in an open gap)
         if n == 0 or law[i, DASHPOT] > 0.0:
             sig[i, n] = _stress_term(law, i, eps, sig, n, memory)
     if damped == i1 - i0:
@@ -357,7 +348,7 @@ def _group_term(
 def _stressed_term(
     law: Array, i0: int, i1: int, eps: Array, sig: Array, s_n: float, n: int, memory: Memory | None
 ) -> bool:
-    """Order n of the strains of a group whose stress is prescribed; false if it cannot be."""
+    """Fill order n of the strains of a group under prescribed stress; false on a flat branch."""
     for i in range(i0, i1):
         if law[i, DASHPOT] > 0.0 or n == 0:
             sig[i, n] = _stress_term(law, i, eps, sig, n, memory)
@@ -374,7 +365,7 @@ def _stressed_term(
 
 @inner
 def is_bare(links: Links, memory: Memory | None) -> bool:
-    """Whether every spring is undamped and, but for those with memory, alone between two masses."""
+    """Whether every spring is undamped and, without memory, alone between two masses."""
     if links.top != FREE or (memory is None and links.ends.size != links.law.shape[0]):
         return False
     damped = 0
@@ -385,7 +376,7 @@ def is_bare(links: Links, memory: Memory | None) -> bool:
 
 @inlined
 def _accelerate(links: Links, s: Array, push: Array, n: int) -> None:
-    """Write the next order of the motion of all masses under a chain without dashpots."""
+    """Write the next order of the motion of all masses of a chain without dashpots."""
     w, v, group, last, share = s[W], s[V], s[GROUP], links.mass.size - 1, 1.0 / (n + 1)
     for g in range(last + 1):
         net = -group[g, n]
@@ -401,7 +392,7 @@ def _accelerate(links: Links, s: Array, push: Array, n: int) -> None:
 
 @inlined
 def expand_bare(links: Links, s: Array, push: Array, order: int, memory: Memory | None) -> None:
-    """Fill the series of a chain that `is_bare`, as `expand` does, asking less at each order."""
+    """Fill the series of a chain that `is_bare`, as `expand` does, with fewer cases."""
     law, w, eps, sig, group = links.law, s[W], s[EPS], s[SIG], s[GROUP]
     for n in range(order + 1):
         for g in range(links.mass.size):
@@ -427,7 +418,7 @@ def expand_bare(links: Links, s: Array, push: Array, order: int, memory: Memory 
 def expand(
     links: Links, s: Array, push: Array, motion: Array, order: int, memory: Memory | None
 ) -> bool:
-    """Fill the series up to `order`; false if a prescribed stress meets a flat branch.
+    """Fill the series up to `order`; return false if a prescribed stress meets a flat branch.
 
     `push` (2,) is the stress on the top and its rate, `motion` (2,) its displacement and rate.
     """
@@ -471,10 +462,10 @@ def expand(
 
 @inlined
 def _settle_group(links: Links, s: Array, g: int, memory: Memory | None) -> None:
-    """Share the elongation of a group anew, so that no error piles up.
+    """Redistribute the elongation of a group, so that errors do not accumulate.
 
-    The springs without dashpot take it by their compliances; a flat branch takes all; if every
-    spring has a dashpot they share it as these would.
+    Springs without dashpot share the difference according to their compliances, a flat branch takes
+    all of it, and if every spring has a dashpot the dashpots share it.
     """
     law, (i0, i1) = links.law, springs_of(links.ends, g)
     if i1 - i0 == 1 or (g == links.ends.size - 1 and links.top == STRESS):
@@ -501,20 +492,20 @@ def _settle_group(links: Links, s: Array, g: int, memory: Memory | None) -> None
 
 @inner
 def settle(links: Links, s: Array) -> None:
-    """Share the elongation of every group of a chain without memory anew."""
+    """Redistribute the elongation of every group of a chain without memory."""
     for g in range(links.ends.size):
         _settle_group(links, s, g, None)
 
 
 @inlined
 def share_stresses(links: Links) -> bool:
-    """Whether springs have one stress, or are given it."""
+    """Whether springs carry a common or a prescribed stress."""
     return links.ends.size < links.law.shape[0] or links.top == STRESS
 
 
 @inner
 def share_a_stress(law: Array, ends: Branches, i: int, j: int, memory: Memory) -> bool:
-    """Whether two springs bear one stress, without dashpot or relaxation."""
+    """Whether two springs carry one stress, without dashpot or relaxation."""
     plain = law[i, DASHPOT] == 0.0 and law[j, DASHPOT] == 0.0
     plain = plain and memory.now[i, GAIN] == 1.0 and memory.now[j, GAIN] == 1.0
     for g in range(ends.size if plain else 0):
@@ -528,9 +519,10 @@ def share_a_stress(law: Array, ends: Branches, i: int, j: int, memory: Memory) -
 def _share_under(
     law: Array, i0: int, i1: int, eps: Array, softs: Array, stress: float, memory: Memory
 ) -> tuple[float, float, float]:
-    """Give the undamped springs of a group a stress; elongation, its size, and compliance.
+    """Put the undamped springs of a group under a stress.
 
-    Fills their strains, and the slopes dε/dΣ in `softs`.
+    Fill their strains, and the slopes dε/dΣ in `softs`; return elongation, sum of absolute
+    elongations, and compliance.
     """
     total = size = compliance = 0.0
     for i in range(i0, i1):
@@ -564,10 +556,10 @@ def _common_stress(
     stressed: bool,
     memory: Memory,
 ) -> tuple[bool, float, float]:
-    """Search the stress at which the undamped springs of a group share an elongation `rest`.
+    """Solve for the stress at which the undamped springs of a group have the elongation `rest`.
 
-    Returns whether it was found, their elongation, and what is left to add to the stress. Newton's
-    method in the bracket that it meets; a prescribed stress is taken as it is.
+    Return whether it was found, the elongation, and the remaining correction of the stress. The
+    method is Newton's, inside the bracket found so far; a prescribed stress is used as it is.
     """
     before, low, high = math.inf, -math.inf, math.inf
     total, more = 0.0, 0.0
@@ -579,11 +571,11 @@ def _common_stress(
         more = (rest - total) / compliance
         if miss <= 4e-16 * (size + abs(rest)) or abs(more) <= 4e-15 * abs(stress):
             return True, total, more
-        if 0.5 * before <= miss <= 1e-14 * size:  # no better than rounding allows
+        if 0.5 * before <= miss <= 1e-14 * size:  # limited by rounding
             return True, total, more
         if total > rest:
             high = stress
-        else:  # also where a law has ended: then nothing can be said but that this is too low
+        else:  # also where the law ends (NaN)
             low = stress
         before, more = miss, more if math.isfinite(total + more) else 0.0
         stress += more
@@ -601,12 +593,12 @@ def _common_stress(
 def settle_together(
     links: Links, s: Array, order: int, span: float, push: Array, memory: Memory
 ) -> None:
-    """Bring the undamped springs of each group to one stress, at the elongation that they share.
+    """Bring the undamped springs of each group to one stress at their common elongation.
 
-    Truncation of the strains lets their stresses part: of a nearly rigid spring, or one that snaps
-    all at once, by very much.
+    Truncation errors of the strains make their stresses differ: by a large amount for a nearly
+    rigid spring, or one with a very narrow snap.
     """
-    law, eps, softs = links.law, s[EPS], s[SIG]  # until the next series, stresses are not used
+    law, eps, softs = links.law, s[EPS], s[SIG]  # stresses are unused until the next series
     for g in range(links.ends.size):
         i0, i1 = springs_of(links.ends, g)
         stressed = g == links.ends.size - 1 and links.top == STRESS
@@ -632,14 +624,14 @@ def settle_together(
             if lost:
                 eps[i, 0] = s[TILT, i, 0]
             elif law[i, DASHPOT] == 0.0:
-                eps[i, 0] += softs[i, 0] * more  # what no number for the stress is fine enough for
+                eps[i, 0] += softs[i, 0] * more  # a correction below the resolution of the stress
         if lost:
             _settle_group(links, s, g, memory)
 
 
 @inner
 def advance(s: Array, groups: int, order: int, span: float) -> None:
-    """Carry the state, order 0 of W, V and EPS, over a step of length `span`."""
+    """Advance the state, order 0 of W, V and EPS, over a step of length `span`."""
     for row in range(W, EPS + 1):
         for i in range(s.shape[1] if row == EPS else groups):
             s[row, i, 0] = value_at(s[row, i], order, span)

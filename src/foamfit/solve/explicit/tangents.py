@@ -1,11 +1,11 @@
-"""The Taylor series in time of the derivatives of a chain by parameters.
+"""Taylor series in time of the derivatives of a chain by parameters.
 
-Their recurrence is that of `explicit.series`, linearised about the motion: with T the series of the
+Their recurrence is that of `explicit.series`, linearised about the motion. With the series T of the
 slope dσ/dε,
 
     δσ_n = Σ_j T_{n-j} δx_j + (∂σ/∂k)_n δk,      x = ε - x0.
 
-The law is continuous at its switches, so the derivatives pass from branch to branch without a jump.
+The law is continuous at its switches, so the derivatives do not jump there.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 
 @inner
 def _fill_tilt(law: Array, i: int, sig: Array, tilt: Array, order: int) -> None:
-    """Series T of dσ/dε on a branch: k on a straight one, (k + σ)²/k on a curved one."""
+    """Fill the series T of dσ/dε: k on a straight branch, (k + σ)²/k on a curved one."""
     k = law[i, SLOPE]
     tilt[i, 0] = k
     if law[i, CURVED] == 0.0:
@@ -68,7 +68,7 @@ def _fill_tilt(law: Array, i: int, sig: Array, tilt: Array, order: int) -> None:
 def _known_tangent(
     law: Array, s: Array, m: Array, d: Array, i: int, n: int, memory: Memory | None, p: int
 ) -> float:
-    """Order n of δσ of a spring in direction p, but for the term T_0 δε_n."""
+    """Return order n of δσ of a spring in direction p, without the term T_0 δε_n."""
     eps, sig, tilt, gain = s[EPS], s[SIG], s[TILT], 1.0
     if memory is not None:
         sig, gain = memory.series[:, :, EQ], memory.now[i, GAIN]
@@ -85,7 +85,7 @@ def _known_tangent(
             known = tangent_of_mixture(memory, p, i, law[i, CURVED] > HELD, tilt[i, 0], n)
         memory.now[i, BASE] = relaxed_tangent(memory, p, i, n)
         known += memory.now[i, BASE]
-    if law[i, DASHPOT] == 0.0 and n + 2 < tilt.shape[1]:  # a dashpot of zero: what it would take
+    if law[i, DASHPOT] == 0.0 and n + 2 < tilt.shape[1]:  # derivative by a zero dashpot
         known += (n + 1) * eps[i, n + 1] * m[i, DASHPOT]
         if memory is not None:
             memory.now[i, BASE] += (n + 1) * eps[i, n + 1] * m[i, DASHPOT]
@@ -96,10 +96,10 @@ def _known_tangent(
 def _share_tangent(
     law: Array, tilt: Array, d: Array, i0: int, i1: int, rest: float, n: int
 ) -> float:
-    """Order n of the derivative of a group's stress, where some springs have no dashpot.
+    """Return order n of the derivative of a group's stress if some springs have no dashpot.
 
-    `rest` is that of the elongation, but for the moves of the springs. Fills their δε and δσ from
-    the known parts in d[SIG].
+    `rest` is the derivative of the elongation at fixed strains. The δε and δσ of the springs are
+    filled from the known parts in d[SIG].
     """
     eps, sig = d[EPS], d[SIG]
     compliance, flat = 0.0, -1
@@ -117,7 +117,7 @@ def _share_tangent(
             soft = 1.0 / tilt[i, 0] if tilt[i, 0] > 0.0 else 0.0
             eps[i, n] = (common - sig[i, n]) * soft
             sig[i, n] = common
-    if flat >= 0:  # the flat branch takes up all that the others leave
+    if flat >= 0:  # the flat branch takes up the remaining elongation
         eps[flat, n] = (rest - common * compliance) / law[flat, HEIGHT]
     return common
 
@@ -126,7 +126,7 @@ def _share_tangent(
 def _damped_tangent(
     links: Links, s: Array, m: Array, drag: float, d: Array, g: int, i0: int, i1: int, n: int
 ) -> float:
-    """Order n of the derivative of `_damped_term`."""
+    """Return order n of the derivative of `_damped_term`."""
     law, viscous = links.law, g == links.ends.size - 1 and links.top == VISCOUS
     total, weight = (0.0 if viscous else d[V, g, n]), 0.0
     if g > 0:
@@ -154,7 +154,7 @@ def _group_tangent(
     memory: Memory | None,
     p: int,
 ) -> None:
-    """Order n of the derivative of a group's stress and of its strains that are no state."""
+    """Fill order n of the derivatives of a group's stress and of strains that are not states."""
     law, tilt = links.law, s[TILT]
     i0, i1 = springs_of(links.ends, g)
     stressed = g == links.ends.size - 1 and links.top == STRESS
@@ -193,7 +193,7 @@ def _expand_tangent(
     memory: Memory | None,
     p: int,
 ) -> None:
-    """Fill the derivatives in direction p, that moves `m` and `drag`, up to `order`."""
+    """Fill the derivatives in direction p, with changes `m` and `drag`, up to `order`."""
     law, last = links.law, links.ends.size - 1
     w, v = d[W], d[V]
     for n in range(order + 1):
@@ -228,7 +228,7 @@ def _expand_tangent(
 def expand_tangents(
     links: Links, s: Array, d: SeriesTangents, order: int, memory: Memory | None
 ) -> None:
-    """Fill the derivatives up to `order`, after `expand`; those that are still zero stay so."""
+    """Fill the derivatives up to `order`, after `expand`; skip those that are still zero."""
     for i in range(links.law.shape[0]):
         if memory is None:
             _fill_tilt(links.law, i, s[SIG], s[TILT], order)
@@ -247,7 +247,7 @@ def expand_tangents(
 
 @inner
 def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memory) -> None:
-    """Let nothing have relaxed yet of the stress at which a spring starts: q_k = 0."""
+    """Start relaxation from the unrelaxed state q_k = 0 at the initial stress of a spring."""
     sig, tilt = s[SIG], s[TILT]
     _stress_term(law, i, s[EPS], sig, 0, memory)
     kind, stress = law[i, CURVED], memory.series[i, 0, EQ]
@@ -276,7 +276,7 @@ def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memo
 def advance_tangents(
     d: SeriesTangents, groups: int, order: int, span: float, memory: Memory | None
 ) -> None:
-    """Carry the derivatives of the state over a step of length `span`."""
+    """Advance the derivatives of the state over a step of length `span`."""
     for p in range(d.drag.size):
         if d.live[p] > 0.0:
             advance(d.series[p], groups, order, span)

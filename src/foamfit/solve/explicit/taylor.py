@@ -1,8 +1,8 @@
-"""The compiled integrator: Taylor series from switch to switch.
+"""The compiled integrator: Taylor series between switches of branch.
 
-A step is as long as the series of `explicit.series` allow at the wanted tolerance; switches of
-branch, the end of contact and the samples are roots and values of the same polynomials. No branch
-changes inside a step. Derivatives by parameters are carried along where they are asked for.
+A step is as long as the series of `explicit.series` allow at the requested tolerance. Switches of
+branch and the end of contact are roots, and samples are values, of the same polynomials. No branch
+changes inside a step. Derivatives by parameters are integrated on request.
 """
 
 from __future__ import annotations
@@ -74,39 +74,34 @@ from foamfit.springs.kernels import (
 from foamfit.springs.law import MICROSCALE
 from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_RELAXATION
 
-# Strains closer than this to the end of a branch are at it.
-CLOSE = 1e-13
-# Side on which a spring leaves its branch where its strain turns.
-TURN = 2
+CLOSE = 1e-13  # distance of a strain from the end of a branch below which it is at the end
+TURN = 2  # "side" on which a spring leaves its branch at a turning point
 MOST_ORDERS = 24
 Scales = tuple[float, float, float]  # largest displacement, stress and base stress so far
-# Truncation of derivatives, relative to what they were so far, over that of the motion.
-OF_TANGENTS = 1e3
+OF_TANGENTS = 1e3  # relative truncation of derivatives over that of the motion
 
 
 class Run(NamedTuple):
-    """A chain on its way over the samples of a scene.
+    """State and output of a run.
 
-    `links` with `branches` (springs,) are its springs, `s` and `d` its series and their derivatives
-    in `directions` (p, 2), `out` the samples to fill, `log` the switches to note. Loops that take
-    it at every step are `inlined`: to pass it would take longer than they do.
+    Loops that take it at every step are `inlined`, because passing it would take longer than they.
     """
 
-    rows: Array
-    branches: Branches
+    rows: Array  #: springs, (springs, columns)
+    branches: Branches  #: (springs,)
     links: Links
-    s: Array
+    s: Array  #: series, see `Links`
     d: SeriesTangents
-    directions: Branches
+    directions: Branches  #: of the derivatives, (p, 2)
     out: Samples
-    log: Array
+    log: Array  #: switches of branch
 
 
 @inlined
 def _tail(
     law: Array, s: Array, n: int, per_reach: float, per_load: float, per_base: float
 ) -> float:
-    """Largest coefficient of order n among strains, stresses and base stress, over their scales."""
+    """Return the largest coefficient of order n of strains and stresses, over their scales."""
     worst = abs(s[GROUP, 0, n]) * per_base
     for i in range(law.shape[0]):
         worst = max(worst, abs(s[EPS, i, n]) * law[i, HEIGHT] * per_reach)
@@ -118,13 +113,14 @@ def _tail(
 def step_length(
     links: Links, s: Array, push: Array, order: int, tol: float, span: float, scales: Scales
 ) -> float:
-    """Longest step within `span` whose last two terms fall below `tol` of motion and stress.
+    """Return the longest step within `span` with the last two terms below `tol`.
 
-    The base stress is measured by its own size: by that of all springs if its scale is infinite.
+    The terms are relative to the scales of motion, stress and base stress. An infinite scale of the
+    base stress means that it needs no test of its own.
     """
     w_scale, s_scale, b_scale = scales
     reach, load = w_scale, max(s_scale, abs(push[0]))
-    for _ in range(60):  # at rest the only scale is what the step itself reaches
+    for _ in range(60):  # at rest the step itself sets the scale
         tried = span
         if w_scale == 0.0 or s_scale == 0.0:
             top = links.ends.size - 1
@@ -154,17 +150,18 @@ def step_length(
 def tangent_length(
     law: Array, d: SeriesTangents, order: int, tol: float, span: float, sizes: Array, lagging: bool
 ) -> float:
-    """Longest step within `span` whose last two terms fall below `tol` of the derivatives so far.
+    """Return the longest step within `span` for the derivatives.
 
-    Steps too long for a vibration or relaxation that shows in derivatives alone let these grow
-    without bound. `sizes` (p, 2) are the largest elongation and base stress of each direction;
-    behind masses and relaxation (`lagging`) some have none yet that could bound a step.
+    Their last two terms must be below `tol` of their sizes so far. A vibration or relaxation that
+    appears only in the derivatives grows without bound if steps are too long for it. `sizes` (p, 2)
+    are the largest elongation and base stress of each direction; springs with memory (`lagging`)
+    may have directions that are still zero and do not bound the step.
     """
     for p in range(d.drag.size):
         if d.live[p] == 0.0:
             continue
         for part in range(2):
-            for _ in range(2):  # what a step that is too long reaches is too large
+            for _ in range(2):  # a step that is too long overestimates the size
                 bar = tail = before = 0.0
                 for i in range(law.shape[0] if part == 0 else 1):
                     c = d.series[p, EPS, i] if part == 0 else d.series[p, GROUP, 0]
@@ -190,7 +187,7 @@ def tangent_length(
 
 @piece
 def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, int, int]:
-    """First end of a branch within `span`: when, which spring (-1: none), on which side."""
+    """Return time, spring (-1: none) and side of the first end of a branch within `span`."""
     spring, side = -1, 0
     for i in range(law.shape[0]):
         when, where = first_crossing(s[EPS, i], order, law[i, LOW], law[i, HIGH], span)
@@ -201,7 +198,7 @@ def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, 
 
 @inner
 def _enough(law: Array, s: Array, order: int, span: float, tol: float, scales: Scales) -> int:
-    """Orders that are enough over a step that a switch or a sample made short."""
+    """Return the order that suffices for a step shortened by a switch or a sample."""
     w_scale, s_scale, b_scale = scales
     base = max(b_scale, scenes.LEAST_BASE * s_scale)
     if w_scale == 0.0 or s_scale == 0.0 or span == 0.0:
@@ -231,12 +228,12 @@ def switch(
     push: Array,
     memory: Memory | None,
 ) -> int:
-    """Change the branch of a spring, and of all that end theirs at the same time; counts them."""
+    """Switch a spring, and all that switch at the same time; return the number of switches."""
     rows, branches, law, eps = run.rows, run.branches, run.links.law, run.s[EPS]
     turned = branches[spring]
     for i in range(branches.size):
         near = 1.0
-        if rows[i, KIND] == MICROSCALE:  # its first micro-spring may snap at any strain above 0
+        if rows[i, KIND] == MICROSCALE:  # micro-springs may snap at any strain above 0
             near = min(abs(eps[i, 0]), 1.0)
         together = False
         if memory is not None and side == TURN and branches[i] == turned:
@@ -244,7 +241,7 @@ def switch(
         if i == spring:
             out = side
         elif together:
-            out = TURN  # the stress turns for both
+            out = TURN  # their common stress turns
         elif eps[i, 0] >= law[i, HIGH] - CLOSE * near and slope_at(eps[i], order, span) > 0.0:
             out = 1
         elif eps[i, 0] <= law[i, LOW] + CLOSE * near and slope_at(eps[i], order, span) < 0.0:
@@ -274,7 +271,7 @@ def switch(
 def _prescribe(
     top: int, values: Array, clock: Array, knot: int, now: float, push: Array, motion: Array
 ) -> float:
-    """Write what the top is given from a sample on; returns the time from it to the next one."""
+    """Prescribe the top from a sample on; return the time from it to the next sample."""
     horizon = rate = 0.0
     if values.size > 1:
         horizon = clock[knot + 1]
@@ -286,10 +283,10 @@ def _prescribe(
 
 @piece
 def first_lift(s: Array, order: int, first: bool, pressed: bool, span: float) -> tuple[float, bool]:
-    """When within `span` the base stress meets zero again, and whether it does.
+    """Return when the base stress returns to zero within `span`, and whether it does.
 
-    Before the blow has come through to the base (`pressed`) rounding alone may do so; only in the
-    first step can it come and go.
+    Before the impact has reached the base (`pressed`), rounding errors may cross zero, and do not
+    count. Only in the first step can it reach the base and end.
     """
     base = s[GROUP, 0]
     when, where = first_crossing(base, order, 0.0, math.inf, span)
@@ -304,7 +301,7 @@ def first_lift(s: Array, order: int, first: bool, pressed: bool, span: float) ->
 def begin(
     run: Run, heights: Array, start: Array, speed: float, gravity: float, memory: Memory | None
 ) -> int:
-    """Write the state at the first sample; returns how many samples lie before an impact."""
+    """Set the initial state; return the number of samples before an impact."""
     rows, branches, law, s, d = run.rows, run.branches, run.links.law, run.s, run.d
     for i in range(branches.size):
         branches[i] = first_branch(rows[i])
@@ -332,7 +329,7 @@ def begin(
 
 @inner
 def _reached(links: Links, s: Array, w_scale: float) -> tuple[float, float]:
-    """Largest displacement so far, and a number that is finite only if the state is."""
+    """Return the largest displacement so far, and a number that is finite if the state is."""
     top = links.ends.size - 1
     total = s[W, top, 0]
     if links.top != scenes.STRESS:
@@ -347,11 +344,9 @@ def _reached(links: Links, s: Array, w_scale: float) -> tuple[float, float]:
 def _first_end(
     run: Run, order: int, tol: float, span: float, c: Array, memory: Memory | None
 ) -> tuple[float, int, int]:
-    """First end of a branch within `span`, or turn of a spring that snaps; see `first_switch`."""
+    """Return the first end of a branch, or turn of a snapping spring; see `first_switch`."""
     if memory is not None:
-        fine = (
-            0.0 if run.directions.shape[0] > 0 else tol
-        )  # derivatives feel even what is negligible
+        fine = 0.0 if run.directions.shape[0] > 0 else tol  # no snap is negligible for derivatives
         for i in range(run.branches.size):
             if run.branches[i] > HELD:
                 span = longest(memory.series[i], memory.now[i], order, fine, span)
@@ -365,10 +360,10 @@ def _first_end(
 
 @inlined
 def _scales(run: Run, started: bool, reach: float, stress: float, base: float) -> Scales:
-    """Largest displacement, stress and base stress so far.
+    """Return the largest displacement, stress and base stress so far.
 
-    That of the base is infinite unless a mass hides the base from the blow, or a dashpot acts
-    there: it cannot be much smaller, or change faster, than the stresses of the springs.
+    Without a mass or dashpot at the base, the base stress cannot be much smaller, or change faster,
+    than the stresses of the springs, and its scale is infinite.
     """
     for i in range(run.branches.size if started else 0):
         stress = max(stress, abs(run.s[SIG, i, 0]))
@@ -381,7 +376,7 @@ def _scales(run: Run, started: bool, reach: float, stress: float, base: float) -
 def _shorten(
     run: Run, order: int, tol: float, span: float, sizes: Array, memory: Memory | None
 ) -> float:
-    """Fill the derivatives of a step; returns the longest step within `span` for them."""
+    """Fill the derivatives of a step; return the longest step within `span` for them."""
     expand_tangents(run.links, run.s, run.d, order, memory)
     if memory is not None:
         mark_one_sided(memory, run.branches, run.s[EPS], run.d.series[:, EPS], order, span)
@@ -400,7 +395,7 @@ def _record(
     scratch: Array,
     ends: bool,
 ) -> None:
-    """Write the samples first … done-1 of a step; where it `ends` at an event, how late that is."""
+    """Write samples first … done-1 of a step and, if it `ends` at an event, the delay of that."""
     if first < done:
         sample(run.links, run.s, orders[0], run.out, first, done, now, scratch[3])
     if run.directions.shape[0] > 0:
@@ -413,7 +408,7 @@ def _record(
 def _carry(
     run: Run, order: int, more: int, span: float, push: Array, memory: Memory | None
 ) -> None:
-    """Carry the state over a step, the derivatives by `more` orders, and share elongations anew."""
+    """Advance the state, and the derivatives to order `more`, and redistribute elongations."""
     groups = run.links.ends.size
     advance(run.s, groups, order, span)
     if memory is not None:
@@ -429,14 +424,14 @@ def _carry(
 
 @inner
 def _fill_clock(t: Array, struck: bool, clock: Array) -> None:
-    """Count the times of a drive from sample to sample: no origin then takes their digits."""
+    """Store the times of a drive as differences: a distant origin would cost digits."""
     for j in range(1, t.size if not struck else 1):
         clock[j] = t[j] - t[j - 1]
 
 
 @inlined
 def _passed(clock: Array, done: int, knot: int, end: float, last: bool, struck: bool) -> int:
-    """How many samples are filled after a step until `end`; its `last` one is before a kink."""
+    """Return the number of samples filled after a step; the `last` ends at the next sample."""
     if struck:
         return first_past(clock, done, end, last)
     if last:
@@ -472,8 +467,8 @@ def _integrated(
     done = begin(run, heights, start, speed, gravity, memory)
     bare, scales = is_bare(links, memory), (0.0, 0.0, math.inf)
     pressed, knot, stalled = False, 0, 0
-    switches = count - count  # a whole number, and no constant: one type to compile for
-    now = since = 0.0  # of a drive, since the sample where it last had a kink
+    switches = count - count  # 0, but not a literal, which would be another type
+    now = since = 0.0  # along a drive, since the last sample
     for step in range(max_steps):
         if done == t.size:
             return scenes.DONE, math.nan, step, switches
@@ -498,9 +493,9 @@ def _integrated(
             pressed |= s[GROUP, 0, 0] > tol * scales[1]
             span, leaves = first_lift(s, order, step == 0, pressed, span)
         least = order
-        if spring >= 0 or leaves or now + span >= horizon:  # not its own error ended the step
+        if spring >= 0 or leaves or now + span >= horizon:  # an event ended the step
             least = _enough(links.law, s, order, span, 1e-3 * tol, scales)
-        more = min(least + 2, order)  # for what is, in time, a derivative of these
+        more = min(least + 2, order)  # for their time derivatives
         if size > 0:
             shorter = _shorten(run, more, tol, span, sizes, memory)
             if shorter < span:
@@ -544,15 +539,15 @@ def integrate(
 ) -> tuple[int, float, int, int]:
     """Integrate a chain over the samples of a scene.
 
-    rows, heights, ends, mass, values and t are fields of a `Scene`, which itself would cost a call
-    as much as a short run; `numbers` (5,) are its drag, top and speed, the truncation of a step
-    relative to the motion so far, and the bound on steps. An impact ends when the base stress is
-    back at zero. Derivatives are carried along in `directions` (p, 2). Springs start from strains
-    and their derivatives, `start` (1 + p, springs), or from rest (1 + p, 0). Filled are `out` (1 +
-    p, …), the curves and their derivatives (see `Samples`), and the switches, `log`.
+    rows, heights, ends, mass, values and t are fields of a `Scene`; passing a `Scene` would take as
+    long as a short run. `numbers` (5,) contains its drag, top and speed, the truncation of a step
+    relative to the motion so far, and the bound on steps. An impact ends when the base stress
+    returns to zero. Derivatives are computed in `directions` (p, 2). Springs start from strains and
+    their derivatives, `start` (1 + p, springs), or from rest (1 + p, 0). The curves and their
+    derivatives are written to `out` (1 + p, …), see `Samples`, and the switches to `log`.
 
-    Returned are the outcome, the end of contact (NaN if none; without an answer, how far it came),
-    the steps taken, and the number of switches, also of those past the log.
+    Return the outcome, the end of contact (NaN if none; after a failure, the time reached), the
+    number of steps, and the number of switches, including those that did not fit the log.
     """
     given = (rows, heights, ends, mass, numbers[0], int(numbers[1]), values, numbers[2], t)
     return _integrated(given, numbers[3], int(numbers[4]), directions, start, out, log, None)
@@ -570,9 +565,9 @@ def integrate_with_memory(
     log: Array,
     one_sided: Array,
 ) -> tuple[int, float, int, int]:
-    """Integrate a chain in which springs relax or are microscale, as `integrate` does others.
+    """Integrate a chain with microscale springs or relaxation; see `integrate`.
 
-    Times are counted in a `unit`, s. Derivatives that do not exist are marked in `one_sided` (p,).
+    The internal unit of time is `unit`, s. One-sided derivatives are marked in `one_sided` (p,).
     """
     rows, heights, ends, mass, drag, top, values, speed, t = given
     order = order_for(max(tol, LEAST_TRUNCATION), MOST_ORDERS)

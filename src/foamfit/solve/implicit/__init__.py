@@ -1,6 +1,5 @@
-"""Implicit steps for stiff scenes, in plain NumPy: collocation of order 9, from switch to switch.
+"""Implicit steps for stiff scenes: collocation of order 9 in NumPy. Newcomers may skip them.
 
-`collocation` is one step, `control` its length; `steps` goes from step to step, `vibration`
-estimates what steps do not resolve.
-A newcomer may skip all of it.
+`collocation` solves one step, `control` sets its length, `steps` is the loop over steps, and
+`vibration` estimates the vibrations that steps do not resolve.
 """

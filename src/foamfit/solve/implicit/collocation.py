@@ -1,15 +1,15 @@
 """One implicit step of a chain on fixed branches: Radau IIA collocation, and its linearisation.
 
-A step is a polynomial in time through five Radau points (order 9), on which the balance of every
-node holds exactly:
+A step is a polynomial in time that satisfies the balance of every node at five Radau points (order
+9):
 
     μ_i d²w_i/dt² + c dw_i/dt + Σ_i - Σ_{i+1} = p,      Σ_i = σ_i(ε_i) + η_i dε_i/dt
 
-A node without mass or a spring without dashpot only lacks its term, so massless, undamped and mixed
-chains are one case. Newton's method with the exact Jacobian finds the displacements of all nodes at
-the points. Its linear systems also keep the stresses of the springs as unknowns: so a soft spring
-beside a stiff one loses no digits. They are banded, and cost grows with the number of springs. The
-derivatives by parameters solve the same equations, linearised at the points that were found.
+For a node without mass or a spring without dashpot a term vanishes, so that massless, undamped and
+mixed chains are one case. Newton's method with the exact Jacobian solves for the displacements of
+all nodes at the points. The linear systems keep the stresses of the springs as unknowns, so that a
+soft spring next to a stiff one loses no digits. They are banded, and their cost is proportional to
+the number of springs. The derivatives by parameters solve the same equations, linearised.
 """
 
 from __future__ import annotations
@@ -28,13 +28,12 @@ from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
 from foamfit.springs.sensitivities import branch_derivative
 
 STAGES = 5
-# Diagonals of the linear systems beside the main one, on each side.
-_BAND = 2 * STAGES - 1
-_ROWS = 3 * _BAND + 1  # of LAPACK's storage of a band: it needs room for its factors
+_BAND = 2 * STAGES - 1  # diagonals of the linear systems on each side of the main one
+_ROWS = 3 * _BAND + 1  # of LAPACK's band storage, with room for the factors
 
 
 def radau(stages: int) -> tuple[Array, Array]:
-    """Nodes c and matrix A of the Radau IIA method of order 2 stages - 1."""
+    """Return the nodes c and the matrix A of the Radau IIA method of order 2 stages - 1."""
     series = np.zeros(stages + 1)
     series[-2:] = 1.0, -1.0
     nodes = np.sort(0.5 * (1.0 + np.real(np.polynomial.legendre.legroots(series))))
@@ -46,29 +45,29 @@ def radau(stages: int) -> tuple[Array, Array]:
 
 
 NODES, WEIGHTS = radau(STAGES)
-# From increments at the points to their time derivatives (times the step), first and second.
+# Matrices from increments at the points to: their first and second time derivatives times step,
 RATES = np.linalg.inv(WEIGHTS)
 RATES_2 = RATES @ RATES
-# From increments at the points to the coefficients 1 … 5 of the polynomial over the step [0, 1].
+# coefficients 1 … 5 of the polynomial over the step [0, 1],
 COEFFICIENTS = np.linalg.inv(NODES[:, None] ** np.arange(1, STAGES + 1))
-# From values at the points to the coefficients 0 … 4 of the polynomial through them alone.
+# and, from values at the points, coefficients 0 … 4 of the polynomial through the points only.
 THROUGH = np.linalg.inv(NODES[:, None] ** np.arange(STAGES))
 
 
 def plain(loop: Any) -> Any:
-    """Return the Python function of a compiled one."""
+    """Return the Python function of a compiled function."""
     return getattr(loop, "py_func", loop)
 
 
 def relative(nodes: Array) -> Array:
-    """From quantities of the nodes, along the second last axis, to those of the springs below."""
+    """Return differences of neighbouring nodes, along the second last axis, for the springs."""
     out = nodes.copy()
     out[..., 1:, :] -= nodes[..., :-1, :]
     return out
 
 
 def polynomial(first: Array | float, points: Array) -> Array:
-    """Coefficients over [0, 1] of the polynomials through `first` at 0 and the values at points."""
+    """Return polynomials over [0, 1] through `first` at 0 and the values at the points."""
     out = np.empty((*points.shape[:-1], STAGES + 1))
     out[..., 0] = first
     out[..., 1:] = (points - out[..., :1]) @ COEFFICIENTS.T
@@ -76,16 +75,16 @@ def polynomial(first: Array | float, points: Array) -> Array:
 
 
 class Step:
-    """A chain, the state that a step starts from, and what it finds at its points.
+    """A chain, its state at the start of a step, and the solution at the points of the step.
 
-    `w` and `v` (springs,) are displacements and velocities of the nodes, `v0` those of nodes with a
-    mass (0 of the others) or a prescribed motion, `eps0` the strains, `branches` the branches,
-    between the strains `low` and `high`, `stress0` and `slope0` the law's stresses and slopes;
-    `moves` (springs, 6) the polynomials of the last motion. At the points, (springs, points), z is
-    what the nodes move beyond v0 times time, `eps` the strains, `vel` the velocities of the nodes,
-    `stress` that of the law, `total` that with the dashpots, `slope` dσ/dε. Of p derivatives,
-    `d_w`, `d_v0`, `d_eps0` are (p, springs), `d_z`, `d_eps`, `d_total` (p, springs, points), and
-    `d_base` (p,) is that of the last base stress.
+    State, (springs,): displacements `w` and velocities `v` of the nodes; `v0`, the velocities of
+    nodes with a mass or prescribed motion (0 for others); strains `eps0`; `branches` and the
+    strains `low` and `high` at which they end; stresses `stress0` and slopes `slope0` of the law.
+    `moves` (springs, 6) are the polynomials of the last motion. Solution, (springs, points): node
+    displacements `z` beyond v0 times time, strains `eps`, node velocities `vel`, stress of the law
+    `stress`, with dashpots `total`, and `slope` dσ/dε. Derivatives in p directions: `d_w`, `d_v0`,
+    `d_eps0` (p, springs), `d_z`, `d_eps`, `d_total` (p, springs, points), and `d_base` (p,) of the
+    last base stress.
     """
 
     def __init__(self, scene: Scene, directions: kernels.Branches) -> None:
@@ -122,12 +121,12 @@ class Step:
                 self.d_shape[:, p, i, 0] = plain(branch_derivative)(row, branch, what)
 
     def settle(self) -> None:
-        """Find stresses and slopes where the next step starts."""
+        """Compute stresses and slopes at the start of the next step."""
         stress, slope = self.law(self.eps0[:, None])
         self.stress0, self.slope0 = stress[:, 0], slope[:, 0]
 
     def law(self, eps: Array) -> tuple[Array, Array]:
-        """Stress and slope dσ/dε at strains (springs, …); infinite past the end of a branch."""
+        """Return stress and slope dσ/dε at strains (springs, …); infinite past a branch's end."""
         curved, k, x0, s0 = self._shape
         x = eps - x0
         rest = 1.0 - x
@@ -135,7 +134,7 @@ class Step:
         return np.where(curved, bent, s0 + k * x), np.where(curved, k / (rest * rest), k)
 
     def stress_tangents(self, d_eps: Array) -> Array:
-        """Derivatives of the stresses at the points, at which the strains move by d_eps."""
+        """Return derivatives of the stresses at the points from those of the strains."""
         (curved, k, x0, _), (dk, dx0, ds0) = self._shape, self.d_shape
         x = self.eps - x0
         at_rest = np.where(curved, x / (1.0 - x), x) * dk + ds0
@@ -144,12 +143,12 @@ class Step:
         return out
 
     def ahead(self) -> Array:
-        """How far, in strain, the springs are from the end of their curved branches."""
+        """Return the distances of the strains from the ends of curved branches."""
         curved, _, x0, _ = self._shape[..., 0]
         return np.where(curved > 0.0, 1.0 - (self.eps0 - x0), math.inf)
 
     def _fill(self, span: float) -> bool:
-        """Fill what follows from z at the points; false past the end of a branch."""
+        """Compute the solution from z; return false past the end of a branch."""
         self.vel = self.v0[:, None] + self.z @ RATES.T / span
         moved = relative(self.z + self.v0[:, None] * (span * NODES))
         self.stretching = relative(self.vel) / self.height
@@ -161,9 +160,9 @@ class Step:
     # ---------------------------------------------------------------- the linear systems
 
     def _lay_out(self, count: int) -> None:
-        """Places of the entries in LAPACK's storage of a band.
+        """Compute the places of the entries in LAPACK's band storage.
 
-        Equations and unknowns of spring i: its stresses at the points, the displacements above it.
+        The unknowns of spring i are its stresses and the displacements above it, at the points.
         """
         i, j, k = np.ogrid[:count, :STAGES, :STAGES]
         spring, node = 2 * STAGES * i, 2 * STAGES * i + STAGES
@@ -189,10 +188,10 @@ class Step:
         self._soft = 1e-12 * self.rows[:, kernels.K0, None]
 
     def _solve(self, residual: Array, span: float) -> Array | None:
-        """Displacements (…, springs, points) that balance forces; None if there are none."""
+        """Return displacements (…, springs, points) that balance forces; None if singular."""
         count = self.heights.size
         stiff = self.eta[..., None] / (self.height[..., None] * span) * RATES
-        # On a flat branch the step would have no bound; the force has.
+        # Keep the Newton step bounded on a flat branch.
         diagonal = np.maximum(self.slope, self._soft) / self.height
         stiff[:, range(STAGES), range(STAGES)] += diagonal
         unit = float(np.abs(stiff).max())
@@ -210,15 +209,15 @@ class Step:
         right[:, :, 1] = (residual / unit).reshape(columns, count, STAGES)
         if self.held:
             right[:, -1] = 0.0
-        matrix, known = band.reshape(-1, _ROWS).T, right.reshape(columns, -1).T
-        found, info = lapack.dgbsv(_BAND, _BAND, matrix, known, overwrite_ab=1, overwrite_b=1)[2:]
+        matrix, sides = band.reshape(-1, _ROWS).T, right.reshape(columns, -1).T
+        x, info = lapack.dgbsv(_BAND, _BAND, matrix, sides, overwrite_ab=1, overwrite_b=1)[2:]
         if info != 0:
             return None
-        out: Array = found.T.reshape(columns, count, 2, STAGES)[:, :, 1].reshape(residual.shape)
+        out: Array = x.T.reshape(columns, count, 2, STAGES)[:, :, 1].reshape(residual.shape)
         return out
 
     def _net(self, total: Array) -> Array:
-        """What the stresses of the springs do to the nodes."""
+        """Return the net stress on each node from the stresses of the springs."""
         out = -total
         out[..., :-1, :] += total[..., 1:, :]
         return out
@@ -226,7 +225,7 @@ class Step:
     # ---------------------------------------------------------------- Newton's method
 
     def collocate(self, push: float, push_rate: float, span: float, reach: float) -> bool:
-        """Solve one step by Newton's method from the guess in z; false if it does not converge."""
+        """Solve one step by Newton's method from the guess in z; return false if it fails."""
         if not self._fill(span):
             self.z[:] = 0.0
             if not self._fill(span):
@@ -255,16 +254,15 @@ class Step:
                 if size <= 1e-8 * moved + 1e-15 * reach:
                     return True
                 slow = slow + 1 if size > 0.5 * before else 0
-                if slow > 5:  # near a pole corrections double before they halve
+                if slow > 5:  # near a pole corrections may grow at first
                     return False
                 before = size
         return False
 
     def linearise(self, span: float) -> bool:
-        """Derivatives at the points of a step that was found; false if there are none.
+        """Compute the derivatives at the points of a solved step; return false if singular.
 
-        First what parameters and the start of the step do to the forces while z rests, then the z
-        that balances them.
+        First those of the forces by parameters and initial state at fixed z, then those of z.
         """
         d_v = relative(self.d_v0[..., None])
         moved = d_v * (span * NODES) - (self.eps - self.eps0[:, None]) * self.longer
@@ -274,11 +272,11 @@ class Step:
         self.d_total += self.stretching * self._damped
         net = self._net(self.d_total)
         net[:, -1] -= self.drag * self.d_v0[:, -1:] + self.vel[-1] * self._dragged
-        found = self._solve(net, span)
-        if found is None:
+        d_z = self._solve(net, span)
+        if d_z is None:
             return False
-        self.d_z = found
-        moved = relative(found) / self.height
+        self.d_z = d_z
+        moved = relative(d_z) / self.height
         self.d_eps += moved
         self.d_total += self.slope * moved + self.eta * (moved @ RATES.T) / span
         return True
@@ -286,13 +284,13 @@ class Step:
     # ---------------------------------------------------------------- the end of a step
 
     def carry(self, span: float) -> None:
-        """Carry the state over a step."""
+        """Advance the state over a step."""
         self.w += self.z[:, -1] + span * self.v0
         self.eps0, self.v = self.eps[:, -1].copy(), self.vel[:, -1].copy()
         self.v0 = np.where(self.heavy, self.v, self.v0)
 
     def carry_tangents(self, span: float) -> None:
-        """Carry the derivatives of the state over a step."""
+        """Advance the derivatives of the state over a step."""
         self.d_w += self.d_z[..., -1] + span * self.d_v0
         self.d_eps0 = self.d_eps[..., -1].copy()
         self.d_v0 += np.where(self.heavy, self.d_z @ RATES[-1] / span, 0.0)

@@ -1,8 +1,8 @@
-"""How long an implicit step may be: the error control, and the first event of a step.
+"""Length of implicit steps: error control, and the first event in a step.
 
-A step is as long as its truncation allows. Where the error alone keeps steps short for long,
-something vibrates too fast to be worth following: from the follow limit on steps grow up to a step
-floor whatever their error, and the vibration is damped out (L-stability).
+A step is as long as its truncation error allows. If the error keeps many steps in a row short,
+something vibrates too fast to be worth resolving: after the follow limit, steps grow up to a floor
+regardless of their error, and the vibration is damped out (L-stability).
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ from foamfit.solve.polynomial import first_crossing
 from foamfit.solve.scene import LEAST_BASE
 from foamfit.springs.kernels import compiled
 
-# A step is short below this share of the motion; so many in a row are followed.
-SHORT, FOLLOW_LIMIT = 5e-4, 600
-# Behind heavy dashpots contact ends when no more than 1e-12 of the peak of the base stress is left:
-# while the striker presses it is followed with so large an error of what is left, at most.
+SHORT = 5e-4  # length of a short step, as a share of the duration, for a truncation of 3e-8
+FOLLOW_LIMIT = 600  # number of short steps in a row that are taken
+# Behind heavy dashpots contact ends when the base stress has fallen to 1e-12 of its peak. Until
+# then its error, relative to the remaining stress, is at most:
 SMALL_BASE_ERROR = 1e-7
-# What to do with a step whose end was compared with the first event in it.
+# Decision on a step after a search for events: repeat it with another length, accept it without an
+# event, accept it ending at an event, or switch at its start.
 AGAIN, FREELY, ARRIVED, AT_ONCE = range(4)
 
 
 class Start(NamedTuple):
-    """Where a step starts; `pressed` says that the blow has come through to the base."""
+    """State at the start of a step; `pressed` once the impact has reached the base."""
 
     now: float
     base: float
@@ -39,7 +40,7 @@ class Start(NamedTuple):
 
 
 class Event(NamedTuple):
-    """When in a step [0, 1], of which spring (-1: none, one past the last: base), on which side."""
+    """Time in a step [0, 1], spring (-1: none; one past the last: base), and side of an event."""
 
     when: float
     which: int
@@ -50,7 +51,7 @@ class Event(NamedTuple):
 def first_leaving(
     polynomials: Array, order: int, low: Array, high: Array
 ) -> tuple[float, int, int]:
-    """First time in [0, 1] at which one of several polynomials leaves [low, high]; see `Event`."""
+    """Return when, in [0, 1], the first of several polynomials leaves [low, high]; see `Event`."""
     when, which, side = 1.0, -1, 0
     for i in range(low.size):
         at, where = first_crossing(polynomials[i], order, low[i], high[i], 1.0)
@@ -60,26 +61,26 @@ def first_leaving(
 
 
 def value_at(c: Array, tau: float) -> float:
-    """Value of a polynomial of a step."""
+    """Return the value of a polynomial of a step."""
     return float(((((c[5] * tau + c[4]) * tau + c[3]) * tau + c[2]) * tau + c[1]) * tau + c[0])
 
 
 def slope_at_end(c: Array) -> float:
-    """Derivative of a polynomial of a step at its end."""
+    """Return the derivative of a polynomial of a step at its end."""
     return float(c[1] + 2.0 * c[2] + 3.0 * c[3] + 4.0 * c[4] + 5.0 * c[5])
 
 
 class Control:
-    """Control of the steps.
+    """Control of the step length.
 
-    `tol` is the truncation of a step relative to the motion so far, `short` the length (s) under
-    which steps are short, `weight` that of the truncation of the base stress relative to what is
-    left of it, while the striker presses. `taken` and `proposed` are the lengths of the last step
-    and the next; `floor` is the least that the error may ask for; `short_in_row` counts steps that
-    the error alone made short; `worst` is the largest error let pass, over tol. `damped` is the
-    size of all vibrations that were damped out, `damping` of those in the last steps. `motion` (m),
-    `stress` and `base` (Pa) are the largest so far, `step_…` with the step that is tried; `strains`
-    and `ending` (the base stress) polynomials over [0, 1] of a step.
+    `tol` is the truncation of a step relative to the motion so far, `short` the length (s) of a
+    short step, and `weight` that of the error of the base stress relative to the remaining stress,
+    during contact. `taken` and `proposed` are the lengths of the last and the next step, and
+    `floor` is the least length that the error can enforce. `short_in_row` counts the steps that
+    the error made short, and `worst` is the largest accepted error over tol. `damped` is the size
+    of all damped-out vibrations, `damping` of those in the last steps. `motion` (m), `stress` and
+    `base` (Pa) are the largest values so far, `step_…` those including the trial step. `strains`
+    and `ending` (the base stress) are polynomials over [0, 1] of a step.
     """
 
     def __init__(
@@ -93,24 +94,24 @@ class Control:
         self.strains, self.ending = np.zeros((step.heights.size, STAGES + 1)), np.zeros(STAGES + 1)
 
     def error(self, start: Start) -> float:
-        """Truncation of a step, relative to motion and stress with what the step itself reaches."""
+        """Return the truncation error of a step over the largest motion and stress so far."""
         step, count = self.step, self.step.heights.size
         present = max(abs(start.base), float(np.abs(step.total[0]).max()))
         reach = max(self.motion, float((step.heights * np.abs(step.eps).max(axis=1)).max()))
         load = max(self.stress, float(np.abs(step.stress).max()), present)
         self.step_motion, self.step_stress = reach, load
         first = np.concatenate((step.eps0, step.stress0, [start.base]))
-        found = polynomial(first, np.concatenate((step.eps, step.stress, step.total[:1])))
-        self.strains, self.ending = found[:count], found[-1]
-        # The sizes of the first Legendre term that the polynomials leave out.
-        fifth = np.abs(found[:, 5]) / 252.0
-        fourth = np.abs(found[:, 4] + 2.5 * found[:, 5]) / 70.0
+        curves = polynomial(first, np.concatenate((step.eps, step.stress, step.total[:1])))
+        self.strains, self.ending = curves[:count], curves[-1]
+        # Estimate the first Legendre term that the polynomials neglect from the last two.
+        fifth = np.abs(curves[:, 5]) / 252.0
+        fourth = np.abs(curves[:, 4] + 2.5 * curves[:, 5]) / 70.0
         left_out = fifth * np.minimum(np.maximum(fifth / (fourth + 1e-300), 0.02), 1.0)
         error, of_base = 0.0, float(left_out[-1])
         if load > 0.0:
             error = of_base / max(self.base, present, LEAST_BASE * load)
             if self.weight > 0.0 and start.pressed:
-                # What is left is known to the rounding of its parts.
+                # The remaining stress is subject to the rounding errors of its parts.
                 least = SMALL_BASE_ERROR * float(np.abs(step.stress[0]).max())
                 error = max(error, self.weight * of_base / max(present, least))
             error = max(error, float(left_out[count:-1].max()) / load)
@@ -119,9 +120,9 @@ class Control:
         return error
 
     def allowed(self, now: float, span: float, error: float, rounded: bool) -> float:
-        """Length at which to take a step whose truncation is `error`: its own where that may pass.
+        """Return the length to use for a step with this truncation error: `span` to accept it.
 
-        It may also where the error is one of rounding, or the step as short as times can resolve.
+        An excessive error is accepted if rounding dominates it or if no shorter step is resolved.
         """
         excess = error / self.tol
         if not math.isfinite(excess):
@@ -142,12 +143,12 @@ class Control:
         return span
 
     def slack(self) -> tuple[Array, float]:
-        """What strains and base stress are known to."""
+        """Return the uncertainty of strains and base stress."""
         strains = np.maximum(1e-12, self.tol * self.step_motion / self.step.heights)
         return strains, min(self.worst * self.tol, 1e-3) * self.step_stress
 
     def note(self, span: float, last: bool) -> None:
-        """Take the scales from a step; let steps grow that only the error kept short for long."""
+        """Update the scales by a step; raise the floor after too many short steps in a row."""
         step = self.step
         self.motion = max(self.motion, float((step.heights * np.abs(step.eps0)).max()))
         self.base = max(self.base, abs(float(step.total[0, -1])))
@@ -164,10 +165,10 @@ class Control:
     # ---------------------------------------------------------------- where a step ends
 
     def _first_event(self, start: Start, struck: bool) -> Event:
-        """First event of a step.
+        """Return the first event of a step.
 
-        A spring that starts within its slack of the end of its branch leaves it by more than that.
-        The base stress has to rise by ten times its slack before contact can end.
+        A spring that starts within its slack of the end of its branch must exceed the slack to
+        leave. The base stress must rise to ten times its slack before contact can end.
         """
         step, (slack, least) = self.step, self.slack()
         low = step.low - np.where(np.abs(self.strains[:, 0] - step.low) <= slack, slack, 0.0)
@@ -188,12 +189,12 @@ class Control:
     def aim(
         self, start: Start, struck: bool, span: float, longest: float, last: bool, aimed_at: Event
     ) -> tuple[int, float, Event]:
-        """What to do with a step aimed at an event, for what length, and the event from then on."""
-        step, found = self.step, self._first_event(start, struck)
-        when, which, side = found.when, aimed_at.which, aimed_at.side
-        aimed = which >= 0 and (found.which < 0 or found.which == which or when > 1.0 - 1e-9)
+        """Return what to do with a step aimed at an event, its length, and its new target."""
+        step, first = self.step, self._first_event(start, struck)
+        when, which, side = first.when, aimed_at.which, aimed_at.side
+        aimed = which >= 0 and (first.which < 0 or first.which == which or when > 1.0 - 1e-9)
         if not aimed:
-            which, side = found.which, found.side
+            which, side = first.which, first.side
         target = Event(when, which, side)
         if which < 0:
             return FREELY, span, target
@@ -208,7 +209,7 @@ class Control:
         if aimed:
             if abs(level - value) <= (1e5 * fine if last else fine):
                 return ARRIVED, span, target
-            if found.which < 0:  # a little further; where it turned back, nothing was crossed
+            if first.which < 0:  # aim a little further, unless the curve turns back
                 slope = slope_at_end(ending)
                 more = (level - value) / slope if slope != 0.0 else math.inf
                 when = 1.0 + more if more > 0.0 else math.inf

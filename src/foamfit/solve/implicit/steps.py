@@ -1,16 +1,15 @@
-"""The integrator for stiff scenes: implicit collocation from switch to switch.
+"""The integrator of stiff scenes: implicit collocation between switches of branch.
 
-Light masses and heavy or very light dashpots make rates that explicit steps must follow. The steps
-of `implicit.collocation` (Radau IIA, order 9) need not: the method is L-stable, what relaxes or
-vibrates too fast to be followed dies out (and `implicit.vibration` estimates how much that was).
+Light masses, and heavy or very light dashpots, cause fast rates that explicit steps must resolve.
+The steps of `implicit.collocation` (Radau IIA, order 9) need not: the method is L-stable, so that
+unresolved relaxation and vibration die out (`implicit.vibration` estimates the resulting error).
 
 No branch changes inside a step. A switch, or the end of contact, is the first crossing of the
-polynomial; the step is then taken again, shorter, until it ends there. Derivatives by parameters
-are carried along where they are asked for; the law is continuous at its switches, so they pass
-from branch to branch without a jump.
+polynomial; the step is repeated, shorter, until it ends there. Derivatives by parameters are
+integrated on request; the law is continuous at its switches, so they do not jump there.
 
-Stiff scenes are rare, and compiling these steps would take longer than thousands of them: they are
-plain NumPy, over all springs and points at once.
+Stiff scenes are rare, and compilation would take longer than thousands of steps. The steps are
+therefore plain NumPy, vectorised over springs and points.
 """
 
 from __future__ import annotations
@@ -54,10 +53,10 @@ def integrate_implicit(
     out: scenes.Samples,
     log: Array,
 ) -> tuple[int, float, int, int, float]:
-    """Integrate a chain from rest (or struck) over the samples of a scene, by implicit steps.
+    """Integrate a chain, at rest or struck, over the samples of a scene by implicit steps.
 
-    See `explicit.taylor.integrate`. Returned are also the vibrations that were damped out because
-    they could not be followed, relative to motion and stress.
+    See `explicit.taylor.integrate`. The last value returned is the size of the unresolved
+    vibrations that were damped out, relative to motion and stress.
     """
     with np.errstate(all="ignore"):
         run = _Run(scene, tol, directions, start, out, log)
@@ -69,7 +68,7 @@ def integrate_implicit(
                 scales = run.control.motion, run.control.stress
                 lost += float((run.vibrations.worst / scales).max())
             return end.outcome, end.time, run.steps, run.switches, lost
-    raise AssertionError  # a run ends by `_EndError`
+    raise AssertionError  # `follow` always raises `_EndError`
 
 
 class _Run:
@@ -88,14 +87,14 @@ class _Run:
         self.t, self.struck = scene.t, scene.speed > 0.0
         self.step = Step(scene, directions)
         self.count, self.first = scene.heights.size, int(scene.ends[0])
-        # The springs above the last mass inside, whose nodes start where the drive wants them.
+        # The springs above the last mass inside; the drive determines where their nodes start.
         self.above = slice(int(scene.ends[-2]) if scene.ends.size > 1 else 0, None)
         self.nodes = slice(None) if len(out.curves) > 2 else slice(-1, None)
         duration, weight = float(self.t[-1] - (0.0 if self.struck else self.t[0])), 0.0
         if self.struck:
-            given = scene.rows, scene.heights, scene.mass[-1]
-            duration = min(duration, 5.0 * plain(contact_time)(*given, scene.drag))
-            if plain(is_overdamped)(*given):
+            chain = scene.rows, scene.heights, scene.mass[-1]
+            duration = min(duration, 5.0 * plain(contact_time)(*chain, scene.drag))
+            if plain(is_overdamped)(*chain):
                 weight = min(1.0, tol / SMALL_BASE_ERROR)
         self.vibrations = Vibrations(scene)
         self.control = Control(self.step, self.vibrations, tol, duration, weight)
@@ -108,7 +107,7 @@ class _Run:
         self._begin(start)
 
     def _begin(self, start: Array) -> None:
-        """Fill the state at the start and its scales; the nodes below the last mass are at rest."""
+        """Fill the initial state and its scales; the nodes below the last mass are at rest."""
         step, heights = self.step, self.scene.heights
         for i, row in enumerate(self.scene.rows):
             branch = plain(kernels.first_branch)(row)
@@ -137,7 +136,7 @@ class _Run:
             self.out.curves[-1, before] = falling * self.t[before]
 
     def follow(self, max_steps: int) -> None:
-        """Step from event to event until the run ends."""
+        """Take steps until the run ends, which raises `_EndError`."""
         step, stalled = self.step, 0
         while self.steps < max_steps:
             if self.done == self.t.size:
@@ -174,7 +173,7 @@ class _Run:
         raise _EndError(scenes.TOO_MANY_STEPS, self.now)
 
     def _longest_step(self, start: Start, span: float) -> tuple[float, bool, Event]:
-        """Find the longest step: its length, whether it ends at an event, and that event."""
+        """Return the longest step, whether it ends at an event, and that event."""
         step, control, now = self.step, self.control, start.now
         longest, trials, event = span, 0, Event(1.0, -1, 0)
         first, first_error = span, math.inf
@@ -204,7 +203,7 @@ class _Run:
         raise _EndError(scenes.STEP_UNDERFLOW, now)
 
     def _guess(self, span: float) -> None:
-        """Fill z with the motion of the last step carried on over the next."""
+        """Fill z with the motion of the last step, extrapolated."""
         step, taken = self.step, self.control.taken
         times = span * NODES
         if 0.0 < span <= 2.0 * taken:
@@ -216,7 +215,7 @@ class _Run:
             step.z[-1] = 0.0
 
     def _take(self, span: float, horizon: float, leaves: bool) -> None:
-        """Take a step that was found: write its samples, and carry the state."""
+        """Accept a step: write its samples and advance the state."""
         step, control = self.step, self.control
         last = span >= horizon - self.now or self.now + span >= horizon
         end = horizon if last else self.now + span
@@ -240,7 +239,7 @@ class _Run:
     # ---------------------------------------------------------------- the state between steps
 
     def _drive(self, fresh: bool) -> tuple[float, float, float]:
-        """Prescribe motion or stress from the last sample on; its end, the stress and its rate."""
+        """Prescribe motion or stress until the next sample; return its time, stress and rate."""
         t, values, step = self.t, self.scene.values, self.step
         while self.knot < t.size - 2 and self.now >= t[self.knot + 1]:
             self.knot, fresh = self.knot + 1, True
@@ -253,14 +252,14 @@ class _Run:
         if fresh:
             if knot > 0 and self.scene.ends.size == 1:
                 self._mend_kink(rate - float(step.v0[-1]))
-            # Without rounding.
+            # Remove accumulated rounding errors.
             step.eps0[-1] += (values[knot] - step.w[-1]) / self.scene.heights[-1]
             step.w[-1] = values[knot]
         step.v0[-1] = step.v[-1] = rate
         return horizon, 0.0, 0.0
 
     def _base_stress(self, push: float) -> float:
-        """Stress that the springs below the lowest node with a state carry together."""
+        """Return the stress of the springs below the lowest node with a state."""
         scene, first = self.scene, self.first
         alone = scene.ends.size == 1
         if alone and scene.top == scenes.STRESS:
@@ -276,10 +275,9 @@ class _Run:
         return (rate + float(self.step.v0[first - 1])) / flow
 
     def _switch(self, event: Event, span: float) -> bool:
-        """Change the branch of a spring, and of all that end theirs at the same time.
+        """Change the branch of a spring, and of all that reach an end at the same time.
 
-        Returns whether a spring of the first group without dashpot opened: nothing presses on the
-        base.
+        Return whether an undamped spring of the first group opened, so that the base is unloaded.
         """
         step, opened = self.step, False
         out = np.zeros(self.count)
@@ -300,10 +298,10 @@ class _Run:
             step.enter(int(i), entered)
         return opened
 
-    # ---------------------------------------------------------------- what is recorded
+    # ---------------------------------------------------------------- samples
 
     def _record(self, done: slice, span: float) -> bool:
-        """Write the samples of a step and its derivatives; false if these are not finite."""
+        """Write the samples and derivatives of a step; return false if there are no derivatives."""
         step, (_, curves, slopes) = self.step, self.out
         at = (self.t[done] - self.now) / span
         powers = at ** np.arange(STAGES + 1)[:, None]
@@ -313,8 +311,8 @@ class _Run:
             return True
         if not step.linearise(span):
             return False
-        # Where nothing has inertia or a dashpot, derivatives by a dashpot jump at switches and
-        # kinks: the polynomial through the points alone does not start where the last one ended.
+        # Without inertia or dashpots, derivatives by a dashpot jump at switches and kinks, so the
+        # polynomial passes through the points only, not through the end of the last step.
         through = THROUGH.T @ powers[:-1]
         slopes[:, 0, done] = step.d_total[:, 0] @ through
         start = step.d_w[:, self.nodes, None] + step.d_v0[:, self.nodes, None] * (at * span)
@@ -323,7 +321,7 @@ class _Run:
         return True
 
     def _mend_kink(self, jump: float) -> None:
-        """Dashpots feel the mean rate where the prescribed motion has a kink of `jump`."""
+        """Give dashpots the mean rate at a sample where the prescribed rate jumps by `jump`."""
         t, k, heights, eta = self.t, self.knot, self.scene.heights, self.scene.rows[:, ETA]
         flow = float((heights / eta).sum())
         share = jump * float((t[k] - t[k - 1]) / (t[k + 1] - t[k - 1]))
@@ -334,10 +332,10 @@ class _Run:
                 self.out.slopes[p, 0, k] -= share / (flow * flow) * more
 
     def _fly(self) -> None:
-        """Fill the samples after contact, which ended now.
+        """Fill the samples after contact, which ends now, and their derivatives.
 
-        If contact ends later, the nodes move on until then, and the top keeps the velocity that it
-        has then.
+        These include the shift of the end of contact: the nodes move on until then, and the top
+        keeps its velocity from then on.
         """
         step, (_, curves, slopes) = self.step, self.out
         done = slice(self.done, None)
