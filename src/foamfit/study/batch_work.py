@@ -183,10 +183,7 @@ def _fitted(task: Task) -> tuple[tuple[Row, ...], Write]:
 
 
 def _results(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write]:
-    """Return one row, or one per cycle, and a function that writes the files.
-
-    The folders of several cycles are in the folder of the test.
-    """
+    """Return one row, or one per cycle (a subfolder), and a function that writes the files."""
     recipe, file = task.recipe, str(task.path)
     pictures: dict[str, Any] = {"pages": recipe.pages, "width": recipe.width}
     if not isinstance(recipe.cycles, tuple):

@@ -168,8 +168,8 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
     tests = list[_Test]()
     for (name, path, test), params in zip(found, all_params, strict=True):
         problem = options.problem(test, study.model, params)
-        rate, error = loading_rate(test), rate_error(problem.measurement)
-        tests.append(_Test(name, path, problem, params, rate, error))
+        rate, sigma = loading_rate(test), rate_error(problem.measurement)
+        tests.append(_Test(name, path, problem, params, rate, sigma))
     return tests, refused
 
 
@@ -202,10 +202,7 @@ def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters
 
 
 def _links(study: Study, tests: Sequence[_Test]) -> Links:
-    """Return the kinds of the parameters, and ln(rate/rate0) for rate laws.
-
-    Raises InputError if the tests do not allow a kind.
-    """
+    """Return the links of the parameters; InputError if the tests do not allow a kind."""
     rates = [test.rate for test in tests]
     for name, kind in study.kinds.items():
         where = f'{study.path}: [parameters] {name} = "{kind}"'

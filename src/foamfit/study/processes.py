@@ -80,10 +80,8 @@ class Processes(Executor):
     """
 
     def __init__(self, count: int, preload: tuple[str, ...] = ()) -> None:
-        methods = multiprocessing.get_all_start_methods()
-        self._context: Any = multiprocessing.get_context(
-            "forkserver" if "forkserver" in methods else "spawn"
-        )
+        server = "forkserver" in multiprocessing.get_all_start_methods()
+        self._context: Any = multiprocessing.get_context("forkserver" if server else "spawn")
         prepare(preload)
         self._threads = Threads(count, thread_name_prefix="foamfit")
         self._pools = dict[int, ProcessPoolExecutor]()  # by the thread that uses it
