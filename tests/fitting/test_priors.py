@@ -74,7 +74,7 @@ def test_the_toml_may_have_priors(impact: ff.Measurement, tmp_path: Path) -> Non
     assert result.parameters["s1_k0"].value == pytest.approx(4e6, rel=2e-3)
     study = tmp_path / "study.toml"
     study.write_text('name = "x"\ntests = ["*.csv"]\nmodel = "bistable"\n')
-    with pytest.raises(ff.InputError, match="a joint fit takes none"):
+    with pytest.raises(ff.InputError, match=r"a joint fit accepts no \[priors\]"):
         ff.joint(study, jobs=1)
     (tmp_path / "a.toml").write_text(toml + "4e6\n")
     with pytest.raises(ff.InputError, match=r"\[priors\] s1_k0 = 4000000.0 must be like "):

@@ -419,7 +419,7 @@ def test_a_full_disk_ends_in_one_sentence_and_loses_nothing(here, tried, monkeyp
         real(result, folder, **options)
 
     monkeypatch.setattr(batch_work, "write_result", write_result)
-    with pytest.raises(ff.InputError, match=r"No space left.*1 of 4 tests are done and stay"):
+    with pytest.raises(ff.InputError, match=r"No space left.*1 of 4 tests are done and kept"):
         again()
     assert list(numbers("out")) == ["a"]
     assert not [name for name in names("out") if name.startswith(".")]

@@ -429,8 +429,8 @@ def test_the_command_writes_and_prints(folder, tmp_path, monkeypatch):
     ("parameters", "more", "wanted"),
     [
         ('s1_kx = "shared"', "", "[parameters] s1_kx is not a parameter of the model microscale"),
-        ('contact_time = "shared"', "", 'contact_time = "shared" cannot be: each test has its own'),
-        ('velocity = "auto"', "", 'velocity = "auto" cannot be: each test has its own'),
+        ('contact_time = "shared"', "", 'contact_time = "shared" is impossible: each test has'),
+        ('velocity = "auto"', "", 'velocity = "auto" is impossible: each test has'),
         ("velocity = 2", "", "[parameters] velocity is a parameter of none of these tests"),
         ('s1_k0 = "share"', "", "s1_k0 = 'share' must be one of shared, own, scatter"),
         ('s1_k0 = "shared"', 'drive = "pull"', "drive = 'pull' must be one of impact"),
@@ -439,7 +439,7 @@ def test_the_command_writes_and_prints(folder, tmp_path, monkeypatch):
         ('s1_k0 = "shared"', 'tests = ["u*.csv"]', "u*.csv: the glob matches no file"),
         ('s1_k0 = "shared"', 'tests = ["t0.csv"]', "a joint fit needs at least two"),
         ('s1_k0 = "shared"', 'model = "microscale+x"', "'x' is not a spring"),
-        ('s1_k0 = "shared"', 'drive = "impact"', "of 4 can be used, a joint fit needs two"),
+        ('s1_k0 = "shared"', 'drive = "impact"', "of 4 can be used, but a joint fit needs two"),
         ('s1_k0 = "shared"', 'specimen = "no.toml"', "no.toml: no such file"),
     ],
 )  # fmt: skip

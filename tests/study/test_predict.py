@@ -423,7 +423,7 @@ def test_a_law_of_rate_is_taken_at_the_rate_of_the_test():
 
 def test_a_law_of_rate_needs_a_rate():
     content = joint_content({"s1_sigma_plus": {"kind": "power rate", "value": 1.1e5, "b": 0.3}})
-    with pytest.raises(InputError, match="s1_sigma_plus follows a law of rate, and the rate of"):
+    with pytest.raises(InputError, match="s1_sigma_plus follows a rate law, but the rate of"):
         ff.predict(InMemory(content), replace(loop(), time=None), draws=DRAWS)
 
 
@@ -468,7 +468,7 @@ BROKEN = {
     "parameter": (lambda c: without(c, "parameters", "s1_kc"), "no parameter s1_kc"),
     "value": (lambda c: c["parameters"]["s1_kc"].update(value=None), "s1_kc: value is nan"),
     "item": (lambda c: c["parameters"].update(s1_kc=4.0), "parameter s1_kc: "),
-    "unknown": (lambda c: c["parameters"].update(s9_k0={"value": 1.0}), "s9_k0 is no parameter"),
+    "unknown": (lambda c: c["parameters"].update(s9_k0={"value": 1.0}), "s9_k0 is not a parameter"),
     "stderr": (lambda c: c["parameters"]["s1_kc"].update(stderr=-1.0), "stderr is -1.0"),
     "ci95": (lambda c: c["parameters"]["s1_kc"].update(ci95=[1.0]), "parameter s1_kc: "),
     "matrix": (lambda c: c["correlation"].update(matrix=[[1.0, 0.0]]), "cannot reshape"),

@@ -105,5 +105,5 @@ def test_a_name_with_brackets_is_a_file_where_there_is_one(here):
 
 def test_a_toml_that_a_shell_names_is_no_test(here):
     assert names("monday/a.csv", "monday/a.toml", "monday/b.txt") == ["a", "b"]
-    with pytest.raises(InputError, match=r"monday/a\.toml: a TOML is no test"):
+    with pytest.raises(InputError, match=r"monday/a\.toml: a TOML is not a test"):
         find_tests("monday/a.toml")

@@ -1,6 +1,6 @@
-"""Several tests or cycles: each fitted on its own, and together.
+"""Several tests or cycles, fitted separately or together.
 
-A newcomer reads `cycles`, from a record to its table, `batch`, many tests side by side, and
-`joint`, from a study file (`study_file`) to a result; how tests are fitted together (`joint_fit`)
-and the `processes` of this machine may wait.
+Start with `cycles` (the cycles of one record), `batch` (many separate tests) and `joint` (from a
+study file, `study_file`, to a result). `joint_fit` has the fit of several tests with linked
+parameters, `predict` the prediction of another test, and `processes` a process pool.
 """

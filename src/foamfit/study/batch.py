@@ -1,4 +1,4 @@
-"""Many tests, each on its own: in parallel, resumable, a folder for each and one summary."""
+"""Separate fits of many tests: parallel, resumable, with a folder per test and one summary."""
 
 from __future__ import annotations
 
@@ -44,43 +44,43 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _LOG = logging.getLogger(__name__)
-# Most tests, and most bytes of their files, that wait in an executor.
+# Largest number of tests submitted to the executor at a time, and total size of their files.
 MOST_AHEAD, MOST_BYTES = 1000, 2**28
-# Least time between two summaries: in seconds, and over the time that writing one takes.
-PAUSE, SHARE = 5.0, 50.0
+PAUSE = 5.0  # least time between two summaries, s
+SHARE = 50.0  # least ratio of this time to the time that writing a summary takes
 Tests = str | Path | Iterable[str | Path]
 Cycles = int | Sequence[int] | Literal["all"] | None
 
 
 @dataclass
 class Batch:
-    """The tests of a batch, what became of them, and the fits that an executor has; see `batch`."""
+    """The tests of a batch, their results so far, and the fits under way; see `batch`."""
 
     out: Path
     recipe: Recipe
-    tests: list[tuple[str, Path]]
-    toml: Path | None = None  # for all; else the one beside each
-    foreign: bool = False  # whether the executor's machines may have other files
-    fresh: bool = False
-    progress: Callable[[Batch], None] = lambda _: None
-    rows: dict[str, tuple[Row, ...]] = field(default_factory=dict)  # by the name of the test
+    tests: list[tuple[str, Path]]  # name and file
+    toml: Path | None  # for all tests; None: the TOML next to each
+    foreign: bool  # whether the fits may run on machines with other files
+    fresh: bool
+    progress: Callable[[Batch], None]
+    rows: dict[str, tuple[Row, ...]] = field(default_factory=dict)  # by name of the test
     waiting: dict[Future[Outcome], Task] = field(default_factory=dict)
-    fitted: int = 0  # now
-    wrong: int = 0  # of all that are done, without a fit
-    saved: float = field(default_factory=lambda: time.monotonic())  # when the summary was written
-    took: float = 0.0  # to write it, s
+    fitted: int = 0  # number of tests fitted in this call
+    wrong: int = 0  # number of finished tests without an acceptable fit
+    saved: float = field(default_factory=lambda: time.monotonic())  # time of the last summary
+    took: float = 0.0  # time that writing the summary took, s
 
     @property
     def summary(self) -> list[Row]:
-        """A row for each test, or for each of its cycles, in the order of the tests."""
-        found = list[Row]()
+        """One row per test, or per cycle of a test, in the order of the tests."""
+        why = "not fitted yet because the batch ended early; call it again"
+        rows = list[Row]()
         for name, path in self.tests:
-            again = "not fitted yet, because the batch was ended before; call it again"
-            found += self.rows.get(name) or (Row(name, str(path), tables.OPEN, again),)
-        return found
+            rows += self.rows.get(name) or (Row(name, str(path), tables.OPEN, why),)
+        return rows
 
     def save(self, *, whole: bool = False) -> None:
-        """Write summary.csv and summary.html; as a `whole` also parameters side by side."""
+        """Write summary.csv and summary.html; `whole` adds a comparison of the parameters."""
         rows = self.summary
         tables.write_summary(rows, self.out)
         options = Options(**self.recipe.options)
@@ -93,7 +93,7 @@ class Batch:
         tables.write_page(rows, self.out, title, picture)
 
     def fit(self, executor: Executor) -> None:
-        """Fit what is to be fitted; what ends this leaves a summary of what is done."""
+        """Fit all tests without a stored result; write a summary even if this ends early."""
         try:
             for i, (name, path) in enumerate(self.tests):
                 self._begin(executor, name, path)
@@ -104,7 +104,7 @@ class Batch:
                     self._collect(1.0)
                 self._collect(0.0)
                 while i == 0 and not self.foreign and self._is_cold() and self.waiting:
-                    self._collect(1.0)  # one compiles, for all
+                    self._collect(1.0)  # the first fit compiles for all others
             while self.waiting:
                 self._collect(1.0)
         except BaseException as error:
@@ -112,50 +112,54 @@ class Batch:
                 future.cancel()
             with without_ctrl_c(), suppress(InputError):
                 self.save()
-            told = " ".join(str(error).split())
+            why = " ".join(str(error).split())
             if isinstance(error, futures.BrokenExecutor | futures.CancelledError):
-                told = f"the executor has ended: {told or 'it has given up the tests'}"
+                why = f"the executor has ended: {why or 'it cancelled the tests'}"
             elif not isinstance(error, InputError):
                 raise
-            done = f"{len(self.rows)} of {counted(len(self.tests), 'test')} are done and stay"
-            raise InputError(f"{told}; {done}, call again for the others") from error
+            done = f"{len(self.rows)} of {counted(len(self.tests), 'test')} are done and kept"
+            raise InputError(f"{why}; {done}; call again to fit the others") from error
         self.save(whole=True)
 
     def _is_cold(self) -> bool:
-        """Whether the first fit compiles what the others need too."""
+        """Return whether the first fit compiles functions that the other fits need too."""
         model = self.recipe.model
         memory = model == "auto" or self.recipe.options["relaxation"] > 0
         memory = memory or any(law.remembers for law in Model.parse(model).laws)
         return memory and not cache.compiled("integrate_with_memory")
 
     def _begin(self, executor: Executor, name: str, path: Path) -> None:
-        """Take the stored rows of a test, or have it fitted."""
+        """Use the stored rows of a test, or submit its fit."""
         toml = toml_beside(path) if self.toml is None else self.toml
         folder = self.out / name
         try:
             data, settings, camera = read_whole(path), _bytes(toml), motion_file(toml)
             motion = None if camera is None else _bytes(camera)
-        except OSError:  # reading the test gives a better message
+        except OSError:  # the fit reads the test again, with a better error message
             data, settings, motion = b"", None, None
         mark = fingerprint(self.recipe.key, data, settings, motion)
-        known = None if self.fresh else stored(folder, mark, self.recipe)
-        if known is not None:
-            self._keep(name, tuple(replace(row, file=str(path)) for row in known))
+        rows = None if self.fresh else stored(folder, mark, self.recipe)
+        if rows is not None:
+            self._keep(name, tuple(replace(row, file=str(path)) for row in rows))
             return
         content = (data, settings, motion) if self.foreign and data else None
         out = None if self.foreign else folder.absolute()
         task = Task(name, path, toml, self.recipe, mark, out, content)
         try:
             self.waiting[executor.submit(work, task)] = task
-        except RuntimeError as error:  # it was shut down
+        except RuntimeError as error:  # the executor was shut down
             raise futures.BrokenExecutor(str(error)) from error
 
     def _collect(self, seconds: float) -> None:
-        """Take the fits that are done, waiting for one so long."""
+        """Take finished fits, waiting up to the given time for one; update an old summary."""
         done, _ = futures.wait(self.waiting, seconds, futures.FIRST_COMPLETED)
-        for future in [one for one in self.waiting if one in done]:
+        for future in [future for future in self.waiting if future in done]:
             self._take(future)
-        self._save_sometimes()
+        began = time.monotonic()
+        if began - self.saved >= max(PAUSE, SHARE * self.took):
+            self.save()
+            self.saved = time.monotonic()
+            self.took = self.saved - began
 
     def _take(self, future: Future[Outcome]) -> None:
         task = self.waiting.pop(future)
@@ -163,8 +167,8 @@ class Batch:
             rows, files = future.result()
             if files is not None:
                 put(files, self.out / task.name)
-        except (futures.BrokenExecutor, futures.CancelledError, InputError):  # not written
-            raise
+        except (futures.BrokenExecutor, futures.CancelledError, InputError):
+            raise  # the result cannot be written, or no other test can be fitted
         except Exception as error:
             self._keep(task.name, (Row(task.name, str(task.path), tables.REFUSED, _lost(error)),))
             return
@@ -175,15 +179,6 @@ class Batch:
         self.rows[name] = rows
         self.wrong += not all(row.has_fit for row in rows)
         self.progress(self)
-
-    def _save_sometimes(self) -> None:
-        """Write the summary from time to time: what is killed leaves it as it was then."""
-        began = time.monotonic()
-        if began - self.saved < max(PAUSE, SHARE * self.took):
-            return
-        self.save()
-        self.saved = time.monotonic()
-        self.took = self.saved - began
 
 
 def batch(
@@ -202,43 +197,44 @@ def batch(
     progress: Callable[[Batch], None] | None = None,
     **options: Unpack[Keywords],
 ) -> pd.DataFrame:
-    """Fit every test on its own, in parallel; a result folder for each and one summary.
+    """Fit many tests separately and in parallel; write a result folder per test and one summary.
 
-    Called again, only what is missing or has changed is fitted: data, TOML, settings or version.
-    A test that cannot be read or fitted is a row with its sentence. What is done stays, whatever
-    ends the call.
+    A repeated call fits only tests that have no result yet or whose data, TOML, settings or version
+    of foamfit have changed. A test that cannot be read or fitted gets a row with the error message.
+    Finished results are kept however the call ends.
 
     Parameters
     ----------
     tests : str, Path or several
         Files, folders and globs; see `foamfit.study.test_files.find_tests`.
     out : str or Path, optional
-        The folder; by default ``fits/batch/<model>``. It holds ``<test>/`` for each test, the
-        result folder of its fit, ``summary.csv`` and ``summary.html``.
+        The folder; by default ``fits/batch/<model>``. It contains the result folder ``<test>/``
+        of each test, ``summary.csv`` and ``summary.html``.
     model, options
         As for `foamfit.fit`.
     executor : concurrent.futures.Executor, optional
-        What runs the fits, as a Dask client's ``get_executor()``; tests go there and results come
-        back with the calls, so that its machines need no common file system. By default processes
-        of this machine, one for each core, with one thread each.
+        Executor that runs the fits, such as a Dask client's ``get_executor()``. Tests and results
+        are passed with the calls, so its machines need no common file system. By default the fits
+        run in single-threaded processes on this machine, one per core.
     jobs : int, optional
-        How many processes of this machine.
+        Number of processes on this machine.
     fresh : bool
-        Whether everything is fitted again.
+        Whether to fit all tests again.
     specimen : str or Path, optional
-        One TOML for all tests; by default the one beside each.
+        One TOML for all tests; by default the TOML next to each test.
     cycle : int, sequence of int or "all", optional
-        The cycle of each record; several are fitted as `foamfit.fit_cycles` does, and each is a
-        row of the summary.
+        The cycle of each record to fit; several cycles are fitted separately, as by
+        `foamfit.fit_cycles`, and each has a row in the summary.
     cycles : (int, int), optional
         First and last of several cycles that are fitted as one history.
     report : bool
-        Whether each fit has a report and figures.
+        Whether to write a report and figures for each fit.
     figure_width : str
         "one" or "two" columns, or a length such as "85 mm". A test whose figures have another
-        width is fitted again, as its curves are not kept.
+        width is fitted again, because its curves are not stored.
     progress : callable, optional
-        Given the `Batch` after each test: `rows`, `tests`, `wrong` and `fitted` say how far it is.
+        Called with the `Batch` after each test; its `rows`, `tests`, `wrong` and `fitted` describe
+        the progress.
 
     Returns
     -------
@@ -248,14 +244,14 @@ def batch(
     Raises
     ------
     InputError
-        If the call is wrong, or a result cannot be written, as to a full disk.
+        If the call is wrong, or a result cannot be written (full disk).
     """
-    each = () if cycle == "all" else cycle
-    if each is not None and not isinstance(each, int):
-        each = tuple(int(number) for number in each)
-    found = run(
+    numbers = () if cycle == "all" else cycle
+    if numbers is not None and not isinstance(numbers, int):
+        numbers = tuple(int(number) for number in numbers)
+    done = run(
         tests,
-        Recipe(model, options, each, report, figure_width, history=cycles),
+        Recipe(model, options, numbers, report, figure_width, history=cycles),
         out=out,
         executor=executor,
         jobs=jobs,
@@ -263,7 +259,7 @@ def batch(
         specimen=specimen,
         progress=progress,
     )
-    return tables.table(found.summary)
+    return tables.table(done.summary)
 
 
 def run(
@@ -277,7 +273,7 @@ def run(
     specimen: str | Path | None = None,
     progress: Callable[[Batch], None] | None = None,
 ) -> Batch:
-    """Do what `batch` says, and return all that is known of it."""
+    """Fit the tests as `batch` does, and return the finished `Batch`."""
     options = Options.of("batch", recipe.options)
     recipe = replace(recipe, model=_checked(recipe.model, options), options=vars(options))
     check_jobs(jobs)
@@ -285,17 +281,17 @@ def run(
         raise InputError("give either cycle or cycles, not both")
     if jobs is not None and executor is not None:
         raise InputError("jobs and an executor exclude each other; leave one of them out")
-    inches(recipe.width)  # refuses what is no width
+    inches(recipe.width)  # rejects an invalid width
     toml = None if specimen is None else Path(specimen)
     if toml is not None and not toml.is_file():
-        raise InputError(f"{toml}: no such file; name the TOML of the specimen of all tests")
+        raise InputError(f"{toml}: no such file; give the TOML of the specimen for all tests")
     folder = Path("fits", "batch", recipe.model) if out is None else Path(out)
-    tell = progress or (lambda _: None)
-    made = Batch(folder, recipe, find_tests(tests), toml, executor is not None, fresh, tell)
+    named, notify = find_tests(tests), progress or (lambda _: None)
+    made = Batch(folder, recipe, named, toml, executor is not None, fresh, notify)
     _check_out(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        sweep(folder.resolve(), [*(name for name, _ in made.tests), *FILES["batch.json"]])
+        sweep(folder.resolve(), [*(name for name, _ in named), *FILES["batch.json"]])
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {reason(error)}") from None
     with _executor(executor, jobs, made) as runner:
@@ -304,19 +300,19 @@ def run(
 
 
 def _checked(model: str, options: Options) -> str:
-    """Return the model's name; refuse what no test could be fitted with."""
+    """Return the model's name; reject a model or options that no test could be fitted with."""
     if model.strip() == "auto":
         options.check_auto()
         return "auto"
     read = Model.parse(with_options(model, **options.of_springs), options.relaxation)
-    drive = options.drive or "impact"  # which has them all; each test checks its own
+    drive = options.drive or "impact"  # has all nuisance parameters; each test checks its own
     names = (*read.names, *nuisance.names_of(drive, time_shift=True))
     check_fixed_and_varied(names, read.name, options.fix or {}, options.vary)
     return read.name
 
 
 def _check_out(out: Path) -> None:
-    """Raise InputError unless a folder is free, or holds nothing but what foamfit wrote."""
+    """Raise InputError unless foamfit may use the folder: it contains no files of others."""
     if not out.is_dir():
         check_target(out)
         return
@@ -328,7 +324,7 @@ def _check_out(out: Path) -> None:
             if path.is_dir() and not path.is_symlink():
                 inside = list(path.iterdir())
                 foreign = [inner.name for inner in inside if not is_written(inner)]
-                if not inside or (not foreign and any(one.name in FILES for one in inside)):
+                if not inside or (not foreign and any(inner.name in FILES for inner in inside)):
                     continue
                 name = "/".join([name, *foreign[:1]])
             raise InputError(
@@ -342,7 +338,7 @@ def _check_out(out: Path) -> None:
 
 @contextmanager
 def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator[Executor]:
-    """Give what runs the fits; processes of this machine end with the body."""
+    """Yield the given executor, or else processes of this machine, which end with the body."""
     if given is not None:
         yield given
         return
@@ -363,11 +359,11 @@ def _bytes(path: Path) -> bytes | None:
 
 
 def _lost(error: Exception) -> str:
-    """Say why a test has no result that the test itself is not known to be the reason of."""
-    if isinstance(error, EndedError) or type(error).__name__ == "KilledWorker":  # that is Dask's
+    """Return why a test has no result if the cause may lie outside the test."""
+    if isinstance(error, EndedError) or type(error).__name__ == "KilledWorker":  # raised by Dask
         return (
-            "its process ended each time that the fit was tried (killed, or out of memory); call "
-            "again to try once more"
+            "its process ended in every attempt to fit it (killed, or out of memory); call again "
+            "to retry"
         )
-    told = " ".join(f"{type(error).__name__}: {error}".split())
-    return f"its fit was lost ({told}); call again to try once more"
+    why = " ".join(f"{type(error).__name__}: {error}".split())
+    return f"its fit was lost ({why}); call again to retry"

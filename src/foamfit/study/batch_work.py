@@ -1,6 +1,6 @@
-"""One test of a batch: read, fitted, and written whole; what runs in another process.
+"""The work on one test of a batch, done in another process: read, fit, and write its folder.
 
-Everything here takes and returns what can be pickled, and a test depends on nothing but its task.
+All arguments and results can be pickled, and a test depends only on its task.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from foamfit.springs import laws
 from foamfit.study.cycles import fit_cycles
 
 SCHEMA = 1
-RECORD = "batch.json"  # in the folder of each test: its rows, and what they were made from
-# One fit at a time in a process, whatever its executor: drawing is not safe in two threads.
+RECORD = "batch.json"  # in the folder of each test: its rows, and the fingerprint of their inputs
+# One fit at a time per process, also in an executor with threads: drawing is not thread-safe.
 _ALONE = threading.Lock()
 
 
@@ -40,8 +40,8 @@ _ALONE = threading.Lock()
 class Recipe:
     """How every test of a batch is fitted.
 
-    `cycles` is one number, several, () for all of a record, or None for the one that the TOML
-    names; `options` are keywords of `foamfit.fit`.
+    `cycles` is one number, several, () for all cycles of a record, or None for the cycle that the
+    TOML names; `options` are keywords of `foamfit.fit`.
     """
 
     model: str
@@ -54,7 +54,7 @@ class Recipe:
 
     @cached_property
     def key(self) -> str:
-        """What results are made by: settings and version; `stored` compares figures and pages."""
+        """Settings and version that determine the results; `stored` checks pages and width."""
         parts = asdict(replace(self, pages=True)) | {"foamfit": version("foamfit")}
         del parts["width"]
         texts = parts.pop("laws")
@@ -67,9 +67,9 @@ class Recipe:
 class Task:
     """One test to be fitted.
 
-    `out` is the folder to write; None brings the files back in the outcome. `content` holds the
-    bytes of the test, of its TOML and of its file of [motion] where the paths may be those of
-    another machine, which must have the same `version` of foamfit.
+    `out` is the folder to write; with None the files are returned in the outcome. `content` has the
+    bytes of the test, its TOML and its [motion] file if the fit may run on another machine, which
+    must have the same `version` of foamfit.
     """
 
     name: str
@@ -83,42 +83,42 @@ class Task:
 
     @property
     def size(self) -> int:
-        """Bytes of the content."""
-        return sum(len(one) for one in self.content or () if one)
+        """Size of the content in bytes."""
+        return sum(len(part) for part in self.content or () if part)
 
 
-# What became of a test: its rows, and its files if they were to come back.
+# Rows of a test, and its files by path if the task has no folder to write.
 Outcome = tuple[tuple[Row, ...], Mapping[str, bytes] | None]
 
 
 def fingerprint(key: str, data: bytes, toml: bytes | None, motion: bytes | None) -> str:
-    """Identify what a result is made from: settings and version (`Recipe.key`), and files."""
+    """Return a hash of everything that determines a result: `Recipe.key` and the files."""
     parts = (data, toml) if motion is None else (data, toml, motion)
     digests = (None if part is None else hashlib.sha256(part).hexdigest() for part in parts)
     return hashlib.sha256(json.dumps([key, *digests]).encode()).hexdigest()
 
 
 def stored(folder: Path, wanted: str, recipe: Recipe) -> tuple[Row, ...] | None:
-    """The rows in a test's folder if they were made from what is `wanted`; else None.
+    """Return the rows in a test's folder if they have the fingerprint `wanted`, else None.
 
-    Where figures are wanted, they must be there and as wide as the recipe says.
+    If the recipe includes figures, they must exist and have its width.
     """
     try:
         content = json.loads((folder / RECORD).read_text(encoding="utf-8"))
         if content["fingerprint"] != wanted:
             return None
-        there = content.get("figure_width", inches(TWO)) if content["pages"] else None
-        if recipe.pages and there != inches(recipe.width):
+        width = content.get("figure_width", inches(TWO)) if content["pages"] else None
+        if recipe.pages and width != inches(recipe.width):
             return None
         return tuple(build(Row, row, {}) for row in content["rows"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return None  # none, or of another version
+        return None  # no record, or one of another version
 
 
 def work(task: Task) -> Outcome:
-    """Fit one test and write its folder whole; raises nothing that the test could be blamed for.
+    """Fit one test and write its folder at once; an error in the test becomes a row.
 
-    InputError says why the result could not be written.
+    Raises InputError if the result cannot be written.
     """
     if task.version != (own := version("foamfit")):
         raise RuntimeError(
@@ -147,15 +147,15 @@ def work(task: Task) -> Outcome:
                 return rows, None
             with TemporaryDirectory() as place:
                 fill(folder := Path(place))
-                found = (path for path in sorted(folder.rglob("*")) if path.is_file())
-                files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in found}
+                paths = (path for path in sorted(folder.rglob("*")) if path.is_file())
+                files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
             return rows, files
         except OSError as error:
             raise InputError(str(error)) from None
 
 
 def put(files: Mapping[str, bytes], out: Path) -> None:
-    """Write the files that came back from another process as a whole folder."""
+    """Write the files returned by another process as one folder, all at once."""
 
     def write(folder: Path) -> None:
         for name, content in files.items():
@@ -169,13 +169,13 @@ Write = Callable[[Path], None]
 
 
 def _fitted(task: Task) -> tuple[tuple[Row, ...], Write]:
-    """The rows of a test, and what writes its files into a folder."""
+    """Return the rows of a test, and a function that writes its files into a folder."""
     try:
         with _inputs(task) as (path, toml):
             return _results(task, path, toml)
     except (InputError, SimulationError) as error:
         why = str(error)
-    except (MemoryError, OSError):  # of this machine
+    except (MemoryError, OSError):  # a fault of this machine, not of the test
         raise
     except Exception as error:
         why = f"this is a defect of foamfit, please report it ({type(error).__name__}: {error})"
@@ -183,28 +183,28 @@ def _fitted(task: Task) -> tuple[tuple[Row, ...], Write]:
 
 
 def _results(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write]:
-    """One row, or one for each of several cycles, whose folders are in the folder of the test."""
+    """Return one row, or one per cycle (a subfolder), and a function that writes the files."""
     recipe, file = task.recipe, str(task.path)
     pictures: dict[str, Any] = {"pages": recipe.pages, "width": recipe.width}
     if not isinstance(recipe.cycles, tuple):
         test = read_test(path, toml, recipe.cycles, cycles=recipe.history)
         result = fit(test, model=recipe.model, **recipe.options)
         return (row_of(task.name, file, result),), partial(write_result, result, **pictures)
-    wanted = recipe.cycles or None
-    found = fit_cycles(path, toml, cycles=wanted, model=recipe.model, **recipe.options)
+    numbers = recipe.cycles or None
+    fits = fit_cycles(path, toml, cycles=numbers, model=recipe.model, **recipe.options)
     rows = list[Row]()
-    for number in sorted({*found.results, *found.refused}):
+    for number in sorted({*fits.results, *fits.refused}):
         name = f"{task.name}/cycle-{number}"
-        if number in found.results:
-            rows.append(row_of(name, file, found.results[number]))
+        if number in fits.results:
+            rows.append(row_of(name, file, fits.results[number]))
         else:
-            rows.append(Row(name, file, REFUSED, " ".join(found.refused[number].split())))
-    return tuple(rows), partial(write_cycles, found, **pictures)
+            rows.append(Row(name, file, REFUSED, " ".join(fits.refused[number].split())))
+    return tuple(rows), partial(write_cycles, fits, **pictures)
 
 
 @contextmanager
 def _inputs(task: Task) -> Iterator[tuple[Path, Path]]:
-    """The files of a test, which are made here if they came with the task."""
+    """Yield test file and TOML, written to a temporary folder if they came with the task."""
     if task.content is None:
         yield task.path, task.toml
         return
@@ -222,5 +222,5 @@ def _inputs(task: Task) -> Iterator[tuple[Path, Path]]:
         try:
             yield path, settings
         except (InputError, SimulationError) as error:
-            told = str(error).replace(str(path), str(task.path))
-            raise type(error)(told.replace(str(settings), str(task.toml))) from None
+            message = str(error).replace(str(path), str(task.path))
+            raise type(error)(message.replace(str(settings), str(task.toml))) from None

@@ -1,4 +1,4 @@
-"""The cycles of one record, each fitted on its own."""
+"""Separate fits of the cycles of one record."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ def fit_cycles(
     tell: Announce | None = None,
     **options: Unpack[Keywords],
 ) -> CycleFits:
-    """Fit cycles of a record in turn; returns `CycleFits`.
+    """Fit cycles of a record one after the other; returns `CycleFits`.
 
-    A later cycle starts at its own contact; its start strain is taken off (see `read_test`). A
-    cycle that cannot be read or fitted is in `refused` of the result with its sentence.
+    A later cycle starts at its own contact, and its start strain is subtracted (see `read_test`). A
+    cycle that cannot be read or fitted is listed in `refused` of the result, with the error
+    message.
 
     Parameters
     ----------
@@ -45,24 +46,24 @@ def fit_cycles(
     Raises
     ------
     InputError
-        If the record or an option cannot be used at all.
+        If the record or an option cannot be used for any cycle.
     """
-    Options.of("fit_cycles", options)  # refuses what is not admissible
+    Options.of("fit_cycles", options)  # rejects invalid options
     report = progress or (lambda *_: None)
     first = read_test(path, specimen)
     wanted = first.cycles if cycles is None else tuple(dict.fromkeys(cycles))
     if not wanted:
-        raise InputError("no cycle is named; name one or leave cycles out for all")
+        raise InputError("no cycle is given; give at least one, or omit cycles to fit all")
     results, refused = dict[int, Fit](), dict[int, str]()
     stopped = None
     for i, number in enumerate(wanted):
 
-        def told(done: float, what: str, i: int = i, number: int = number) -> None:
+        def notify(done: float, what: str, i: int = i, number: int = number) -> None:
             report((i + done) / len(wanted), f"cycle {number}: {what}")
 
         try:
             test = first if number == first.cycle else read_test(path, specimen, number)
-            results[number] = fit(test, model=model, progress=told, tell=tell, **options)
+            results[number] = fit(test, model=model, progress=notify, tell=tell, **options)
             stopped = results[number].stopped
         except (InputError, SimulationError) as error:
             refused[number] = str(error)
@@ -71,7 +72,7 @@ def fit_cycles(
                 raise
             stopped = what_stopped(error)
         if stopped not in (None, "the time limit"):
-            why = f"not fitted, because {stopped} ended the command before"
-            refused |= {left: why for left in wanted[i:] if left not in results}
+            why = f"not fitted because {stopped} ended the command first"
+            refused |= {later: why for later in wanted[i:] if later not in results}
             break
     return CycleFits(first.name, model, first.cycles, results, refused)

@@ -1,4 +1,4 @@
-"""Several tests in one fit: what the study says of each parameter, from files to joint.json."""
+"""Joint fits of several tests, from a study file to a result."""
 
 from __future__ import annotations
 
@@ -37,17 +37,16 @@ from foamfit.study.processes import begin, workers
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
 
-# Tests that are searched as a fit of their own is; the others start at what these have found.
+# Number of tests fitted by a full search; the others start at the results of these.
 SEARCHED = 3
-# Up to so many tests are fitted in this process: most take less than a tenth of a second each.
+# Largest number of tests fitted in this process: most fits take less than 0.1 s.
 FEW = 100
-# A test whose reduced χ² is so many times the largest of those is searched as well.
+# A test is searched as well if its reduced χ² exceeds the largest of those by this factor.
 FAR = 2.0
-# Steps of a descent from what another test has found.
-STEPS = 60
-# Starts of the joint fit besides the own fits: what one test has found, for all.
+STEPS = 60  # of a descent from the result of another test
+# Number of tests whose values are tried as start values of the joint fit for all tests.
 ONE_FOR_ALL = 2
-# Rates that differ by less than this share are one.
+# Rates with a smaller relative difference count as equal.
 SAME_RATE = 0.02
 
 
@@ -59,8 +58,8 @@ class _Test:
     file: Path
     problem: Problem
     params: lmfit.Parameters  # Before any fit
-    rate: float | None
-    rate_error: float = 0.0  # Of its logarithm
+    rate: float | None  # 1/s
+    rate_error: float = 0.0  # Standard error of the logarithm of the rate
 
 
 @single_threaded
@@ -78,23 +77,22 @@ def joint(
     Parameters
     ----------
     path : str, Path or Study
-        STUDY.toml, or what `read_study` has read of it: tests, model, drive, and what each
-        parameter is: "shared", "own", "scatter", "log rate", "power rate" or "auto", or a number
-        that it is held at.
+        STUDY.toml, or the result of `read_study`: tests, model, drive, and for each parameter its
+        kind ("shared", "own", "scatter", "log rate", "power rate" or "auto") or a fixed value.
     jobs : int, optional
-        Processes; by default one for each core. The numbers are the same with any.
+        Number of processes; by default one per core. It does not affect the numbers.
     out : str or Path, optional
-        Folder to write the result to, as `JointResult.save` does, with or without `report`.
+        Folder for the result, written as by `JointResult.save` with or without `report`.
     seed : int, optional
-        Of the search; by default that of the study, or 0.
+        Seed of the search; by default the seed of the study, or 0.
     progress : callable, optional
-        Told the fraction done and what is going on.
+        Called with the completed fraction and the name of the current step.
 
     Raises
     ------
     InputError
-        If the study cannot be used: the message names the file and the key. A single test that
-        cannot be read or fitted is in `refused` with its sentence.
+        If the study cannot be used; the message names the file and the key. A single test that
+        cannot be read or fitted is only listed in `refused`, with the error message.
     SimulationError
         If no start of the joint fit can be simulated.
     """
@@ -109,12 +107,12 @@ def joint(
         drive=study.drive, seed=study.seed, starts=study.starts, relaxation=study.relaxation
     )
     tests, refused = _read(study, options, tell)
-    _links(study, tests)  # refuses what cannot be, before anything is fitted
+    _links(study, tests)  # rejects invalid kinds before anything is fitted
     with workers(jobs, len(tests), FEW) as each:
         tests, alone = _own_fits(study, options, tests, refused, each, tell)
         links, starts = _links(study, tests), alone.starts(ONE_FOR_ALL)
         names, rates = tuple(test.name for test in tests), tuple(test.rate for test in tests)
-        # There is no evidence for a law of rate but from several rates, nor for a scatter.
+        # The evidence is not computed for scatter, nor for rate laws if all rates are equal.
         kinds = [kind for kind in KINDS if kind not in ("scatter", *RATES)]
         kinds += RATES if None not in rates and _several(rates) else ()
         tell(0.5, "together")
@@ -124,8 +122,8 @@ def joint(
         fit = fit_jointly(alone.problems, links, starts, each=each)
         tell(0.9, "evidence")
         every = (*fit.found.shared, *fit.found.own)
-        asked = [name for name in every if fit.found.links.kind(name) in RATES or name in auto]
-        tried = joint_fit.evidence(fit.found, asked, alone.n_eff, kinds, [alone.values])
+        compared = [name for name in every if links.kind(name) in RATES or name in auto]
+        tried, slopes = joint_fit.evidence(fit.found, compared, alone.n_eff, kinds, [alone.values])
         result = JointResult(
             study=study,
             tests=names,
@@ -135,8 +133,8 @@ def joint(
             fit=fit,
             parameters=parameters_of(fit, names),
             covariance=common_covariance(fit),
-            evidence=tried[0],
-            open_slopes=tried[1],
+            evidence=tried,
+            open_slopes=slopes,
             alone=alone,
             refused=refused,
             runtime_s=time.perf_counter() - began,
@@ -149,7 +147,7 @@ def joint(
 
 
 def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], dict[str, str]]:
-    """Read all tests; those that cannot be used are refused, each with its sentence."""
+    """Return the tests, and the error messages of those that cannot be used, by file."""
     found, refused = list[tuple[str, Path, Measurement]](), dict[str, str]()
     for i, (name, path, specimen) in enumerate(study.tests):
         tell(0.1 * i / len(study.tests), "reading")
@@ -157,8 +155,8 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
             test = read_test(path, specimen, study.cycle, cycles=study.cycles)
             if test.priors:
                 raise InputError(
-                    f"{path}: [priors] are those of one test, and a joint fit takes none; leave "
-                    "them out of its TOML"
+                    f"{path}: a joint fit accepts no [priors]; leave them out of the TOML of the "
+                    "test"
                 )
             options.problem(test, study.model)
             found.append((name, path, test))
@@ -166,59 +164,62 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
             refused[str(path)] = str(error)
     if len(found) < 2:
         _too_few(study, len(found), refused)
-    params = _params(study, [test for _, _, test in found])
-    out = list[_Test]()
-    for (name, path, test), own in zip(found, params, strict=True):
-        problem = options.problem(test, study.model, own)
-        rate, doubt = loading_rate(test), rate_error(problem.measurement)
-        out.append(_Test(name, path, problem, own, rate, doubt))
-    return out, refused
+    all_params = _params(study, [test for _, _, test in found])
+    tests = list[_Test]()
+    for (name, path, test), params in zip(found, all_params, strict=True):
+        problem = options.problem(test, study.model, params)
+        rate, sigma = loading_rate(test), rate_error(problem.measurement)
+        tests.append(_Test(name, path, problem, params, rate, sigma))
+    return tests, refused
 
 
 def _too_few(study: Study, count: int, refused: Mapping[str, str]) -> NoReturn:
-    told = "; ".join(list(refused.values())[:2])
+    reasons = "; ".join(list(refused.values())[:2])
     raise InputError(
-        f"{study.path}: {counted(count, 'test')} of {len(study.tests)} can be used, a joint fit "
-        f"needs two: {told}"
+        f"{study.path}: {counted(count, 'test')} of {len(study.tests)} can be used, but a joint "
+        f"fit needs two: {reasons}"
     )
 
 
 def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters]:
-    """Parameters of each test; what is named varies where it does so by itself, or else in all."""
+    """Return the parameters of each test.
+
+    A named parameter varies in the tests in which it varies by default, or else in all tests.
+    """
     model = Model.parse(study.model, study.relaxation)
     every = [make_params(test, model, study.drive) for test in tests]
     for name in (*study.kinds, *study.held):
-        there = [params[name].vary for params in every if name in params]
-        if not there:
-            told = f"{name} is a parameter of none of these tests; leave it out"
-            raise InputError(f"{study.path}: [parameters] {told}")
+        varies = [params[name].vary for params in every if name in params]
+        if not varies:
+            why = f"{name} is a parameter of none of these tests; leave it out"
+            raise InputError(f"{study.path}: [parameters] {why}")
         fix = {name: study.held[name]} if name in study.held else {}
         for params in every:
-            if name in params and (fix or not any(there)):
+            if name in params and (fix or not any(varies)):
                 with naming(f"{study.path}: [parameters]"):
                     fix_and_vary(params, study.model, fix, () if fix else (name,))
     return every
 
 
 def _links(study: Study, tests: Sequence[_Test]) -> Links:
-    """What each parameter is to the tests, and ln(rate/rate0) where a law of rate needs it."""
+    """Return the links of the parameters; InputError if the tests do not allow a kind."""
     rates = [test.rate for test in tests]
     for name, kind in study.kinds.items():
         where = f'{study.path}: [parameters] {name} = "{kind}"'
-        there = [test for test in tests if name in test.problem.free()]
-        if kind == "scatter" and len(there) < 2:
+        free = [test for test in tests if name in test.problem.free()]
+        if kind == "scatter" and len(free) < 2:
             raise InputError(
-                f"{where} needs two or more tests in which it varies, and there is "
-                f"{counted(len(there), 'test')}"
+                f"{where} needs two or more tests in which it varies, but it varies in "
+                f"{counted(len(free), 'test')}"
             )
         if kind not in RATES:
             continue
-        if untimed := [test.file for test in there if test.rate is None]:
+        if untimed := [test.file for test in free if test.rate is None]:
             raise InputError(
-                f"{where} needs the strain rate of every test, and {untimed[0]} has no time"
+                f"{where} needs the strain rate of every test, but {untimed[0]} has no time"
             )
-        if not _several([test.rate for test in there]):
-            rate = f"{there[0].rate:.3g} 1/s" if there else "none"
+        if not _several([test.rate for test in free]):
+            rate = f"{free[0].rate:.3g} 1/s" if free else "none"
             raise InputError(
                 f"{where} needs tests at two or more rates, and all have one ({rate}); make it "
                 '"shared" or "own", or add tests'
@@ -234,13 +235,13 @@ def _links(study: Study, tests: Sequence[_Test]) -> Links:
 
 
 def _median_rate(rates: Sequence[float | None]) -> float | None:
-    """Rate of the median test of those that have one; of an even number that of the slower one."""
+    """Return the median of the known rates; for an even number, the lower of the middle two."""
     known = sorted(rate for rate in rates if rate is not None)
     return known[(len(known) - 1) // 2] if known else None
 
 
 def _several(rates: Sequence[float | None]) -> bool:
-    """Whether there are tests at two rates."""
+    """Return whether there are at least two different rates."""
     known = [rate for rate in rates if rate is not None]
     return len(known) > 1 and max(known) > (1.0 + SAME_RATE) * min(known)
 
@@ -253,10 +254,10 @@ def _own_fits(
     each: Map,
     tell: Progress,
 ) -> tuple[list[_Test], Together]:
-    """Tests that can be fitted, and what a fit of each alone finds.
+    """Return the tests that can be fitted, and the results of their separate fits.
 
-    A few, spread over the rates, are searched; the others descend from what these have found, and
-    are searched too where that does not follow them as well.
+    A few tests, spread over the rates, are fitted by a search; the others descend from the results
+    of these, and are searched too if that gives a much larger misfit.
     """
     order = sorted(range(len(tests)), key=lambda t: (tests[t].rate or 0.0, t))
     places = np.unique(np.linspace(0, len(order) - 1, min(SEARCHED, len(order))).astype(int))
@@ -268,32 +269,32 @@ def _own_fits(
             (tests[t].problem.measurement, study.model, tests[t].params, options, near)
             for t in chosen
         ]
-        made = each(_own_fit, *zip(*work, strict=True)) if work else ()
-        for i, (t, own) in enumerate(zip(chosen, made, strict=True)):
-            if isinstance(own, str):
-                refused[str(tests[t].file)] = own
+        fits = each(_own_fit, *zip(*work, strict=True)) if work else ()
+        for i, (t, fitted) in enumerate(zip(chosen, fits, strict=True)):
+            if isinstance(fitted, str):
+                refused[str(tests[t].file)] = fitted
             else:
-                found[t] = own
+                found[t] = fitted
             tell(done + 0.2 * (i + 1) / len(chosen), "each test")
 
     do(first, (), 0.1)
     near = tuple(found[t][0] for t in first if t in found)
-    do([t for t in order if t not in first], near, 0.3)
     worst = max((found[t][1] for t in first if t in found), default=math.inf)
+    do([t for t in order if t not in first], near, 0.3)
     do([t for t in order if t not in first and t in found and found[t][1] > FAR * worst], (), 0.3)
-    there = sorted(found)
-    if len(there) < 2:
-        _too_few(study, len(there), refused)
-    vectors = tuple(found[t][0] for t in there)
-    for t, own in zip(there, vectors, strict=True):
-        objective = tests[t].problem.objective
+    if len(found) < 2:
+        _too_few(study, len(found), refused)
+    kept, vectors = list[_Test](), list[Array]()
+    for t, (own, _) in sorted(found.items()):
+        test, objective = tests[t], tests[t].problem.objective
         objective.weigh_motion(own)
-        if objective.drive == "impact" and tests[t].rate is not None:
-            # The rate is that of the fitted motion: the fit's errors already include its error.
-            moved = objective.simulate(own, everything=True).curves["displacement_time"]
-            rate = loading_rate(tests[t].problem.measurement, moved)
-            tests[t] = replace(tests[t], rate=rate, rate_error=0.0)
-    kept = [tests[t] for t in there]
+        if objective.drive == "impact" and test.rate is not None:
+            # The rate of the fitted motion: the fit's errors already include its error.
+            motion = objective.simulate(own, everything=True).curves["displacement_time"]
+            rate = loading_rate(test.problem.measurement, motion)
+            test = replace(test, rate=rate, rate_error=0.0)
+        kept.append(test)
+        vectors.append(own)
     return kept, Together.of_own_fits([test.problem for test in kept], vectors)
 
 
@@ -304,7 +305,10 @@ def _own_fit(
     options: Options,
     near: tuple[Array, ...],
 ) -> tuple[Array, float] | str:
-    """Fit one test from points nearby, or search: its vector and χ² per sample, or why not."""
+    """Fit one test, starting from the points `near` it or else by a search.
+
+    Returns its parameters and χ² per sample, or the error message.
+    """
     if not near:
         try:
             found = identify(measurement, model, params, options, lambda *_: None)

@@ -1,9 +1,9 @@
-"""The fit of several tests with linked parameters, its uncertainty, and the scatter between them.
+"""The fit of several tests with linked parameters, its uncertainty, and scatter between tests.
 
-With a parameter that scatters, the best values of the tests, the common value and the spread depend
-on each other. Given a spread, the tests are drawn to their common value as much as their errors
-allow; what they would say undrawn follows from the curvature, and from that REML gives the common
-value and the spread (`trust.scatter`): in turn until the spread stands still (Laplace's method).
+The best values of a scattering parameter in the tests, its common value and its spread depend on
+each other. For a given spread, a fit pulls the values towards the common value. The values without
+this pull follow from the curvature of the cost, and REML estimates common value and spread from
+them (`trust.scatter`). This is repeated until the spread no longer changes (Laplace's method).
 """
 
 from __future__ import annotations
@@ -29,23 +29,22 @@ from foamfit.trust.ranges import ITERATIONS, TRIALS, nearer, tolerance
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.scatter import Spread, common_and_spread, correlation
 
-# Rounds between the best values and the spreads at most, and the change of the logarithm of a
-# spread at which they end.
-ROUNDS, STILL = 12, 0.01
-# Least spread of a scattering parameter, over the error of a single test: with zero spread all
-# tests would have one value, and their own values would stay unknown.
+ROUNDS = 12  # most iterations between best values and spreads
+STILL = 0.01  # relative change of the spreads at which these iterations end
+# Least spread used in a fit, in units of the error of a single test: zero spread would force all
+# tests to one value, and their own values would remain unknown.
 LEAST_SPREAD = 0.3
-# Tests say nothing of a parameter whose logarithm has a larger error than this (a factor of 150).
+# Tests in which the logarithm of a parameter has a larger error (a factor of 150) are ignored.
 SAYS_NOTHING = 5.0
-# Groups of tests that are left out in turn, and steps of a fit without one of them.
-GROUPS, REFIT = 10, 15
+GROUPS = 10  # largest number of groups of tests that are left out in turn
+REFIT = 15  # iterations of a fit without one group
 Map = Callable[..., Iterable[Any]]
 Vectors = Sequence[Array]  # Parameters of each test
 
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """Several tests fitted together: the best point, and the spread of what scatters."""
+    """Several tests fitted together: the best point, and the spreads of scattering parameters."""
 
     point: JointPoint
     spreads: Mapping[str, Spread] = field(default_factory=dict)
@@ -54,7 +53,7 @@ class JointFit:
 
     @property
     def found(self) -> Together:
-        """The fit itself."""
+        """The fitted tests at the best point."""
         return self.point.found
 
 
@@ -65,7 +64,7 @@ def fit_jointly(
     *,
     each: Map = map,
 ) -> JointFit:
-    """Fit tests as `fitting.together.fit_linked` does, and judge the fit; `each` is like `map`."""
+    """Fit tests by `fitting.together.fit_linked` and find the uncertainty; `each` acts as `map`."""
     found = fit_linked(problems, links, starts)
     errors = errors_of(found, each)
     point, undrawn, spreads = JointPoint(found, errors), dict[str, Array](), dict[str, Spread]()
@@ -74,8 +73,8 @@ def fit_jointly(
         before, spreads = spreads, {}
         inflations, pulls = dict[str, Array](), dict[str, Array]()
         for name in scatter:
-            if (told := _spread(point, name)) is not None:
-                undrawn[name], spreads[name], inflations[name], pulls[name] = told
+            if (estimate := _spread(point, name)) is not None:
+                undrawn[name], spreads[name], inflations[name], pulls[name] = estimate
         if _still(before, spreads):
             break
         found = fit_linked(problems, replace(links, pulls=pulls), [found.values])
@@ -84,32 +83,32 @@ def fit_jointly(
 
 
 def _spread(point: JointPoint, name: str) -> tuple[Array, Spread, Array, Array] | None:
-    """What tests say undrawn (logarithms), spread, inflations, pulls; None of fewer than two."""
+    """Return logarithms without the pull, spread, inflations and pulls; None for < 2 tests."""
     found, (matrix, bread) = point.found, point.of_logarithms(name)
     drawn = _logarithms(found, name)
-    there = (np.diag(matrix) < SAYS_NOTHING**2) & np.isfinite(drawn)
-    if np.count_nonzero(there) < 2:
+    sure = (np.diag(matrix) < SAYS_NOTHING**2) & np.isfinite(drawn)
+    if np.count_nonzero(sure) < 2:
         return None
-    inner, variance = np.ix_(there, there), np.diag(matrix)[there]
-    pull = found.links.pulls.get(name, np.zeros(drawn.size))[there]
-    off = drawn[there] - math.log(found.common[name][0])
+    inner, variance = np.ix_(sure, sure), np.diag(matrix)[sure]
+    pull = found.links.pulls.get(name, np.zeros(drawn.size))[sure]
+    deviation = drawn[sure] - math.log(found.common[name][0])
     undrawn, inflation = np.full(drawn.size, np.nan), np.ones(drawn.size)
-    undrawn[there] = drawn[there] + bread[inner] @ (pull**2 * off)
-    spread = common_and_spread(undrawn[there], matrix[inner])
-    inflation[there] = np.maximum(variance / np.diag(bread)[there], 1e-6)
+    undrawn[sure] = drawn[sure] + bread[inner] @ (pull**2 * deviation)
+    spread = common_and_spread(undrawn[sure], matrix[inner])
+    inflation[sure] = np.maximum(variance / np.diag(bread)[sure], 1e-6)
     least = LEAST_SPREAD * math.sqrt(float(np.median(variance)))
     return undrawn, spread, inflation, np.sqrt(inflation) / max(spread.tau, least)
 
 
 def _logarithms(found: Together, name: str) -> Array:
-    """Logarithms of a parameter in all tests; NaN where it does not vary, or vanishes."""
+    """Return the logarithms of a parameter in all tests; NaN where it is fixed or zero."""
     values = np.abs(np.array(found.value(name)))
     free = np.array([name in problem.free() for problem in found.problems]) & (values > 0.0)
     return np.log(np.where(free, values, np.nan))
 
 
 def _still(before: Mapping[str, Spread], now: Mapping[str, Spread]) -> bool:
-    """Whether no spread changed by more than `STILL` of itself."""
+    """Return whether no spread changed by more than `STILL`, relative to itself."""
     return before.keys() == now.keys() and all(
         abs(one.tau - before[name].tau) <= STILL * max(one.tau, 1e-3 * one.stderr)
         for name, one in now.items()
@@ -119,10 +118,11 @@ def _still(before: Mapping[str, Spread], now: Mapping[str, Spread]) -> bool:
 def correlation_of(
     point: JointPoint, undrawn: Mapping[str, Array]
 ) -> tuple[tuple[str, ...], Array]:
-    """Names of own and scattering parameters, and their correlation between specimens.
+    """Return names of own and scattering parameters, and their correlation between specimens.
 
-    Of logarithms where these are what varies (`is_logarithmic`); `undrawn` has them for what
-    scatters. Tests count that tell of all of these parameters; see `trust.scatter.correlation`.
+    It is the correlation of logarithms for parameters with `is_logarithmic`; `undrawn` are the
+    logarithms of scattering parameters. Only tests that determine all of these parameters are used;
+    see `trust.scatter.correlation`.
     """
     found, columns, scales = point.found, dict[str, Array](), list[Array]()
     for name in found.own:
@@ -136,43 +136,43 @@ def correlation_of(
         scales.append(np.abs(values) if logs else np.ones(values.size))
     names = tuple(columns)
     table = np.reshape(list(columns.values()), (len(names), len(found.problems))).T
-    there = np.flatnonzero(np.isfinite(table).all(axis=1))
+    complete = np.flatnonzero(np.isfinite(table).all(axis=1))
     errors = np.zeros((len(names), len(names)))
-    for t in there:
-        scale = np.array([one[t] for one in scales])
-        errors += point.own_errors(int(t), names) / np.outer(scale, scale) / there.size
-    return names, correlation(table[there], errors)
+    for t in complete:
+        scale = np.array([of_tests[t] for of_tests in scales])
+        errors += point.own_errors(int(t), names) / np.outer(scale, scale) / complete.size
+    return names, correlation(table[complete], errors)
 
 
 def errors_of(found: Together, each: Map = map) -> tuple[tuple[CurveError, ...], ...]:
-    """What the residual of each curve of each test is made of; see `BestPoint.errors`."""
+    """Return noise and model error in each curve of each test; see `BestPoint.errors`."""
     point = JointPoint(found)
     work = [best.to_judge(point.taken(t)) for t, best in enumerate(point.bests)]
     return tuple(each(curve_errors, *zip(*work, strict=True)))
 
 
 def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, float]]:
-    """What the error of the law leaves open of shared values and (":b") slopes by rate.
+    """Return ranges of shared values and slopes of rate laws (":b") due to model error.
 
-    The wider of two: where a value would lie (95 %) were it found from as many other specimens, by
-    fits without each test in turn (a jackknife of at most `GROUPS` groups, with Student's t of one
-    less than their number); and how far a shared value can be held off while all tests are followed
-    about as well (`trust.ranges`). Empty where all is noise.
+    A range is the hull of two: the 95 % interval of a value found from the same number of other
+    specimens, from fits without each test in turn (a jackknife of n <= `GROUPS` groups, with
+    Student's t of n - 1 degrees of freedom); and shared values that fit almost equally well
+    (`trust.ranges`). Empty if there is only noise.
     """
     if not point.uncertainty.errs:
         return {}
     out = _over_specimens(point.found, each)
     shared = [name for name in point.found.shared if point.found.links.kind(name) == "shared"]
-    ways = [(name, sign) for name in shared for sign in (-1.0, 1.0)]
-    held = each(_held, [point] * len(ways), *zip(*ways, strict=True)) if ways else ()
-    for (name, _), end in zip(ways, held, strict=True):
+    sides = [(name, sign) for name in shared for sign in (-1.0, 1.0)]
+    held = each(_held, [point] * len(sides), *zip(*sides, strict=True)) if sides else ()
+    for (name, _), end in zip(sides, held, strict=True):
         ends = [end, point.found.common[name][0], *out.get(name, ())]
         out[name] = min(ends), max(ends)
     return out
 
 
 def _over_specimens(found: Together, each: Map) -> dict[str, tuple[float, float]]:
-    """Ranges of shared values and of slopes by the fits without each test in turn."""
+    """Return ranges of shared values and slopes from fits without each group of tests."""
     count = len(found.problems)
     groups = [range(first, count, GROUPS) for first in range(min(count, GROUPS))]
     kept = [[t for t in range(count) if t not in group] for group in groups]
@@ -182,7 +182,7 @@ def _over_specimens(found: Together, each: Map) -> dict[str, tuple[float, float]
     out, quantile = dict[str, tuple[float, float]](), covariance.half_width(1.0, len(others) - 1)
     for name in found.shared:
         values = np.array([common[name] for common in others if name in common])
-        if len(values) < len(others):  # a test that alone has it says nothing of others
+        if len(values) < len(others):  # only one group has the parameter
             continue
         halves = quantile * np.sqrt((len(values) - 1.0) * np.var(values, axis=0))
         for at, (value, half) in enumerate(zip(found.common[name], halves, strict=True)):
@@ -191,7 +191,7 @@ def _over_specimens(found: Together, each: Map) -> dict[str, tuple[float, float]
 
 
 def _without(found: Together, kept: list[int]) -> Mapping[str, tuple[float, ...]] | None:
-    """What the kept tests have in common; None where they cannot be fitted alone."""
+    """Return the common values of the kept tests; None if they cannot be fitted."""
     links = found.links.of(kept)
     laws = any(links.kind(name) in RATES for name in found.shared)
     if laws and links.log_rates is not None and not np.ptp(links.log_rates) > 0.0:
@@ -204,31 +204,31 @@ def _without(found: Together, kept: list[int]) -> Mapping[str, tuple[float, ...]
 
 
 def _held(point: JointPoint, name: str, sign: float) -> float:
-    """How far a shared value can be held off while the tests are followed about as well."""
+    """Return the farthest shared value that fits almost equally well, found in a few refits."""
     found, (value,) = point.found, point.found.common[name]
     rise = sum(map(tolerance, point.bests, point.errors))
     low, high = next(best for best in point.bests if name in best.problem.free()).limits(name)
-    off = math.sqrt(rise) * point.reach(name)
+    change = math.sqrt(rise) * point.reach(name)
     for _ in range(TRIALS):
-        end = min(max(value + sign * off, low), high) if math.isfinite(off) else value
+        end = min(max(value + sign * change, low), high) if math.isfinite(change) else value
         if end == value:
             break
         start = point.moved(name, end - value)
         problems = [problem.holding(name, end) for problem in found.problems]
         try:
-            missed = fit_linked(problems, found.links, [start], iterations=ITERATIONS).cost
+            cost = fit_linked(problems, found.links, [start], iterations=ITERATIONS).cost
         except SimulationError:
-            off *= 0.5
+            change *= 0.5
             continue
-        if missed - found.cost <= rise:
+        if cost - found.cost <= rise:
             return end
-        off = abs(end - value) * nearer(rise, missed - found.cost, 0.8)
+        change = abs(end - value) * nearer(rise, cost - found.cost, 0.8)
     return value
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """One kind of a parameter, and the evidence for it."""
+    """A joint fit with one kind of a parameter, as evidence for this kind."""
 
     parameter: str
     kind: str
@@ -241,16 +241,16 @@ class Alternative:
 def evidence(
     fit: Together, names: Sequence[str], n_eff: int, kinds: Sequence[str], near: Sequence[Vectors]
 ) -> tuple[tuple[Alternative, ...], dict[str, float]]:
-    """Evidence for each of these kinds of each of these parameters, the others as they are.
+    """Compare these kinds of each of these parameters, leaving the other parameters as they are.
 
-    Also the parameters whose slope by rate the tests leave open, and by how much (`open_slope`).
+    Also returns the parameters whose slope with rate the tests do not determine, with `open_slope`.
     """
     found, wide = list[Alternative](), dict[str, float]()
     for name in names:
-        mine = fit.links.kind(name)
-        for kind, one in _kinds_of(fit, name, (mine, *kinds), [fit.values, *near], wide):
-            score = one.bic(n_eff)
-            found.append(Alternative(name, kind, kind == mine, score, one.n_vary, one.cost))
+        present = fit.links.kind(name)
+        for kind, other in _kinds_of(fit, name, (present, *kinds), [fit.values, *near], wide):
+            bic = other.bic(n_eff)
+            found.append(Alternative(name, kind, kind == present, bic, other.n_vary, other.cost))
     return tuple(found), wide
 
 
@@ -262,60 +262,61 @@ def choose_kinds(
     n_eff: int,
     kinds: Sequence[str],
 ) -> Links:
-    """Links in which each of these parameters has the kind of the least BIC.
+    """Return links in which these parameters have the kinds of least BIC.
 
-    All are shared at first; in each round the change of one kind that lowers BIC most is taken. A
-    law of rate is not offered where the tests leave its slope open (`open_slope`).
+    All are shared at first; each round makes the change of one kind that lowers BIC most. A rate
+    law is not tried if the tests do not determine its slope (`open_slope`).
     """
     now = fit_linked(problems, links.having(**dict.fromkeys(names, "shared")), starts)
     while True:
         trials = [
-            one
+            fit
             for name in names
-            for kind, one in _kinds_of(now, name, kinds, [now.values, *starts[:1]], {})
+            for kind, fit in _kinds_of(now, name, kinds, [now.values, *starts[:1]], {})
             if kind != now.links.kind(name)
         ]
-        found = min(trials, key=lambda one: one.bic(n_eff), default=now)
-        if found.bic(n_eff) >= now.bic(n_eff):
+        best = min(trials, key=lambda fit: fit.bic(n_eff), default=now)
+        if best.bic(n_eff) >= now.bic(n_eff):
             return now.links
-        now = found
+        now = best
 
 
 def _kinds_of(
     fit: Together, name: str, kinds: Sequence[str], near: Sequence[Vectors], wide: dict[str, float]
 ) -> Iterator[tuple[str, Together]]:
-    """Fits with a parameter of these kinds, and of its present one, the others as they are.
+    """Yield fits with each of these kinds of a parameter, and the other parameters as they are.
 
-    Kinds that cannot be simulated are left out, and laws of rate where the slope is open (`wide`).
+    Kinds that cannot be simulated are omitted, and rate laws if the slope is not determined, in
+    which case `open_slope` is entered in `wide`.
     """
-    mine = fit.links.kind(name)
-    for kind in sorted(dict.fromkeys(kinds), key=lambda kind: (kind in RATES, kind != mine)):
-        if kind in RATES and kind != mine and name in wide:
+    present = fit.links.kind(name)
+    for kind in sorted(dict.fromkeys(kinds), key=lambda kind: (kind in RATES, kind != present)):
+        if kind in RATES and kind != present and name in wide:
             continue
         try:
             links = fit.links.having(**{name: kind})
-            one = fit if kind == mine else fit_linked(fit.problems, links, near)
+            other = fit if kind == present else fit_linked(fit.problems, links, near)
         except SimulationError:
             continue
-        yield kind, one
-        if kind == "own" and any(other in RATES for other in kinds):
-            half = open_slope(one, name)
+        yield kind, other
+        if kind == "own" and any(law in RATES for law in kinds):
+            half = open_slope(other, name)
             if half > covariance.WEAK:
                 wide[name] = half
 
 
 def open_slope(fit: Together, name: str) -> float:
-    """Half of the 95 % interval of a parameter's slope by rate from its own value in each test.
+    """Return half the 95 % interval of the slope b of a parameter, from its own values.
 
-    The scatter of specimens about a law of rate is in no error of a fit in which that law holds. A
-    slope (of the logarithm) of one doubles a value with the rate.
+    The errors of a fit with a rate law do not include the scatter of specimens about the law. With
+    b = 1 a power law is proportional to the rate.
     """
-    there = [name in problem.free() for problem in fit.problems]
-    values = np.array(fit.value(name))[there]
+    free = [name in problem.free() for problem in fit.problems]
+    values = np.array(fit.value(name))[free]
     level = float(np.median(values))
     if fit.links.log_rates is None or values.size < 3 or level == 0.0:
         return math.inf
-    x = fit.links.log_rates[there]
+    x = fit.links.log_rates[free]
     if not np.ptp(x) > 0.0:
         return math.inf
     logs = np.log(values / level) if np.all(values / level > 0.0) else values / level

@@ -1,4 +1,4 @@
-"""What a joint fit found: values, intervals, states, sentences, and the content of joint.json."""
+"""The result of a joint fit: values, intervals, states, sentences, and the file joint.json."""
 
 from __future__ import annotations
 
@@ -35,27 +35,29 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import POOR, UNACCEPTABLE, status_of, warnings_of
 from foamfit.trust.conclude import conclude, noise_of
 
-# Up to so many result folders are written in this process: each takes a second or two.
+# Largest number of result folders written in this process: each takes a second or two.
 FEW_FOLDERS = 3
-# Questions of the checklist that only the search of one test answers.
+# Items of the checklist that apply only to a search.
 _OF_A_SEARCH = ("ended", "agree")
+LARGEST = 300.0  # largest logarithm of a common value that the tests do not determine
+DOMINANT = 0.5  # a test with at least this share of χ² causes a warning
 
 
 def fit_of_test(
     problem: Problem, values: Array, parameters: dict[str, ParameterEstimate], note: str, seed: int
 ) -> Fit:
-    """The result of a test in a joint fit; `systematic` is that of a fit of this test alone."""
+    """Return the result of a test in a joint fit; `systematic` is from this test alone."""
     problem.put(values)
-    made = conclude(BestPoint(problem, values), SearchRecord(seed, 0, time.perf_counter()))
-    checklist = tuple(check for check in made.checklist if check.key not in _OF_A_SEARCH)
+    alone = conclude(BestPoint(problem, values), SearchRecord(seed, 0, time.perf_counter()))
+    checklist = tuple(check for check in alone.checklist if check.key not in _OF_A_SEARCH)
     own = {
-        name: replace(one, systematic=made.parameters.get(name, one).systematic)
+        name: replace(one, systematic=alone.parameters.get(name, one).systematic)
         for name, one in parameters.items()
     }
     return replace(
-        made,
+        alone,
         parameters=own,
-        notes=(note, *made.notes),
+        notes=(note, *alone.notes),
         checklist=checklist,
         status=status_of(checklist),
         warnings=warnings_of(checklist),
@@ -65,19 +67,19 @@ def fit_of_test(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JointResult(JointViews):
-    """Everything that a joint fit found; arrays are in the order of `tests`."""
+    """The result of a joint fit; sequences are in the order of `tests`."""
 
     study: Study
     tests: tuple[str, ...]
     files: tuple[Path, ...]
     rates: tuple[float | None, ...]  # Mean strain rate on loading, 1/s
-    rate0: float | None  # That of the median test
+    rate0: float | None  # Rate of the median test, 1/s
     fit: JointFit
     parameters: Mapping[str, JointParameter]
     covariance: tuple[tuple[str, ...], Array]  # Names and matrix, SI; see `to_json_dict`
     evidence: tuple[Alternative, ...]
-    alone: Together  # The fits of the tests one by one
-    refused: Mapping[str, str]  # File and sentence
+    alone: Together  # The separate fits of the tests
+    refused: Mapping[str, str]  # Files that were not used, with error messages
     open_slopes: Mapping[str, float] = field(default_factory=dict)
     status: str = "ok"
     warnings: tuple[str, ...] = ()
@@ -96,7 +98,7 @@ class JointResult(JointViews):
 
     @cached_property
     def loops(self) -> tuple[Loop, ...]:
-        """The loop of each test, measured and fitted."""
+        """Measured and fitted loop of each test."""
         out = list[Loop]()
         for name, best in zip(self.tests, self.fit.point.bests, strict=True):
             curves, test = best.simulated.curves, best.problem.measurement
@@ -107,18 +109,18 @@ class JointResult(JointViews):
 
     @property
     def problems(self) -> tuple[Problem, ...]:
-        """What was fitted, for each test."""
+        """The fitted problem of each test."""
         return self.fit.found.problems
 
     @property
     def drive(self) -> str | None:
-        """The drive; None where the tests have different ones."""
+        """The drive; None if the tests have different drives."""
         drives = {problem.objective.drive for problem in self.problems}
         return drives.pop() if len(drives) == 1 else None
 
     @property
     def bic(self) -> float:
-        """Bayesian information criterion, counted as that of the tests one by one in `alone`."""
+        """Bayesian information criterion, with the effective number of samples of `alone`."""
         return self.fit.found.bic(self.alone.n_eff)
 
     @property
@@ -130,17 +132,11 @@ class JointResult(JointViews):
 
     @cached_property
     def noise(self) -> tuple[dict[str, dict[str, Any]], ...]:
-        """Noise of each counted curve of each test, by which it is weighted; as in fit.json."""
+        """Noise of the fitted curves of each test, which determines the weights; see fit.json."""
         return tuple(map(noise_of, self.fit.point.bests, self.fit.point.errors))
 
-    @property
-    def tried(self) -> dict[str, list[Alternative]]:
-        """The kinds that were tried, by parameter."""
-        names = dict.fromkeys(one.parameter for one in self.evidence)
-        return {name: [one for one in self.evidence if one.parameter == name] for name in names}
-
     def estimates(self, test: int) -> dict[str, ParameterEstimate]:
-        """Parameters of one test, as its fit.json has them."""
+        """Return the parameters of one test, as in its fit.json."""
         problem, values = self.problems[test], self.fit.found.values[test]
         out = dict[str, ParameterEstimate]()
         for name, value in zip(problem.names, (values + problem.origins).tolist(), strict=True):
@@ -166,22 +162,22 @@ class JointResult(JointViews):
     ) -> Path:
         """Write joint.json, its page, pictures and table.tex, and a result folder per test.
 
-        An older result there is replaced as a whole, at the end. The folders of the tests are made
-        by `jobs` processes (by default one for each core). Without `report` there are tables alone.
-        Figures are "one" or "two" columns wide, or as wide as a length ("85 mm"). Returns the
+        An older result in the folder is replaced at the end, all at once. The folders of the tests
+        are written by `jobs` processes (by default one per core). Without `report`, only tables are
+        written. The width of figures is "one" or "two" columns or a length ("85 mm"). Returns the
         folder.
         """
-        inches(figure_width)  # refuses what is no width
+        inches(figure_width)  # rejects an invalid width
         check_target(folder)
         with workers(jobs, len(self.tests), FEW_FOLDERS) as each:
             return save_joint(self, folder, each, report=report, width=figure_width)
 
     def to_json_dict(self) -> dict[str, Any]:
-        """Return the content of joint.json: SI, plain types, null for what is not there.
+        """Return the content of joint.json: SI units, plain types, null for missing values.
 
-        The covariance is that of shared values, common values of what scatters, and by a law of
-        rate of the value at `rate0` and, with ":b", the slope. "specimens" has the correlation of
-        what changes from specimen to specimen.
+        "covariance" is that of shared values, common values of scattering parameters, and for rate
+        laws of the values at `rate0` and the slopes (":b"). "specimens" is the correlation of own
+        and scattering parameters between specimens.
         """
         found, model = self.fit.found, Model.parse(self.study.model)
         content = {
@@ -216,16 +212,16 @@ class JointResult(JointViews):
         return dict(plain(content))
 
     def test_fits(self) -> Iterator[Callable[[], Fit]]:
-        """What makes the result of each test, in any process."""
+        """Yield functions that make the result of each test and can run in any process."""
         others = counted(len(self.tests) - 1, "other test")
-        note = f"Fitted together with {others} ({self.study.name}): intervals are those of all."
+        note = f"Fitted together with {others} ({self.study.name}): intervals use all of them."
         pairs = zip(self.problems, self.fit.found.values, strict=True)
         for t, (problem, values) in enumerate(pairs):
             yield partial(fit_of_test, problem, values, self.estimates(t), note, self.study.seed)
 
     @property
     def statistics(self) -> dict[str, float | int]:
-        """Counts and χ² of the whole fit."""
+        """Statistics of the joint fit and of the separate fits."""
         found = self.fit.found
         return {
             "n_tests": len(self.tests),
@@ -242,27 +238,21 @@ class JointResult(JointViews):
         }
 
 
-# Largest logarithm: tests may leave a value open by any number of orders of magnitude.
-LARGEST = 300.0
-# A test with at least this share of χ² is named.
-DOMINANT = 0.5
-
-
 def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
-    """Covariance of the common values and slopes, SI; see `JointResult.to_json_dict`."""
+    """Return the covariance of common values and slopes, SI; see `JointResult.to_json_dict`."""
     point, count = fit.point, len(fit.point.names)
     scales = np.ones(count)
     for i, name in enumerate(point.names):
         if fit.found.links.kind(name) == "scatter":
-            one, before = fit.spreads.get(name), point.of_common(name)[0]
-            scales[i] = math.exp(min(one.mean, LARGEST)) if one else fit.found.common[name][0]
-            scales[i] *= one.stderr / before if one and before > 0.0 else 1.0
+            spread, error = fit.spreads.get(name), point.of_common(name)[0]
+            scales[i] = math.exp(min(spread.mean, LARGEST)) if spread else fit.found.common[name][0]
+            scales[i] *= spread.stderr / error if spread and error > 0.0 else 1.0
     matrix = point.uncertainty.covariance.matrix[:count, :count]
     return point.names, matrix * np.outer(scales, scales)
 
 
 def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, JointParameter]:
-    """All parameters of the joint fit, those of the springs first."""
+    """Return all parameters of the joint fit, those of the springs first."""
     problems = fit.found.problems
     return {
         name: parameter_of(fit, tests, name)
@@ -272,35 +262,35 @@ def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, JointParam
 
 
 def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParameter:
-    """One parameter of the joint fit."""
+    """Return one parameter of the joint fit."""
     found, unit, kind = fit.found, unit_of(name), fit.found.links.kind(name)
-    there = [t for t, problem in enumerate(found.problems) if name in problem.free()]
+    free = [t for t, problem in enumerate(found.problems) if name in problem.free()]
     each = _values(fit, tests, name)
-    if not there:
+    if not free:
         value = float(np.median([one.value for one in each.values()]))
         return JointParameter("fixed", value, unit, state="fixed", why="held fixed")
     if kind == "own":
-        value = float(np.median([each[tests[t]].value for t in there]))
+        value = float(np.median([each[tests[t]].value for t in free]))
         why = "one value for each test; this is their median"
         return JointParameter(kind, value, unit, why=why, tests=each)
     if kind == "scatter":
         return _scattering(fit, name, each)
     (value, *slope), span = found.common[name], fit.ranges.get(name)
-    one = _judged(fit, there[0], name, value, fit.point.of_common(name), span)
-    why = f"one value for {counted(len(there), 'test')}: {one.why}"
+    one = _judged(fit, free[0], name, value, fit.point.of_common(name), span)
+    why = f"one value for {counted(len(free), 'test')}: {one.why}"
     why = f"at the rate of the median test; {why}" if slope else why
     joint = JointParameter(kind, value, unit, one.stderr, one.ci95, one.state, why, range=span)
     if not slope:
         return joint
     b, (error, freedom) = slope[0], fit.point.of_common(f"{name}:b")
     half = covariance.half_width(error, freedom)
-    known = math.isfinite(half)
+    determined = math.isfinite(half)
     return replace(
         joint,
         tests=each,
         b=b,
-        b_stderr=error if known else None,
-        b_ci95=(b - half, b + half) if known else None,
+        b_stderr=error if determined else None,
+        b_ci95=(b - half, b + half) if determined else None,
         b_range=fit.ranges.get(f"{name}:b"),
     )
 
@@ -308,21 +298,20 @@ def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParam
 def _scattering(fit: JointFit, name: str, tests: dict[str, TestValue]) -> JointParameter:
     unit, spread, kind = unit_of(name), fit.spreads.get(name), "scatter"
     if spread is None:
-        why = "too few tests determine it to tell its common value"
+        why = "too few tests determine it to estimate its common value"
         value = fit.found.common[name][0]
         return JointParameter(kind, value, unit, state="not determined", why=why, tests=tests)
     sign = -1.0 if next(iter(tests.values())).value < 0.0 else 1.0
     value, *ends = (sign * np.exp(np.minimum([spread.mean, *spread.ci95], LARGEST))).tolist()
-    known_to = (min(ends), max(ends))
-    limits = (-math.inf, math.inf)
-    state, why = covariance.state(name, value, covariance.wider(known_to, None), abs(value), limits)
-    known = state != "not determined"
+    ci95, limits = (min(ends), max(ends)), (-math.inf, math.inf)
+    state, why = covariance.state(name, value, covariance.wider(ci95, None), abs(value), limits)
+    determined = state != "not determined"
     return JointParameter(
         kind,
         value,
         unit,
-        abs(value) * spread.stderr if known else None,
-        known_to if known else None,
+        abs(value) * spread.stderr if determined else None,
+        ci95 if determined else None,
         state,
         f"common value of {counted(spread.count, 'test')}: {why}",
         tests,
@@ -337,11 +326,14 @@ def _judged(
     test: int,
     name: str,
     value: float,
-    known: tuple[float, float],
+    error: tuple[float, float],
     span: tuple[float, float] | None = None,
 ) -> TestValue:
-    """Judge a value by its interval, or by its range if that is wider (`trust.covariance.RULE`)."""
-    problem, (stderr, freedom) = fit.found.problems[test], known
+    """Judge a value by the wider of interval and range (`trust.covariance.RULE`).
+
+    `error` contains standard error and degrees of freedom; limits and scale are those of `test`.
+    """
+    problem, (stderr, freedom) = fit.found.problems[test], error
     limits = fit.point.bests[test].limits(name)
     size = float(problem.sizes((name,), fit.found.values[test])[0])
     half = covariance.half_width(stderr, freedom)
@@ -353,7 +345,7 @@ def _judged(
 
 
 def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestValue]:
-    """A parameter in each test that leaves it free or holds it, in the numbers of its file."""
+    """Return a parameter in each test that has it, with the zeros of the test's file."""
     out, found = dict[str, TestValue](), fit.found
     for t, (test, problem) in enumerate(zip(tests, found.problems, strict=True)):
         if name not in problem.index or problem.is_exact(name):
@@ -374,25 +366,27 @@ def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestV
 
 
 def with_words(result: JointResult) -> JointResult:
-    """Give a joint fit its status, warnings and sentences."""
+    """Return a joint fit with its status, warnings and sentences."""
     lost, large = dict[str, None](), list[str]()
     for t, (test, problem) in enumerate(zip(result.tests, result.problems, strict=True)):
         for curve in problem.objective.counted:
-            off, measured = result.fit.found.misfits[t][curve], problem.objective.measured[curve]
-            if off is None or not off <= UNACCEPTABLE * np.std(measured) / np.ptp(measured):
+            misfit = result.fit.found.misfits[t][curve]
+            measured = problem.objective.measured[curve]
+            if misfit is None or not misfit <= UNACCEPTABLE * np.std(measured) / np.ptp(measured):
                 lost[test] = None
-            elif off > POOR:
-                large.append(f"{test} ({curve} {percent(off)})")
+            elif misfit > POOR:
+                large.append(f"{test} ({curve} {percent(misfit)})")
     share, top = max(zip(result.shares, result.tests, strict=True))
-    evidence = list[tuple[str, str, str, float]]()  # the best kind, its own, how much lower BIC is
-    for name, tried in result.tried.items():
-        mine, best = next(o for o in tried if o.chosen), min(tried, key=lambda one: one.bic)
-        evidence.append((name, best.kind, mine.kind, mine.bic - best.bic))
-    known = [rate for rate in result.rates if rate is not None]
+    evidence = list[tuple[str, str, str, float]]()  # parameter, best kind, its kind, gain in BIC
+    for chosen in (tried for tried in result.evidence if tried.chosen):
+        others = (tried for tried in result.evidence if tried.parameter == chosen.parameter)
+        best = min(others, key=lambda tried: tried.bic)
+        evidence.append((chosen.parameter, best.kind, chosen.kind, chosen.bic - best.bic))
+    rates = [rate for rate in result.rates if rate is not None]
     shown = {
         "parameters": list(result.parameters.items()),
         "laws": RATES,
-        "rates": f"{min(known):.3g} to {max(known):.3g} 1/s" if known else "",
+        "rates": f"{min(rates):.3g} to {max(rates):.3g} 1/s" if rates else "",
         "slopes": [
             (name, result.parameters[name].kind, half) for name, half in result.open_slopes.items()
         ],
@@ -429,8 +423,8 @@ def with_words(result: JointResult) -> JointResult:
 
 
 def span_of(found: Sequence[dict[str, float | None]]) -> tuple[float, float] | None:
-    """Smallest and largest misfit of some fits, of the loop or else of the stress; None if none."""
+    """Return smallest and largest misfit of some fits, of the loop or else of a time curve."""
     names = ("stress_strain", "stress_time", "displacement_time")
-    each = (next((one[n] for n in names if one.get(n) is not None), None) for one in found)
-    known = [one for one in each if one is not None]
-    return (min(known), max(known)) if known else None
+    each = (next((fit[n] for n in names if fit.get(n) is not None), None) for fit in found)
+    misfits = [misfit for misfit in each if misfit is not None]
+    return (min(misfits), max(misfits)) if misfits else None

@@ -30,16 +30,15 @@ from foamfit.springs.parameters import unit_of
 from foamfit.study.identified import NORMAL, HasContent, Population, Source, read_source
 from foamfit.text import engineering
 
-# Draws of specimens: by default, and at least, as fewer do not resolve the ends of a 95 % band.
-DRAWS, FEWEST = 400, 40
+DRAWS = 400  # default number of draws of specimens
+FEWEST = 40  # least number of draws: fewer do not resolve the ends of a 95 % band
 # Factor by which the rate of a test may lie outside the fitted rates.
 RATE_FACTOR = 1.25
-# Most draws that are tried for each one wanted.
-TRIES = 5
+TRIES = 5  # largest number of attempts per draw
 BAND = (0.025, 0.975)
-# So many tests are not said to be few; fewer suffice where fewer parameters change.
+# Number of tests that gives no warning; fewer suffice if fewer parameters scatter.
 FEW_TESTS = 5
-ALIGNING = 40  # steps of the fit of what a record does not say exactly
+ALIGNING = 40  # iterations of the fit of nuisance parameters
 
 
 @single_threaded
@@ -54,35 +53,35 @@ def predict(
 ) -> Prediction:
     """Predict a test that was not fitted, as a `Prediction`.
 
-    Height, area, mass and velocity are those of the test, and so is the rate at which laws of rate
-    are evaluated. What its record does not say exactly, such as the contact time and zeros of an
-    impact, is fitted to it (`Prediction.aligned`). The 95 % band has these parts: what the
-    result leaves uncertain of the parameters, to first order; their scatter between specimens (of a
-    joint result), drawn and simulated; the noise of the test and that of a motion that drives; and
-    what the law has missed of the fitted tests beyond their noise, which grows with each cycle
-    after the last of a fitted history (`foamfit.trust.best_point.cycle_growth`).
+    Height, area, mass, velocity and the rate for rate laws are those of the test. Quantities that
+    its record does not give exactly, such as the contact time and zeros of an impact, are fitted to
+    it (`Prediction.aligned`). The 95 % band consists of the uncertainty of the parameters, to first
+    order; their scatter between specimens (for a joint result), drawn and simulated; the noise of
+    the test and of a driving motion; and model error, which is the part of the residuals of the
+    fitted tests beyond their noise. Model error increases with each cycle after the last fitted one
+    (`foamfit.trust.best_point.cycle_growth`).
 
     Parameters
     ----------
     result : FitResult, JointResult, str or Path
-        A result of `fit` or `joint`, its folder, or its fit.json or joint.json; the file gives the
-        same numbers.
+        A result of `fit` or `joint`, its folder, or its fit.json or joint.json; all give the same
+        numbers.
     test : Measurement, str or Path
-        The test, or its file with its TOML beside it.
+        The test, or its file with the TOML next to it.
     drive : str, optional
-        "impact", "stress" or "displacement"; by default that of the result.
+        "impact", "stress" or "displacement"; by default the drive of the result.
     extrapolate : bool
         Whether the rate of the test may lie outside the fitted rates by more than `RATE_FACTOR`.
     draws, seed : int
-        Draws of specimens; same seed, same numbers.
+        Number of drawn specimens and seed; the same seed gives the same numbers.
 
     Raises
     ------
     InputError
-        If the result or the test cannot be read, the test cannot feed the drive, or its rate lies
-        outside the fitted ones.
+        If the result or the test cannot be read, the test lacks the data for the drive, or its rate
+        lies outside the fitted rates.
     SimulationError
-        If the test cannot be simulated with the common values, or with too few of the draws.
+        If the test cannot be simulated with the common values, or with too many of the draws.
     """
     for name, value, least in (("draws", draws, FEWEST), ("seed", seed, 0)):
         if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
@@ -93,8 +92,8 @@ def predict(
     outside = _outside(source, rate)
     if outside and not extrapolate:
         raise InputError(
-            f"{measurement.name}: {outside}; --extrapolate (extrapolate=True) predicts it all the "
-            "same, with a warning"
+            f"{measurement.name}: {outside}; --extrapolate (extrapolate=True) predicts it "
+            "anyway, with a warning"
         )
     problem = _problem(source, measurement, drive)
     objective = problem.objective
@@ -111,13 +110,13 @@ def predict(
     values, drawn, redrawn = list[Array](), list[dict[str, Array]](), 0
     if population.scattering:
         values, drawn, redrawn = _draw(population, problem, point, draws, seed)
-    known = {"parameters": _by_parameters(population, aligning, point, tuple(aligned))}
-    known |= {"motion": _by_motion(problem, point)}
+    halves = {"parameters": _by_parameters(population, aligning, point, tuple(aligned))}
+    halves |= {"motion": _by_motion(problem, point)}
     curves = dict[str, PredictedCurve]()
     for name in objective.counted:
-        parts = {part: sides[name] for part, sides in known.items() if name in sides}
+        parts = {part: of_curves[name] for part, of_curves in halves.items() if name in of_curves}
         curves[name] = _curve(problem, name, simulated.curves[name], drawn, source, parts)
-    changing, count = population.scattering, population.fewest if population.scattering else 0
+    changing, count = population.scattering, population.fewest
     warnings = render.sentences(
         "predicted_warnings",
         source=source,
@@ -129,7 +128,7 @@ def predict(
         few=count if changing and count < max(3, min(len(changing), FEW_TESTS)) else None,
         scattering=changing,
         held=population.held,
-        untold=[one.channel for one in curves.values() if one.channel not in source.misses],
+        untold=[c.channel for c in curves.values() if c.channel not in source.misses],
         drawn=len(values) if changing else draws,
         draws=draws,
     )
@@ -167,7 +166,7 @@ def predict(
 
 
 def _outside(source: Source, rate: float | None) -> str | None:
-    """Say how the rate of a test lies outside the fitted ones; None if it does not."""
+    """Return a clause if the rate of a test lies outside the fitted rates, else None."""
     if rate is None or not source.rates:
         return None
     low, high = min(source.rates), max(source.rates)
@@ -181,7 +180,7 @@ def _outside(source: Source, rate: float | None) -> str | None:
 
 
 def _problem(source: Source, measurement: Measurement, drive: str | None) -> Problem:
-    """The scene of the test under the law of the result."""
+    """Return the problem of the test with the law of the result."""
     chosen = drive or source.drive or choose_drive(measurement)
     try:
         check_drive(measurement, chosen)
@@ -189,61 +188,64 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
         if drive is not None:
             raise
         raise InputError(
-            f"{error}; {source.name} was fitted in this drive, --drive (drive=) chooses another"
+            f"{error}; {source.name} was fitted with this drive, choose another by --drive (drive=)"
         ) from None
-    inside, late = source.interior_mass and chosen == "impact", source.time_shift
-    if late:
+    inside, shift = source.interior_mass and chosen == "impact", source.time_shift
+    if shift:
         try:
             check_time_shift(measurement, chosen)
-        except InputError:  # it was that of another record
-            late = False
+        except InputError:  # this record cannot have the time shift of the fitted one
+            shift = False
     law, terms = source.model.name, source.model.relaxation
     problem = make_problem(
-        measurement, law, chosen, None, None, inside, time_shift=late, relaxation=terms
+        measurement, law, chosen, None, None, inside, time_shift=shift, relaxation=terms
     )
     objective, same = problem.objective, source.sha256 == measurement.data_sha256
     if not same or source.smoothed is None or chosen != "displacement":
         return problem
-    # More or other cycles of the record that was fitted: its motion is what it was then.
+    # The fitted record, possibly with other cycles: smooth the motion only if the fit did.
     motion = driving_motion(objective.measurement, objective.time, always=source.smoothed)
     followed = (motion if source.smoothed else None,)
     return replace(problem, objective=replace(objective, followed=followed))
 
 
 def _before(problem: Problem, source: Source) -> Problem:
-    """The problem without the cycles that come after the last fitted one, if others are left."""
+    """Return the problem without samples after the last fitted cycle, if any are left."""
     objective, test, last = problem.objective, problem.measurement, source.last_cycle
     ends = [part.stop for number, part in cycles_of(test).items() if last and number <= last]
     if not ends or ends[-1] == objective.time.size:
         return problem
     before = np.arange(objective.time.size) < ends[-1]
     channels = map(objective.channel, objective.counted)
-    sampled = {one: before & test.sampled.get(one, True) for one in channels}
+    sampled = {channel: before & test.sampled.get(channel, True) for channel in channels}
     test = replace(test, sampled=test.sampled | sampled)
     followed = (objective.motion,)
     return replace(problem, objective=replace(objective, measurement=test, followed=followed))
 
 
 def _point(population: Population, problem: Problem) -> Array:
-    """The common values; where they are not admissible together, those of the nearest test."""
+    """Return the common values, or if these are inadmissible the values of the nearest test."""
     for values in population.candidates():
         own = values[: len(problem.model.names)]
         heights = problem.model.heights(own, problem.measurement.specimen.height)
-        known = np.all(np.isfinite(values)) and np.all(heights > 0.0) and own[-1] >= 0.0
-        if known and problem.model.rows(own) is not None:
+        valid = np.all(np.isfinite(values)) and np.all(heights > 0.0) and own[-1] >= 0.0
+        if valid and problem.model.rows(own) is not None:
             return values
     raise SimulationError(
-        f"{population.source.where}: its common values are no admissible spring, nor are those of "
-        "a test; give the result of a fit as foamfit wrote it"
+        f"{population.source.where}: neither its common values nor those of any test are an "
+        "admissible spring; give the result of a fit as foamfit wrote it"
     )
 
 
 def _aligned(
     problem: Problem, springs: Array, scattering: tuple[str, ...]
 ) -> tuple[Array, dict[str, float]]:
-    """The springs and what of the record fits them best, and that in the numbers of its file."""
-    # Parameters that change from specimen to specimen are fitted with it and then given up: held,
-    # a stiffer specimen would be taken for one that is touched earlier.
+    """Fit the nuisance parameters of the record.
+
+    Returns all parameters, and the fitted ones with the zeros of the record's file.
+    """
+    # Scattering parameters are fitted too and then discarded: if they were fixed, a stiffer
+    # specimen would be mistaken for an earlier contact.
     params = problem.params.copy()
     for name, value in zip(problem.model.names, springs.tolist(), strict=True):
         one = params[name]
@@ -262,16 +264,19 @@ def _aligned(
     descend(tracker, space, space.encode(point), ALIGNING)
     assert tracker.best_values is not None  # the first point can be simulated
     point = np.append(springs, tracker.best_values[springs.size :])
-    told = dict(zip(problem.names, (point + problem.origins).tolist(), strict=True))
-    return point, {name: told[name] for name in names}
+    values = dict(zip(problem.names, (point + problem.origins).tolist(), strict=True))
+    return point, {name: values[name] for name in names}
 
 
 def _draw(
     population: Population, problem: Problem, point: Array, draws: int, seed: int
 ) -> tuple[list[Array], list[dict[str, Array]], int]:
-    """Draw and simulate: parameters, curves, and how many more were drawn as not admissible."""
-    # What lies beyond the limits of a fit of the test is moved there, as a fit does: to draw it
-    # again would leave one side of all other parameters out.
+    """Draw and simulate specimens.
+
+    Returns their parameters and curves, and the number of additional draws that failed.
+    """
+    # Parameters outside the limits of a fit are clipped, as in a fit. Drawing them again would
+    # distort the distribution of the other parameters.
     objective, specimens, tried = problem.objective, population.draws(seed), 0
     values, curves = list[Array](), list[dict[str, Array]]()
     limits = _limits(population, point[: len(population.source.parameters)])
@@ -287,7 +292,7 @@ def _draw(
     if len(values) < FEWEST:
         raise SimulationError(
             f"{population.source.where}: only {len(values)} of {tried} specimens drawn from its "
-            "scatter can be simulated; hold or share what it leaves undetermined"
+            "scatter can be simulated; fix or share the parameters that are not determined"
         )
     return values, curves, tried - len(values)
 
@@ -295,7 +300,7 @@ def _draw(
 def _by_parameters(
     population: Population, aligning: Problem, point: Array, aligned: tuple[str, ...]
 ) -> dict[str, Array]:
-    """Half of the 95 % band (n,), SI, by what the result leaves uncertain, to first order."""
+    """Return half the 95 % band (n,) due to the uncertainty of the result, to first order, SI."""
     objective, covariance = aligning.objective, population.covariance
     own = np.flatnonzero(np.diag(covariance) > 0.0)
     places = np.append(own, [aligning.index[name] for name in aligned]).astype(np.int64)
@@ -303,7 +308,7 @@ def _by_parameters(
     if not own.size or slopes is None:
         return {}
     jacobian, out = objective.jacobian(point, places), dict[str, Array]()
-    # What is aligned to the record would follow the parameters.
+    # With other parameters, the aligned nuisance parameters would change as well.
     follow = np.linalg.lstsq(jacobian[:, own.size :], jacobian[:, : own.size], rcond=None)[0]
     for name in objective.counted:
         moved = slopes[name][: own.size] - follow.T @ slopes[name][own.size :]
@@ -313,17 +318,17 @@ def _by_parameters(
 
 
 def _by_motion(problem: Problem, point: Array) -> dict[str, Array]:
-    """Half of the 95 % band (n,), SI, by what stays uncertain of a driving motion."""
+    """Return half the 95 % band (n,) due to the uncertainty of a driving motion, SI."""
     objective, out = problem.objective, dict[str, Array]()
     changes, level = objective.by_motion(point), objective.measurement.noise.of("displacement")
     if changes is None or objective.motion is None or level is None:
         return out
-    apart = np.linalg.norm(objective.motion.modes(objective.time), axis=1)
-    share = np.minimum(1.0, level.sigma / np.maximum(apart, 1e-300))
+    size = np.linalg.norm(objective.motion.modes(objective.time), axis=1)
+    share = np.minimum(1.0, level.sigma / np.maximum(size, 1e-300))
     samples = np.arange(objective.time.size)
     for name, part in objective.by_curve(np.linalg.norm(changes, axis=1)).items():
-        size = np.interp(samples, objective.kept(name), part / objective.factor(name))
-        out[name] = NORMAL * share * size
+        sigma = np.interp(samples, objective.kept(name), part / objective.factor(name))
+        out[name] = NORMAL * share * sigma
     return out
 
 
@@ -333,24 +338,23 @@ def _curve(
     predicted: Array,
     drawn: list[dict[str, Array]],
     source: Source,
-    known: dict[str, Array],
+    halves: dict[str, Array],  # of the parts "parameters" and "motion", if known
 ) -> PredictedCurve:
-    """One curve with its band: quantiles of the draws, all other parts added in quadrature."""
+    """Return one curve with its band: quantiles of the draws, and other parts in quadrature."""
     objective = problem.objective
     channel, n = objective.channel(name), predicted.size
-    parts = {part: np.zeros(n) for part in COLOURS if part != "motion"} | known
+    parts = {part: np.zeros(n) for part in COLOURS if part != "motion"} | halves
     low = middle = high = predicted
     if drawn:
-        ends = np.quantile([curves[name] for curves in drawn], (*BAND, 0.5), axis=0)
-        low, high, middle = ends
+        low, high, middle = np.quantile([c[name] for c in drawn], (*BAND, 0.5), axis=0)
         both = 0.5 * (high - low)
         parts["scatter"] = np.sqrt(np.maximum(both**2 - parts["parameters"] ** 2, 0.0))
     sigma, span = objective.noise(name).sigma, float(np.ptp(predicted))
     parts["noise"] = np.full(n, NORMAL * sigma)
-    missed = source.law_error(channel, sigma / float(np.ptp(objective.measured[name])))
-    parts["law_error"] = missed * span * np.sqrt(_grown(problem.measurement, source))
-    within = {"scatter", "parameters"} if drawn else {"scatter"}  # of the draws
-    more = sum(parts[part] ** 2 for part in parts.keys() - within)
+    law_error = source.law_error(channel, sigma / float(np.ptp(objective.measured[name])))
+    parts["law_error"] = law_error * span * np.sqrt(_growth(problem.measurement, source))
+    contained = {"scatter", "parameters"} if drawn else {"scatter"}  # in the draws
+    more = sum(parts[part] ** 2 for part in parts.keys() - contained)
     kept = np.zeros(n, dtype=bool)
     kept[objective.kept(name)] = True
     return PredictedCurve(
@@ -365,31 +369,28 @@ def _curve(
     )
 
 
-def _grown(measurement: Measurement, source: Source) -> Array:
-    """Mean square of the law's error over that of the fitted cycles, (n,); each later one adds."""
+def _growth(measurement: Measurement, source: Source) -> Array:
+    """Return the mean square of the model error over its value in the fitted cycles, (n,)."""
     assert measurement.stress is not None
-    grown = np.ones(measurement.stress.size)
+    growth = np.ones(measurement.stress.size)
     last = source.last_cycle or math.inf
     for number, part in cycles_of(measurement).items():
-        grown[part] += source.growth * max(number - last, 0.0)
-    return grown
+        growth[part] += source.growth * max(number - last, 0.0)
+    return growth
 
 
 def _parameters(
     population: Population, point: Array, drawn: list[Array]
 ) -> dict[str, PredictedParameter]:
-    """Each parameter at the test and its 95 % interval, within its limits."""
+    """Return each parameter at the test with its 95 % interval, within its limits."""
     half = population.quantile * np.sqrt(np.maximum(np.diag(population.covariance), 0.0))
-    ends = np.array([point - half, point + half])
-    if drawn:
-        ends = np.quantile(drawn, BAND, axis=0)
+    ends = np.quantile(drawn, BAND, axis=0) if drawn else np.array([point - half, point + half])
     ends = np.clip(ends, *_limits(population, point))
-    rows = zip(population.source.parameters, point.tolist(), *ends.tolist(), strict=True)
-    known = population.source.parameters
-    return {name: PredictedParameter(known[name].kind, *row) for name, *row in rows}
+    rows = zip(population.source.parameters.items(), point.tolist(), *ends.tolist(), strict=True)
+    return {name: PredictedParameter(one.kind, *row) for (name, one), *row in rows}
 
 
 def _limits(population: Population, point: Array) -> tuple[Array, Array]:
-    """Limits of the parameters in a fit of the test, which hold the point."""
+    """Return the limits of the parameters in a fit of the test, widened to contain the point."""
     low, high = np.array([population.limits[name] for name in population.source.parameters]).T
     return np.minimum(low, point), np.maximum(high, point)

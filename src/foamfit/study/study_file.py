@@ -1,4 +1,4 @@
-"""STUDY.toml: which tests are fitted together, and what each parameter is to them."""
+"""STUDY.toml: the tests that are fitted together, and the kinds of their parameters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.test_files import find_tests
 
-# The kind of a parameter for which evidence chooses one of `KINDS`.
+# Kind of a parameter for which the evidence decides between `KINDS`.
 AUTO = "auto"
 _EXAMPLES = {"tests": 'tests = ["runs/*.csv"]', "model": 'model = "microscale"'}
 
@@ -41,15 +41,15 @@ _KEYS = (*_RULES, "tests", "model", "relaxation", "specimens", "parameters")
 
 @dataclass(frozen=True)
 class Study:
-    """What a study says; `tests` are names, files, and the TOML of each (None: beside it).
+    """The content of a study file.
 
-    `kinds` has the kind of each parameter that is named, one of `links.KINDS` or "auto"; `held`
-    the values (SI) of those that are held.
+    `kinds` maps parameters to one of `links.KINDS` or "auto"; `held` maps fixed parameters to their
+    values (SI).
     """
 
     path: Path
     name: str
-    tests: tuple[tuple[str, Path, Path | None], ...]
+    tests: tuple[tuple[str, Path, Path | None], ...]  # name, file, TOML (None: next to the file)
     model: str
     relaxation: int
     drive: str | None
@@ -58,11 +58,11 @@ class Study:
     seed: int
     cycle: int | None
     starts: int | None
-    cycles: tuple[int, int] | None = None  # first and last of several that are one history
+    cycles: tuple[int, int] | None = None  # first and last of several cycles fitted as one history
 
 
 def read_study(path: str | Path) -> Study:
-    """Read and check a study; InputError names the file and the key that is wrong or missing."""
+    """Read and check a study file; InputError names the file and the wrong or missing key."""
     path = Path(path)
     content = load_toml(path, "a study is a TOML with tests, model and [parameters]")
     check_keys(f"{path}:", content, _KEYS)
@@ -100,7 +100,7 @@ def _read(path: Path, content: Mapping[str, Any]) -> Study:
 
 
 def _tests(path: Path, content: Mapping[str, Any]) -> tuple[tuple[str, Path, Path | None], ...]:
-    """Tests, and the TOML of each: its own in [specimens], else that of all."""
+    """Return tests with their TOML: from [specimens], or else the key specimen."""
     patterns = content["tests"]
     patterns = [patterns] if isinstance(patterns, str) else patterns
     if not isinstance(patterns, list) or not all(isinstance(p, str) for p in patterns):
@@ -113,20 +113,19 @@ def _tests(path: Path, content: Mapping[str, Any]) -> tuple[tuple[str, Path, Pat
         raise InputError(
             f"tests names {'one test' if found else 'none'}; a joint fit needs at least two"
         )
-    own, names = content.get("specimens", {}), [name for name, _ in found]
-    if not isinstance(own, dict):
+    specimens, names = content.get("specimens", {}), [name for name, _ in found]
+    if not isinstance(specimens, dict):
         raise InputError(f'specimens must be a table of tests, like {names[0]} = "a.toml"')
-    check_keys("[specimens]", own, names)
-    for name, value in own.items():
+    check_keys("[specimens]", specimens, names)
+    for name, value in specimens.items():
         if not isinstance(value, str):
             raise InputError(f"[specimens] {name} = {value!r} must be the name of a TOML")
-    tomls = (own.get(name, content.get("specimen")) for name in names)
-    places = (None if toml is None else path.parent / toml for toml in tomls)
-    return tuple((*test, place) for test, place in zip(found, places, strict=True))
+    pairs = ((test, specimens.get(test[0], content.get("specimen"))) for test in found)
+    return tuple((*test, None if toml is None else path.parent / toml) for test, toml in pairs)
 
 
 def _parameters(table: Any, model: Model) -> tuple[dict[str, str], dict[str, float]]:
-    """Kinds, and held values, of the parameters that are named."""
+    """Return kinds, and values of fixed parameters, from the table [parameters]."""
     if not isinstance(table, dict):
         raise InputError('parameters must be a table, like s1_k0 = "shared"')
     kinds, held = dict[str, str](), dict[str, float]()
@@ -140,8 +139,8 @@ def _parameters(table: Any, model: Model) -> tuple[dict[str, str], dict[str, flo
             )
         if name in NUISANCE and value in (*KINDS, AUTO) and value != "own":
             raise InputError(
-                f'{where} = "{value}" cannot be: each test has its own contact, zeros, striker and '
-                f'clock; leave it out, or make it "own" or a number (SI) to hold it at'
+                f'{where} = "{value}" is impossible: each test has its own contact, zeros, striker '
+                f'and clock; leave it out, make it "own", or give a number (SI) to fix it'
             )
         if value in (*KINDS, AUTO):
             kinds[name] = str(value)
@@ -150,6 +149,6 @@ def _parameters(table: Any, model: Model) -> tuple[dict[str, str], dict[str, flo
         else:
             wanted = ", ".join((*KINDS, AUTO))
             raise InputError(
-                f"{where} = {value!r} must be one of {wanted}, or a number (SI) to hold it at"
+                f"{where} = {value!r} must be one of {wanted}, or a number (SI) to fix it"
             )
     return kinds, held

@@ -1,4 +1,4 @@
-"""From files, folders and globs to named tests."""
+"""Find test files by files, folders and globs, and name them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from foamfit.text import listed
 
 ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
 WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
-# Stems of tables that say what the specimens are, beside the tests.
+# Stems of tables that list the specimens next to the tests.
 _SPECIMENS = ("specimen", "specimens")
 _WRITTEN = set[str]().union(*FILES.values())
 
@@ -23,64 +23,63 @@ _WRITTEN = set[str]().union(*FILES.values())
 def find_tests(
     patterns: str | Path | Iterable[str | Path], base: str | Path = "."
 ) -> list[tuple[str, Path]]:
-    """Find the tests that files, folders and globs ("**" goes into folders) name, from `base`.
+    """Find tests by files, folders and globs ("**" includes subfolders), relative to `base`.
 
-    From a folder, and from what a glob matches, it takes the tables (`ENDINGS`), but no list of
-    specimens, no motion file that the TOML of another test names, and no result of foamfit. A file
-    that is named itself is taken unless it is a TOML. Returned are names and files in the order of
-    the files, each file once. The name is the stem of the file; where two are the same, the parent
-    folders are put before it, joined by "-".
+    In folders and among the matches of a glob, only tables (`ENDINGS`) are tests, except lists of
+    specimens, motion files named in the TOML of another test, and results of foamfit. A file that
+    is given by its own name is always a test unless it is a TOML. Returns names and files, sorted
+    by file, each file once. The name is the stem of the file; equal names are prefixed by parent
+    folders, joined by "-".
 
     Raises
     ------
     InputError
-        If a glob matches no test, a folder has none, or nothing is there at all; the message names
-        it. A missing file among several is refused where it is read, as a broken link is.
+        If a glob or folder contains no test, or no file exists; the message names it. One missing
+        file among several, or a broken link, is not an error until it is read.
     """
     given = [patterns] if isinstance(patterns, str | Path) else list(patterns)
     if not given:
-        raise InputError("no test is named; give files, folders or globs")
-    found = {_whole(path): path for one in given for path in _matches(one, Path(base))}
+        raise InputError("no test is given; give files, folders or globs")
+    found = {_real(path): path for pattern in given for path in _matches(pattern, Path(base))}
     paths = sorted(found.values())
     if not paths:
-        raise InputError(f"{listed(map(str, given))}: a TOML is no test; name the tables beside it")
+        raise InputError(f"{listed(map(str, given))}: a TOML is not a test; give its table")
     if not any(map(os.path.lexists, paths)):
         raise InputError(f"{listed(map(str, given))}: no such file or folder; {WANTED}")
     return list(zip(_names(paths), paths, strict=True))
 
 
-def _whole(path: Path) -> Path:
-    """Absolute path of a file; `Path.resolve` refuses a link that leads to itself."""
+def _real(path: Path) -> Path:
+    """Return the absolute path of a file; `Path.resolve` fails for a link to itself."""
     return Path(os.path.realpath(path))
 
 
 def _matches(pattern: str | Path, base: Path) -> list[Path]:
-    """The files of one pattern."""
     path = base / pattern
     if folder := path.is_dir():
         hits = list(path.iterdir())
     elif path.exists() or not glob.has_magic(str(pattern)):
-        # One that is not there is refused where it is read. A shell's glob also names the TOMLs.
+        # A missing file fails when it is read. A glob expanded by the shell may include TOMLs.
         return [] if path.suffix.lower() == ".toml" else [path]
     else:
         hits = [Path(hit) for hit in glob.glob(str(path), recursive=True)]
         hits += [inner for hit in hits if hit.is_dir() for inner in hit.iterdir()]
     files = [hit for hit in hits if _is_test(hit)]
     tomls = (toml for place in {file.parent for file in files} for toml in place.glob("*.toml"))
-    motions = {_whole(motion) for motion in map(motion_file, tomls) if motion is not None}
-    there = [file for file in files if _whole(file) not in motions]
-    if not there:
+    motions = {_real(motion) for motion in map(motion_file, tomls) if motion is not None}
+    tests = [file for file in files if _real(file) not in motions]
+    if not tests:
         matched = f"the glob matches no {'test' if hits else 'file'}"
         why = "the folder has no test" if folder else matched
         raise InputError(f"{pattern}: {why}; {WANTED}")
-    return there
+    return tests
 
 
 def _is_test(path: Path) -> bool:
-    """Whether a file is taken where it is not named itself."""
+    """Return whether a file of a folder or among the matches of a glob is a test."""
     if not path.is_file() and (path.is_dir() or not path.is_symlink()):
-        return False  # a broken link is refused where it is read
-    plain = path.with_suffix("") if path.suffix.lower() == ".gz" else path  # no .tar.gz
+        return False  # a broken link to a table is a test, and fails when it is read
+    plain = path.with_suffix("") if path.suffix.lower() == ".gz" else path  # excludes .tar.gz
     if plain.suffix.lower() not in ENDINGS or plain.stem.lower() in _SPECIMENS:
         return False
     if path.name.startswith((".", "~$")):
@@ -90,23 +89,23 @@ def _is_test(path: Path) -> bool:
 
 
 def _names(paths: list[Path]) -> Iterator[str]:
-    """Name each file by its stem, and by as many parents as tell it from the others."""
-    wholes = [_whole(path) for path in paths]
-    beside = Counter((whole.parent, whole.stem.casefold()) for whole in wholes)
+    """Name each file by its stem and as many parent folders as make the name unique."""
+    files = [_real(path) for path in paths]
+    same = Counter((file.parent, file.stem.casefold()) for file in files)
     stems = [
-        w.stem if beside[w.parent, w.stem.casefold()] == 1 else w.name.replace(".", "-")
-        for w in wholes
+        file.stem if same[file.parent, file.stem.casefold()] == 1 else file.name.replace(".", "-")
+        for file in files
     ]
     names = list(stems)
-    for depth in range(1, max((len(whole.parts) for whole in wholes), default=0)):
+    for depth in range(1, max(len(file.parts) for file in files)):
         counts = Counter(name.casefold() for name in names)
-        for i, whole in enumerate(wholes):
+        for i, file in enumerate(files):
             if counts[names[i].casefold()] > 1:
-                names[i] = "-".join([*whole.parent.parts[1:][-depth:], stems[i]])
+                names[i] = "-".join([*file.parent.parts[1:][-depth:], stems[i]])
     taken = set[str]()
     for name in names:
         unique, count = name, 1
-        while unique.casefold() in taken:  # "a-b.csv" beside "a/b.csv"
+        while unique.casefold() in taken:  # "a-b.csv" and "a/b.csv"
             unique, count = f"{name}-{count + 1}", count + 1
         taken.add(unique.casefold())
         yield unique
