@@ -24,7 +24,7 @@ EPS, SIGMA = 0, 1
 
 
 def fill(values, row):
-    row[:] = values
+    row[0], row[1] = values
     return values[0] > 0.0 and values[1] > 0.0
 
 

@@ -96,7 +96,7 @@ def either() -> Law:
     which = ff.Param("which", coordinate="value", start=(0.0, "one"), admissible="finite")
     of = PAPERS["bistable"]
     own = [dataclasses.replace(one, admissible="finite") for one in of.params]
-    functions = of.loaded_functions()._replace(fill=_either)
+    functions = PAPERS["microscale"].loaded_functions()._replace(fill=_either)  # follow both
     searched = ("which", *of.searched)
     copied = {"kind": "copy", "spring": None, "columns": 16, "states": 18, "searched": searched}
     return laws.register(

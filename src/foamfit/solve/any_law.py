@@ -24,7 +24,7 @@ from foamfit.springs import kernels
 from foamfit.springs import laws as known
 from foamfit.springs.chain import Chain
 from foamfit.springs.laws import followed
-from foamfit.springs.laws.followed import MEMORY, STRENGTH, TIME, Springs, compiled
+from foamfit.springs.laws.followed import MEMORY, STRENGTH, TIME, Springs, compiled, inner
 from foamfit.springs.laws.record import BRANCH, EPS, Law
 from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
@@ -40,12 +40,12 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
     loops, count = followed.loops_of(laws), len(laws)
     start, step, to_stress = loops.start, loops.step, loops.to_stress
 
-    @compiled
+    @inner
     def begin(springs: Springs) -> None:
         for i in range(count):
             start(i, springs.rows[i], springs.states[i], 0.0)
 
-    @compiled
+    @inner
     def stretch(springs: Springs, sigma: float, h: float) -> float:
         """Take all springs to a stress; returns the elongation, m."""
         out = 0.0
@@ -53,14 +53,14 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
             out += springs.heights[i] * to_stress(i, springs, sigma, h)
         return out
 
-    @compiled
+    @inner
     def beside(given: tuple[Springs, float], sigma: float) -> float:
         """Elongation under a stress; the springs stay where they are."""
         return stretch(followed.trial_of(given[0]), sigma, given[1])
 
     find = followed.inverse(beside)
 
-    @compiled
+    @inner
     def elongate(springs: Springs, sigma: float, moved: float, h: float) -> float:
         """Take springs to an elongation, m; returns their stress, sought about `sigma`."""
         if count == 1:
@@ -70,7 +70,7 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
             stretch(springs, common, h)
         return common
 
-    @compiled
+    @inner
     def note(springs: Springs, j: int, nodes: Array, branches: NDArray[np.int64]) -> None:
         """Write displacements and branches of a sample."""
         top = 0.0
@@ -87,7 +87,7 @@ def driven(laws: tuple[Law, ...], top: int) -> Callable[..., tuple[float, bool]]
     """Loop along a prescribed stress (Pa) or motion (m), for springs of these laws."""
     begin, stretch, elongate, note = in_series(laws)
 
-    @compiled
+    @inner
     def press(springs: Springs, sigma: float, value: float, h: float) -> float:
         return value if math.isfinite(stretch(springs, value, h)) else math.nan
 
