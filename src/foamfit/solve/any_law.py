@@ -64,7 +64,8 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
     def elongate(springs: Springs, sigma: float, moved: float, h: float) -> float:
         """Take springs to an elongation, m; returns their stress, sought about `sigma`."""
         if count == 1:
-            return step(0, springs, moved / springs.heights[0], h)
+            # The base, but not as the constant 0, for which `step` would be compiled once more.
+            return step(count - 1, springs, moved / springs.heights[0], h)
         common = find((springs, h), sigma, 1e-3 * max(abs(sigma), 1.0), 0.0, moved)
         if math.isfinite(common):
             stretch(springs, common, h)
@@ -137,7 +138,7 @@ def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
         sigma = speed / soft  # what the dashpots bear at contact; 0 where a spring has none
         if count == 1:
             pace = speed / springs.heights[0], 0.0
-            sigma += delayed(0, springs.rows[0], springs.states[0], pace)
+            sigma += delayed(count - 1, springs.rows[0], springs.states[0], pace)
         for j in range(t.size):
             if t[j] <= 0.0:
                 nodes[:, j], stress[j], branches[:, j] = 0.0, sigma if t[j] == 0.0 else 0.0, 0

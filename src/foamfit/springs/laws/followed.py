@@ -24,8 +24,9 @@ from foamfit.springs.laws.record import BRANCH, EPS, SIGMA, Functions, Law
 
 Compiled = Callable[..., Any]
 _PLAIN: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
+_BRIDGELESS: dict[str, Any] = {**_PLAIN, "no_cpython_wrapper": True}
 compiled = njit(**_PLAIN)
-inner = njit(**_PLAIN, no_cpython_wrapper=True)  # for what only other loops call
+inner = njit(**_BRIDGELESS)  # for what only other loops call
 MOST_SWITCHES = 10_000  # of one spring on the way to one strain
 
 
@@ -366,9 +367,10 @@ def _back(law: Law) -> Compiled:
 
     @compiled
     def back(springs: Springs, stress: Array, out: Array) -> None:
-        start(0, springs.rows[0], springs.states[0], 0.0)
+        base = len(springs.heights) - 1  # the constant 0 would be compiled anew
+        start(base, springs.rows[base], springs.states[base], 0.0)
         for j in range(stress.size):
-            out[j] = to_stress(0, springs, stress[j], 0.0)
+            out[j] = to_stress(base, springs, stress[j], 0.0)
 
     return back
 
