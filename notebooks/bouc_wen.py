@@ -13,7 +13,7 @@ EPS, SIGMA, BRANCH, Z = range(4)
 
 def fill(values, row):
     """Copy the parameters; refuse what no spring has."""
-    row[:] = values
+    row[0], row[1], row[2], row[3] = values
     return values[0] > 0.0 and values[2] > 0.0
 
 

@@ -20,7 +20,8 @@ EPS, SIGMA, BRANCH, Z = range(4)
 
 def fill(values, row):
     """Copy the parameters; refuse what no spring has."""
-    row[:] = values
+    for j in range(7):
+        row[j] = values[j]
     return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4:].min() > 0.0
 
 

@@ -27,7 +27,8 @@ N, SLOWEST, RATIO = 17, 1e-4, 4.0
 
 def fill(values, row):
     """Copy the parameters, then the strength of each exponential."""
-    row[:6] = values
+    for j in range(6):
+        row[j] = values[j]
     g, a = values[4], values[5]
     if values[:3].min() <= 0.0 or values[3] < -3.0 or g <= 0.0 or not 0.0 < a < 1.0:
         return False

@@ -23,7 +23,8 @@ N = 24
 
 def fill(values, row):
     """Copy the parameters, then the slip strains."""
-    row[:7] = values
+    for j in range(7):
+        row[j] = values[j]
     for j in range(N):
         row[7 + j] = values[5] * ((j + 0.5) / N) ** values[6]
     return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4:].min() > 0.0

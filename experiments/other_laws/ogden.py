@@ -73,7 +73,8 @@ def read_curve(loop, marks, scales, share):
 
 def fill(values, row):
     """Copy the parameters; refuse what no spring has."""
-    row[:] = values
+    for j in range(4):  # `row[:] = values` takes two seconds to compile
+        row[j] = values[j]
     return values[:3].min() > 0.0 and values[3] >= -3.0
 
 

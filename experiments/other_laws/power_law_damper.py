@@ -23,7 +23,7 @@ paper_fill = PAPER_FUNCTIONS.fill
 
 def fill(values, row):
     """Fill the row of the paper's spring, then that of the damper."""
-    row[COLUMNS:] = values[7:]
+    row[COLUMNS], row[COLUMNS + 1] = values[7], values[8]
     return paper_fill(values[:7], row[:COLUMNS]) and values[7] >= 0.0 and values[8] > 0.0
 
 

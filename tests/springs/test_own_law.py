@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 
 import foamfit as ff
 from foamfit.springs import kernels, laws
-from foamfit.springs.laws import Law
+from foamfit.springs.laws import Law, followed
 
 FILE = Path(__file__).parents[2] / "notebooks" / "bouc_wen.py"
 VALUES = (2e6, 0.3, 0.1, 1.5, 0.0)
@@ -96,7 +96,7 @@ def either() -> Law:
     which = ff.Param("which", coordinate="value", start=(0.0, "one"), admissible="finite")
     of = PAPERS["bistable"]
     own = [dataclasses.replace(one, admissible="finite") for one in of.params]
-    functions = of.loaded_functions()._replace(fill=_either)
+    functions = PAPERS["microscale"].loaded_functions()._replace(fill=_either)  # follow both
     searched = ("which", *of.searched)
     copied = {"kind": "copy", "spring": None, "columns": 16, "states": 18, "searched": searched}
     return laws.register(
@@ -191,6 +191,10 @@ def _infinite(row, state, strain):  # type: ignore[no-untyped-def]
     state[0], state[1] = strain, row[0] * strain / (0.2 - 0.2)
 
 
+def _nothing(row, state, rate, h):  # type: ignore[no-untyped-def]
+    pass
+
+
 def test_a_wrong_law_gets_one_sentence(bouc_wen: Law) -> None:
     of = bouc_wen.functions
     assert isinstance(of, ff.Functions)
@@ -200,6 +204,9 @@ def test_a_wrong_law_gets_one_sentence(bouc_wen: Law) -> None:
         "a function goes beyond": changed(bouc_wen, states=3),
         "the stress falls on loading": changed(bouc_wen, functions=of._replace(settle=_falling)),
         "the stress is not finite": changed(bouc_wen, functions=of._replace(settle=_infinite)),
+        "its functions cannot be compiled": changed(
+            bouc_wen, functions=of._replace(viscous=_nothing)
+        ),
         "the name is that of a law of foamfit": changed(bouc_wen, kind="bistable"),
         "its kind must be small letters": changed(bouc_wen, kind="Bouc Wen"),
         "it has no parameters": changed(bouc_wen, params=()),
@@ -216,6 +223,13 @@ def test_a_wrong_law_gets_one_sentence(bouc_wen: Law) -> None:
         assert "\n" not in str(caught.value)
         assert law.kind in ("bistable", "bouc-wen") or law.kind not in laws.kinds()
     assert laws.law("bouc-wen") is bouc_wen
+
+
+def test_what_is_compiled_to_try_a_law_follows_its_springs(bouc_wen: Law) -> None:
+    known = laws.register(changed(bouc_wen, kind="once", spring=None))
+    before = followed._along.cache_info().misses
+    known.make(VALUES, ()).stress([0.0, 0.1])
+    assert followed._along.cache_info().misses == before
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from foamfit.springs import kernels
 from foamfit.springs import laws as known
 from foamfit.springs.chain import Chain
 from foamfit.springs.laws import followed
-from foamfit.springs.laws.followed import MEMORY, STRENGTH, TIME, Springs, compiled
+from foamfit.springs.laws.followed import MEMORY, STRENGTH, TIME, Springs, compiled, inner
 from foamfit.springs.laws.record import BRANCH, EPS, Law
 from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
@@ -40,12 +40,12 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
     loops, count = followed.loops_of(laws), len(laws)
     start, step, to_stress = loops.start, loops.step, loops.to_stress
 
-    @compiled
+    @inner
     def begin(springs: Springs) -> None:
         for i in range(count):
             start(i, springs.rows[i], springs.states[i], 0.0)
 
-    @compiled
+    @inner
     def stretch(springs: Springs, sigma: float, h: float) -> float:
         """Take all springs to a stress; return their elongation, m."""
         out = 0.0
@@ -53,24 +53,25 @@ def in_series(laws: tuple[Law, ...]) -> tuple[followed.Compiled, ...]:
             out += springs.heights[i] * to_stress(i, springs, sigma, h)
         return out
 
-    @compiled
+    @inner
     def beside(given: tuple[Springs, float], sigma: float) -> float:
         """Return the elongation under a stress, without moving the springs."""
         return stretch(followed.trial_of(given[0]), sigma, given[1])
 
     find = followed.inverse(beside)
 
-    @compiled
+    @inner
     def elongate(springs: Springs, sigma: float, moved: float, h: float) -> float:
         """Take springs to an elongation, m; return their stress, found from the guess `sigma`."""
         if count == 1:
-            return step(0, springs, moved / springs.heights[0], h)
+            # The base, but not as the constant 0, for which `step` would be compiled once more.
+            return step(count - 1, springs, moved / springs.heights[0], h)
         common = find((springs, h), sigma, 1e-3 * max(abs(sigma), 1.0), 0.0, moved)
         if math.isfinite(common):
             stretch(springs, common, h)
         return common
 
-    @compiled
+    @inner
     def note(springs: Springs, j: int, nodes: Array, branches: NDArray[np.int64]) -> None:
         """Write the displacements and branches of a sample."""
         top = 0.0
@@ -87,7 +88,7 @@ def driven(laws: tuple[Law, ...], top: int) -> Callable[..., tuple[float, bool]]
     """Return the loop along a prescribed stress (Pa) or motion (m) for springs of these laws."""
     begin, stretch, elongate, note = in_series(laws)
 
-    @compiled
+    @inner
     def press(springs: Springs, sigma: float, value: float, h: float) -> float:
         return value if math.isfinite(stretch(springs, value, h)) else math.nan
 
@@ -137,7 +138,7 @@ def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
         sigma = speed / soft  # stress of the dashpots at contact; 0 if a spring has none
         if count == 1:
             pace = speed / springs.heights[0], 0.0
-            sigma += delayed(0, springs.rows[0], springs.states[0], pace)
+            sigma += delayed(count - 1, springs.rows[0], springs.states[0], pace)
         for j in range(t.size):
             if t[j] <= 0.0:
                 nodes[:, j], stress[j], branches[:, j] = 0.0, sigma if t[j] == 0.0 else 0.0, 0

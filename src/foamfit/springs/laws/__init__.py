@@ -95,14 +95,15 @@ def register(law: Law) -> Law:
     """
     from foamfit.springs.laws.checked import check
 
-    check(law, PAPER)
-    if law.spring is None:
+    known = law
+    if isinstance(law, Law) and law.spring is None:
 
         def make(*values: float, relaxation: Relaxation = ()) -> LawSpring:
             return LawSpring(known, values, relaxation)
 
-        law = replace(law, spring=make)
-    known = _LAWS[law.kind] = law
+        known = replace(law, spring=make)
+    check(known, PAPER)  # its functions stay compiled for the springs that `make` makes
+    _LAWS[known.kind] = known
     return known
 
 

@@ -111,6 +111,7 @@ def _trial(law: Law) -> str | None:
         if followed.row_of(law, values) is None:
             return f"fill refuses its own start values ({shown}); give others"
         stress, branches = followed.stress_along(law, values, TRIED)
+        followed.compile_delayed(law)
     except Exception as error:  # any error of the compiler in a user's function
         told = " ".join(str(error).split())[:300]
         return f"its functions cannot be compiled or run ({type(error).__name__}: {told})"

@@ -13,7 +13,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
+from numba import float64, njit, types
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
@@ -23,7 +23,10 @@ from foamfit.springs.law import MICROSCALE
 from foamfit.springs.laws.record import BRANCH, EPS, SIGMA, Functions, Law
 
 Compiled = Callable[..., Any]
-compiled = njit(error_model="numpy")
+_PLAIN: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
+_BRIDGELESS: dict[str, Any] = {**_PLAIN, "no_cpython_wrapper": True}
+compiled = njit(**_PLAIN)
+inner = njit(**_BRIDGELESS)  # for functions that only compiled ones call
 MOST_SWITCHES = 10_000  # largest number of switches of a spring in one step
 
 
@@ -31,11 +34,8 @@ MOST_SWITCHES = 10_000  # largest number of switches of a spring in one step
 
 
 @kernels.compiled
-def _begin(row: Array, state: Array) -> None:
-    """Set the state of a spring at rest."""
-    if row[kernels.KIND] == MICROSCALE:
-        micro.begin(row, state, 0.0)
-        return
+def _begin_on_branch(row: Array, state: Array) -> None:
+    """Set the state at rest of a spring that is not a microscale spring."""
     state[:] = 0.0
     branch = kernels.first_branch(row)
     state[BRANCH] = branch
@@ -43,11 +43,43 @@ def _begin(row: Array, state: Array) -> None:
 
 
 @kernels.compiled
+def _leaves_branch(row: Array, state: Array, eps: float) -> bool:
+    """Return whether the spring leaves its branch before it reaches a strain."""
+    return eps > state[micro.HIGH] if eps > state[EPS] else eps < state[micro.LOW]
+
+
+@kernels.compiled
+def _settle_on_branch(row: Array, state: Array, eps: float) -> None:
+    """Move the spring to a strain on its branch."""
+    state[EPS], state[SIGMA] = eps, kernels.stress_on(row, int(state[BRANCH]), eps)
+
+
+@kernels.compiled
+def _switch_branch(row: Array, state: Array, up: bool) -> None:
+    """Change to the next branch, at the end of this one."""
+    branch = int(state[BRANCH])
+    state[EPS] = state[micro.HIGH] if up else state[micro.LOW]
+    branch = kernels.above(branch) if up else kernels.below(branch)
+    state[BRANCH] = branch
+    state[micro.LOW], state[micro.HIGH] = kernels.interval(row, branch)
+    state[SIGMA] = kernels.stress_on(row, branch, state[EPS])
+
+
+@kernels.compiled
+def _begin(row: Array, state: Array) -> None:
+    """Set the state of a spring at rest."""
+    if row[kernels.KIND] == MICROSCALE:
+        micro.begin(row, state, 0.0)
+    else:
+        _begin_on_branch(row, state)
+
+
+@kernels.compiled
 def _leaves(row: Array, state: Array, eps: float) -> bool:
     """Return whether a spring leaves its branch before it reaches a strain."""
     if row[kernels.KIND] == MICROSCALE:
         return micro.leaves(state, eps)
-    return eps > state[micro.HIGH] if eps > state[EPS] else eps < state[micro.LOW]
+    return _leaves_branch(row, state, eps)
 
 
 @kernels.compiled
@@ -56,7 +88,7 @@ def _settle(row: Array, state: Array, eps: float) -> None:
     if row[kernels.KIND] == MICROSCALE:
         micro.settle(row, state, eps)
     else:
-        state[EPS], state[SIGMA] = eps, kernels.stress_on(row, int(state[BRANCH]), eps)
+        _settle_on_branch(row, state, eps)
 
 
 @kernels.compiled
@@ -64,13 +96,8 @@ def _switch(row: Array, state: Array, up: bool) -> None:
     """Change to the next branch, at the end of this one or at a turn of the strain."""
     if row[kernels.KIND] == MICROSCALE:
         micro.switch(row, state, up)
-        return
-    branch = int(state[BRANCH])
-    state[EPS] = state[micro.HIGH] if up else state[micro.LOW]
-    branch = kernels.above(branch) if up else kernels.below(branch)
-    state[BRANCH] = branch
-    state[micro.LOW], state[micro.HIGH] = kernels.interval(row, branch)
-    state[SIGMA] = kernels.stress_on(row, branch, state[EPS])
+    else:
+        _switch_branch(row, state, up)
 
 
 _FILL = {
@@ -85,19 +112,31 @@ _FILL = {
 
 
 def functions_of(kind: str) -> Functions:
-    """Return the functions of a built-in law."""
-    return Functions(_FILL[kind], _begin, _leaves, _switch, _settle)
+    """Return the functions of a built-in law; those of a microscale law follow any built-in law.
+
+    The other laws have functions of their own, because the microscale code takes long to compile.
+    """
+    if kind.startswith("microscale"):
+        return Functions(_FILL[kind], _begin, _leaves, _switch, _settle)
+    return Functions(
+        _FILL[kind], _begin_on_branch, _leaves_branch, _switch_branch, _settle_on_branch
+    )
 
 
 # ---------------------------------------------------------------- loops for any laws
 
 
 @cache
+def _ready(function: Any, compiler: Compiled) -> Any:
+    """Return a compiled function; laws that share a function share its compiled form."""
+    return compiler(function) if function and not hasattr(function, "py_func") else function
+
+
+@cache
 def compiled_functions(law: Law) -> Functions:
     """Return the compiled functions of a law."""
-    given: tuple[Any, ...] = law.loaded_functions()
-    ready = (None, *(one for one in given if hasattr(one, "py_func")))
-    return Functions(*(one if one in ready else compiled(one) for one in given))
+    fill, *followed = law.loaded_functions()
+    return Functions(_ready(fill, compiled), *(_ready(one, inner) for one in followed))
 
 
 def sizes_of(law: Law) -> tuple[int, int]:
@@ -159,6 +198,7 @@ class Loops(NamedTuple):
     delayed: Compiled
 
 
+@cache
 def _own_loops(law: Law) -> tuple[Compiled, Compiled, Compiled]:
     """Return loops that set a spring to rest, take it to a strain, and give its viscous stress.
 
@@ -167,13 +207,13 @@ def _own_loops(law: Law) -> tuple[Compiled, Compiled, Compiled]:
     _, begin, leaves, switch, settle, viscous = compiled_functions(law)
     columns, states = sizes_of(law)
 
-    @compiled
+    @inner
     def start(rows: Array, whole: Array, eps: float) -> float:
         whole[:] = 0.0
         begin(rows[:columns], whole[:states])
         return eps
 
-    @compiled
+    @inner
     def walk(rows: Array, whole: Array, eps: float) -> float:
         row, state = rows[:columns], whole[:states]
         for _ in range(MOST_SWITCHES):
@@ -183,13 +223,13 @@ def _own_loops(law: Law) -> tuple[Compiled, Compiled, Compiled]:
             switch(row, state, eps > state[EPS])
         return math.nan
 
-    @compiled
+    @inner
     def none(rows: Array, whole: Array, pace: tuple[float, float]) -> float:
         return 0.0
 
-    @compiled
+    @inner
     def delayed(rows: Array, whole: Array, pace: tuple[float, float]) -> float:
-        return viscous(rows[:columns], whole[:states], pace[0], pace[1])  # type: ignore[misc]
+        return float(viscous(rows[:columns], whole[:states], *pace))  # type: ignore[misc]
 
     return start, walk, none if viscous is None else delayed
 
@@ -198,7 +238,7 @@ def _chosen(functions: Sequence[Compiled]) -> Compiled:
     """Combine functions of several springs into one that takes the index i of a spring."""
     first = functions[0]
 
-    @compiled
+    @inner
     def alone(i: int, row: Array, state: Array, given: Any) -> float:
         return first(row, state, given)
 
@@ -206,7 +246,7 @@ def _chosen(functions: Sequence[Compiled]) -> Compiled:
         return alone
     rest = _chosen(functions[1:])
 
-    @compiled
+    @inner
     def choose(i: int, row: Array, state: Array, given: Any) -> float:
         return first(row, state, given) if i == 0 else rest(i - 1, row, state, given)
 
@@ -220,7 +260,7 @@ def inverse(value_at: Compiled) -> Compiled:
     of x or of `size`, and returns NaN without a root.
     """
 
-    @compiled
+    @inner
     def find(given: Any, start: float, pace: float, size: float, target: float) -> float:
         low = high = start
         least = most = value_at(given, start)
@@ -254,7 +294,7 @@ def inverse(value_at: Compiled) -> Compiled:
     return find
 
 
-@compiled
+@inner
 def trial_of(springs: Springs) -> Springs:
     """Return the springs with a copy of their states, for trial steps."""
     states, terms = springs.states.copy(), springs.terms.copy()
@@ -266,7 +306,7 @@ def loops_of(laws: tuple[Law, ...]) -> Loops:
     """Return the loops for springs of these laws, base first."""
     start, walk, delayed = map(_chosen, zip(*map(_own_loops, laws), strict=True))
 
-    @compiled
+    @inner
     def step(i: int, springs: Springs, eps: float, h: float) -> float:
         row, state = springs.rows[i], springs.states[i]
         before, from_eps = state[SIGMA], state[EPS]
@@ -285,7 +325,7 @@ def loops_of(laws: tuple[Law, ...]) -> Loops:
             out += delayed(i, row, state, (rate, h)) + springs.eta[i] * rate
         return out
 
-    @compiled
+    @inner
     def beside(given: Any, eps: float) -> float:
         """Return the stress at a strain without moving the spring."""
         i, springs, h = given
@@ -293,7 +333,7 @@ def loops_of(laws: tuple[Law, ...]) -> Loops:
 
     find = inverse(beside)
 
-    @compiled
+    @inner
     def to_stress(i: int, springs: Springs, sigma: float, h: float) -> float:
         eps = find((i, springs, h), springs.states[i, EPS], 1e-3, 1e-3, sigma)
         if math.isfinite(eps):
@@ -303,28 +343,60 @@ def loops_of(laws: tuple[Law, ...]) -> Loops:
     return Loops(start, step, to_stress, delayed)
 
 
-def _followed(law: Law, values: ArrayLike) -> tuple[Loops, Springs]:
-    """Return the loops and a single spring at rest, of height 1."""
-    row, loops = row_of(law, values), loops_of((law,))
+@cache
+def _along(law: Law) -> Compiled:
+    """Return a loop that follows one spring from rest along a strain history, without time."""
+    start, walk, _ = _own_loops(law)
+
+    @compiled
+    def along(
+        row: Array, state: Array, strain: Array, out: Array, branches: NDArray[np.int64]
+    ) -> None:
+        start(row, state, 0.0)
+        for j in range(strain.size):
+            out[j] = walk(row, state, strain[j])
+            branches[j] = int(state[BRANCH])
+
+    return along
+
+
+@cache
+def _back(law: Law) -> Compiled:
+    """Return a loop that follows one spring of height 1 along a stress history, without time."""
+    start, _, to_stress, _ = loops_of((law,))
+
+    @compiled
+    def back(springs: Springs, stress: Array, out: Array) -> None:
+        base = len(springs.heights) - 1  # for the constant 0 numba would compile another version
+        start(base, springs.rows[base], springs.states[base], 0.0)
+        for j in range(stress.size):
+            out[j] = to_stress(base, springs, stress[j], 0.0)
+
+    return back
+
+
+def compile_delayed(law: Law) -> None:
+    """Compile the time-dependent stress of a law; raises the errors of the compiler."""
+    numbers = types.Array(float64, 1, "C")
+    _own_loops(law)[2].compile((numbers, numbers, types.UniTuple(float64, 2)))  # type: ignore
+
+
+def _row_and_state(law: Law, values: ArrayLike) -> tuple[Array, Array]:
+    row = row_of(law, values)
     assert row is not None
-    springs = Springs(
-        row[None], np.empty((1, sizes_of(law)[1])), np.empty((1, 0, 3)), np.ones(1), np.zeros(1)
-    )
-    loops.start(0, row, springs.states[0], 0.0)
-    return loops, springs
+    return row, np.empty(sizes_of(law)[1])
 
 
 def stress_along(law: Law, values: ArrayLike, strain: Array) -> tuple[Array, NDArray[np.int64]]:
     """Return stress (Pa) and branch number along a strain history (n,), from rest."""
-    loops, springs = _followed(law, values)
     out, branches = np.empty(strain.size), np.empty(strain.size, np.int64)
-    for j, eps in enumerate(strain):
-        out[j] = loops.step(0, springs, eps, 0.0)
-        branches[j] = int(springs.states[0, BRANCH])
+    _along(law)(*_row_and_state(law, values), strain, out, branches)
     return out, branches
 
 
 def strain_along(law: Law, values: ArrayLike, stress: Array) -> Array:
     """Return the strain along a stress history (n,), Pa, from rest; NaN without a solution."""
-    loops, springs = _followed(law, values)
-    return np.array([loops.to_stress(0, springs, sigma, 0.0) for sigma in stress])
+    out, (row, state) = np.empty(stress.size), _row_and_state(law, values)
+    springs = Springs(row[None], state[None], np.empty((1, 0, 3)), np.ones(1), np.zeros(1))
+    _back(law)(springs, stress, out)
+    return out
