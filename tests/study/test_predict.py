@@ -648,7 +648,7 @@ def test_the_command_replaces_predictions_and_nothing_else(tmp_path, monkeypatch
     before = (result / "fit.json").read_bytes()
     done = run("predict", result, record, "--out", result, "--draws", DRAWS)
     assert done.exit_code == 1
-    assert "holds fit.json, which is no part of a prediction" in done.stderr
+    assert "holds fit.json, which does not belong to a prediction" in done.stderr
     assert (result / "fit.json").read_bytes() == before
     out = tmp_path / "out"
     for seed in (0, 1):
