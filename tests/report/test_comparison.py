@@ -111,7 +111,7 @@ def test_independent_errors_of_a_ratio_add_in_squares_and_the_text_says_so() -> 
     # Δσ (1 - ε_a)/(k0 ε_a): the last enters as 1/(1 - ε_a)
     drop = 0.2 * math.sqrt(0.01**2 + 0.01**2 + (0.01 / 0.86) ** 2)
     assert row(section, "Δσ/σ_a").stderr == pytest.approx(drop)
-    assert "no correlation in fit.json" in comparison_text(compare([result]))
+    assert "fit.json contains no correlations" in comparison_text(compare([result]))
 
 
 @pytest.mark.parametrize("rho", [-0.8, 0.5, 0.99])
@@ -163,7 +163,7 @@ def test_the_published_damping_is_answered_in_words() -> None:
     assert zeta.value == pytest.approx(ratio * 12.0 / 1e4)
     assert zeta.stderr == pytest.approx(zeta.value * math.hypot(0.25, 0.005))
     assert (zeta.reference, zeta.percent) == (0.894, None)
-    assert "a viscosity in real time" in " ".join(text.split())
+    assert "a physical viscosity" in " ".join(text.split())
     assert "gives 0.845, but the paper states 0.894" in " ".join(text.split())
 
 

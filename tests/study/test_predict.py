@@ -247,7 +247,7 @@ def test_two_tests_are_said_to_leave_the_scatter_open():
     found = ff.predict(InMemory(scattering(2)), loop(seed=0), draws=DRAWS)
     assert any("determine how s1_k0 and s1_sigma_plus vary" in w for w in found.warnings)
     many = ff.predict(InMemory(scattering(5)), loop(seed=0), draws=DRAWS)
-    assert not any("leave open" in one for one in many.warnings)
+    assert not any("too few" in one for one in many.warnings)
     width = {n: one.curves["stress_strain"].half_width for n, one in ((2, found), (5, many))}
     assert width[2] > 1.5 * width[5]
 
@@ -442,7 +442,7 @@ def test_a_rate_outside_the_fitted_ones_is_refused_unless_it_is_wanted():
     assert "Extrapolation: its rate, 0.5 1/s" in prediction_text(found).replace("\n  ", " ")
     told = found.to_json_dict()
     assert told["extrapolated"]
-    assert any("extrapolation" in one for one in told["warnings"])
+    assert any("Extrapolation" in one for one in told["warnings"])
 
 
 def test_a_drive_that_the_test_cannot_feed_is_named_with_the_way_out():
