@@ -139,7 +139,7 @@ def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
     present = sorted(place.iterdir())
     if present and not any(_content(place / name) for name in FILES):
         raise InputError(
-            f"{folder} is not empty and contains no result of foamfit (such as fit.json), so it is "
+            f"{folder} is not empty and contains no foamfit result (such as fit.json), so it is "
             "not replaced; choose a new or an empty folder"
         )
     tests = _content(place / "joint.json").get("tests")  # folders of a joint fit
