@@ -369,8 +369,8 @@ def test_where_no_model_reaches_the_noise_prediction_decides(monkeypatch):
     assert row["gain_over"] == simpler["model"]
     assert row["gain"] == pytest.approx(1.0 - row["predicted_misfit"] / simpler["predicted_misfit"])
     assert f"{100 * row['gain']:.0f} % less than {simpler['model']};" in ladder.chosen.why
-    assert any("AICc and BIC do not hold" in sentence for sentence in ladder.sentences)
-    assert any(text.startswith("With every model systematic res") for text in result.warnings)
+    assert any("AICc and BIC are not valid" in sentence for sentence in ladder.sentences)
+    assert any(text.startswith("Every model leaves system") for text in result.warnings)
 
 
 @pytest.mark.parametrize("given", [None, 0.004])
@@ -529,7 +529,7 @@ def test_outliers_leave_the_ladder_standing():
         patch.setattr(auto, "LADDER", groups("bistable"))
         spoilt = replace(test, stress=stress, outliers=spikes)
         result = ff.fit(spoilt, model="auto", starts=2, intervals="local")
-    assert any("systematic residuals remain" in text for text in result.warnings)
+    assert any("leaves systematic residuals" in text for text in result.warnings)
 
 
 # ---------------------------------------------------------------- interruption
@@ -641,12 +641,12 @@ def test_ranges_are_made_of_the_chosen_model_alone(climbed, models_with_ranges):
     assert all(p.range is not None for p in known)
     states = [name for name, p in result.parameters.items() if p.state == "weak"]
     assert list(result.ladder.chosen.weak) == states
-    assert any("Ranges were made of the chosen" in text for text in result.ladder.sentences)
+    assert any("Ranges were computed for the chosen" in text for text in result.ladder.sentences)
 
 
 def test_what_remains_is_said(climbed):
     warning = next(
-        text for text in climbed.warnings if text.startswith("With every model systematic")
+        text for text in climbed.warnings if text.startswith("Every model leaves systematic")
     )
     assert "those of stress_strain are" in warning
     size = float(warning.split("stress_strain are ")[1].split(" %")[0])

@@ -239,7 +239,7 @@ def test_the_terminal_is_one_screen_and_verbose_says_the_rest(
 def test_compare(here: Path, fitted: tuple[Path, Result]) -> None:
     folder = next(fitted[0].rglob("fit.json")).parent
     args = ("--published", "foam-1/model-1", "--plot", "comparison.png")
-    assert "beside published foam-1/model-1" in accepted("compare", folder, *args).stdout
+    assert "compared with published foam-1/model-1" in accepted("compare", folder, *args).stdout
     assert set(files(here)) == {"comparison.png"}
 
 

@@ -111,7 +111,7 @@ def test_independent_errors_of_a_ratio_add_in_squares_and_the_text_says_so() -> 
     # Δσ (1 - ε_a)/(k0 ε_a): the last enters as 1/(1 - ε_a)
     drop = 0.2 * math.sqrt(0.01**2 + 0.01**2 + (0.01 / 0.86) ** 2)
     assert row(section, "Δσ/σ_a").stderr == pytest.approx(drop)
-    assert "no correlation in fit.json" in comparison_text(compare([result]))
+    assert "fit.json contains no correlations" in comparison_text(compare([result]))
 
 
 @pytest.mark.parametrize("rho", [-0.8, 0.5, 0.99])
@@ -163,8 +163,8 @@ def test_the_published_damping_is_answered_in_words() -> None:
     assert zeta.value == pytest.approx(ratio * 12.0 / 1e4)
     assert zeta.stderr == pytest.approx(zeta.value * math.hypot(0.25, 0.005))
     assert (zeta.reference, zeta.percent) == (0.894, None)
-    assert "a viscosity in real time" in " ".join(text.split())
-    assert "gives 0.845, where the paper says 0.894" in " ".join(text.split())
+    assert "a physical viscosity" in " ".join(text.split())
+    assert "gives 0.845, but the paper states 0.894" in " ".join(text.split())
 
 
 @pytest.mark.parametrize(
@@ -354,7 +354,7 @@ def test_the_command_prints_and_draws(tmp_path: Path) -> None:
     one, plot = (str(tmp_path / name) for name in ("one", "c.svg"))
     done = CliRunner().invoke(main, ["compare", one, "--plot", plot])
     assert done.exit_code == 0
-    assert "beside published foam-1/model-1" in done.stdout
+    assert "compared with published foam-1/model-1" in done.stdout
     assert Path(plot).is_file()
 
 
@@ -412,7 +412,7 @@ def test_no_published_set_has_microscale_springs() -> None:
     one = replace(one, measurement=named)
     assert compare([one, one]).reference == "reference"  # though the name is that of a set
     told = comparison_text(compare([one], "foam-1/model-1"))
-    assert "The published sets have no microscale springs, so there is nothing" in told
+    assert "The published sets have no microscale springs, so there are no" in told
     with pytest.raises(InputError, match="no published set has microscale springs; give a second"):
         compare([one])
 

@@ -52,7 +52,7 @@ def test_all_figures_of_the_report_are_pdf_where_that_is_asked_for(
     small_pictures(monkeypatch)
     result.save(folder)  # and may be replaced
     assert {path.name for path in folder.glob("*.pdf")} == {"fit.pdf"}
-    with pytest.raises(InputError, match="behind a comma may stand untitled or pdf"):
+    with pytest.raises(InputError, match="optionally followed by a comma and untitled or pdf"):
         result.save(folder, figure_width="two, png")
 
 

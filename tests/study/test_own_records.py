@@ -148,7 +148,7 @@ def test_an_unseen_impact_is_aligned_before_it_is_compared(together, fitted):
             )
             assert made.parameters.keys() == {*SPRING, "site_eta"}
             assert all(share > 0.9 for share in made.inside.values())
-            assert "Aligned to the record, with the springs held" in " ".join(made.sentences)
+            assert "not predicted (with the springs fixed)" in " ".join(made.sentences)
             assert made.to_json_dict()["aligned"] == made.aligned
 
 

@@ -420,7 +420,7 @@ def test_the_report_shows_them_too() -> None:
     assert 99 <= sum(map(int, re.findall(r">(\d+)</td>", shares.split("</tr>")[2]))) <= 101
     for words in (
         "Checklist",
-        "What the test determines",
+        "Information in the test",
         "Are the residuals at the estimated noise?",
     ):
         assert words in page

@@ -1,5 +1,5 @@
-"""Material cards: the curves of a fitted law for finite elements, and what they lose.
+"""Material cards of a fitted law for finite elements, and their deviation from the law.
 
-`curves` makes the loading curves, follows a card as its solver does and fits its unloading, `card`
-makes the files. The texts of the cards are templates.
+`curves` computes the loading curves, evaluates a card as its solver does and fits its unloading;
+`card` writes the files. The texts of the cards are templates.
 """

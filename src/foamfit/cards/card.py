@@ -1,4 +1,4 @@
-"""A material card for finite elements, what it loses of its fit, and the picture of both."""
+"""A material card for finite elements: its text, misfit, warnings and figure."""
 
 from __future__ import annotations
 
@@ -48,18 +48,18 @@ STYLES: dict[str, Any] = {
     "card": {"color": VERMILION, "linewidth": 1.0, "linestyle": (0, (5, 1.2))},
 }
 WIDTH, HEIGHT = 2.7, 2.9  # of a panel, inches
-MOST = 3  # records that are drawn: the slowest, the middle and the fastest
+MOST = 3  # records drawn: the slowest, the middle and the fastest
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
     """The record of a fitted test, SI, with the stress that the card has along its motion."""
 
-    rate: float | None  # mean on loading
+    rate: float | None  # mean strain rate on loading, 1/s
     time: Array
-    strain: Array  # measured; fitted where the test has only the force
+    strain: Array  # measured, or fitted if only the force was measured
     stress: Array  # measured
-    motion: Array  # strain that law and card follow: fitted of an impact, else measured
+    motion: Array  # strain history of law and card: fitted for an impact, otherwise measured
     fitted: Array  # stress of the fit along `motion`
     misfit: float | None  # of the fit
     density: float | None
@@ -67,29 +67,29 @@ class Record:
 
     @property
     def misfit_of_card(self) -> float:
-        """RMS of card minus measured over the measured range."""
+        """RMS of card minus measured stress over the measured range."""
         return float(np.sqrt(np.mean((self.card - self.stress) ** 2)) / np.ptp(self.stress))
 
     @classmethod
     def of(cls, result: Fit) -> Record:
-        """Make it of a fit; zeros of the channels that were fitted are taken off."""
+        """Return the record of a fit, with the fitted zeros of the channels subtracted."""
         test, c, impact = result.measurement, result.curves, result.drive == "impact"
 
         def zero(channel: str) -> float:
             name = f"{channel}_zero"
-            found = result.parameters.get(name)
-            return found.value - test.origins.get(name, 0.0) if found else 0.0
+            fitted = result.parameters.get(name)
+            return fitted.value - test.origins.get(name, 0.0) if fitted else 0.0
 
         measured, specimen = c.measured_displacement, test.specimen
         moved = c.displacement if measured is None else measured
         if c.measured_stress is None or moved is None:
-            raise InputError(f"{test.name} has no measured loop, which a card needs")
+            raise InputError(f"{test.name} has no measured loop; a card needs force and motion")
         fitted = c.stress if impact else c.stress_along
         strain, motion = (
             (one - zero("displacement")) / specimen.height
             for one in (moved, c.displacement if impact and c.displacement is not None else moved)
         )
-        # Without a time, the law depends on none.
+        # The law of a record without time does not depend on time.
         steps = np.abs(np.diff(motion, prepend=motion[0])) + 1e-9
         mass, volume = specimen.mass, specimen.height * specimen.area
         return cls(
@@ -115,11 +115,11 @@ def read_records(result: object) -> list[Record]:
         return [Record.of(one) for one in result.results.values()]
     if isinstance(result, Fit):
         return [Record.of(result)]
-    raise InputError(f"a card is made of a result of fit or joint, not of {result!r}")
+    raise InputError(f"a card needs a result of fit or joint, not {result!r}")
 
 
-# Of each format: ending of its file, what begins a comment, and what stands for an unknown density:
-# a parameter that is nowhere defined, which the solvers refuse.
+# File suffix, comment sign and placeholder of an unknown density of each format. The placeholder is
+# an undefined parameter, which the solvers reject.
 FORMATS = {
     "mat083": (".k", "$", "&RHO"),
     "mat057": (".k", "$", "&RHO"),
@@ -133,14 +133,14 @@ UNITS = {
     "t-mm-s": ("t", "mm", "s", "MPa"),
     "SI": ("kg", "m", "s", "Pa"),
 }
-_LINE = 78  # characters of a comment
+_LINE = 78  # most characters of a comment
 
 
 @dataclass(frozen=True, eq=False)
 class Card:
-    """A material card, in SI but for its text.
+    """A material card; only its text is in `units`, everything else is in SI.
 
-    `misfit` of fit and card is the RMS over the measured range, over all tests.
+    `misfit` contains the RMS over the measured range of fit and card, over all tests.
     """
 
     name: str
@@ -157,7 +157,7 @@ class Card:
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of FILE.json; curves in SI, engineering, compression positive."""
         c = self.curves
-        made: dict[str, Any] = plain(
+        content: dict[str, Any] = plain(
             {
                 "format": self.format,
                 "misfit": self.misfit,
@@ -169,11 +169,11 @@ class Card:
                 "warnings": self.warnings,
             }
         )
-        return made
+        return content
 
     @property
     def text(self) -> str:
-        """The card in its units."""
+        """The text of the card, in its units."""
         mass, length, time, stress = UNITS[self.units]
         ending, sign, unknown = FORMATS[self.format]
         units = ((stress, "Pa"), (f"{mass}/{length}^3", "kg/m^3"), (f"1/{time}", "1/s"))
@@ -189,18 +189,18 @@ class Card:
             "strain": self.curves.strain.tolist(),
             "stresses": (pa * stresses).tolist(),
         }
-        told = (one.encode("ascii", "replace").decode() for one in _lines("comments", **values))
-        lines = (line for one in told for line in textwrap.wrap(one, _LINE))
+        text = (one.encode("ascii", "replace").decode() for one in _lines("comments", **values))
+        lines = (line for one in text for line in textwrap.wrap(one, _LINE))
         values["comments"] = "\n".join(f"{sign} {line}" for line in lines)
         template = environment().get_template(f"{self.format}{ending}")
         return f"{template.render(values).rstrip()}\n"
 
     def _written(self) -> tuple[Array, Array]:
-        """Rates and stresses of the curves in the file: of Abaqus with the unloading curve."""
+        """Return rates and stresses of the curves in the file; for Abaqus also the unloading."""
         rates, stress = self.curves.rates, self.curves.stress
         if self.format != "abaqus":
             return rates, stress
-        # Abaqus refuses curves that meet; beyond the last rate it takes the last curve.
+        # Abaqus rejects curves that meet; beyond the last rate it uses the last curve.
         kept = [0, *(1 + np.flatnonzero(np.any(np.diff(stress, axis=0) > 0.0, axis=1)))]
         apart = np.cumprod([[1.0], *[[1.001]] * (len(kept) - 1)], axis=0)
         loading = apart * np.maximum.accumulate(stress[kept] / apart, axis=0)
@@ -208,13 +208,13 @@ class Card:
         return np.array([-rates[0], *rates[kept]]), np.vstack([back, loading])
 
     def __repr__(self) -> str:
-        """Tell what the card is and what it loses, as the command prints it."""
+        """Return a summary of the card and its warnings, as the command prints them."""
         return "\n".join(_lines("terminal", card=self))
 
     def save(self, path: str | Path) -> Path:
-        """Write the card, PATH.json, PATH.png and PATH.pdf; returns the path.
+        """Write the card, PATH.json, PATH.png and PATH.pdf; return the path.
 
-        Raises InputError if one of them cannot be written; nothing is written then.
+        Raises InputError and writes nothing if one of the files cannot be written.
         """
         path = Path(path)
         files = [path, *(path.with_name(f"{path.name}.{form}") for form in ("json", "png", "pdf"))]
@@ -223,8 +223,8 @@ class Card:
         figure = draw(self)
         with laid_out(figure):
             pictures = (image(figure, "png"), image(figure, "pdf"))
-        told = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
-        contents = (self.text.encode(), told.encode(), *pictures)
+        text = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
+        contents = (self.text.encode(), text.encode(), *pictures)
         for done, (one, content) in enumerate(zip(files, contents, strict=True)):
             try:
                 write_file(one, content)
@@ -236,14 +236,14 @@ class Card:
 
 
 def draw(card: Card) -> Figure:
-    """Draw the records with law and card along them, and the loading curves to their ends."""
-    misfits = (f"{what} {percent(off)}" for what, off in card.misfit.items() if off is not None)
+    """Draw the records with law and card along them, and the complete loading curves."""
+    misfits = (f"{name} {percent(rms)}" for name, rms in card.misfit.items() if rms is not None)
     shown, curves = sorted(card.records, key=lambda one: one.rate or 0.0), card.curves
     if len(shown) > MOST:
         shown = [shown[0], shown[len(shown) // 2], shown[-1]]
     width = WIDTH * (len(shown) + 1)
-    told = f"{card.name} as {card.format}", f"misfit: {', '.join(misfits)}"
-    title = figures.title_lines(width, *told)
+    about = f"{card.name} as {card.format}", f"misfit: {', '.join(misfits)}"
+    title = figures.title_lines(width, *about)
     factor, unit = readable_unit(max(float(one.stress.max()) for one in shown), "Pa")
     with figures.drawing(width, HEIGHT, title) as figure:
         axes = figure.subplots(1, len(shown) + 1)
@@ -276,7 +276,7 @@ def card(
     rates: float | Iterable[float | str] | None = None,
     out: str | Path | None = None,
 ) -> Card:
-    r"""Make a material card of a fitted law, a `Card`.
+    r"""Make a material card (`Card`) of a fitted law.
 
     Parameters
     ----------
@@ -284,13 +284,13 @@ def card(
         A result of `fit` or `joint`, or its folder.
     format : str
         "mat083" (LS-DYNA \*MAT_FU_CHANG_FOAM), "mat057" (\*MAT_LOW_DENSITY_FOAM), "law90"
-        (Radioss), "abaqus" (\*LOW DENSITY FOAM) or "csv" (the curves alone).
+        (Radioss), "abaqus" (\*LOW DENSITY FOAM) or "csv" (only the curves).
     units : str
         "kg-mm-ms", "t-mm-s" or "SI".
     rates : float or iterable of float, optional
         Strain rates of the loading curves, 1/s; by default those of the fitted tests.
     out : str or Path, optional
-        File to write; FILE.json, FILE.png and FILE.pdf stand beside it.
+        File to write; FILE.json, FILE.png and FILE.pdf are written next to it.
 
     Raises
     ------
@@ -298,40 +298,40 @@ def card(
         If the result cannot be read or has no hysteretic spring, format or units are unknown, a
         rate is not positive, or `out` cannot be written.
     SimulationError
-        If the law cannot be followed along a curve or a record.
+        If the law cannot be simulated along a curve or a record.
     """
-    asked = check(format, units, rates)
+    requested = check(format, units, rates)
     source = read_source(result)
     if not any(law.hysteretic for law in source.model.laws):
         raise InputError(
             f"{source.where} has no hysteretic spring (model {source.model.words}), so it has no "
-            "unloading; make the card of a fit with a hysteretic one"
+            "unloading; a card needs a fit with a hysteretic spring"
         )
     records = read_records(result)
-    asked = asked or fitted_rates(source) or [1.0]
-    chosen = [asked[(len(asked) - 1) // 2]] if format == "mat057" else asked
+    requested = requested or fitted_rates(source) or [1.0]
+    chosen = [requested[(len(requested) - 1) // 2]] if format == "mat057" else requested
     curves, crossed = loading_curves(source, chosen, max(one.motion.max() for one in records))
     replays = [REPLAYS[format](curves, Motion.of(one.motion, one.time)) for one in records]
     laws = [follow(source, one.rate, one.motion, one.time).base_stress for one in records]
-    targets = [  # a card has no tension
+    targets = [  # cards contain no tension
         np.where(one.motion > 0.0, law, 0.0) for one, law in zip(records, laws, strict=True)
     ]
     unloading = fit_unloading(replays, targets, expon=format != "mat057")
     records = [
         replace(one, card=replay(unloading)) for one, replay in zip(records, replays, strict=True)
     ]
-    known = [one.density for one in records if one.density is not None]
+    densities = [one.density for one in records if one.density is not None]
     warnings = _lines(
         "warnings",
         source=source,
         format=format,
-        asked=asked,
+        requested=requested,
         chosen=chosen,
         crossed=crossed,
         guessed=guessed(source, curves),
-        density=bool(known),
+        density=bool(densities),
     )
-    found = Card(
+    made = Card(
         name=source.name,
         format=format,
         units=units,
@@ -342,17 +342,17 @@ def card(
             "fit": _rms(one.misfit for one in records),
             "card": _rms(one.misfit_of_card for one in records),
         },
-        density=float(np.mean(known)) if known else None,
+        density=float(np.mean(densities)) if densities else None,
         warnings=tuple(warnings),
         records=tuple(records),
     )
     if out is not None:
-        found.save(out)
-    return found
+        made.save(out)
+    return made
 
 
 def check(format: str, units: str, rates: float | Iterable[float | str] | None) -> list[float]:
-    """Return the rates, ascending; InputError for an unknown format, units or rates."""
+    """Return the rates, ascending; InputError for an unknown format or units, or invalid rates."""
     for name, value, known in (("format", format, FORMATS), ("units", units, UNITS)):
         if value not in known:
             raise InputError(f"{name} = {value!r} is unknown; it must be one of {', '.join(known)}")
@@ -364,17 +364,18 @@ def check(format: str, units: str, rates: float | Iterable[float | str] | None) 
     except (TypeError, ValueError):
         found = []
     if not found or not all(0.0 < rate < math.inf for rate in found):
-        told = ",".join(map(str, given))
-        raise InputError(f"rates = {told} must be positive numbers in 1/s, like 0.01,1,100")
+        raise InputError(
+            f"rates = {','.join(map(str, given))} must be positive numbers in 1/s, like 0.01,1,100"
+        )
     return found
 
 
 def _rms(values: Iterable[float | None]) -> float | None:
-    """Root mean square of what is known."""
+    """Return the root mean square of the values that are not None."""
     known = [value for value in values if value is not None]
     return float(np.sqrt(np.mean(np.square(known)))) if known else None
 
 
 def _lines(name: str, **values: Any) -> list[str]:
-    """Return the lines of a text, without empty ones."""
+    """Return the nonempty lines of a text."""
     return [line for line in words(name, **values).splitlines() if line.strip()]

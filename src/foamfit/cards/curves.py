@@ -1,12 +1,12 @@
-"""Loading curves of a fitted law, and a card along a strain, its unloading fitted to the law.
+"""Loading curves of a fitted law, and the unloading of a card, fitted to the law.
 
-Values are engineering, compression positive. Unloading takes a share of the stress σ_load of the
-loading curve,
+Values are engineering, compression positive. Unloading scales the stress σ_load of the loading
+curve,
 
     σ = [1 - (1 - HU) (1 - (W/Wmax)^SHAPE)^EXPON] σ_load,
 
-with the energy W under the loading curve at the strain, and Wmax at the largest strain so far. The
-solvers differ in what they do with it: see `REPLAYS`.
+with the energy W under the loading curve at the current strain, and Wmax at the largest strain so
+far. Each solver applies this formula in its own way: see `REPLAYS`.
 """
 
 from __future__ import annotations
@@ -29,16 +29,14 @@ from foamfit.springs.chain import DisplacementDrive
 from foamfit.study.identified import Population, Source
 
 POINTS = 100  # of a curve in a card
-# A curve ends at this strain, or where the stress is so many times the largest measured one, but
-# not within the measured strain.
+# A curve ends at the strain END, or where its stress exceeds MOST times the largest stress within
+# the measured strain. It always covers the measured strain.
 END, MOST = 0.9, 10.0
 _FINE = 2000  # intervals of the strain from which the points are chosen
-# Least slope of a curve over its mean slope within the measured strain.
-_LEAST_SLOPE = 1e-3
-# The jump that a dashpot makes at the start is spread over this strain.
-_START = 0.01
-# Rates that differ by less than this share are one; so are curves, of their range.
-_SAME, _CLOSE = 0.1, 0.01
+_LEAST_SLOPE = 1e-3  # least slope of a curve over its mean slope within the measured strain
+_START = 0.01  # strain over which the initial jump due to a dashpot is spread
+_SAME = 0.1  # rates that differ by a smaller fraction count as equal
+_CLOSE = 0.01  # smaller differences of stress, over its range, are ignored
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,26 +58,27 @@ class Curves:
 
     @property
     def measured(self) -> int:
-        """How many of the points lie within the measured strain."""
+        """Number of points within the measured strain."""
         return int(np.sum(self.strain <= self.measured_to))
 
     def at(self, values: Array, strain: Array, rate: Array) -> Array:
         """Interpolate `stress` or `work` linearly in strain and rate, clamped at the ends."""
-        each = np.array([np.interp(strain, self.strain, one) for one in values])
+        curves = np.array([np.interp(strain, self.strain, one) for one in values])
         place = np.interp(rate, self.rates, np.arange(self.rates.size))
         low, samples = place.astype(int), np.arange(strain.size)
         high = np.minimum(low + 1, self.rates.size - 1)
-        below: Array = each[low, samples]
-        return np.asarray(below + (place - low) * (each[high, samples] - below))
+        below: Array = curves[low, samples]
+        return np.asarray(below + (place - low) * (curves[high, samples] - below))
 
 
 def follow(
     source: Source, rate: float | None, strain: Array, time: Array, names: Sequence[str] = ()
 ) -> Response:
-    """Follow the law, as it is at a strain rate (1/s), along a strain; the time is in s.
+    """Simulate the law along a strain (over time in s), its parameters being those at `rate` (1/s).
 
-    `names` are parameters by which the stress is differentiated. Raises InputError if the common
-    values of a joint result are not admissible together, SimulationError if it cannot be followed.
+    The response contains the derivatives with respect to the parameters `names`. Raises InputError
+    if the common values of a joint result are not admissible together, SimulationError if the
+    simulation fails.
     """
     heights = [one.value for name, one in source.parameters.items() if name.endswith("_height")]
     height = sum(heights) or 1.0  # a single spring of any height has the same stress
@@ -89,7 +88,7 @@ def follow(
 
 
 def fitted_rates(source: Source) -> list[float]:
-    """Return the rates of the fitted tests, ascending, one of each group of about the same rate."""
+    """Return the rates of the fitted tests, ascending, one for each group of nearly equal rates."""
     rates = np.sort(source.rates)
     return [float(rates[at]) for at in np.unique(np.round(np.log(rates) / _SAME), True)[1]]
 
@@ -97,16 +96,16 @@ def fitted_rates(source: Source) -> list[float]:
 def loading_curves(
     source: Source, rates: Sequence[float], measured_to: float
 ) -> tuple[Curves, bool]:
-    """Return the loading curves at ascending rates, and whether curves of the law had crossed.
+    """Return the loading curves at ascending rates, and whether curves of the law cross.
 
-    Each starts at zero and rises strictly, and none is below that of a lower rate. A rate beyond
-    the fitted ones has the curve of the nearest fitted rate.
+    Each curve starts at zero, rises strictly and is nowhere below that of a lower rate. For a rate
+    outside the fitted ones it is the curve at the nearest fitted rate.
     """
     ends = (min(source.rates), max(source.rates)) if source.rates else (rates[0], rates[0])
     fine = np.linspace(0.0, max(END, measured_to), _FINE + 1)
     within = fine <= measured_to
-    known = np.clip(rates, *ends).tolist()
-    raw = np.array([follow(source, rate, fine, fine / rate).base_stress for rate in known])
+    inside = np.clip(rates, *ends).tolist()
+    raw = np.array([follow(source, rate, fine, fine / rate).base_stress for rate in inside])
     jumps = np.maximum(2.0 * raw[:, 1:2] - raw[:, 2:3], 0.0)
     raw = raw - jumps * np.maximum(1.0 - fine / _START, 0.0)
     raw[:, 0] = 0.0
@@ -122,9 +121,9 @@ def loading_curves(
 
 
 def _points(fine: Array, stress: Array, measured_to: float) -> Array:
-    """Choose the strains of a card: dense where a curve bends, `measured_to` among them."""
-    # What lines between points miss goes with curvature times the square of their distance; it is
-    # judged against the stress, at least that at `measured_to` (1).
+    """Choose the strains of a card, dense where a curve bends; `measured_to` is one of them."""
+    # The error of linear interpolation is proportional to the curvature times the square of the
+    # spacing. It is taken relative to the stress, or to the largest measured stress (1) if larger.
     bend = np.abs(np.gradient(np.gradient(stress, fine, axis=1), fine, axis=1))
     density = np.sqrt((bend / np.maximum(stress, 1.0)).max(axis=0))
     density = density / density.mean() + 0.5
@@ -135,7 +134,7 @@ def _points(fine: Array, stress: Array, measured_to: float) -> Array:
 
 
 def guessed(source: Source, curves: Curves) -> list[str]:
-    """Return the parameters on which the curves depend and which the tests do not determine."""
+    """Return the parameters that affect the curves but are not determined by the tests."""
     open_ = [name for name, one in source.parameters.items() if one.state == "not determined"]
     rate = source.rates[0] if source.rates else 1.0
     slopes = follow(source, rate, curves.strain, curves.strain / rate, open_).sensitivities
@@ -144,35 +143,34 @@ def guessed(source: Source, curves: Curves) -> list[str]:
     return [name for name in open_ if np.abs(changes[name]).max() > least]
 
 
-# Least and largest HU, SHAPE and EXPON, and where their search starts. HU = 0 would switch the
-# hysteresis off.
+# Bounds of HU, SHAPE and EXPON, and starting points of their search. HU = 0 would switch off the
+# hysteresis.
 _LEAST, _MOST = (1e-3, 0.05, 0.05), (1.0, 50.0, 50.0)
 _STARTS = ((0.2, 0.5, 0.9), (0.2, 2.0, 0.9), (0.5, 5.0, 1.1), (0.1, 1.0, 0.5))
-# Window over which the strain of a record is smoothed, as a share of its samples.
-_WINDOW = 0.03
+_WINDOW = 0.03  # smoothing window of the strain, as a fraction of the samples of a record
 
 
 class Unloading(NamedTuple):
-    """Parameters of the unloading, as cards name them."""
+    """Parameters of the unloading, by their names in the cards."""
 
     HU: float
     SHAPE: float
     EXPON: float = 1.0
 
     def share(self, energy: Array) -> Array:
-        """Share of the loading stress at W/Wmax."""
-        gone = 1.0 - np.clip(energy, 0.0, 1.0) ** self.SHAPE
-        return np.asarray(1.0 - (1.0 - self.HU) * gone**self.EXPON)
+        """Return the stress over the loading stress at `energy` = W/Wmax."""
+        recovered = 1.0 - np.clip(energy, 0.0, 1.0) ** self.SHAPE
+        return np.asarray(1.0 - (1.0 - self.HU) * recovered**self.EXPON)
 
 
-# The stress (Pa) of a card along a record, by its unloading.
+# The stress (Pa) of a card along a record, as a function of the unloading.
 Replay = Callable[[Unloading], Array]
 
 
 class Motion(NamedTuple):
-    """Strain of a record, its strain rate (1/s), and where it is the largest so far.
+    """Strain of a record, its rate (1/s), and whether it is the largest so far (first loading).
 
-    The last two are those of the smoothed strain: noise neither loads nor unloads.
+    Rate and `first` use the smoothed strain, so that noise neither loads nor unloads.
     """
 
     strain: Array
@@ -189,7 +187,7 @@ class Motion(NamedTuple):
 
 
 def by_energy(curves: Curves, motion: Motion) -> Replay:
-    """LS-DYNA: below the largest strain so far the stress is the share, also in loading again."""
+    """LS-DYNA: the stress is scaled below the largest strain so far, on reloading as well."""
     strain, speed = motion.strain, np.abs(motion.rate)
     load, work = (curves.at(values, strain, speed) for values in (curves.stress, curves.work))
     most = curves.at(curves.work, np.maximum.accumulate(strain), speed)
@@ -198,9 +196,9 @@ def by_energy(curves: Curves, motion: Motion) -> Replay:
 
 
 def by_slowest(curves: Curves, motion: Motion) -> Replay:
-    """Radioss LAW90: unloading takes a share of the slowest curve, any loading the whole stress.
+    """Radioss LAW90: unloading scales the slowest curve, any loading follows the loading curves.
 
-    The energy is summed up along the path.
+    The energy is integrated along the path.
     """
     back = (motion.rate < 0.0) & ~motion.first
     load = curves.at(curves.stress, motion.strain, np.where(back, 0.0, motion.rate))
@@ -211,7 +209,7 @@ def by_slowest(curves: Curves, motion: Motion) -> Replay:
 
 
 def by_rate(curves: Curves, motion: Motion) -> Replay:
-    """Abaqus: interpolated in the rate between an unloading curve and the loading curves."""
+    """Abaqus: interpolate in the rate between an unloading curve and the loading curves."""
     load = curves.at(curves.stress, motion.strain, np.maximum(motion.rate, 0.0))
     back = np.clip(0.5 * (1.0 - motion.rate / curves.rates[0]), 0.0, 1.0)
 
@@ -227,14 +225,14 @@ REPLAYS |= {"law90": by_slowest, "abaqus": by_rate}
 
 
 def _ratio(work: Array, most: Array) -> Array:
-    """W/Wmax; 1 where nothing has been loaded."""
+    """Return W/Wmax, or 1 where Wmax is zero."""
     return np.divide(work, most, out=np.ones_like(most), where=most > 0.0)
 
 
 def unloading_curve(curves: Curves, unloading: Unloading) -> Array:
     """Return the stress (Pa) of unloading from the largest measured strain at the lowest rate.
 
-    Beyond that it stays just below the loading curve, which it must not meet.
+    Beyond this strain it stays just below the loading curve, which it must not meet.
     """
     most = np.interp(curves.measured_to, curves.strain, curves.work[0])
     share = np.minimum(unloading.share(curves.work[0] / most), 0.999)
@@ -246,16 +244,16 @@ def fit_unloading(
 ) -> Unloading:
     """Fit the unloading to stresses (Pa) along records; without `expon` the exponent is 1.
 
-    Each record counts the same, by the mean square of the residuals over its range.
+    The cost is the mean square of the residuals over the range, summed over the records.
     """
     free = slice(None) if expon else slice(2)
     weights = [1.0 / (np.ptp(target) * np.sqrt(target.size)) for target in targets]
 
-    def off(logs: Array) -> Array:
+    def residuals(logs: Array) -> Array:
         unloading = Unloading(*np.exp(logs).tolist())
         triples = zip(replays, targets, weights, strict=True)
         return np.concatenate([w * (replay(unloading) - target) for replay, target, w in triples])
 
     bounds = (np.log(_LEAST)[free], np.log(_MOST)[free])
-    found = [least_squares(off, np.log(start)[free], bounds=bounds) for start in _STARTS]
+    found = [least_squares(residuals, np.log(start)[free], bounds=bounds) for start in _STARTS]
     return Unloading(*np.exp(min(found, key=lambda one: one.cost).x).tolist())

@@ -1,6 +1,6 @@
-"""What a person reads: terminal, report, figures and comparisons.
+"""Output for readers: terminal, report, figures and comparisons.
 
-The sentences stand in `templates`, `render` fills them in. `summary` makes the report; `plots`
-draws the fit and `result_figures` what else the report shows, `figures` has what all pictures
-share; `comparison` sets results beside published ones, `studies` is about several tests.
+`render` fills the sentences in `templates`. `summary` makes the report; `plots` draws the fit,
+`result_figures` the other figures of the report, and `figures` contains their common layout and
+style. `comparison` compares results with published ones; `studies` covers several tests.
 """

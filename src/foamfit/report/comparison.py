@@ -1,7 +1,7 @@
-"""Fitted parameters beside the published ones, or beside those of another fit.
+"""Comparison of fitted parameters with published ones, or with those of another fit.
 
-Everything is shown as the paper's tables show it: stiffness of branch a in MPa, the other slopes as
-ratios to it, the stress drop as a ratio to σ_a.
+Quantities are those of the paper's tables: stiffness of branch a in MPa, other slopes as ratios to
+it, stress drop as a ratio to σ_a.
 """
 
 from __future__ import annotations
@@ -38,9 +38,8 @@ if TYPE_CHECKING:
 
 Result = Fit | Mapping[str, Any] | str | Path
 
-_GIVEN: dict[str, Any] = dict.fromkeys(
-    ("drive", "status", "stopped", "data_sha256", "correlation")
-)  # which a published set lacks, or an older fit.json
+# Keys that a published set, or an older fit.json, does not have.
+_GIVEN = dict[str, Any].fromkeys(("drive", "status", "stopped", "data_sha256", "correlation"))
 NOTHING = 3.0  # standard error over value beyond which a difference is meaningless
 WORST_FIRST = ("not determined", "weak", "determined", "fixed", "published")
 VAGUE = "its standard error is many times its value, so the test does not determine it"
@@ -48,11 +47,11 @@ VAGUE = "its standard error is many times its value, so the test does not determ
 
 @dataclass(frozen=True)
 class Row:
-    """One parameter in the paper's unit ("k_h+/k0", "" or "k0", "MPa"), and its reference.
+    """One quantity and its reference, in the paper's unit ("k_h+/k0", "" or "k0", "MPa").
 
-    `spring` is 1 at the base, 0 for what belongs to the chain; the state of a ratio is the worst of
-    its parts. A published `reference` has no standard error. `remark` says why the two are not
-    compared; it is "" where they are.
+    `spring` is 1 at the base and 0 for quantities of the chain. The state of a ratio is the worst
+    of its parts. A published `reference` has no standard error. `remark` is the reason why value
+    and reference are not compared, or "".
     """
 
     spring: int
@@ -67,7 +66,7 @@ class Row:
 
     @property
     def label(self) -> str:
-        """Name with its spring, for example "s2 k0"."""
+        """The name with the spring, for example "s2 k0"."""
         return f"s{self.spring} {self.name}" if self.spring else self.name
 
     @property
@@ -77,7 +76,7 @@ class Row:
         return nothing and self.reference is not None
 
     def difference_over(self, unit: float) -> float | None:
-        """Fitted minus reference over a unit; None where it means nothing."""
+        """Return fitted minus reference over a unit; None if this is meaningless."""
         if self.remark or self.reference is None or not unit:
             return None
         return (self.value - self.reference) / unit
@@ -89,13 +88,13 @@ class Row:
 
     @property
     def standard_errors(self) -> float | None:
-        """The difference in standard errors, those of both sides taken as independent."""
+        """The difference in standard errors; both sides are assumed to be independent."""
         return self.difference_over(math.hypot(self.stderr or 0.0, self.reference_stderr or 0.0))
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One result beside its reference."""
+    """One result and its reference."""
 
     side: Side
     other: Side
@@ -105,30 +104,30 @@ class Pair:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Results beside the published sets that they belong to, or beside the first of them."""
+    """Results compared with their published sets, or with the first result."""
 
     pairs: tuple[Pair, ...]
 
     @property
     def reference(self) -> str:
-        """What the results stand beside, in a word."""
+        """The kind of reference in one word."""
         return "published" if all(pair.other.source for pair in self.pairs) else "reference"
 
 
 def compare(results: Sequence[Result], published: str | None = None) -> Comparison:
-    """Put fits, result folders or what `load_result` gives beside what was published.
+    """Compare results (fits, result folders or the output of `load_result`) with published sets.
 
-    Without `published`, each goes beside the set that its test names, for example "foam-1/model-3";
-    where a test names none, all are put beside the first of them. InputError if a result cannot be
-    read, the set is unknown, or there is nothing to compare with.
+    Without `published`, each result is compared with the set that the name of its test contains,
+    for example "foam-1/model-3"; if a test names none, all results are compared with the first.
+    InputError if a result cannot be read, the set is unknown, or there is no reference.
     """
     sides = [side_of(result) for result in results]
     if not sides:
         raise InputError("nothing to compare; give at least one result folder")
-    belongs = [published or (None if s.unpublished else recognised(s.given["test"])) for s in sides]
-    found = [published_side(name) for name in belongs if name is not None]
-    if len(found) == len(sides):
-        return Comparison(tuple(map(_pair, sides, found)))
+    names = [published or (None if s.unpublished else recognised(s.given["test"])) for s in sides]
+    references = [published_side(name) for name in names if name is not None]
+    if len(references) == len(sides):
+        return Comparison(tuple(map(_pair, sides, references)))
     if len(sides) == 1:
         kind, test = sides[0].unpublished, sides[0].given["test"]
         raise InputError(
@@ -141,7 +140,7 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
 
 
 def recognised(test: str) -> str | None:
-    """Return the published set that the name of a test contains, if there is one."""
+    """Return the published set that is named in the name of a test, if there is one."""
 
     def plain(text: str) -> str:
         return re.sub(r"[\s/_-]+", "-", text.casefold())
@@ -157,12 +156,12 @@ def recognised(test: str) -> str | None:
 
 @dataclass(frozen=True)
 class Side:
-    """The parameters of one side of a comparison: of a fit, or published."""
+    """One side of a comparison: the parameters of a fit or of a published set."""
 
     label: str
     model: Model
     estimates: Mapping[str, ParameterEstimate]
-    numbers: Mapping[str, Any] = field(compare=False)  # the values with their errors, correlated
+    numbers: Mapping[str, Any] = field(compare=False)  # values with correlated errors
     given: Mapping[str, Any] = field(compare=False)  # content of fit.json
     source: PublishedSet | None = None
 
@@ -173,33 +172,33 @@ class Side:
 
     @property
     def families(self) -> list[str]:
-        """The kinds of the springs, of which all without hysteresis are "linear"."""
+        """The kinds of the springs; all springs without hysteresis count as "linear"."""
         return [one.kind if one.hysteretic else "linear" for one in self.model.laws]
 
     @property
     def unpublished(self) -> str:
-        """The first kind of spring that has no published parameters, or ""."""
+        """The first kind of spring without published parameters, or ""."""
         kinds = (one.kind for one in self.model.laws if one.hysteretic and not one.published)
         return next(kinds, "")
 
     def evaluate(
         self, names: Sequence[str], formula: Callable[..., Any]
     ) -> ParameterEstimate | None:
-        """Return a function of parameters with its error; None if a parameter is missing."""
+        """Return a function of parameters with its error; None if it cannot be evaluated."""
         if not names or any(name not in self.estimates for name in names):
             return None
         try:
-            found = formula(*(self.numbers[name] for name in names))
+            value = formula(*(self.numbers[name] for name in names))
         except (ZeroDivisionError, ValueError):
             return None
         parts = (self.estimates[name] for name in names)
         worst = min(parts, key=lambda part: WORST_FIRST.index(part.state))
-        error = 0.0 if worst.state == "not determined" else std_dev(found)
-        return replace(worst, value=float(nominal_value(found)), stderr=error or None)
+        error = 0.0 if worst.state == "not determined" else std_dev(value)
+        return replace(worst, value=float(nominal_value(value)), stderr=error or None)
 
 
 def side_of(result: Result) -> Side:
-    """Return the parameters of a fit; InputError if the result is not whole."""
+    """Return the parameters of a fit; InputError if the result is incomplete."""
     given: Mapping[str, Any]
     if isinstance(result, Fit):
         given = result.to_json_dict()
@@ -217,7 +216,7 @@ def side_of(result: Result) -> Side:
 def _with_errors(
     estimates: Mapping[str, ParameterEstimate], names: Sequence[str], matrix: Sequence[Any]
 ) -> dict[str, Any]:
-    """Return values with correlated errors; parameters outside of the matrix are independent."""
+    """Return values with correlated errors; parameters missing in the matrix are independent."""
     every = list(estimates)
     correlation, at = np.eye(len(every)), [every.index(name) for name in names if name in every]
     if names:
@@ -262,7 +261,7 @@ def _total(*parts: Any) -> Any:
 
 
 def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
-    """Give the compared quantities of a law: those of its record, or each parameter."""
+    """Yield the compared quantities of a law: those of its record, or else each parameter."""
     own, hysteretic = law(kind), law(kind).hysteretic
     for param in () if own.compared else own.params:
         factor, unit = (1e6, "MPa") if param.unit == "Pa" else (1.0, param.unit)
@@ -282,14 +281,14 @@ def _row(
     *,
     eta: bool = False,
 ) -> Row:
-    """Make a row of spring, name and unit; `about` are both sides and why nothing is compared."""
+    """Return a row; `at` is spring, name and unit, `about` both sides and why none is compared."""
     side, other, nothing = about
     size = max(abs(value.value), abs(reference.value) if reference else 0.0)
     vague = reference is not None and (value.stderr or 0.0) > NOTHING * size
-    given: dict[str, Any] = {"value": value, "reference": reference, "side": side, "other": other}
-    told = nothing or words("remark", eta=eta, vague=VAGUE if vague else "", **given)
+    known: dict[str, Any] = {"value": value, "reference": reference, "side": side, "other": other}
+    remark = nothing or words("remark", eta=eta, vague=VAGUE if vague else "", **known)
     theirs, error = (reference.value, reference.stderr) if reference else (None, None)
-    return Row(*at, value.value, value.stderr, value.state, theirs, error, told)
+    return Row(*at, value.value, value.stderr, value.state, theirs, error, remark)
 
 
 def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
@@ -302,7 +301,7 @@ def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
             names = [f"s{i}_{part}" for part in one.of]
             value = side.evaluate(names, one.formula)
             reference = other.evaluate(names, one.formula) if i in alike else None
-            # The damping of a single spring stands with the onsite damper.
+            # The damping of a single spring is shown with the onsite damper.
             if value is None or (eta and not several):
                 continue
             if not (eta and reference is None and (value.state, value.value) == ("fixed", 0.0)):
@@ -311,7 +310,7 @@ def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
 
 
 def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
-    """Give the damping of the striker's motion, and its ratio as the paper defines it."""
+    """Yield the damping of the striker's motion, and the damping ratio as defined in the paper."""
     kinds, item = side.model.kinds, other.source
     names = [n for n in ("site_eta", "s1_eta")[: 1 if len(kinds) > 1 else 2] if n in side.estimates]
     same = [n for n in names if n in other.estimates] if item is None else ["site_eta"]
@@ -333,22 +332,22 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
         lambda *at: _total(*at[:-1]) / (2.0 * (inertia * at[-1]) ** 0.5),
     )
     if ratio is not None:
-        # ζ is η over a root, so it is known as well as η unless k_c is undetermined.
+        # ζ is η over a square root, so it has the state of η unless k_c is undetermined.
         unknown = ratio.state == "not determined" and value.state != "fixed"
-        state, told = ratio.state if unknown else value.state, damping.remark
-        yield Row(0, "ζ", "", ratio.value, ratio.stderr, state, item.damping_ratio, None, told)
+        state, remark = ratio.state if unknown else value.state, damping.remark
+        yield Row(0, "ζ", "", ratio.value, ratio.stderr, state, item.damping_ratio, None, remark)
 
 
-# ---------------------------------------------------------------- as a text and as a figure
+# ---------------------------------------------------------------- text and figure
 
 
 def comparison_text(comparison: Comparison) -> str:
-    """Return a comparison as aligned text, at most 100 columns wide, no newline at the end."""
+    """Return a comparison as aligned text of at most 100 columns, without a final newline."""
     return words("comparison", comparison=comparison, with_error=_with_error)
 
 
 def _with_error(value: float | None, stderr: float | None) -> str:
-    """Return a number with its error, rounded to two digits of the error; "–" for none."""
+    """Return a number and its error, rounded to two digits of the error; "–" for None."""
     if value is None:
         return "–"
     if stderr is None:
@@ -361,10 +360,10 @@ def _with_error(value: float | None, stderr: float | None) -> str:
 def plot_comparison(
     comparison: Comparison, path: str | Path | None = None, *, width: str = TWO
 ) -> Figure:
-    """Draw fitted values with 95 % intervals, a row for each result, and the references as ticks.
+    """Draw fitted values with 95 % intervals, one row per result, and the references as ticks.
 
-    What is neither compared nor lost (`Row.lost`) is left out. For `path` and `width` see
-    `plots.plot_fit`.
+    Quantities that are neither compared nor lost (`Row.lost`) are omitted. For `path` and `width`
+    see `plots.plot_fit`.
     """
     sources = [pair.other.source for pair in comparison.pairs]
     tests = [
@@ -373,16 +372,16 @@ def plot_comparison(
     ]
     if len(set(tests)) < len(tests):
         tests = [f"{i}: {name}" for i, name in enumerate(tests, start=1)]
-    found = dict[str, Panel]()
+    panels = dict[str, Panel]()
     for test, pair in zip(tests, comparison.pairs, strict=True):
         for row in pair.rows:
             if row.standard_errors is not None or row.lost:
-                one = found.setdefault(row.label, Panel(row.label, _math(row.label), {}, {}))
+                one = panels.setdefault(row.label, Panel(row.label, _math(row.label), {}, {}))
                 one.tests[test] = _estimate(row.value, row.stderr, row.unit, row.state)
                 theirs = row.reference or 0.0, row.reference_stderr
                 one.references[test] = _estimate(*theirs, row.unit, comparison.reference)
-    title = f"fitted parameters beside {comparison.reference} ones"
-    figure = plot_parameters(title, tests, list(found.values()), width=width)
+    title = f"fitted and {comparison.reference} parameters"
+    figure = plot_parameters(title, tests, list(panels.values()), width=width)
     return figures.save(figure, path)
 
 
@@ -392,8 +391,8 @@ def _estimate(value: float, stderr: float | None, unit: str, state: str) -> Para
 
 
 def _math(label: str) -> str:
-    """Write the symbols of a label as formulas: "s2 k_h+/k0" gives "s2 $k_{h+}$/$k_{0}$"."""
+    """Convert the symbols of a label to formulas: "s2 k_h+/k0" gives "s2 $k_{h+}$/$k_{0}$"."""
     *spring, name = label.split(" ")
     parts = re.findall(r"(Δ?\w)_?([^/]*)/?", name.translate(str.maketrans("₊₋−", "+--")))
-    told = "/".join(f"${stem}_{{{index}}}$" if index else f"${stem}$" for stem, index in parts)
-    return " ".join([*spring, told])
+    formulas = (f"${stem}_{{{index}}}$" if index else f"${stem}$" for stem, index in parts)
+    return " ".join([*spring, "/".join(formulas)])

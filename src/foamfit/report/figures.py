@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # by Okabe and Ito
-INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of interior masses, from the base up
-MEASURED = "0.65"  # of wide lines below what is simulated, which is darker in grey too
+GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # palette of Okabe and Ito
+INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # interior masses, from the base up
+MEASURED = "0.65"  # wide measured curves; simulated curves are darker, even in greyscale
 STYLE: Any = {  # matplotlib types its keys one by one
     "font.family": "DejaVu Sans",  # one upright font: each further font costs 0.1 s per PDF
     "font.size": 7.5,
@@ -36,21 +36,22 @@ STYLE: Any = {  # matplotlib types its keys one by one
     "ytick.major.width": 0.6,
     "legend.frameon": False,
     "legend.fontsize": 7.5,
-    # Text stays text, to be edited and searched: TrueType in a PDF, text elements in an SVG.
+    # Keep text editable and searchable: TrueType in a PDF, text elements in an SVG.
     "pdf.fonttype": 42,
     "svg.fonttype": "none",
 }
 NO_LAYOUT = {"figure.autolayout": False, "figure.constrained_layout.use": False}
 DPI = 250  # of a PNG
-# Width of one and of two columns of the Journal of Applied Mechanics, in.
+# Width of one and two columns of the Journal of Applied Mechanics, inches.
 TWO = "two"
 COLUMNS = {"one": 3.25, TWO: 7.0}
 NARROWEST, WIDEST = 2.5, 20.0
-UNTITLED, PDF = "untitled", "pdf"  # after a width and a comma: no title; all figures as PDF
+# Options after a width and a comma: no title; all figures also as PDF.
+UNTITLED, PDF = "untitled", "pdf"
 
 
 def inches(width: str) -> float:
-    """Return the width of a figure that "one" or "two" columns or a length ("85 mm") name."""
+    """Return the width of a figure from "one" or "two" columns or a length such as "85 mm"."""
     from foamfit.data.units import parse_quantity
 
     length, *words = _parts(width)
@@ -62,28 +63,28 @@ def inches(width: str) -> float:
         low, high = (f"{25.4 * end:.0f}" for end in (NARROWEST, WIDEST))
         raise InputError(
             f"the width of figures = {width!r} is not admissible; it must be one, two (columns) or "
-            f"a length from {low} to {high} mm, and behind a comma may stand untitled or pdf"
+            f"a length from {low} to {high} mm, optionally followed by a comma and untitled or pdf"
         )
     return wide
 
 
 def _parts(width: str) -> list[str]:
-    """Split "two, untitled" into the width and the words behind it."""
+    """Split "two, untitled" into the width and its options."""
     return [part.strip().lower() for part in width.split(",")]
 
 
 def is_titled(width: str) -> bool:
-    """Whether a figure of such a width has a title: all but "two, untitled" and its like."""
+    """Return whether a figure of this width has a title, that is, no option "untitled"."""
     return UNTITLED not in _parts(width)
 
 
 def all_as_pdf(width: str) -> bool:
-    """Whether all figures of a report are written as PDF too, as by "two, pdf"."""
+    """Return whether all figures of a report are also written as PDF (option "pdf")."""
     return PDF in _parts(width)
 
 
 def abreast(width: float, panels: int, least: float = 2.1) -> int:
-    """Return how many panels of at least `least` inches fit side by side."""
+    """Return the number of panels of at least `least` inches that fit side by side."""
     return max(1, min(panels, int(width / least)))
 
 
@@ -93,14 +94,14 @@ def title_lines(wide: float, *parts: str, titled: bool = True) -> list[str]:
 
 
 def tail(name: str, most: int) -> str:
-    """Return a name, or its end if it is too long."""
+    """Return a name, or only its end if it is longer than `most` characters."""
     return name if len(name) <= most else f"…{name[1 - most :]}"
 
 
 def grid_of(
     part: Figure | SubFigure, rows: int, columns: int, count: int, **more: Any
 ) -> list[Axes]:
-    """Return `count` panels, row by row; the rest of the grid stays empty."""
+    """Return the first `count` panels of a grid, row by row; the others stay empty."""
     every: list[Axes] = part.subplots(rows, columns, squeeze=False, **more).ravel().tolist()
     for ax in every[count:]:
         ax.set_axis_off()
@@ -109,16 +110,13 @@ def grid_of(
 
 @contextmanager
 def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[Figure]:
-    """Give an empty figure of a size in inches, and the style of all figures to draw it in.
-
-    `title` is a list of lines.
-    """
+    """Yield an empty figure of a size in inches, within the common style; `title` is its lines."""
     import matplotlib
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
-        if title:  # a name may hold a dollar sign: it is no formula
+        if title:  # a dollar sign in a name does not start a formula
             style: Any = {"fontsize": 8, "parse_math": False}
             figure.suptitle("\n".join(title), x=0.01, ha="left", **style)
         yield figure
@@ -126,7 +124,7 @@ def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[
 
 @contextmanager
 def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
-    """Give the axes of the caller, or those of a new pyplot figure in the style of all figures."""
+    """Yield the axes of the caller, or those of a new pyplot figure in the common style."""
     if ax is not None:
         yield ax
         return
@@ -138,34 +136,34 @@ def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
 
 
 def named_in(axes: Iterable[Axes]) -> dict[str, Any]:
-    """Return labelled artists by their label, as for a legend of all axes."""
+    """Return the labelled artists of all axes by label, for a common legend."""
     each = (zip(*reversed(ax.get_legend_handles_labels()), strict=True) for ax in axes)
     return {name: artist for pairs in each for name, artist in pairs}
 
 
 def legend_below(figure: Figure, entries: dict[str, Any]) -> int:
-    """Draw a legend below all panels; returns its number of lines."""
+    """Draw a legend below all panels; return its number of lines."""
     if not entries:
         return 0
     handles, names = list(entries.values()), list(entries)
-    # In typographic points: width of a letter, and of a handle with its margins.
+    # In points: 4.2 per letter, 33 for a handle with its margins.
     sizes, room = [4.2 * len(name) + 33.0 for name in names], 72.0 * figure.get_figwidth()
     for columns in range(len(names), 0, -1):
         lines = -(-len(names) // columns)
         widths = [max(sizes[i : i + lines]) for i in range(0, len(names), lines)]
         if sum(widths) <= room:
             break
-    told = [name.replace("$", r"\$") for name in names]
-    figure.legend(handles, told, loc="outside lower center", ncols=len(widths))
+    escaped = [name.replace("$", r"\$") for name in names]
+    figure.legend(handles, escaped, loc="outside lower center", ncols=len(widths))
     return lines
 
 
 @contextmanager
 def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
-    """Keep one layout for all images of a figure that are made in the body.
+    """Use one layout for all images of a figure that are made in the body.
 
-    By default matplotlib repeats the layout for every image, and draws the figure an extra time to
-    do so. `dpi` is the resolution at which texts are measured.
+    By default matplotlib repeats the layout, which draws the figure once more, for every image.
+    Texts are measured at the resolution `dpi`.
     """
     import matplotlib
 
@@ -186,7 +184,7 @@ def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
 
 @contextmanager
 def _unnamed_letters() -> Iterator[None]:
-    """Ignore letters in the name of a test that the font lacks."""
+    """Suppress warnings about letters, in names of tests, that the font lacks."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         yield
@@ -205,7 +203,7 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
 
 
 def limits(values: Sequence[float], ends: Sequence[float]) -> tuple[float, float]:
-    """Return limits of an axis; wide intervals run out of it, so that values stay apart."""
+    """Return limits of an axis; very wide intervals are cut, so that values stay apart."""
     low, high = min(values), max(values)
     room = max(1.5 * (high - low), 0.1 * max(abs(low), abs(high)), 1e-12)
     bottom, top = max(min([low, *ends]), low - room), min(max([high, *ends]), high + room)
@@ -213,14 +211,14 @@ def limits(values: Sequence[float], ends: Sequence[float]) -> tuple[float, float
     return bottom - edge, top + 2.0 * edge
 
 
-def say_nothing_there(ax: Axes, told: str = "no curve to compare") -> None:
-    """Write into an empty panel that there is no curve."""
+def say_nothing_there(ax: Axes, text: str = "no curve to compare") -> None:
+    """Write into an empty panel why it is empty."""
     ax.set_axis_off()
-    ax.text(0.5, 0.5, told, ha="center", va="center", transform=ax.transAxes)
+    ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes)
 
 
 def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
-    """Return the format that the suffix of a path names; any other is refused."""
+    """Return the format given by the suffix of a path; InputError if it is not supported."""
     match Path(path).suffix.lower()[1:]:
         case ("png" | "pdf" | "svg") as form:
             return form
@@ -228,7 +226,7 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
 
 
 def write_both(figure: Figure, place: Path, dpi: int = DPI) -> bytes:
-    """Write a figure as PNG and, for print, as PDF; returns the PNG. `place` has no suffix."""
+    """Write a figure as PNG and PDF; return the PNG. `place` is a path without suffix."""
     with laid_out(figure, dpi):
         png = image(figure, "png", dpi)
         place.with_suffix(".png").write_bytes(png)
@@ -237,7 +235,7 @@ def write_both(figure: Figure, place: Path, dpi: int = DPI) -> bytes:
 
 
 def save(figure: Figure, path: str | Path | None) -> Figure:
-    """Save a figure, if there is a path, in the format of its suffix; returns the figure."""
+    """Save a figure in the format of the suffix of `path`, if there is one; return the figure."""
     if path is not None:
         write_file(path, image(figure, figure_format(path)))
     return figure

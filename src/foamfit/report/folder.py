@@ -1,4 +1,4 @@
-"""Result folders: written and replaced as a whole, and read again."""
+"""Writing, replacing and reading of result folders."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from foamfit.report.summary import render_report
 from foamfit.report.tables import numbers_of, parameters_tex, with_head
 from foamfit.results import SCHEMA, Fit, plain
 
-# Files of each kind of result, by the file that marks it. Folders of older versions, which wrote
-# other files too, are replaced as well.
+# Files of each kind of result, by the file that identifies it. They include files that only older
+# versions wrote, so that older folders can be replaced.
 _OLDER = {"fit.csv", "residuals.csv", "sensitivities.csv", "residuals.pdf", "information.pdf"}
 _TABLES = {"fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "budget.csv"}
 _DRAWN = {"fit.png", "fit.pdf", "report.html", "snapping.pdf", "profiles.pdf"}
@@ -40,21 +40,21 @@ FILES = {
 
 
 class _TriedError(Exception):
-    """Ends a trial of whether a folder can be written."""
+    """Raised by `try_target` to undo its trial."""
 
 
 def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool = False) -> Path:
-    """Let `write` fill a new folder, which replaces an older result at the end; returns it.
+    """Let `write` fill a new folder, which replaces an older result when complete; return it.
 
-    It is made with its parents; InputError if something else stands there (see `check_target`) or
-    it cannot be written, and nothing is changed then. `swept` is that of `foamfit.files.replacing`.
+    Parent folders are created. If `folder` must not be replaced (see `check_target`) or cannot be
+    written, InputError is raised and nothing is changed. For `swept` see `foamfit.files.replacing`.
     """
     folder = Path(folder)
     check_target(folder)
     try:
         with replacing(folder.resolve(), swept=swept) as fresh:
             write(fresh)
-            check_target(folder)  # files put there in the meantime are kept
+            check_target(folder)  # keep files that were added in the meantime
     except OSError as error:
         raise InputError(
             f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
@@ -63,7 +63,7 @@ def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool
 
 
 def try_target(folder: str | Path) -> None:
-    """Raise InputError unless a result can be written to `folder`; the trial is undone."""
+    """Raise InputError if no result can be written to `folder`; leave nothing behind."""
 
     def undo(_: Path) -> NoReturn:
         raise _TriedError
@@ -75,21 +75,21 @@ def try_target(folder: str | Path) -> None:
 def save_somewhere(
     save: Callable[..., object], folder: Path, *, report: bool = True, **options: Any
 ) -> None:
-    """Call `save` with a folder, whether there is to be a `report`, and its options.
+    """Call `save` with a folder, `report` and further options.
 
-    Where `folder` cannot be written the result goes beside it, into the current directory or among
-    temporary files. Where the report fails, which is a defect, the numbers are saved all the same.
+    If `folder` cannot be written, save the result next to it, in the current directory or among
+    temporary files. If the report fails, which is a defect, save the numbers without it.
 
     Raises
     ------
     InputError
-        If `folder` cannot be written; the message names the other one.
+        If `folder` cannot be written; the message names the folder used instead.
     """
     try:
         save(folder, report=report, **options)
         return
     except InputError as error:
-        told = str(error)
+        message = str(error)
     except Exception:
         with suppress(Exception):
             save(folder, report=False, **options)
@@ -98,15 +98,15 @@ def save_somewhere(
         other = place / f"{folder.resolve().name}-{time.strftime('%Y%m%d-%H%M%S')}"
         with suppress(InputError):
             save(other, report=report, **options)
-            told = f"{told.removesuffix('; choose another folder')}; it is in {other} instead"
+            message = f"{message.removesuffix('; choose another folder')}; it is in {other} instead"
             break
-    raise InputError(told)
+    raise InputError(message)
 
 
 def check_target(folder: str | Path, *, of: str | None = None) -> None:
     """Raise InputError unless `folder` is free, empty or an older result that may be replaced.
 
-    `of` is the kind of result (one of `FILES`) where those of other kinds may not be replaced.
+    With `of`, one of `FILES`, only results of this kind may be replaced.
     """
     folder = Path(folder)
     try:
@@ -114,36 +114,36 @@ def check_target(folder: str | Path, *, of: str | None = None) -> None:
         here = Path.cwd()
         if place.exists() and any(place.samefile(at) for at in (here, *here.parents)):
             raise InputError(
-                f"{folder} is the current directory or holds it, and a result folder is replaced "
-                "as a whole; choose a folder of its own"
+                f"{folder} is or contains the current directory and cannot be replaced; choose a "
+                "separate folder"
             )
         if place.is_dir():
             _check_replaceable(folder, place, of)
         elif os.path.lexists(place):
             raise InputError(f"{folder} is a file; choose a new or an empty folder")
-        for there in (place, next(path for path in place.parents if path.exists())):
-            if there.exists() and not there.is_dir():
-                raise NotADirectoryError(0, f"{there} is a file")
-            if there.exists() and not os.access(there, os.W_OK | os.X_OK):
-                raise PermissionError(0, f"Permission denied in {there}")
-    except (OSError, RuntimeError) as error:  # also a link to itself
+        for path in (place, next(path for path in place.parents if path.exists())):
+            if path.exists() and not path.is_dir():
+                raise NotADirectoryError(0, f"{path} is a file")
+            if path.exists() and not os.access(path, os.W_OK | os.X_OK):
+                raise PermissionError(0, f"Permission denied in {path}")
+    except (OSError, RuntimeError) as error:  # RuntimeError: a link to itself
         raise InputError(
             f"{folder} cannot be written: {reason(error)}; choose another folder"
         ) from error
 
 
 def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
-    """Refuse an existing folder at `place` that must not or cannot be replaced."""
+    """Raise InputError if the existing folder at `place` must not or cannot be replaced."""
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
-    there = sorted(place.iterdir())
-    if there and not any(_content(place / name) for name in FILES):
+    present = sorted(place.iterdir())
+    if present and not any(_content(place / name) for name in FILES):
         raise InputError(
-            f"{folder} is not empty and holds no foamfit result (no fit.json of foamfit), so it is "
+            f"{folder} is not empty and contains no foamfit result (such as fit.json), so it is "
             "not replaced; choose a new or an empty folder"
         )
-    tests = _content(place / "joint.json").get("tests")  # a joint fit's own folders
-    for path in there:
+    tests = _content(place / "joint.json").get("tests")  # folders of a joint fit
+    for path in present:
         if not is_written(path, tests if isinstance(tests, dict) else ()):
             raise InputError(
                 f"{folder} holds {path.name}, which foamfit did not write, so it is not replaced; "
@@ -151,16 +151,13 @@ def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
             )
         if of is not None and path.name not in FILES[of]:
             raise InputError(
-                f"{folder} holds {path.name}, which is no part of a {Path(of).stem}, so it is not "
-                "replaced; choose a new or an empty folder"
+                f"{folder} holds {path.name}, which does not belong to a {Path(of).stem}, so it is "
+                "not replaced; choose a new or an empty folder"
             )
 
 
 def is_written(path: Path, tests: Collection[str] = ()) -> bool:
-    """Whether a path in a result folder is one that foamfit writes.
-
-    `tests` are the names of the test folders of a joint fit.
-    """
+    """Return whether foamfit writes such a path; `tests` are the folders of a joint fit."""
     if path.is_symlink():
         return False
     if path.is_dir() and (re.fullmatch(r"cycle-\d+", path.name) or path.name in tests):
@@ -170,19 +167,19 @@ def is_written(path: Path, tests: Collection[str] = ()) -> bool:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """Content of a fit.json of any version; empty if the file is not a fit.json."""
+    """Return the content of a fit.json or the like of any version, or {} if the file is none."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):  # neither UTF-8 nor JSON
         return {}
-    known = isinstance(content, dict) and {"schema", "foamfit"} <= content.keys()
-    return content if known else {}
+    valid = isinstance(content, dict) and {"schema", "foamfit"} <= content.keys()
+    return content if valid else {}
 
 
 def load_result(folder: str | Path) -> dict[str, Any]:
-    """Return the content of a result folder's ``fit.json``, or of that file itself; values are SI.
+    """Return the content of ``fit.json``, given its path or its folder; values are in SI.
 
-    InputError if there is none that this version of foamfit understands.
+    InputError if there is none that this version of foamfit can read.
     """
     path = Path(folder)
     if path.is_dir():
@@ -194,13 +191,13 @@ def load_result(folder: str | Path) -> dict[str, Any]:
             f"{folder} is not a result folder: {path.name} cannot be read "
             f"({error.strerror or error})"
         ) from error
-    except (ValueError, RecursionError) as error:  # neither UTF-8 nor JSON, or nested too deeply
+    except (ValueError, RecursionError) as error:  # not UTF-8 or JSON, or nested too deeply
         raise InputError(f"{path} is not valid JSON: {error}") from error
     if not isinstance(content, dict) or "schema" not in content:
         raise InputError(f"{path} is not the result of a fit (it has no schema number)")
     if content["schema"] != SCHEMA:
         raise InputError(
-            f"{path} has schema {content['schema']}, this foamfit reads schema {SCHEMA}"
+            f"{path} has schema {content['schema']}, but this version of foamfit reads {SCHEMA}"
         )
     return content
 
@@ -208,17 +205,17 @@ def load_result(folder: str | Path) -> dict[str, Any]:
 def write_result(
     result: Fit, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
 ) -> None:
-    """Write all files of a result into a folder that is there; the report and figures if wanted.
+    """Write all files of a result into an existing folder; report and figures only with `pages`.
 
-    ``profiles.csv`` is written where there are profiles, ``ladder.csv`` where there is a ladder,
-    ``budget.csv`` where the budget says more than the parameters. For `width` and `mapped` see
+    ``profiles.csv`` and ``ladder.csv`` are written if there are profiles and a ladder,
+    ``budget.csv`` if the budget contains more than the parameters. For `width` and `mapped` see
     `foamfit.report.result_figures.draw_all`.
     """
-    figures = draw_all(result, width, mapped) if pages else ()  # which begins to draw
+    figures = draw_all(result, width, mapped) if pages else ()  # other processes start to draw now
     write_json(folder / "fit.json", result.to_json_dict())
-    told = ("unit", "state", "why", "ci95_method")
+    texts = ("unit", "state", "why", "ci95_method")
     parameters = (
-        {"name": name, **plain(numbers_of(p)), **{key: getattr(p, key) for key in told}}
+        {"name": name, **plain(numbers_of(p)), **{key: getattr(p, key) for key in texts}}
         for name, p in result.parameters.items()
     )
     write_table(folder / "parameters.csv", parameters)
@@ -245,7 +242,7 @@ def write_result(
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write an object as JSON; a non-UTF-8 name keeps its bytes as a JSON escape.
 
-    What `load` needs, which nobody reads, is one line at the end.
+    The value of "load", which is not meant for readers, is one line at the end.
     """
     form: Any = {"ensure_ascii": False, "allow_nan": False}
     text = json.dumps({k: v for k, v in content.items() if k != "load"}, indent=2, **form)
@@ -255,17 +252,17 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def write_text(path: Path, content: str) -> None:
-    """Write a text; letters of a non-UTF-8 name are replaced."""
+    """Write a text; replace characters that are not UTF-8."""
     path.write_text(content, encoding="utf-8", errors="replace")
 
 
 def write_table(path: Path, rows: Iterable[Mapping[str, object]]) -> None:
-    """Write rows, which have the same columns, as CSV."""
+    """Write rows with identical columns as CSV."""
     path.write_bytes(csv_bytes(with_head(rows)))
 
 
 def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
-    """Write columns, named in the first row, as CSV."""
-    # Python floats are written with as many digits as they have, numpy's with their type's name.
+    """Write columns as CSV, with their names in the first row."""
+    # As Python floats, because NumPy floats would be written with the name of their type.
     samples = zip(*(column.tolist() for column in columns.values()), strict=True)
     path.write_bytes(csv_bytes([columns, *samples]))

@@ -1,4 +1,4 @@
-"""Figures of a fit and of a forward run: the three panels of the paper's Figs. 3 and 4."""
+"""Figures of a fit and of a forward run: the three panels of Figs. 3 and 4 of the paper."""
 
 from __future__ import annotations
 
@@ -33,32 +33,31 @@ POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"
 # Preferred offset of the name of a switching point, in typographic points.
 IN_LOOP = {"A1": (-4, 5), "C1": (-5, 3), "C2": (5, -3), "A2": (4, -7), "σ₊": (-4, 5), "σ₋": (5, -5)}
 IN_TIME = {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4), "σ₊": (5, -4), "σ₋": (5, 4)}
-# The same for a branch, if not to the upper left; for an elastic branch, after the share of its
-# length at which its name stands.
+# The same for branches whose name is not at the upper left.
 BESIDE = {"c": (7.0, -3.0), "e": (4.0, -7.0), "snap-back": (7.0, -6.0)}
+# Position of the name along an elastic branch, as a fraction of its length, and its offset.
 LIGHT = {"a": (0.9, (-4.0, 3.0)), "c": (0.5, (5.0, -4.0))}
-MARKERS = 60  # markers on a measured curve; more would blot
+MARKERS = 60  # markers on a measured curve; more would merge
 PALE = "#A6CEE3"
-MOST_NAMED = 12  # loops that a legend names
-STOOD = "#F2DC6B"  # where the gauge stood still
-# Dashes and marks of interior masses, from the base up, to be told apart without colour.
+MOST_NAMED = 12  # loops up to which a legend names all
+STOOD = "#F2DC6B"  # standstill of the gauge
+# Dashes and marks of interior masses, from the base up, distinguishable without colour.
 DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)))
 MARKS = ("^", "v", "D", "p")
-# Typographic points: height of panels side by side, of stacked ones and of a residual; room for the
-# labels beside and below a panel, and for title and legend.
-HEIGHT, STACKED, STRIP, BESIDE_IT, BELOW_IT, AROUND = 133.0, 112.0, 40.0, 31.0, 26.0, 39.0
-MOST_WIDE = {0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}  # in, by the number of panels
-LOOP, WIDER = 165.0, 1.45  # of a known motion: height of the loop, its width over that of others
+# Typographic points: height of panels side by side, of stacked panels and of a residual strip.
+HEIGHT, STACKED, STRIP = 133.0, 112.0, 40.0
+BESIDE_IT, BELOW_IT, AROUND = 31.0, 26.0, 39.0  # room for labels, and for title and legend
+MOST_WIDE = {0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}  # largest width in inches, by number of panels
+LOOP, WIDER = 165.0, 1.45  # prescribed motion: height of the loop, its width over that of others
 
 
 def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -> Figure:
     """Draw stress-time, displacement-time and stress-strain, measured and fitted, and residuals.
 
-    A panel of which the fit has no curve is left out. Where the motion is prescribed, the loop is
-    large and the input is not drawn. `width` is "one" or "two" columns, or a length such as
-    "85 mm", and with ", untitled" behind it there is no title; panels for which it has no room side
-    by side stand one above the other, and a figure of fewer panels is no wider than these need.
-    Saved at `path`, if one is given, in the format of its suffix.
+    Panels without a curve are omitted. If the motion is prescribed, the loop is large and the input
+    is not drawn. `width` is "one" or "two" columns, or a length such as "85 mm"; ", untitled" after
+    it omits the title. Panels that do not fit side by side are stacked, and few panels make a
+    narrower figure. With `path`, the figure is saved in the format of its suffix.
     """
     panels = _panels(result)
     with _panelled(panels, width, residuals=True, known=is_known(result)) as (figure, axes, sizes):
@@ -69,7 +68,7 @@ def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -
 
 
 def draw_panel(result: Fit, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
-    """Draw one panel of `plot_fit` into axes, or into those of a new figure; returns them.
+    """Draw one panel of `plot_fit` into axes or a new figure; return the axes.
 
     `what` is "stress-strain", "stress-time" or "displacement-time".
     """
@@ -85,10 +84,10 @@ def draw_panel(result: Fit, ax: Axes | None = None, what: str = "stress-strain")
 
 
 def draw_loops(loops: Iterable[Loop], ax: Axes | None = None) -> Axes:
-    """Draw the loops of several tests into axes, or into those of a new figure; returns them.
+    """Draw the loops of several tests into axes or a new figure; return the axes.
 
-    Measured curves are grey and wide, fitted ones thin and coloured from light to dark; of many the
-    key names the first and the last.
+    Measured curves are grey and wide, fitted ones thin and coloured from light to dark. If there
+    are many, the legend names only the first and the last.
     """
     import matplotlib
 
@@ -113,14 +112,14 @@ def draw_loops(loops: Iterable[Loop], ax: Axes | None = None) -> Axes:
 def plot_response(
     response: Response, path: str | Path | None = None, *, width: str = TWO
 ) -> Figure:
-    """Draw what a forward run gave: base stress and displacements over time, stress over strain.
+    """Draw a forward run: base stress and displacements over time, stress over strain.
 
     For `path` and `width` see `plot_fit`.
     """
     time, stress, nodes = response.time, response.base_stress, response.displacement
     end = response.contact_end
-    loop = time <= (np.inf if end is None else end)  # then the striker flies
-    # From the base up: light to dark, the top in the colour of what is simulated.
+    loop = time <= (np.inf if end is None else end)  # afterwards the striker flies freely
+    # From the base up: light to dark grey, the top in the colour of simulated curves.
     shades = np.linspace(0.7, 0.35, max(len(nodes) - 1, 1))
     last = {"color": VERMILION, "lw": 1.3}
     moving = [
@@ -144,14 +143,14 @@ def plot_response(
 
 
 def origin_word(result: Fit) -> str | None:
-    """Return "reconstruction" or "synthetic" where the test's name or notes say it is that."""
+    """Return "reconstruction" or "synthetic" if the name or notes of the test contain it."""
     text = " ".join((result.measurement.name, *result.measurement.notes)).lower()
     match = re.search(r"\b(reconstruct|synthetic)", text)
     return match and {"reconstruct": "reconstruction"}.get(match[1], match[1])
 
 
 def is_known(result: Fit) -> bool:
-    """Whether the motion is prescribed, and no motion of interior masses is compared."""
+    """Return whether the motion is prescribed and no interior masses are compared."""
     return result.drive == "displacement" and not result.curves.interior
 
 
@@ -160,15 +159,15 @@ def is_known(result: Fit) -> bool:
 
 @dataclass(frozen=True)
 class _Line:
-    """A curve of a panel, SI; of a measured curve, `off` is the residual in % of its range."""
+    """A curve of a panel in SI; `residual` of a measured one is in % of its range."""
 
     x: Array
     y: Array
     label: str
     style: dict[str, Any]
     kind: Literal["measured", "fitted", "other"] = "other"
-    node: int = 0  # the mass inside that it belongs to, 0 = the top
-    off: Array | None = None
+    node: int = 0  # interior mass, 0 = top
+    residual: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -198,7 +197,7 @@ class _Panel:
 
 def _panels(result: Fit) -> list[_Panel]:
     c, height = result.curves, result.measurement.specimen.height
-    # The fitted loop includes the prescribed curve even if only the measured copy is kept.
+    # The fitted loop needs the prescribed curve, which may exist only as the measured one.
     pushed = c.measured_stress if result.drive == "stress" and c.stress is None else c.stress
     moved = c.displacement
     if result.drive == "displacement" and moved is None:
@@ -209,17 +208,17 @@ def _panels(result: Fit) -> list[_Panel]:
     def compared(curve: str, fitted: Array | None) -> Array | None:
         return None if result.misfit.get(curve) is None else fitted
 
-    off = compared("stress_time", c.stress)
-    pushing = _measured(c.time, c.measured_stress, off) + _fitted(c.time, c.stress)
-    off = compared("displacement_time", c.displacement)
-    moving = _measured(c.time, c.measured_displacement, off, motion)
+    fitted = compared("stress_time", c.stress)
+    pushing = _measured(c.time, c.measured_stress, fitted) + _fitted(c.time, c.stress)
+    fitted = compared("displacement_time", c.displacement)
+    moving = _measured(c.time, c.measured_displacement, fitted, motion)
     moving += _fitted(c.time, c.displacement)
     for node, (measured, fitted) in c.interior.items():
         moving += _measured(c.time, measured, fitted, node=node) + _fitted(c.time, fitted, node)
     loop = _measured(strain, c.measured_stress, compared("stress_strain", c.stress_along), motion)
     loop += _fitted(None if moved is None else moved / height, pushed)
     if strain is not None and c.stress_along is not None and not is_known(result):
-        # Wide and pale below the others, because it coincides with them where the fit is good.
+        # Wide and pale below the others, because it coincides with them if the fit is good.
         pale = {"color": PALE, "lw": 3.2, "zorder": 2}
         loop.append(_Line(strain, c.stress_along, "springs along measured strain", pale))
     panels = [
@@ -244,8 +243,8 @@ def _measured(
     elif motion != "measured":
         label, mark = f"measured, motion {motion}", "s"
     style = {"marker": mark, "mfc": "white", "mec": edge, "mew": 0.6, "ms": 3.4, "zorder": 3}
-    off = None if fitted is None else 100.0 * (fitted - y) / (float(np.ptp(y)) or 1.0)
-    return [_Line(x, y, label, style, "measured", node, off)]
+    residual = None if fitted is None else 100.0 * (fitted - y) / (float(np.ptp(y)) or 1.0)
+    return [_Line(x, y, label, style, "measured", node, residual)]
 
 
 def _fitted(x: Array | None, y: Array | None, node: int = 0) -> list[_Line]:
@@ -264,9 +263,9 @@ def _colour(node: int) -> str:
 def _panelled(
     panels: list[_Panel], width: str, *, residuals: bool = False, known: bool = False
 ) -> Iterator[tuple[Figure, list[Axes], list[tuple[float, float]]]]:
-    """Give a figure with its panels drawn, their axes, and about how large each is, in points.
+    """Yield a figure with its panels drawn, their axes, and their approximate sizes in points.
 
-    With `residuals` these are below the panels; of a `known` motion the first panel is the largest.
+    Residuals are drawn below the panels if wanted; for a `known` motion the first panel is largest.
     """
     count = max(len(panels), 1)
     wide = min(figures.inches(width), MOST_WIDE[3 if known and count > 1 else len(panels)])
@@ -289,9 +288,9 @@ def _panelled(
         for i, (ax, panel) in enumerate(zip(axes, panels, strict=False)):
             ax.set_label(panel.key.replace("_", "-"))
             _draw(ax, panel)
-            if any(line.off is not None for line in panel.lines) and residuals:
+            if residuals and any(line.residual is not None for line in panel.lines):
                 _draw_residuals(ax, below[i], panel)
-            elif residuals:  # the panel takes their place
+            elif residuals:  # the panel fills their place
                 below[i].remove()
                 at = ax.get_subplotspec().rowspan.start
                 ax.set_subplotspec(ax.get_gridspec()[at : at + 2, i % across])
@@ -305,10 +304,10 @@ def _draw(ax: Axes, panel: _Panel) -> None:
     for line in panel.lines:
         x, y, style = line.x / fx, line.y / fy, line.style
         if line.kind == "measured":
-            every = f"_{line.label.removeprefix('_')}, all samples"
-            ax.plot(x, y, color="0.82", lw=0.5, zorder=1, label=every)
-            some = _evenly(x, y, MARKERS)
-            x, y, style = x[some], y[some], {"ls": "none", **style}
+            label = f"_{line.label.removeprefix('_')}, all samples"
+            ax.plot(x, y, color="0.82", lw=0.5, zorder=1, label=label)
+            marked = _evenly(x, y, MARKERS)
+            x, y, style = x[marked], y[marked], {"ls": "none", **style}
         ax.plot(x, y, label=line.label, **style)
     ax.set(xlabel=x_label, ylabel=y_label)
     ax.margins(0.05, 0.11)
@@ -317,9 +316,9 @@ def _draw(ax: Axes, panel: _Panel) -> None:
 def _draw_residuals(ax: Axes, strip: Axes, panel: _Panel) -> None:
     """Draw fitted minus measured below a panel, in percent of the measured range."""
     for line in panel.lines:
-        if line.off is not None:
+        if line.residual is not None:
             style: Any = {"color": _colour(line.node), "lw": 0.7, "label": "_fitted − measured"}
-            strip.plot(line.x / panel.scale()[0], line.off, **style)
+            strip.plot(line.x / panel.scale()[0], line.residual, **style)
     strip.axhline(0.0, color=GREY, lw=0.6, zorder=1)
     strip.set(xlabel=ax.get_xlabel(), label=f"{ax.get_label()}, residual")
     strip.set_ylabel("residual\n(% of range)", fontsize=7)
@@ -329,17 +328,17 @@ def _draw_residuals(ax: Axes, strip: Axes, panel: _Panel) -> None:
 
 
 def _evenly(x: Array, y: Array, n: int) -> NDArray[np.intp]:
-    """Return up to `n` samples, evenly spaced along the curve, not in time."""
-    there = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
-    if there.size <= n:
-        return there
-    dx, dy = (np.diff(v[there]) / (np.ptp(v[there]) or 1.0) for v in (x, y))
+    """Return up to `n` samples, evenly spaced along the curve (not in time)."""
+    finite = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if finite.size <= n:
+        return finite
+    dx, dy = (np.diff(v[finite]) / (np.ptp(v[finite]) or 1.0) for v in (x, y))
     along = np.concatenate(([0.0], np.cumsum(np.hypot(dx, dy))))
-    return there[np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], n)))]
+    return finite[np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], n)))]
 
 
 def _annotate(ax: Axes, panel: _Panel, result: Fit, size: tuple[float, float]) -> None:
-    """Add to a panel of about this size (points) all but its curves."""
+    """Add everything except the curves to a panel of about this size in points."""
     _mark_outliers(ax, panel, result)
     _shade_standstills(ax, panel, result)
     labels = _Labels(ax, panel, size)
@@ -351,7 +350,7 @@ def _annotate(ax: Axes, panel: _Panel, result: Fit, size: tuple[float, float]) -
 
 
 def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
-    """Mark outliers, which are not fitted, by crosses; those beyond the panel at its edge."""
+    """Mark outliers, which are not fitted, with crosses; at the edge if beyond the panel."""
     test = result.measurement
     fx, _, fy, _ = panel.scale()
     own = "displacement" if panel.key == "displacement_time" else "stress"
@@ -364,7 +363,7 @@ def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
             x = np.interp(x, time, motion) / test.specimen.height
         elif panel.is_loop or test.time is None:
             continue
-        low, high = ax.get_ylim()  # fixed: a wild sample must not shrink the curves
+        low, high = ax.get_ylim()  # fixed, so that an outlier does not shrink the curves
         style: Any = {"ms": 4.0, "mew": 1.0, "color": "black", "zorder": 6, "clip_on": False}
         y = np.clip(found.values / fy, low, high)
         ax.plot(x / fx, y, "x", label="outlier, not fitted", **style)
@@ -372,7 +371,7 @@ def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
 
 
 def _shade_standstills(ax: Axes, panel: _Panel, result: Fit) -> None:
-    """Shade where the gauge stood still: a span of time, a part of the measured loop."""
+    """Shade standstills of the gauge: a span of time, or a part of the measured loop."""
     test = result.measurement
     fx, _, fy, _ = panel.scale()
     style: Any = {"color": STOOD, "zorder": 0.5, "label": "gauge stands still, bridged"}
@@ -391,14 +390,14 @@ def _shade_standstills(ax: Axes, panel: _Panel, result: Fit) -> None:
 
 
 class _Labels:
-    """Places names in a panel so that they cover no other name and little of curves and marks."""
+    """Placement of names in a panel, away from other names, curves and marks."""
 
     def __init__(self, ax: Axes, panel: _Panel, size: tuple[float, float]) -> None:
-        """Take a panel and about how large it will be, typographic points."""
+        """Initialise for a panel of about this size in typographic points."""
         self.ax, (self.fx, _, self.fy, _) = ax, panel.scale()
         self.corner, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
         self.size, self.scale = size, np.array(size) / (high - self.corner)  # points per unit
-        self.drawn = [np.empty((0, 2))]  # places that names are to leave free
+        self.drawn = [np.empty((0, 2))]  # points that names should not cover
         for line in panel.lines:
             if line.kind == "fitted":
                 seen = _evenly(line.x, line.y, 4 * MARKERS)
@@ -406,7 +405,7 @@ class _Labels:
         self.taken: list[Array] = []
 
     def mark(self, name: str, places: Array) -> None:
-        """Draw dots at places (n, 2), in the units of the axes, that names are to leave free."""
+        """Draw dots, which names should not cover, at places (n, 2) in the units of the axes."""
         self.ax.plot(*places.T, "o", ms=3.2, color="black", zorder=5, label=f"_{name}")
         self.drawn += [places, places]
 
@@ -419,14 +418,14 @@ class _Labels:
         stay: bool = False,
         **style: Any,
     ) -> None:
-        """Write a name beside one of some places, `wanted` points from it or where it covers least.
+        """Write a name near one of `places`, offset by `wanted` points or where it covers least.
 
-        Earlier places are better. With `stay` it stands on the side that is wanted.
+        Earlier places are preferred. With `stay` the name stays on the wanted side.
         """
         avoid = (np.concatenate(self.drawn) - self.corner) * self.scale
         x, y = wanted
         sides = [(x, y)] if stay else [(x, y), (-x, -y), (x, -y), (-x, y)]
-        found = []
+        candidates = []
         for place, far, (dx, dy) in product(range(len(places)), (1.0, 2.5, 4.0), sides):
             size = np.array([4.2 * len(name), 9.0])
             left = dx - (size[0] if dx < 0 else 0.0)
@@ -436,8 +435,8 @@ class _Labels:
             beyond = bool(np.any((low < 0.0) | (high > self.size)))
             inside = int(np.all((avoid > low) & (avoid < high), axis=1).sum())
             cost = 1000 * names + 50 * beyond + inside + 2.0 * far + 3.0 * place
-            found.append((cost, places[place], (dx, far * dy), np.concatenate((low, high))))
-        _, at, offset, box = min(found, key=lambda one: one[0])
+            candidates.append((cost, places[place], (dx, far * dy), np.concatenate((low, high))))
+        _, at, offset, box = min(candidates, key=lambda one: one[0])
         self.taken.append(box)
         side = "left" if offset[0] > 0 else "right"
         style |= {"ha": side, "va": "center", "zorder": 6, "annotation_clip": False}
@@ -448,7 +447,7 @@ class _Labels:
 
 
 def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
-    """Mark where springs switch, and name each kind of mark once."""
+    """Mark the switches of the springs, and name each kind of switch once."""
     at: dict[str, list[tuple[float, float]]] = {}
     for spring, point, x, y in _points(panel, result):
         name = f"{spring} {point}" if len(result.chain.springs) > 1 else point
@@ -461,7 +460,7 @@ def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
 
 
 def _points(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
-    """Give where springs change branches, and where half of the micro-springs have snapped."""
+    """Yield spring, name, x and y of changes of branch and of half-snapped micro-springs."""
     for switch in result.switches:
         ends, x = (switch.source, switch.target), switch.time
         name = POINTS.get("".join(ends))
@@ -478,7 +477,7 @@ def _points(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float
 
 
 def _draw_law(labels: _Labels, result: Fit) -> None:
-    """Draw the elastic branches of the only spring, if it has any, and its equilibrium."""
+    """Draw the elastic branches, if any, and the equilibrium of a single spring."""
     spring, ax = result.chain.springs[0], labels.ax
     if len(result.chain.springs) > 1 or not hasattr(spring, "elastic_branches"):
         return
@@ -487,19 +486,19 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
     stress = np.linspace(0.0, top * labels.fy, 200)
     for name, strain in spring.elastic_branches(stress).items():
         line = np.column_stack((strain, stress / labels.fy))[strain < right]
-        if len(line):  # branch c may lie beyond all that the test reached
+        if len(line):  # branch c may lie beyond the strains of the test
             ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5, label=f"_branch {name}")
             along, wanted = LIGHT[name[0]]
             at = line[int(along * (len(line) - 1))]
             labels.write(name, [at], wanted, color=GREY, fontsize=7)
     if spring.relaxation and "s1" in result.snapping and result.strain is not None:
         style: Any = {"color": "0.35", "lw": 0.7, "ls": (0, (4, 2)), "zorder": 3.5}
-        held = result.snapping["s1"].stress / labels.fy
-        ax.plot(result.strain, held, label="equilibrium", **style)
+        equilibrium = result.snapping["s1"].stress / labels.fy
+        ax.plot(result.strain, equilibrium, label="equilibrium", **style)
 
 
 def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
-    """Write the names of the branches beside the curve of a single spring."""
+    """Write the names of the branches next to the curve of a single spring."""
     springs, fitted = result.chain.springs, panel.fitted
     if len(springs) > 1 or not springs[0].law.hysteretic or fitted is None:
         return
@@ -514,46 +513,45 @@ def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
 
 
 def _longest_visits(result: Fit, fitted: _Line) -> dict[str, slice]:
-    """Return the samples of the longest visit, in strain, of a single spring to each branch."""
+    """Return the samples of the longest visit (in strain) of a single spring to each branch."""
     ends = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
     at_rest = next(iter(result.chain.springs[0].law.branches))
     branches = [switch.source for switch in result.switches[:1]] or [at_rest]
     branches += [switch.target for switch in result.switches]
-    found, longest = dict[str, slice](), dict[str, float]()
+    visits, longest = dict[str, slice](), dict[str, float]()
     for branch, start, end in zip(branches, ends, ends[1:], strict=False):
         span = float(np.ptp(fitted.x[start : end + 1])) if end > start else 0.0
-        # A shaking motion leaves a branch for less than a fiftieth of the largest strain.
+        # Shorter visits, below 2 % of the range of strain, are vibrations.
         if span > longest.get(branch, 0.02 * float(np.ptp(fitted.x))):
-            found[branch], longest[branch] = slice(start, end + 1), span
-    return found
+            visits[branch], longest[branch] = slice(start, end + 1), span
+    return visits
 
 
 def _switch_samples(result: Fit, loop: _Line) -> list[int]:
-    """Return the sample of the fitted loop (strain, stress) at which each switch happens."""
+    """Return the sample of the fitted loop (strain, stress) at which each switch occurs."""
     samples, time = [0], result.curves.time
     for switch in result.switches:
         if time is not None and switch.time is not None:
             samples.append(min(int(np.searchsorted(time, switch.time)), loop.x.size - 1))
-        else:  # the nearest sample after the switch before
+        else:  # the nearest sample after the previous switch
             strain = switch.displacement / result.measurement.specimen.height
             x, y = loop.x[samples[-1] :] - strain, loop.y[samples[-1] :] - switch.stress
-            away = np.hypot(x / (np.ptp(loop.x) or 1.0), y / (np.ptp(loop.y) or 1.0))
-            samples.append(samples[-1] + int(np.argmin(away)))
+            distance = np.hypot(x / (np.ptp(loop.x) or 1.0), y / (np.ptp(loop.y) or 1.0))
+            samples.append(samples[-1] + int(np.argmin(distance)))
     return samples[1:]
 
 
 def _head(figure: Figure, result: Fit, *, titled: bool) -> None:
-    """Write the title above all panels and the legend below them, and make room for both."""
+    """Write the title above and the legend below the panels, and make room for both."""
     name = printable(" ".join(result.measurement.name.split()))
     name = name if len(name) <= 60 else name[:59] + "…"
     word = origin_word(result)
     more = [word] if word and word not in name.lower() else []
     more += [f"stopped by {result.stopped}"] if result.stopped else []
-    # No line begins with a dot.
+    # The no-break space keeps a line from starting with a dot.
     title = "\u00a0· ".join([name, result.law, f"{result.drive} drive", *more])
     title = textwrap.fill(title, int(12 * figure.get_figwidth()))
-    # A dollar sign in a name begins no formula.
-    if titled:
+    if titled:  # a dollar sign in a name does not start a formula
         figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, parse_math=False)
     lines = figures.legend_below(figure, figures.named_in(figure.axes))
     extra = 11.0 * max(lines - 1, 0) + (11.0 * title.count("\n") if titled else -13.0)

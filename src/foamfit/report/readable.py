@@ -1,4 +1,4 @@
-"""How parameters and numbers are written for readers: unit, digits, symbol."""
+"""Parameters and numbers in readable form: unit, digits, symbol."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from foamfit.results import ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
 from foamfit.text import number
 
-# Parameters that belong to no spring: symbol, index, and their name in reports if it differs. Those
-# of springs are in the records of laws.
+# Parameters that do not belong to a spring: symbol, index, and name in reports if it differs. The
+# parameters of springs are in the records of their laws.
 _OTHERS = {
     "site_eta": ("η", "site", ""),
     "contact_time": ("t", "0", "contact time t₀"),
@@ -32,9 +32,9 @@ UNITS = {
 
 
 def readable_unit(size: float, unit: str) -> tuple[float, str]:
-    """Return factor and name of the unit in which a number of this size reads well.
+    """Return factor and name of a suitable unit for numbers up to `size`, which is given in `unit`.
 
-    `size` is the largest number to show, in `unit`, one of `UNITS`; any other unit is kept.
+    A unit that is not in `UNITS` is kept.
     """
     scales = UNITS.get(unit, ((1.0, unit),))
     return next((scale for scale in scales if abs(size) >= scale[0]), scales[-1])
@@ -42,10 +42,10 @@ def readable_unit(size: float, unit: str) -> tuple[float, str]:
 
 @dataclass(frozen=True)
 class Readable:
-    """A parameter in the unit in which it reads well, its numbers rounded to its uncertainty."""
+    """A parameter in a suitable unit, with numbers rounded to its uncertainty."""
 
     name: str
-    symbol: tuple[str, str]  # and its index
+    symbol: tuple[str, str]  # symbol and index
     value: str
     stderr: str
     interval: str
@@ -54,35 +54,35 @@ class Readable:
     why: str
     method: str = ""
     range: str = ""
-    systematic: str = ""  # with its unit
+    systematic: str = ""
 
     @property
     def label(self) -> str:
-        """The name in reports: for a parameter of a spring, its name in fit.json."""
+        """The name in reports; for parameters of springs, the name in fit.json."""
         return _OTHERS.get(self.name, ("", "", ""))[2] or self.name
 
     @property
     def with_error(self) -> str:
-        """The value with its standard error, where there is one."""
+        """The value with its standard error, if there is one."""
         return f"{self.value} ± {self.stderr}" if self.stderr else self.value
 
-    def with_unit(self, told: str) -> str:
-        """Append the unit to a number of this parameter, if it has one."""
-        return f"{told} {self.unit}".removesuffix(" –") if told else ""
+    def with_unit(self, number: str) -> str:
+        """Append the unit, if there is one, to a number of this parameter."""
+        return f"{number} {self.unit}".removesuffix(" –") if number else ""
 
     @property
     def matters(self) -> bool:
-        """Whether its reason is worth reading: it is not determined, or there is a remark."""
+        """Whether the reason is worth showing: not determined, or a remark after a semicolon."""
         return self.state != "fixed" and (self.state != "determined" or ";" in self.why)
 
 
 def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = None) -> Readable:
     """Return a parameter in readable form, in a given unit (factor and name) or a suitable one.
 
-    It is shown with the digits that its standard error leaves (two of the error), or with four.
+    Numbers are rounded to two digits of the standard error; without one, to four digits.
     """
     size = p.value or p.stderr or 0.0
-    if name in NUISANCE:  # its value may be far below its error
+    if name in NUISANCE:  # the value may be far below the error
         size = max(abs(p.value), p.stderr or 0.0)
     factor, unit = given or readable_unit(size, p.unit)
     value = p.value / factor
@@ -91,22 +91,22 @@ def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = 
         shown, stderr, places = _rounded(value, p.stderr / factor)
         if p.ci95 is not None:
             interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
-    if p.range is not None:  # a range is good to two digits
+    if p.range is not None:  # two digits suffice
         ends = (float(f"{bound / factor + 0.0:.2g}") for bound in p.range)
         span = " to ".join(f"{end:g}".replace("-", "−") for end in ends)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
     scale = f"{p.systematic / factor:.2g}" if p.systematic > 0.0 else ""
-    told = (p.state, p.why, p.ci95_method or "", span, scale)
-    return Readable(name, symbol(name), shown, stderr, interval, unit, *told)
+    rest = (p.state, p.why, p.ci95_method or "", span, scale)
+    return Readable(name, symbol(name), shown, stderr, interval, unit, *rest)
 
 
 def own_name(name: str, model: str) -> str:
-    """Name of a parameter, without the spring where there is only one."""
+    """Return the name of a parameter, without the spring if there is only one."""
     return name if "+" in model else name.removeprefix("s1_")
 
 
 def in_unit(values: Sequence[float], unit: str) -> str:
-    """Write one value, or the ends of an interval, in the unit in which they read well."""
+    """Format one value, or the ends of an interval, in a suitable unit."""
     if not values:
         return ""
     factor, name = readable_unit(max(map(abs, values)), unit)
@@ -114,18 +114,18 @@ def in_unit(values: Sequence[float], unit: str) -> str:
 
 
 def symbol(name: str) -> tuple[str, str]:
-    """Return the symbol of a parameter and its index: k and "c,2" of s2_kc."""
+    """Return the symbol of a parameter and its index: k and "c,2" for s2_kc."""
     spring, short = split_name(name)
     if name in _OTHERS or spring < 0:
         stem, index, _ = _OTHERS.get(name, (name, "", ""))
         return stem, index
     stem, index = any_param(short).symbol
-    term = short.removeprefix(family(short))  # of relaxation
+    term = short.removeprefix(family(short))  # number of the relaxation term
     return stem, ",".join(filter(None, (index, term, str(spring + 1))))
 
 
 def own_symbol(name: str, springs: int = 1) -> tuple[str, str]:
-    """Return the symbol of a parameter, without the spring where there is only one."""
+    """Return symbol and index of a parameter, without the spring if there is only one."""
     stem, index = symbol(name)
     if springs == 1 and split_name(name)[0] >= 0:
         index = index.rpartition(",")[0]
@@ -133,10 +133,10 @@ def own_symbol(name: str, springs: int = 1) -> tuple[str, str]:
 
 
 def _rounded(value: float, stderr: float) -> tuple[str, str, int]:
-    """Return value and standard error to two digits of the error, and the decimal places."""
+    """Return value and standard error to two digits of the error, and the number of decimals."""
     places = 1 - math.floor(math.log10(float(f"{stderr:.1e}")))
     most = 6 - math.floor(math.log10(abs(value))) if value else 6
-    if places > most:  # an error far below the value, as of synthetic data: seven digits are enough
+    if places > most:  # tiny error, as with synthetic data: seven digits are enough
         return _fixed(value, most), f"{stderr:.1e}", most
     return _fixed(value, places), _fixed(stderr, places), places
 

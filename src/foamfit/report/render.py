@@ -1,4 +1,4 @@
-"""Templates of HTML pages and of what the terminal prints."""
+"""Templates of HTML pages and of terminal output."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @functools.cache
 def environment() -> Environment:
-    """Return the templates of all pages, texts and cards, with the filters that write numbers."""
+    """Return the templates of all pages, texts and cards, with filters that format numbers."""
     from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, select_autoescape
 
     made = Environment(
@@ -39,28 +39,28 @@ def environment() -> Environment:
 
 
 def page(name: str, **values: Any) -> str:
-    """Return a page in HTML."""
+    """Render an HTML page."""
     return environment().get_template(f"{name}.html").render(**values)
 
 
 def words(name: str, **values: Any) -> str:
-    """Return a text for the terminal, without a newline at its end."""
+    """Render a text for the terminal, without a final newline."""
     return environment().get_template(f"{name}.txt").render(**values).rstrip("\n")
 
 
 def sentences(name: str, **values: Any) -> tuple[str, ...]:
-    """Return the lines of a text, a sentence each."""
+    """Render a text with one sentence per line and return its lines."""
     return tuple(words(name, **values).splitlines())
 
 
 def table(name: str, **values: Any) -> list[list[str]]:
-    """Return the cells of a table whose rows are the lines of a text, separated by "¦"."""
+    """Render a text with one row per line and return its cells, which "¦" separates."""
     return [line.split("¦") for line in words(name, **values).splitlines()]
 
 
-def _paragraphs(told: str, indent: int = 2) -> str:
-    """Wrap each line of a text as a paragraph of its own; empty lines stay."""
-    lines = (text.wrapped(one, indent) or [""] for one in told.split("\n"))
+def _paragraphs(content: str, indent: int = 2) -> str:
+    """Wrap each line of a text as a separate paragraph; keep empty lines."""
+    lines = (text.wrapped(line, indent) or [""] for line in content.split("\n"))
     return "\n".join(line for paragraph in lines for line in paragraph)
 
 

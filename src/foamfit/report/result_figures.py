@@ -1,7 +1,7 @@
-"""The figures of a result, each drawn once for all its files, in any process.
+"""Figures of a result, each drawn once for all its files, in any process.
 
-That of the fit is in `plots`; here are those that the report shows beside it: the profiles of the
-cost, and what has snapped.
+The figure of the fit is in `plots`; the other figures of the report, profiles of the cost and
+snapped micro-springs, are here.
 """
 
 from __future__ import annotations
@@ -27,20 +27,19 @@ if TYPE_CHECKING:
 
     from foamfit.results import ParameterEstimate, Profile
 
-Mapped = Callable[..., Iterable[Any]]  # as the built-in `map`
-SHOWN = 200  # dots per inch of figures that are only on the page, to save time
-# In the order in which they are begun. Those on the screen show the fit on the page, which has its
-# own title, and on a phone.
+Mapped = Callable[..., Iterable[Any]]  # such as the built-in `map`
+SHOWN = 200  # dpi of figures that only the page contains; a low value saves time
+# Figures of the fit on the page, which has its own title, and on a phone.
 _ON_SCREEN = ("shown", "narrow")
-_NAMES = ("fit", *_ON_SCREEN, "snapping", "profiles")
+_NAMES = ("fit", *_ON_SCREEN, "snapping", "profiles")  # in the order of drawing
 
 INSTANTS = 7  # pictures of a foam
-SNAPPED, STANDING = "#7FB2D9", "#E6EEF4"  # shades of a spring
+SNAPPED, STANDING = "#7FB2D9", "#E6EEF4"  # shades of the snapped part and of the rest of a spring
 
 
 @dataclass(frozen=True)
 class Images:
-    """A figure as the bytes of files: `pdf` where it is for print."""
+    """A figure as the bytes of image files; with `pdf` if it is for print."""
 
     png: bytes
     dpi: int  # of the PNG
@@ -48,31 +47,31 @@ class Images:
 
     @property
     def width(self) -> float:
-        """Its width in inches; that in pixels stands in the header of the PNG."""
+        """Width in inches, from the pixels in the header of the PNG."""
         return int.from_bytes(self.png[16:20]) / self.dpi
 
 
 def draw_all(
     result: Fit, width: str = TWO, mapped: Mapped = map
 ) -> Iterator[tuple[str, Images | None]]:
-    """Draw all figures of a result by a `map`; one that the result does not have is None.
+    """Draw all figures of a result with `mapped`; yield names and images, None if inapplicable.
 
-    A `map` of an executor draws them in its processes: it begins at once, and what is given is
-    waited for when it is asked for. `width` is that of "fit" (`foamfit.report.plots.plot_fit`);
-    with ", pdf" behind it all but those on the screen are made as PDF too.
+    With the `map` of an executor, drawing starts at once in its processes, and the returned
+    iterator waits for each figure. `width` is that of "fit" (`foamfit.report.plots.plot_fit`); with
+    ", pdf" after it, all figures except those for the screen are also made as PDF.
     """
     drawn: dict[str, Any] = {field.name: getattr(result, field.name) for field in fields(Fit)}
-    # No figure needs them, and unpickling them would import lmfit, the slowest import.
+    # No figure needs `params`, and unpickling it would import lmfit, the slowest import.
     drawn["params"] = None
-    images = mapped(partial(_draw, Fit(**drawn), width), _NAMES)  # begins before it is asked for
+    images = mapped(partial(_draw, Fit(**drawn), width), _NAMES)  # not in a generator: start now
     return zip(_NAMES, images, strict=True)
 
 
 def _draw(result: Fit, width: str, name: str) -> Images | None:
-    """Draw one of the figures, if the result has it."""
+    """Draw a figure, or return None if the result does not have it."""
     if name == "profiles":
-        there = result.intervals is not None and result.intervals.profiles
-        figure = plot_profiles(result) if there else None
+        profiled = result.intervals is not None and result.intervals.profiles
+        figure = plot_profiles(result) if profiled else None
     elif name == "snapping":
         figure = plot_snapping(result)
     else:
@@ -88,9 +87,9 @@ def _draw(result: Fit, width: str, name: str) -> Images | None:
 
 
 def plot_profiles(result: Fit) -> Figure:
-    """Draw each profile of the cost with its 95 % threshold and interval.
+    """Draw each profile of the cost with its 95 % threshold and interval, four panels per row.
 
-    Four panels a row; dashed is the parabola of the local covariance.
+    The dashed parabola is that of the local covariance.
     """
     assert result.intervals is not None
     profiles = result.intervals.profiles
@@ -109,7 +108,7 @@ def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> No
     """Draw one profile: threshold, interval, and the parabola of the standard error."""
     factor, unit = readable_unit(float(np.max(np.abs(profile.values))), estimate.unit)
     top = 2.0 * profile.cut
-    best = float(profile.values[np.argmin(profile.rises)])  # from the zero of the profile
+    best = float(profile.values[np.argmin(profile.rises)])
     x = profile.values / factor
     ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)), label="95 % threshold")
     ax.axvspan(*(end / factor for end in profile.ci95), color="0.92", lw=0, label="95 % interval")
@@ -130,9 +129,9 @@ def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> No
 
 
 def plot_snapping(result: Fit) -> Figure | None:
-    """Draw the fraction of micro-springs snapped over time, and the chain at a few instants.
+    """Draw the fraction of snapped micro-springs over time, and the chain at a few instants.
 
-    The instants are even along the motion, within the first cycle of several. None if no fraction
+    The instants are evenly spaced along the motion of the first cycle. Return None if no fraction
     is known.
     """
     snapping, time, strain = result.snapping, result.curves.time, result.strain
@@ -159,10 +158,10 @@ def plot_snapping(result: Fit) -> Figure | None:
 
 
 def _draw_strip(ax: Axes, result: Fit, overall: Array, at: list[int]) -> None:
-    """Draw the chain at some samples, each spring shaded from below by its fraction snapped."""
+    """Draw the chain at the samples `at`, each spring shaded by its snapped fraction."""
     chain, snapping = result.chain, result.snapping
     strains = [overall]
-    if len(chain.springs) > 1:  # all in equilibrium, else no fraction is known
+    if len(chain.springs) > 1:  # all in equilibrium, otherwise no fraction is known
         stress = next(iter(snapping.values())).stress
         strains = [np.asarray(spring.strain(stress)) for spring in chain.springs]
     total = sum(chain.heights)
@@ -174,8 +173,8 @@ def _draw_strip(ax: Axes, result: Fit, overall: Array, at: list[int]) -> None:
             ax.bar(number, tall, 0.5, floor, color=STANDING, edgecolor=GREY, lw=0.6)
             ax.bar(number, share * tall, 0.5, floor, color=SNAPPED)
             floor += tall
-        told = f"{number}: {100 * float(overall[sample]):.0f} %"
-        ax.annotate(told, (number, floor), (0, 3), textcoords="offset points", ha="center")
+        label = f"{number}: {100 * float(overall[sample]):.0f} %"
+        ax.annotate(label, (number, floor), (0, 3), textcoords="offset points", ha="center")
     ax.set(ylim=(0.0, 1.25), xlim=(0.4, len(at) + 0.6))
-    ax.set_title("shaded: the fraction snapped; written: the strain", loc="left", fontsize=7.5)
+    ax.set_title("shaded: snapped fraction; numbers: strain", loc="left", fontsize=7.5)
     ax.set_axis_off()

@@ -1,4 +1,4 @@
-"""Samples of a Markov chain: as a file, netCDF 3, and as a dataset of xarray."""
+"""Samples of a Markov chain as a netCDF 3 file and as an xarray dataset."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DIMS = ("chain", "draw")
 
 
 def write_samples(path: Path, draws: Mapping[str, Array]) -> None:
-    """Write samples (chain, draw) of parameters, SI; `xarray.open_dataset` reads the file."""
+    """Write samples (chain, draw) of parameters in SI; `xarray.open_dataset` reads the file."""
     from scipy.io import netcdf_file
 
     with netcdf_file(path, "w", version=2) as file:
@@ -34,7 +34,7 @@ def write_samples(path: Path, draws: Mapping[str, Array]) -> None:
 
 
 def read_samples(path: Path) -> dict[str, Array]:
-    """Read what `write_samples` wrote; nothing if there is no file."""
+    """Read a file of `write_samples`; return an empty dict if there is none."""
     from scipy.io import netcdf_file
 
     if not path.is_file():
@@ -48,7 +48,7 @@ def read_samples(path: Path) -> dict[str, Array]:
 
 
 def dataset(draws: Mapping[str, Array], **about: str) -> xarray.Dataset:
-    """Return samples as ArviZ takes them: dimensions chain and draw, attributes `units`.
+    """Return samples in the form that ArviZ reads: dimensions chain and draw, attributes `units`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How Python and notebooks show results: a few lines of text, or one line and a table."""
+"""Results as shown by Python and notebooks: a few lines of text, or one line and a table."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-Joint = Any  # `foamfit.study.joint_result.JointResult`, or `foamfit.saved.SavedJoint`, read back
+Joint = Any  # `foamfit.study.joint_result.JointResult`, or `foamfit.saved.SavedJoint` from a file
 
 
 def brief(title: str, line: str, rows: Sequence[Readable], html: bool, table: Any = None) -> str:
-    """Return a result in a few lines, or as HTML with a table of tests."""
+    """Return a result in a few lines, or as HTML with a table of parameters or tests."""
     if html:
         return page("shown", title=title, line=line, rows=rows, by_test=table)
     marks = {"weak": " (weak)", "not determined": " (not determined)"}
-    told = (f"{p.label} {p.with_unit(p.with_error)}{marks.get(p.state, '')}" for p in rows)
-    return "\n".join([*wrapped(f"{title}: {line}", 2), *wrapped(", ".join(told), 2)])
+    values = (f"{p.label} {p.with_unit(p.with_error)}{marks.get(p.state, '')}" for p in rows)
+    return "\n".join([*wrapped(f"{title}: {line}", 2), *wrapped(", ".join(values), 2)])
 
 
 class Shown:
-    """A result that Python shows in a few lines, and a notebook as a line and a table."""
+    """A result that Python shows in a few lines, and a notebook with a table."""
 
     def _shown(self, *, html: bool = False) -> str:
-        """Return it as text, or as HTML."""
+        """Return the result as text or HTML."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
-        """Return it in a few lines."""
+        """Return the result in a few lines."""
         return self._shown()
 
     def _repr_html_(self) -> str:
@@ -44,16 +44,16 @@ class Shown:
 
 
 class JointViews(Shown):
-    """What Python and notebooks show of a joint fit."""
+    """Plot, table and short text of a joint fit."""
 
     def plot(self: Joint, ax: Axes | None = None) -> Axes:
         """Draw the loops of all tests, measured and fitted, into axes or a new figure."""
         return draw_loops(self.loops, ax)
 
     def table(self: Joint) -> pd.DataFrame:
-        """Return a row for each parameter ("" for what is common) and test, SI.
+        """Return a row for each test and parameter, in SI; common values have the test "".
 
-        `kind`, `scatter` and `b` are as in joint.json. The LaTeX of its `to_latex` compiles.
+        `kind`, `scatter` and `b` are as in joint.json. The output of `to_latex` compiles.
         """
         common = {n: p for n, p in self.parameters.items() if p.kind != "own"}
         more = ("kind", "scatter", "b")
@@ -67,7 +67,7 @@ class JointViews(Shown):
         return stacked(frames, "test")
 
     def _shown(self: Joint, *, html: bool = False) -> str:
-        """Return name, model, tests, status and the common values."""
+        """Return name, model, number of tests, status and the common values."""
         line = f"{self.model} · {counted(len(self.tests), 'test')} together · status {self.status}"
         every = self.parameters.items()
         common = {n: p for n, p in every if p.kind != "fixed" and n not in NUISANCE}

@@ -1,4 +1,4 @@
-"""What a fit found: the sentences that begin every report, the terminal and the HTML report."""
+"""Conclusions, terminal output and HTML report of a fit."""
 
 from __future__ import annotations
 
@@ -23,60 +23,55 @@ CURVES = {
     "stress_strain": "stress-strain",
 }
 ANSWERS = {True: "yes", False: "no", None: "–"}
-# Lines of the screen of a fit (two more say where the result is), and lines kept for warnings.
-LINES, COLUMNS, WARNING_LINES = 22, 80, 3
-LONGEST = 180  # characters of the reasons for a state; longer ones are left to the report
+LINES, COLUMNS = 22, 80  # screen of a fit; two more lines state where the result is
+WARNING_LINES = 3  # kept for warnings
+LONGEST = 180  # characters of the reasons for a state; longer ones appear only in the report
 
 
 def summary_text(result: Fit, *, verbose: bool = False) -> str:
-    """Return what the command prints after a fit: one screen of 80 columns and 24 lines.
+    """Return the text that the command prints after a fit: one screen of 80 columns and 24 lines.
 
-    Parameters that are not determined, and those of the record, stand in a line where the table has
-    no room for them; if it still has none, several parameters stand side by side without their
-    intervals. Warnings are cut. `verbose` prints all of that, and what else is only in the
-    report: the ladder, the reasons of each state, the checklist and the notes.
+    If the table is too long, parameters that are not determined and those of the record are moved
+    to a line below; if it is still too long, several parameters are set side by side without
+    intervals. Warnings are cut. With `verbose` nothing is cut, and the ladder, the reason of each
+    state, the checklist and the notes are added.
     """
     ladder, measured = result.ladder, result.measurement
     rows = [readable(name, p) for name, p in result.parameters.items()]
-    given: dict[str, Any] = {
+    values: dict[str, Any] = {
         "result": result,
         "m": measured,
         "ladder": ladder,
-        "shown": [(name, percent(off)) for name, off in compared(result).items()],
+        "shown": [(name, percent(misfit)) for name, misfit in compared(result).items()],
         "fixed": [f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed"],
         "determined": determined(result),
         "unknown": _unknown({n: p for n, p in result.parameters.items() if n not in NUISANCE}),
     }
-    *lines, following = _screen(result, rows, given, verbose=verbose)
+    *lines, last = _screen(result, rows, values, verbose=verbose)
     if verbose:
-        more = {
-            "rows": rows,
-            "conclusions": conclusions(result),
-            "answers": ANSWERS,
-            **tables(result),
-        }
-        lines.append("\n" + words("summary", **more, **given) + "\n")
-    return "\n".join([*lines, following])
+        values |= {"rows": rows, "conclusions": conclusions(result), "answers": ANSWERS}
+        lines.append("\n" + words("summary", **values, **tables(result)) + "\n")
+    return "\n".join([*lines, last])
 
 
 def _screen(
-    result: Fit, rows: list[Readable], given: dict[str, Any], *, verbose: bool
+    result: Fit, rows: list[Readable], values: dict[str, Any], *, verbose: bool
 ) -> Iterator[str]:
-    """Give the lines that have room on one screen, with `verbose` all."""
-    head = words("short", part="head", **given).split("\n")
+    """Yield the lines that fit on one screen, or all lines with `verbose`."""
+    head = words("short", part="head", **values).split("\n")
     head = [line for one in head for line in wrapped(one, 2, COLUMNS)[:2]]
     states = [w for check in result.checklist if check.key == "determined" for w in check.warnings]
     warnings = [one for one in result.warnings if verbose or one not in states]
     varied = [row for row in rows if row.state != "fixed"]
-    sure = [row for row in varied if row.state != "not determined"]
-    springs = [row for row in sure if row.name not in NUISANCE]
+    estimated = [row for row in varied if row.state != "not determined"]
+    springs = [row for row in estimated if row.name not in NUISANCE]
     lines, kept = 10**6 if verbose else LINES, min(len(warnings), WARNING_LINES)
-    stages = [(varied, True, 1), (varied, False, 1), (sure, False, 1)]
+    stages = [(varied, True, 1), (varied, False, 1), (estimated, False, 1)]
     for shown, whole, across in [*stages, *((springs, False, i) for i in (1, 2, 3))]:
         left = [row for row in varied if row not in shown and row.name in NUISANCE]
         record = [f"{row.label} {row.with_unit(row.with_error)}" for row in left]
         more = {"whole": whole, "stated": across == 1, "of_record": record}
-        foot = words("short", part="foot", **more, **given).split("\n")
+        foot = words("short", part="foot", **more, **values).split("\n")
         table = aligned(_table(shown, short=not verbose, across=across)) if shown else []
         room = lines - len(head) - len(foot) - len(table) - 1
         if room >= kept:
@@ -90,9 +85,9 @@ def _screen(
 
 
 def _table(rows: list[Readable], *, short: bool, across: int) -> list[list[str]]:
-    """Table of parameters, its head first; in `short` the range takes the place of the error.
+    """Return a table of parameters, head first; in a `short` one the range replaces the error.
 
-    Several parameters `across` have their values alone, with errors where two have room.
+    With several parameters `across` only values are shown, or values with errors for two.
     """
     ranged = any(row.range for row in rows)
     bare = across == 3 or (across == 1 and short and ranged)
@@ -103,12 +98,12 @@ def _table(rows: list[Readable], *, short: bool, across: int) -> list[list[str]]
         columns |= {"95 % interval": "interval"} | ({"range": "range"} if ranged else {})
         columns |= {"state": "state"}
     tall = -(-len(rows) // across)
-    every = [
-        [getattr(one, column) for one in rows[row::tall] for column in columns.values()]
-        for row in range(tall)
+    lines = [
+        [getattr(row, column) for row in rows[line::tall] for column in columns.values()]
+        for line in range(tall)
     ]
     head = [*columns] * across
-    return [head, *([*cells, *[""] * (len(head) - len(cells))] for cells in every)]
+    return [head, *([*cells, *[""] * (len(head) - len(cells))] for cells in lines)]
 
 
 def _cut(line: str) -> str:
@@ -116,19 +111,19 @@ def _cut(line: str) -> str:
 
 
 def _fitting(warnings: list[str], room: int) -> list[str]:
-    """Return the warnings in `room` lines: the last ones are cut, then left out."""
-    told = [wrapped(f"warning: {warning}", 2, COLUMNS) for warning in warnings]
-    for i in reversed(range(len(told))):
-        if sum(map(len, told)) > room:
-            told[i] = [_cut(f"warning: {warnings[i]}")]
-    if len(told) > room:
-        more = counted(len(told) - room + 1, "more warning")
-        told[room - 1 :] = [[f"and {more}: see the report, or --verbose"]]
-    return [line for lines in told for line in lines]
+    """Return the warnings in `room` lines: the last ones are cut, then omitted."""
+    paragraphs = [wrapped(f"warning: {warning}", 2, COLUMNS) for warning in warnings]
+    for i in reversed(range(len(warnings))):
+        if sum(map(len, paragraphs)) > room:
+            paragraphs[i] = [_cut(f"warning: {warnings[i]}")]
+    if len(warnings) > room:
+        more = counted(len(warnings) - room + 1, "more warning")
+        paragraphs[room - 1 :] = [[f"and {more}: see the report, or --verbose"]]
+    return [line for lines in paragraphs for line in lines]
 
 
 def misfits(result: Fit) -> dict[str, float | None]:
-    """Return the misfits by the names of their curves, interior masses last."""
+    """Return the misfits by the name of the curve, interior masses last."""
     names = CURVES | {
         f"{interior_channel(i)}_time": f"displacement-time of mass {i}"
         for i in result.curves.interior
@@ -138,30 +133,30 @@ def misfits(result: Fit) -> dict[str, float | None]:
 
 def compared(result: Fit) -> dict[str, float]:
     """Return the misfits of the curves that are compared."""
-    return {name: off for name, off in misfits(result).items() if off is not None}
+    return {name: misfit for name, misfit in misfits(result).items() if misfit is not None}
 
 
 def conclusions(result: Fit) -> tuple[str, ...]:
-    """Say in three sentences how well the model fits, what is known, and what is not.
+    """Return sentences on the quality of the fit and on determined and undetermined parameters.
 
-    Further sentences say what the ± of the TOML add and, for microscale springs and relaxation,
-    what the identified law does.
+    Further sentences state the effect of the ± of the TOML and, for microscale springs and
+    relaxation, the behaviour of the identified law.
     """
     shown = compared(result)
-    timed = {name: off for name, off in shown.items() if name != CURVES["stress_strain"]} or shown
+    timed = {name: x for name, x in shown.items() if name != CURVES["stress_strain"]} or shown
     springs = {name: p for name, p in result.parameters.items() if name not in NUISANCE}
-    found = {name: p for name, p in springs.items() if p.state == "determined"}
+    certain = {name: p for name, p in springs.items() if p.state == "determined"}
     widths = {  # half of the 95 % interval over the value
         name: 0.5 * (p.ci95[1] - p.ci95[0]) / abs(p.value)
-        for name, p in found.items()
+        for name, p in certain.items()
         if p.ci95 is not None and p.value and math.isfinite(p.ci95[1] - p.ci95[0])
     }
     ends = dict.fromkeys(choose(widths, key=widths.__getitem__) for choose in (min, max) if widths)
     return sentences(
         "conclusions",
         result=result,
-        followed=[(name, percent(off)) for name, off in timed.items()],
-        determined=len(found),
+        followed=[(name, percent(misfit)) for name, misfit in timed.items()],
+        determined=len(certain),
         varied=sum(p.vary for p in springs.values()),
         widths=[(name, percent(widths[name])) for name in ends],
         unknown=_unknown(springs),
@@ -175,29 +170,29 @@ def conclusions(result: Fit) -> tuple[str, ...]:
 
 
 def determined(result: Fit) -> str:
-    """Say how many of the springs' parameters are determined, "" if none is varied."""
+    """Return how many parameters of the springs are determined, in words; "" if none is varied."""
     varied = [p for name, p in result.parameters.items() if p.vary and name not in NUISANCE]
     found = sum(p.state == "determined" for p in varied)
     return f"{found} of {len(varied)} determined" if varied else ""
 
 
 def _unknown(parameters: dict[str, ParameterEstimate]) -> dict[str, dict[str, list[str]]]:
-    """Group the parameters that are not determined, or weakly, by their state and its reason."""
-    found = dict[str, dict[str, list[str]]]()
+    """Group the weak and undetermined parameters by state and reason."""
+    grouped = dict[str, dict[str, list[str]]]()
     for state in ("not determined", "weak"):
         every = {name: p.why for name, p in parameters.items() if p.state == state}
         reasons = dict.fromkeys(every.values())
         groups = {why: [name for name, own in every.items() if own == why] for why in reasons}
-        told = "; ".join(f"{', '.join(names)} ({why})" for why, names in groups.items())
-        if len(told) > LONGEST:
-            groups = {"see why in the report": list(every)}
+        text = "; ".join(f"{', '.join(names)} ({why})" for why, names in groups.items())
+        if len(text) > LONGEST:
+            groups = {"reasons in the report": list(every)}
         if groups:
-            found[state] = groups
-    return found
+            grouped[state] = groups
+    return grouped
 
 
 def _moved(result: Fit) -> tuple[str, float] | None:
-    """Return the parameter that the unfitted ± of the TOML move most, and by which share."""
+    """Return the parameter most affected by the unfitted ± of the TOML, and its relative change."""
     if (budget := result.budget) is None or not budget.contributions:
         return None
     shares = {
@@ -209,24 +204,21 @@ def _moved(result: Fit) -> tuple[str, float] | None:
 
 
 def tables(result: Fit) -> dict[str, list[list[str]]]:
-    """Return the cells of the tables of cycles and of compared models; [] where there are none."""
-    found, ladder = result.by_cycle, result.ladder
+    """Return the cells of the tables of cycles and of compared models; [] if there are none."""
+    cycles, ladder = result.by_cycle, result.ladder
     return {
-        "cycles": table("by_cycle", found=found) if found else [],
+        "cycles": table("by_cycle", found=cycles) if cycles else [],
         "ladder_rows": table("ladder", ladder=ladder) if ladder else [],
     }
 
 
 def render_report(result: Fit, figures: Mapping[str, Images | None] | None = None) -> str:
-    """Return the report as one self-contained HTML page.
-
-    `figures` are those of `draw_all`, if they are drawn already.
-    """
+    """Return the report as a self-contained HTML page; `figures` are those of `draw_all`."""
     drawn = dict(draw_all(result)) if figures is None else figures
     plain, springs, insight = result.to_json_dict(), result.springs, result.insight
     parts, shares = ((), None) if insight is None else (insight.parts, insight.shares())
     correlation = None if insight is None else insight.correlation
-    if result.correlation is not None:  # better known
+    if result.correlation is not None:  # more accurate
         correlation = result.correlation.matrix
     return page(
         "report",

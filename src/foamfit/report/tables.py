@@ -29,41 +29,41 @@ _TEXT = {letter: f"${name.strip()}$" for letter, name in _MATH.items()}
 _TEXT |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
 _TEXT |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _TEXT |= {"–": "--", "…": r"\dots{}"} | {letter: f"${letter}$" for letter in "<>|"}
-_TEXT |= {letter: f"{{{letter}}}" for letter in "[]*"}  # at the start of a row they are options
-_LAST_LETTER = "ſ"  # that pdfLaTeX sets without further packages
-# Misfits in a table with a row for each test.
+_TEXT |= {letter: f"{{{letter}}}" for letter in "[]*"}  # options at the start of a row
+_LAST_LETTER = "ſ"  # last letter that pdfLaTeX sets without further packages
+# Names of the misfits in a table with one row per test.
 MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
 Parameters = Mapping[str, ParameterEstimate]
 ByTest = Mapping[str, Sequence[ParameterEstimate | None]]
 
 
-def escaped(told: object) -> str:
-    """Escape a text for LaTeX; "?" stands for a letter that its fonts lack."""
-    letters = (c if c.isprintable() else " " for c in str(told))
+def escaped(text: object) -> str:
+    """Escape a text for LaTeX; "?" replaces letters that its fonts lack."""
+    letters = (c if c.isprintable() else " " for c in str(text))
     return "".join(_TEXT.get(c, c if c <= _LAST_LETTER else "?") for c in letters)
 
 
 def formula(pair: tuple[str, str]) -> str:
     """Return a symbol and its index as LaTeX: `$k_{0,1}$`."""
     stem, index = pair
-    if len(stem) > 2:  # the name of a parameter that has no symbol
+    if len(stem) > 2:  # the name of a parameter without a symbol
         return rf"$\mathrm{{{escaped(stem)}}}$"
     stem, index = ("".join(_MATH.get(c, c) for c in part).strip() for part in pair)
-    index = re.sub(r"[a-z]{2,}", lambda word: rf"\mathrm{{{word[0]}}}", index)  # upright
+    index = re.sub(r"[a-z]{2,}", lambda word: rf"\mathrm{{{word[0]}}}", index)  # words upright
     return f"${stem}_{{{index}}}$" if index else f"${stem}$"
 
 
-def numbers(told: str) -> str:
+def numbers(text: str) -> str:
     """Return "5.50 ± 0.01" or "1 to 2" as LaTeX."""
-    told = re.sub(r"e\+?(-?)0*(\d+)", r"\\times 10^{\1\2}", told.replace("−", "-"))
-    told = re.sub(r"(\S+) ± (\S+times \S+)", r"\1 \\pm (\2)", told)
-    return " to ".join(f"${one.replace('±', chr(92) + 'pm')}$" for one in told.split(" to ") if one)
+    text = re.sub(r"e\+?(-?)0*(\d+)", r"\\times 10^{\1\2}", text.replace("−", "-"))
+    text = re.sub(r"(\S+) ± (\S+times \S+)", r"\1 \\pm (\2)", text)
+    return " to ".join(f"${one.replace('±', chr(92) + 'pm')}$" for one in text.split(" to ") if one)
 
 
 def parameters_tex(parameters: Parameters, **more: Any) -> str:
-    """Return table.tex of a fit: a row for each parameter that is not held at zero.
+    """Return table.tex of a fit, with a row for each parameter that is not fixed at zero.
 
-    `more` may hold `kinds` and `between` of a joint fit, by the name of the parameter.
+    `more` may contain `kinds` and `between` of a joint fit, by the name of the parameter.
     """
     shown = {n: p for n, p in parameters.items() if p.state != "fixed" or p.value}
     rows = list(zip(symbols(shown), itertools.starmap(readable, shown.items()), strict=True))
@@ -71,30 +71,30 @@ def parameters_tex(parameters: Parameters, **more: Any) -> str:
 
 
 def names_of(each: Iterable[Parameters]) -> list[str]:
-    """Return the names of the parameters of any test, those of the springs first."""
+    """Return the names of the parameters of all tests, those of the springs first."""
     return springs_first(name for one in each for name in one)
 
 
 def varied(each: Sequence[Parameters]) -> dict[str, list[ParameterEstimate | None]]:
-    """Return the parameters that any test varied, of all tests; None where a test has no value."""
+    """Return, for each parameter varied in any test, its values in all tests; None if missing."""
     out = dict[str, list[ParameterEstimate | None]]()
     for name in names_of(each):
-        there = (one.get(name) for one in each)
-        known = [p if p is not None and np.isfinite(p.value) else None for p in there]
-        if any(p is not None and p.vary for p in known):
-            out[name] = known
+        values = (one.get(name) for one in each)
+        finite = [p if p is not None and np.isfinite(p.value) else None for p in values]
+        if any(p is not None and p.vary for p in finite):
+            out[name] = finite
     return out
 
 
 def with_head(rows: Iterable[Mapping[str, object]]) -> Iterator[Iterable[object]]:
-    """Give the names of the columns of a table, then the cells of each row."""
+    """Yield the column names of a table, then the cells of each row."""
     for i, row in enumerate(rows):
         yield from ([row] if i == 0 else [])
         yield row.values()
 
 
 def wide(each: Sequence[Parameters]) -> Iterator[dict[str, Any]]:
-    """Give the parameters of each test as a row of a table, SI; None where there is nothing."""
+    """Yield the parameters of each test as a row of a table, in SI; None for missing values."""
     names = names_of(each)
     for parameters in each:
         row = dict[str, Any]()
@@ -106,7 +106,7 @@ def wide(each: Sequence[Parameters]) -> Iterator[dict[str, Any]]:
 
 
 def by_test(tests: Sequence[str], parameters: ByTest) -> dict[str, Any]:
-    """Return heads and rows of a table: a row for each test, for each parameter a column."""
+    """Return heads and rows of a table with one row per test and one column per parameter."""
     heads, cells = [], []
     for own, (name, each) in zip(symbols(parameters), parameters.items(), strict=True):
         factor, unit = unit_of_all(each)
@@ -116,23 +116,23 @@ def by_test(tests: Sequence[str], parameters: ByTest) -> dict[str, Any]:
 
 
 def by_test_tex(first: str, tests: Sequence[str], parameters: ByTest) -> str:
-    """Return a table of `by_test` as LaTeX; `first` is the head of its first column."""
+    """Return a table of `by_test` as LaTeX; `first` is the head of the first column."""
     return _tex("by_test", first=first, **by_test(tests, parameters))
 
 
 def symbols(names: Iterable[str]) -> list[tuple[str, str]]:
-    """Return the symbols of parameters, without the spring where there is only one."""
+    """Return the symbols of parameters, without the spring if there is only one."""
     names = list(names)
     springs = 1 + any(name.startswith("s2_") for name in names)
     return [own_symbol(name, springs) for name in names]
 
 
 def unit_of_all(each: Iterable[ParameterEstimate | None]) -> tuple[float, str]:
-    """Return factor and name of the unit in which the values of several tests read well."""
-    there = [one for one in each if one is not None and np.isfinite(one.value)]
-    known = [one for one in there if one.state != "not determined"] or there
+    """Return factor and name of a suitable unit for the values of several tests."""
+    finite = [one for one in each if one is not None and np.isfinite(one.value)]
+    known = [one for one in finite if one.state != "not determined"] or finite
     size = float(np.median([abs(one.value) for one in known])) if known else 0.0
-    return readable_unit(size, there[0].unit if there else "")
+    return readable_unit(size, finite[0].unit if finite else "")
 
 
 def _tex(name: str, **values: Any) -> str:
@@ -141,7 +141,7 @@ def _tex(name: str, **values: Any) -> str:
 
 
 def frame(parameters: Mapping[str, Any], **more: Mapping[str, Any]) -> pd.DataFrame:
-    """Return a row for each parameter, SI; `more` are further columns by the name of parameters."""
+    """Return a row for each parameter, in SI; `more` are further columns, by parameter."""
     made: pd.DataFrame = _frame_type()(_rows(parameters, more))
     return made.set_index("parameter")
 
@@ -155,15 +155,16 @@ def _rows(parameters: Mapping[str, Any], more: Mapping[str, Any]) -> Iterator[di
 
 
 def numbers_of(p: Any) -> dict[str, float | None]:
-    """Return the numbers of a parameter by the names of their columns, SI; None = not there."""
+    """Return the numbers of a parameter by column name, in SI; None for missing values."""
     (low, high), (least, most) = p.ci95 or (None, None), p.range or (None, None)
     ends = {"ci95_low": low, "ci95_high": high, "range_low": least, "range_high": most}
-    systematic = getattr(p, "systematic", None)  # which a joint fit does not tell
-    return {"value": p.value, "stderr": p.stderr, **ends, "systematic": systematic}
+    # A joint fit does not compute `systematic`.
+    ends |= {"systematic": getattr(p, "systematic", None)}
+    return {"value": p.value, "stderr": p.stderr, **ends}
 
 
 def stacked(frames: Mapping[Any, pd.DataFrame], name: str) -> pd.DataFrame:
-    """Return tables of several tests below each other."""
+    """Concatenate the tables of several tests; `name` is that of the new index level."""
     import pandas as pd
 
     made: pd.DataFrame = _frame_type()(pd.concat(frames, names=[name]))
@@ -182,7 +183,7 @@ def _frame_type() -> Any:
             return Table
 
         def to_latex(self, *args: Any, **options: Any) -> Any:
-            """Return the table as LaTeX with booktabs; arguments as those of pandas."""
+            """Return the table as LaTeX with booktabs; arguments are those of pandas."""
             texts = self.columns.difference(["symbol"])
             plain = pd.DataFrame(self).assign(**{name: self[name].map(_cell) for name in texts})
             names = [escaped(name or "") for name in plain.index.names]

@@ -1,1 +1,1 @@
-"""What a person reads of several tests at once: tables, pages and pictures of `foamfit.study`."""
+"""Output for several tests at once: tables, pages and figures of `foamfit.study`."""

@@ -1,4 +1,4 @@
-"""The summary of a batch: a row for each test, as CSV and as an HTML page."""
+"""Summary of a batch, one row per test, as CSV and as an HTML page."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ _STATUS = {
     OPEN: "not fitted yet",
 }
 MOST_ON_PAGE = 5000
-_MOST_REFUSALS = 20  # that the terminal names
+_MOST_REFUSALS = 20  # named on the terminal
 
 
 @dataclass(frozen=True)
 class Row:
-    """What a batch knows of one test, or of one cycle of it; `test` is its folder."""
+    """Result of one test of a batch, or of one cycle of it; `test` is its folder."""
 
     test: str
     file: str
@@ -67,12 +67,12 @@ class Row:
 
 
 def row_of(test: str, file: str, result: Fit) -> Row:
-    """Make the row of a fit."""
+    """Return the row of a fit."""
     error = None
     if result.status == "failed":
         fatal = (check for check in result.checklist if check.fatal and check.answer is False)
-        told = [w for check in fatal for w in (check.warnings or (check.sentence,))]
-        error = " ".join(["no acceptable fit was found:", *(told or result.warnings)[:1]])
+        reasons = [w for check in fatal for w in (check.warnings or (check.sentence,))]
+        error = " ".join(["no acceptable fit was found:", *(reasons or result.warnings)[:1]])
     misfit, runtime = plain(result.misfit), plain(result.runtime_s)
     return Row(test, file, result.status, error, misfit, runtime, result.parameters)
 
@@ -81,7 +81,7 @@ def row_of(test: str, file: str, result: Fit) -> Row:
 
 
 def table_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Rows of summary.csv: SI, one for each test, None = not there."""
+    """Return the rows of summary.csv in SI, one per test; None for missing values."""
     return [
         {name: getattr(row, name) for name in ("test", "file", "status", "error")}
         | {f"misfit_{name}": row.misfit.get(name) for name in CURVES}
@@ -91,7 +91,7 @@ def table_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def table(rows: Sequence[Row]) -> pd.DataFrame:
-    """The rows of summary.csv as pandas reads them."""
+    """Return the rows of summary.csv as a data frame."""
     return _frame(table_rows(rows))
 
 
@@ -102,7 +102,7 @@ def read_table(path: Path) -> pd.DataFrame:
         head, *rows = ([re.sub("^'(?=[=+@-])", "", one) or None for one in row] for row in cells)
         return _frame([dict(zip(head, row, strict=True)) for row in rows])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} is no summary of a batch: {error}") from None
+        raise InputError(f"{path} is not the summary of a batch: {error}") from None
 
 
 def _frame(rows: list[dict[Any, Any]]) -> pd.DataFrame:
@@ -114,37 +114,37 @@ def _frame(rows: list[dict[Any, Any]]) -> pd.DataFrame:
 
 
 def write_summary(rows: Sequence[Row], folder: Path) -> None:
-    """Write summary.csv whole."""
+    """Write summary.csv."""
     write_file(folder / "summary.csv", csv_bytes(with_head(table_rows(rows))))
 
 
 def counts_in_words(rows: Sequence[Row]) -> str:
-    """Say how many tests there are and what became of them."""
-    found = Counter(row.status for row in rows)
-    parts = [f"{found[status]} {told}" for status, told in _STATUS.items() if found[status]]
-    told = counted(len({row.test.partition("/")[0] for row in rows}), "test")
+    """Return the numbers of tests, of cycles and of each status in words."""
+    number = Counter(row.status for row in rows)
+    parts = [f"{number[status]} {label}" for status, label in _STATUS.items() if number[status]]
+    total = counted(len({row.test.partition("/")[0] for row in rows}), "test")
     if cycles := sum("/" in row.test for row in rows):
-        told += f", {counted(cycles, 'cycle')}"
-    return f"{told}: {listed(parts)}" if parts else "no test"
+        total += f", {counted(cycles, 'cycle')}"
+    return f"{total}: {listed(parts)}" if parts else "no test"
 
 
 def summary_words(rows: Sequence[Row]) -> str:
-    """Return what the command prints of a batch.
+    """Return the text that the command prints for a batch.
 
-    Its table has median and quartiles over the tests of each parameter that any test varied.
+    Its table contains median and quartiles over the tests for each varied parameter.
     """
-    wrong, known = [row for row in rows if not row.has_fit], list[Any]()
+    wrong, parameters = [row for row in rows if not row.has_fit], list[Any]()
     for name, each in varied([row.parameters for row in rows if row.has_fit]).items():
-        there = [p for p in each if p is not None]
-        factor, unit = unit_of_all(there)
-        middle = np.quantile([p.value / factor for p in there], [0.5, 0.25, 0.75])
-        known.append((name, middle, unit, [p.state for p in there]))
+        present = [p for p in each if p is not None]
+        factor, unit = unit_of_all(present)
+        quartiles = np.quantile([p.value / factor for p in present], [0.5, 0.25, 0.75])
+        parameters.append((name, quartiles, unit, [p.state for p in present]))
     return words(
         "batch",
         counts=counts_in_words(rows),
         wrong=wrong[:_MOST_REFUSALS],
         more=max(len(wrong) - _MOST_REFUSALS, 0),
-        parameters=known,
+        parameters=parameters,
     )
 
 
@@ -154,9 +154,9 @@ def summary_words(rows: Sequence[Row]) -> str:
 def write_comparison(
     rows: Sequence[Row], folder: Path, title: str, *, width: str, pictures: bool
 ) -> bytes | None:
-    """Write summary.tex, and summary.png and .pdf if wanted: the parameters of all tests.
+    """Write the parameters of all tests as summary.tex and, with `pictures`, as figures.
 
-    Returns the picture of the page, two columns wide.
+    Return the PNG, if there is one.
     """
     fitted = [row for row in rows if row.has_fit]
     tests = [row.test for row in fitted]
@@ -175,12 +175,12 @@ def write_comparison(
 
 
 def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | None = None) -> None:
-    """Write summary.html whole, with a picture (PNG): one file that needs nothing else."""
+    """Write summary.html, a self-contained page, with a figure (PNG)."""
     shown = rows
     if len(rows) > MOST_ON_PAGE:  # tests without a fit are always shown
         first = {id(row) for row in rows[:MOST_ON_PAGE]}
         shown = [row for row in rows if id(row) in first or not row.has_fit][: 2 * MOST_ON_PAGE]
-    measured = {name for row in shown for name, off in row.misfit.items() if off is not None}
+    measured = {name for row in shown for name, x in row.misfit.items() if x is not None}
     text = page(
         "summary",
         title=title,
@@ -189,7 +189,7 @@ def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | N
         total=len(rows),
         reports=[(folder / row.test / "report.html").is_file() for row in shown],
         parameters=by_test([row.test for row in shown], varied([row.parameters for row in shown])),
-        misfits={curve: told for curve, told in MISFITS.items() if curve in measured},
+        misfits={curve: name for curve, name in MISFITS.items() if curve in measured},
         picture=picture,
     )
     write_file(folder / "summary.html", text.encode("utf-8", "replace"))

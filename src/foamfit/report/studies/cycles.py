@@ -1,4 +1,4 @@
-"""The fits of a record's cycles: what they say, their folder, table and picture."""
+"""Fits of the cycles of a record: folder, table, text and figure."""
 
 from __future__ import annotations
 
@@ -20,14 +20,7 @@ from foamfit.report.render import words
 from foamfit.report.shown import Shown, brief
 from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
 from foamfit.report.summary import CURVES
-from foamfit.report.tables import (
-    by_test,
-    by_test_tex,
-    frame,
-    stacked,
-    varied,
-    wide,
-)
+from foamfit.report.tables import by_test, by_test_tex, frame, stacked, varied, wide
 from foamfit.results import Fit, ParameterEstimate, plain
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent
@@ -42,9 +35,9 @@ if TYPE_CHECKING:
 SCHEMA = 1
 ENERGY = "dissipated_energy"
 MOST_LOOPS = 12
-MOST_NAMES = 12  # of parameters on the terminal; those of a chain are in cycles.csv
+MOST_NAMES = 12  # more parameters than this are not printed; all are in cycles.csv
 DPI = 200
-# Panels beside the parameters: columns of cycles.csv (SI), and what these are multiplied with.
+# Panels next to the parameters: columns of cycles.csv (SI), and their factors.
 BY_CYCLE = {
     "start\nstrain (%)": ("start_strain", 100.0),
     "dissipated\n(kJ/m³)": ("dissipated_energy", 1e-3),
@@ -56,20 +49,20 @@ BY_CYCLE = {
 class CycleFits(Shown):
     """Fits of the cycles of one record."""
 
-    test: str  #: Names of the test and of the model
-    model: str
+    test: str  #: Name of the test
+    model: str  #: Name of the model
     recorded: tuple[int, ...]  #: Numbers of all cycles in the record
-    results: dict[int, Fit]  #: Of each cycle that could be read and fitted
-    refused: dict[int, str]  #: Why the others could not, one sentence each
+    results: dict[int, Fit]  #: Fit of each cycle that could be read and fitted
+    refused: dict[int, str]  #: Reason for each of the other cycles, one sentence
 
     @property
     def varied(self) -> dict[str, list[ParameterEstimate | None]]:
-        """The parameters of the springs that vary in any fit, by cycle in ascending order."""
+        """Parameters of the springs that vary in any fit, with their values in ascending cycles."""
         every = varied([one.parameters for _, one in sorted(self.results.items())])
         return {name: each for name, each in every.items() if name not in NUISANCE}
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """Rows of cycles.csv: SI, one for each cycle, None = not there."""
+        """Yield the rows of cycles.csv in SI, one per cycle; None for missing values."""
         every = {n: self.results.get(n) for n in sorted({*self.results, *self.refused})}
         parameters = wide([{} if one is None else one.parameters for one in every.values()])
         names = ["start_strain", "peak_strain", "peak_stress", ENERGY]
@@ -84,8 +77,8 @@ class CycleFits(Shown):
                 stress = None if m.stress is None else m.stress.max()
                 cells = [m.start_strain, strain, stress, one.energy.get(ENERGY)]
                 cells += map(one.misfit.get, CURVES)
-            told = {"status": status, "error": self.refused.get(number)}
-            yield {"cycle": number, **dict(zip(names, plain(cells), strict=True)), **told, **own}
+            row = {"cycle": number, **dict(zip(names, plain(cells), strict=True))}
+            yield row | {"status": status, "error": self.refused.get(number), **own}
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of cycles.json, in plain types."""
@@ -102,29 +95,28 @@ class CycleFits(Shown):
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the loops of all cycles, measured and fitted, into axes or a new figure."""
-        found = ((n, one.loop) for n, one in sorted(self.results.items()))
-        loops = (loop._replace(name=f"cycle {n}") for n, loop in found if loop is not None)
+        every = ((n, one.loop) for n, one in sorted(self.results.items()))
+        loops = (loop._replace(name=f"cycle {n}") for n, loop in every if loop is not None)
         return draw_loops(loops, ax)
 
     def table(self) -> pd.DataFrame:
-        """Return a row for each cycle and parameter, SI; `to_latex` of it compiles."""
+        """Return a row for each cycle and parameter, in SI; the output of `to_latex` compiles."""
         results = sorted(self.results.items())
         return stacked({n: frame(one.parameters) for n, one in results}, "cycle")
 
     @property
     def by_cycle(self) -> pd.DataFrame:
-        """Return the rows of cycles.csv, indexed by the cycle."""
+        """The rows of cycles.csv, indexed by cycle."""
         import pandas as pd
 
         return pd.DataFrame(list(self.rows())).set_index("cycle")
 
     def _shown(self, *, html: bool = False) -> str:
-        """Return how many cycles were fitted and their misfits; in HTML their parameters too."""
-        line = (
-            f"{self.model} · {len(self.results)} of {counted(len(self.recorded), 'cycle')} fitted"
-        )
-        each = (one.misfit.get("stress_strain") for one in self.results.values())
-        if known := [off for off in each if off is not None]:
+        """Return the number of fitted cycles and their misfits; in HTML also their parameters."""
+        cycles = counted(len(self.recorded), "cycle")
+        line = f"{self.model} · {len(self.results)} of {cycles} fitted"
+        misfits = (one.misfit.get("stress_strain") for one in self.results.values())
+        if known := [misfit for misfit in misfits if misfit is not None]:
             line += f" · misfit {percent(min(known))} to {percent(max(known))}"
         table = by_test(list(map(str, sorted(self.results))), self.varied) if html else {}
         return brief(self.test, line, [], html, table and {"first": "cycle", **table})
@@ -137,21 +129,21 @@ class CycleFits(Shown):
         figure_width: str = TWO,
         mapped: Mapped = map,
     ) -> Path:
-        """Write ``cycle-<n>/``, cycles.csv, cycles.png and cycles.json whole; returns the folder.
+        """Write ``cycle-<n>/``, cycles.csv, cycles.png and cycles.json; return the folder.
 
-        An older result there is replaced as a whole, at the end. Without `report` there are tables
-        alone. Figures are "one" or "two" columns wide, or as wide as a length ("85 mm"); `mapped`
-        draws those of the cycles, as the `map` of an executor does.
+        A complete new result replaces an older one. Without `report` only tables are written. The
+        width of figures is "one" or "two" columns or a length such as "85 mm"; `mapped`, such as
+        the `map` of an executor, draws the figures of the cycles.
         """
-        figures.inches(figure_width)  # refuses what is no width
-        drawn: Any = {"pages": report, "width": figure_width, "mapped": mapped}
-        return save_whole(folder, partial(write_cycles, self, **drawn))
+        figures.inches(figure_width)  # reject an invalid width
+        options: Any = {"pages": report, "width": figure_width, "mapped": mapped}
+        return save_whole(folder, partial(write_cycles, self, **options))
 
 
 def write_cycles(
     found: CycleFits, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
 ) -> None:
-    """Write all files of the cycles into a folder that is there; reports and pictures if wanted."""
+    """Write all files of the cycles into an existing folder; figures only with `pages`."""
     for number, result in found.results.items():
         inner = folder / f"cycle-{number}"
         inner.mkdir()
@@ -165,15 +157,15 @@ def write_cycles(
 
 
 def cycles_text(found: CycleFits) -> str:
-    """Return what the command prints of the cycles of a record."""
+    """Return the text that the command prints for the cycles of a record."""
     names = list(found.varied) if len(found.varied) <= MOST_NAMES else []
     return words("cycles", found=found, names={name: own_name(name, found.model) for name in names})
 
 
 def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
-    """Draw the loops over each other, and start strain, energy, misfit and parameters by cycle.
+    """Draw all loops in one panel, and start strain, energy, misfit and parameters by cycle.
 
-    For the parameters and `width` see `plot_parameters`; of very many loops some are drawn.
+    For the parameters and `width` see `plot_parameters`. At most `MOST_LOOPS` loops are drawn.
     """
     results = dict(sorted(found.results.items()))
     loops = [

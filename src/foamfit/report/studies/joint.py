@@ -1,4 +1,4 @@
-"""A joint fit: what the command prints, its page and picture, its folder with one per test."""
+"""Joint fit: text, page and figures, and its folder with a folder per test."""
 
 from __future__ import annotations
 
@@ -29,23 +29,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-DPI = 180  # of the picture
+DPI = 180  # of the figures
 MOST_ROWS = 60  # of the table of tests on the terminal
-# Columns of the picture, and inches of a loop and of a parameter.
-LOOPS, LOOP, COLUMNS, PANEL = 6, (1.25, 1.15), 3, (2.5, 1.6)
-LEAST_LOOP, LEAST_PANEL, ROOMY = 1.05, 1.55, 2.1  # in
+LOOPS, LOOP = 6, (1.25, 1.15)  # loops per row, and size of a loop in inches
+COLUMNS, PANEL = 3, (2.5, 1.6)  # parameters per row, and size of a panel in inches
+LEAST_LOOP, LEAST_PANEL = 1.05, 1.55  # least widths, inches
+ROOMY = 2.1  # width of a panel with room for a title in one line, inches
 MOST_LOOPS = 48
-SEVERAL_RATES = 1.5  # times the smallest rate; those of nominally equal tests differ by percents
-# Keys of a parameter that only some kinds have.
+SEVERAL_RATES = 1.5  # ratio of rates; those of nominally equal tests differ by a few percent
+# Keys that only some kinds of parameters have.
 _OF_SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
 _OF_RATE = ("b", "b_stderr", "b_ci95", "b_range")
 
 
 @dataclass(frozen=True)
 class TestValue:
-    """A parameter in one test, SI; None where the test says nothing of it."""
+    """A parameter in one test, in SI; None if the test does not determine it."""
 
-    __test__ = False  # what pytest must not take for a test
+    __test__ = False  # for pytest: this is not a test class
 
     value: float
     stderr: float | None
@@ -56,13 +57,13 @@ class TestValue:
 
 @dataclass(frozen=True)
 class JointParameter:
-    """One parameter of a joint fit, SI.
+    """One parameter of a joint fit, in SI.
 
-    `kind` is one of `links.KINDS` or "fixed". `value` is the common one: of a scattering parameter
-    the median specimen's, by a law of rate that at the rate of the median test, of an own one the
-    median over the tests (which has no error). `scatter` is the standard deviation of its logarithm
-    between specimens, `b` the slope of the law of rate. `tests` has its value in each test, unless
-    it is the same in all.
+    `kind` is one of `links.KINDS` or "fixed". `value` is the common value: for a scattering
+    parameter that of the median specimen, for a law of rate that at the rate of the median test,
+    for an own parameter the median over the tests (which has no error). `scatter` is the standard
+    deviation of its logarithm between specimens, `b` the slope of the law of rate. `tests` contains
+    the value in each test, unless it is the same in all.
     """
 
     kind: str
@@ -79,26 +80,24 @@ class JointParameter:
     b: float | None = None
     b_stderr: float | None = None
     b_ci95: tuple[float, float] | None = None
-    # What the error of the law leaves open of it (`joint_fit.ranges_of`); None where all is noise.
+    # Uncertainty including the error of the law (`joint_fit.ranges_of`); None if there is none.
     range: tuple[float, float] | None = None
     b_range: tuple[float, float] | None = None
 
     def estimate(self, test: str | None = None) -> ParameterEstimate:
-        """The common value, or that of a test, as the parameter of a fit."""
+        """Return the common value, or that of a test, as the parameter of a fit."""
         if test is None or self.tests is None:
-            told, span = (self.state or "", self.why or ""), self.range
-            return ParameterEstimate(
-                self.value, self.stderr, self.ci95, self.unit, True, *told, range=span
-            )
+            rest = (self.unit, True, self.state or "", self.why or "")
+            return ParameterEstimate(self.value, self.stderr, self.ci95, *rest, range=self.range)
         at = self.tests[test]
         return ParameterEstimate(at.value, at.stderr, at.ci95, self.unit, True, at.state, at.why)
 
     def to_json_dict(self) -> dict[str, Any]:
-        """Return its part of joint.json."""
-        gone = ["tests"] if self.tests is None else []
-        gone += [key for key in _OF_SCATTER if self.kind != "scatter"]
-        gone += [key for key in _OF_RATE if self.kind not in RATES]
-        return {key: value for key, value in asdict(self).items() if key not in gone}
+        """Return the entry of the parameter in joint.json."""
+        omitted = {"tests"} if self.tests is None else set[str]()
+        omitted.update(_OF_SCATTER if self.kind != "scatter" else ())
+        omitted.update(_OF_RATE if self.kind not in RATES else ())
+        return {key: value for key, value in asdict(self).items() if key not in omitted}
 
 
 def save_joint(
@@ -109,10 +108,10 @@ def save_joint(
     report: bool = True,
     width: str = TWO,
 ) -> Path:
-    """Write the folder whole, replacing an older result at the end; returns it.
+    """Write a result folder, which replaces an older one when complete; return its path.
 
     `each` maps a function over the tests, as `map` does; `width` is that of the figures. Without
-    `report` there are tables alone.
+    `report` only tables are written.
     """
 
     def write(fresh: Path) -> None:
@@ -125,23 +124,23 @@ def save_joint(
         )
         write_text(fresh / "table.tex", text)
         folders, n = [fresh / name for name in found.tests], len(found.tests)
-        # Where other processes make the folders, the pictures of all are drawn beside them.
-        made = each(_write_test, found.test_fits(), folders, [report] * n, [width] * n)
+        # If other processes write these folders, the common figures are drawn at the same time.
+        written = each(_write_test, found.test_fits(), folders, [report] * n, [width] * n)
         if report:
             pictures = []
             for name, draw in (("joint", plot_joint), ("parameters", plot_compared)):
                 png = figures.write_both(draw(found, width=width), fresh / name, DPI)
-                # The page is as wide as two columns.
+                # The page has room for two columns.
                 pictures.append(png if width == TWO else image(draw(found), "png", DPI))
             write_text(fresh / "joint.html", joint_page(found, *pictures))
-        for _ in made:
+        for _ in written:
             pass
 
     return save_whole(folder, write)
 
 
 def _of_springs(found: Joint) -> dict[str, JointParameter]:
-    """Parameters of the springs but for those that are held at zero."""
+    """Return the parameters of the springs except those fixed at zero."""
     every = found.parameters.items()
     return {n: p for n, p in every if n not in NUISANCE and (p.kind != "fixed" or p.value)}
 
@@ -151,38 +150,38 @@ def _write_test(one: Callable[[], Fit] | Fit, folder: Path, report: bool, width:
     write_result(one if isinstance(one, Fit) else one(), folder, pages=report, width=width)
 
 
-def _told(found: Joint) -> dict[str, Any]:
-    """Return what text and page have in common."""
+def _common(found: Joint) -> dict[str, Any]:
+    """Return the values that text and page have in common."""
     content = found.to_json_dict()
     tests, evidence = content["tests"].values(), dict[str, list[Mapping[str, Any]]]()
     for one in content["evidence"]:
         evidence.setdefault(one["parameter"], []).append(one)
-    known = {name for one in tests for name, off in one["misfit"].items() if off is not None}
+    known = {name for one in tests for name, x in one["misfit"].items() if x is not None}
     return {
         "found": content,
         "law": law_in_words(Model.of_result(content).name, content["relaxation"]),
         "evidence": evidence,
-        "curves": {name: told for name, told in MISFITS.items() if name in known},
+        "curves": {name: label for name, label in MISFITS.items() if name in known},
         "ranged": any(one.range for one in found.parameters.values()),
     }
 
 
 def joint_text(found: Joint) -> str:
-    """Return what the command prints of a joint fit."""
+    """Return the text that the command prints for a joint fit."""
     every = {n: p for n, p in found.parameters.items() if p.kind != "fixed" or p.value}
-    given: Any = {"parameters": every, "nuisance": NUISANCE, "between": between, "most": MOST_ROWS}
-    return words("joint", **given, **_told(found))
+    more: Any = {"parameters": every, "nuisance": NUISANCE, "between": between, "most": MOST_ROWS}
+    return words("joint", **more, **_common(found))
 
 
 def joint_page(found: Joint, loops: bytes, compared: bytes) -> str:
-    """Return the page with two pictures (PNG)."""
-    told = _told(found)
+    """Return the page with its two figures (PNG)."""
+    common = _common(found)
     each = [
         (one, "".join(symbol(name)), *readable_unit(max(abs(at.value) for at in own), one.unit))
         for name, one in found.parameters.items()
         if one.kind != "fixed" and (own := (one.tests or {}).values())
     ]
-    noise, known = {}, [one["noise"] for one in told["found"]["tests"].values()]
+    noise, known = {}, [one["noise"] for one in common["found"]["tests"].values()]
     for name in MISFITS:
         if levels := [one[name]["sigma"] for one in known if name in one]:
             noise[name] = readable_unit(max(levels), "m" if name.startswith("displ") else "Pa")
@@ -198,12 +197,12 @@ def joint_page(found: Joint, loops: bytes, compared: bytes) -> str:
         of_curve=MISFITS,
         noise=noise,
         each=each,
-        **told,
+        **common,
     )
 
 
 def between(one: JointParameter) -> str:
-    """How a parameter varies from test to test."""
+    """Return a description of the variation of a parameter between the tests."""
     if one.kind == "scatter" and one.scatter is not None and one.scatter_ci95 is not None:
         low, high = one.scatter_ci95
         return f"scatters by {percent(one.scatter)} ({percent(low)} to {percent(high)})"
@@ -214,13 +213,13 @@ def between(one: JointParameter) -> str:
     return in_unit((min(values), max(values)), one.unit) if values else ""
 
 
-# ------------------------------------------------------------------------------- the picture
+# ------------------------------------------------------------------------------- the figures
 
 
 def plot_joint(found: Joint, *, width: str = TWO) -> Figure:
-    """Draw the loop of each test, and each parameter that follows a law of rate against the rate.
+    """Draw the loop of each test, and the parameters with a law of rate over the rate.
 
-    Bars are 95 % intervals of the tests; of very many loops some are drawn. `width` is "one" or
+    Bars are 95 % intervals of the tests. At most `MOST_LOOPS` loops are drawn. `width` is "one" or
     "two" columns, or a length such as "85 mm".
     """
     wide, names = figures.inches(width), _in_order(found)
@@ -232,8 +231,8 @@ def plot_joint(found: Joint, *, width: str = TWO) -> Figure:
     rows, low = -(-len(shown) // across), -(-len(laws) // columns)
     heights = [rows * LOOP[1], low * PANEL[1]]
     more = f"; {len(shown)} of {len(names)} drawn" if len(shown) < len(names) else ""
-    told = f"{found.name} · {found.model} · {len(names)} tests together{more}"
-    lines = figures.title_lines(wide, told, titled=figures.is_titled(width))
+    title = f"{found.name} · {found.model} · {len(names)} tests together{more}"
+    lines = figures.title_lines(wide, title, titled=figures.is_titled(width))
     with figures.drawing(wide, sum(heights) + 0.6 + 0.13 * len(lines), lines) as figure:
         parts = [height for height in heights if height]
         top, *bottom = figure.subfigures(len(parts), 1, height_ratios=parts, squeeze=False)[:, 0]
@@ -250,7 +249,7 @@ def plot_joint(found: Joint, *, width: str = TWO) -> Figure:
 
 
 def plot_compared(found: Joint, *, width: str = TWO) -> Figure:
-    """Draw the parameters of all tests side by side, the tests by rate where they have several."""
+    """Draw the parameters of all tests side by side; tests are sorted by rate if rates differ."""
     names = _in_order(found)
     shown = {name: one for name, one in _of_springs(found).items() if one.kind != "fixed"}
     panels = [
@@ -269,9 +268,9 @@ def plot_compared(found: Joint, *, width: str = TWO) -> Figure:
 
 
 def _in_order(found: Joint) -> dict[str, str]:
-    """Return the names of the tests as they are shown: by rate, with it, where rates differ.
+    """Return the displayed names of the tests; if rates differ, sorted by rate and with the rate.
 
-    They do so where a parameter follows a law of rate, or by more than nominally equal tests.
+    Rates differ if a parameter follows a law of rate, or by the factor `SEVERAL_RATES`.
     """
     known = [rate for rate in found.rates if rate]
     least = 1.0 if any(one.kind in RATES for one in found.parameters.values()) else SEVERAL_RATES
@@ -303,18 +302,18 @@ def _draw_loops(axes: list[Axes], found: Joint, titles: Mapping[str, str]) -> No
 
 
 def _law_of_rate(ax: Axes, found: Joint, name: str, *, parted: bool) -> None:
-    """One parameter by rate, with its law; its title in two lines if `parted`."""
+    """Draw a parameter over the rate, with its law; the title has two lines if `parted`."""
     one, x = found.parameters[name], np.array(found.rates, dtype=float)
     factor, unit = readable_unit(abs(one.value), one.unit)
-    told = f"{own_name(name, found.model)}{f' ({unit})' if unit else ''}: {one.kind}"
-    ax.set(label=told, title=told.replace(": ", ":\n") if parted else told)
+    title = f"{own_name(name, found.model)}{f' ({unit})' if unit else ''}: {one.kind}"
+    ax.set(label=title, title=title.replace(": ", ":\n") if parted else title)
     tests = one.tests or {}
     ends = [tests[t].ci95 or (np.nan,) * 2 if t in tests else (np.nan,) * 2 for t in found.tests]
     ax.vlines(x, *np.transpose(ends) / factor, color=GREY, lw=0.8, label="95 % interval")
     ax.set_xlabel("strain rate (1/s)", labelpad=1)
     ax.set_xscale("log")
     low, high = np.nanmin(x), np.nanmax(x)
-    if high < 10.0 * low:  # no two powers of ten, and minor labels overlap
+    if high < 10.0 * low:  # too few powers of ten, and minor labels would overlap
         ticks = np.geomspace(low, high, 3)
         ax.set_xticks(ticks, [f"{tick:.2g}" for tick in ticks])
         ax.minorticks_off()
@@ -323,5 +322,5 @@ def _law_of_rate(ax: Axes, found: Joint, name: str, *, parted: bool) -> None:
         values = law_values(one.kind, one.value, one.b, np.log(rates / found.rate0))
         ax.plot(rates, values / factor, label="law of rate", color=VERMILION, linewidth=1.0)
         y, va = (0.05, "bottom") if one.b > 0.0 else (0.97, "top")
-        told = between(one).partition(" (")[0] if parted else between(one)
-        ax.text(0.98, y, told, ha="right", va=va, fontsize=6.5, transform=ax.transAxes)
+        slope = between(one).partition(" (")[0] if parted else between(one)
+        ax.text(0.98, y, slope, ha="right", va=va, fontsize=6.5, transform=ax.transAxes)

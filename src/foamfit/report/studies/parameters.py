@@ -1,4 +1,4 @@
-"""The parameters of several tests side by side: a panel each, a row for each test."""
+"""Figure of the parameters of several tests: a panel per parameter, a row per test."""
 
 from __future__ import annotations
 
@@ -20,18 +20,20 @@ if TYPE_CHECKING:
 
     from foamfit.results import ParameterEstimate
 
-LEAST_PANEL, LETTER = 0.62, 0.052  # in, of a panel and of a letter of a name
-TALLEST, ROW, ABOVE, MOST_ROWS = 7.5, 0.17, 2.5, 60  # in; most tests that are named
-DPI, ROOMY = 200, 0.8  # in, of a panel with more numbers
-# Colour of the edge and of the face of a mark.
+LEAST_PANEL, LETTER = 0.62, 0.052  # least width of a panel and width of a letter, inches
+TALLEST, ROW, ABOVE = 7.5, 0.17, 2.5  # heights of all panels, a row and the panel above, inches
+MOST_ROWS = 60  # tests that are named
+ROOMY = 0.8  # width of a panel with room for more numbers, inches
+DPI = 200
+# Colours of edge and face of the marks.
 _MARKS = {"determined": (BLUE, BLUE), "weak": (BLUE, "white"), "not determined": (GREY, "white")}
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One parameter of several tests, and what they are compared with, if anything.
+    """One parameter of several tests, and the values it is compared with.
 
-    `references` are other values by test, `common` is what the tests have in common, and `scatter`
+    `references` are other values by test, `common` is the value common to the tests, and `scatter`
     the standard deviation of its logarithm between specimens.
     """
 
@@ -45,7 +47,7 @@ class Panel:
 
 
 def panels_of(tests: Sequence[str], parameters: ByTest) -> list[Panel]:
-    """Return panels of parameters that have a value, or None, for each of some tests."""
+    """Return a panel for each parameter, given its value, or None, in each test."""
     return [
         Panel(name, formula(own), {t: p for t, p in zip(tests, each, strict=True) if p is not None})
         for own, (name, each) in zip(symbols(parameters), parameters.items(), strict=True)
@@ -60,14 +62,15 @@ def plot_parameters(
     width: str = TWO,
     above: Callable[[Axes], object] | None = None,
 ) -> Figure:
-    """Draw values with 95 % intervals by test, a panel for each parameter, tests named at the left.
+    """Draw values with 95 % intervals, a panel per parameter, a row per test.
 
-    A band is the 95 % interval of a common value, dashed its spread between specimens, a tick a
-    reference. Wide intervals run out of a panel; an arrow at its edge is a value beyond. `width` is
-    "one" or "two" columns, or a length such as "85 mm"; `above` draws a panel above the others.
+    A band is the 95 % interval of a common value, dashed lines its spread between specimens, ticks
+    are references. Very wide intervals are cut; an arrow at the edge is a value outside the panel.
+    `width` is "one" or "two" columns, or a length such as "85 mm"; `above` draws a panel above the
+    others.
     """
     wide, count, n = figures.inches(width), len(tests), max(len(panels), 1)
-    step = max(-(-count // MOST_ROWS), 1)  # of very many tests some are named
+    step = max(-(-count // MOST_ROWS), 1)  # of very many tests only some are named
     names = _short(tests, int(min(0.28 * wide, 1.3) / LETTER))[::step]
     margin = LETTER * max(map(len, names), default=3) + 0.1
     across = figures.abreast(wide - margin, n, LEAST_PANEL)
@@ -98,7 +101,7 @@ def plot_parameters(
 
 
 def _short(tests: Sequence[str], most: int) -> list[str]:
-    """Shorten names to so many letters: without their common end, then without their beginning."""
+    """Shorten names to `most` letters: cut their common end, then the beginning."""
     if all(len(name) <= most for name in tests):
         return list(tests)
     end = len(commonprefix([name[::-1] for name in tests])) if len(tests) > 1 else 0  # noqa: RUF071
@@ -107,14 +110,14 @@ def _short(tests: Sequence[str], most: int) -> list[str]:
 
 
 def _draw(ax: Axes, panel: Panel, tests: Sequence[str], roomy: bool) -> None:
-    """Draw one parameter, with fewer numbers at its axis where it is not `roomy`."""
+    """Draw one parameter; with fewer numbers on its axis unless it is `roomy`."""
     others = [*panel.references.values(), *([panel.common] if panel.common else [])]
     factor, unit = unit_of_all([*panel.tests.values(), *others])
-    there = [(y, panel.tests[test]) for y, test in enumerate(tests) if test in panel.tests]
-    sure = [p for _, p in there if p.state in ("determined", "weak")] or [p for _, p in there]
-    sure += others
-    ends = [end / factor for p in sure for end in p.ci95 or () if np.isfinite(end)]
-    low, high = figures.limits([p.value / factor for p in sure], ends)
+    rows = [(y, panel.tests[test]) for y, test in enumerate(tests) if test in panel.tests]
+    known = [p for _, p in rows if p.state in ("determined", "weak")] or [p for _, p in rows]
+    known += others
+    ends = [end / factor for p in known for end in p.ci95 or () if np.isfinite(end)]
+    low, high = figures.limits([p.value / factor for p in known], ends)
     ax.set_xlim(low, high)
     ax.set_title(f"{panel.head} ({unit})" if unit else panel.head, fontsize=7.5, pad=3)
     ax.set_label(panel.name)
@@ -127,23 +130,23 @@ def _draw(ax: Axes, panel: Panel, tests: Sequence[str], roomy: bool) -> None:
     ax.grid(axis="y", color="0.9", lw=0.5)
     ax.set_axisbelow(True)
     _draw_others(ax, panel, tests, factor)
-    bars = [(y, *p.ci95) for y, p in there if p.ci95 is not None and np.all(np.isfinite(p.ci95))]
+    bars = [(y, *p.ci95) for y, p in rows if p.ci95 is not None and np.all(np.isfinite(p.ci95))]
     if bars:
         y, left, right = np.array(bars).T
         ax.hlines(y, left / factor, right / factor, color=GREY, lw=0.9, label="95 % interval")
     if panel.kind not in RATES:
         size = 3.4 if len(tests) <= 25 else 2.4 if len(tests) <= MOST_ROWS else 1.4
-        _draw_values(ax, there, factor, size)
+        _draw_values(ax, rows, factor, size)
 
 
 def _draw_values(
-    ax: Axes, there: Sequence[tuple[int, ParameterEstimate]], factor: float, size: float
+    ax: Axes, rows: Sequence[tuple[int, ParameterEstimate]], factor: float, size: float
 ) -> None:
-    """Draw values by row and state; those beyond the panel as arrows at its edge."""
+    """Draw values by row and state; those outside the panel as arrows at its edge."""
     low, high = ax.get_xlim()
     for state, (edge, face) in _MARKS.items():
         style: Any = {"color": edge, "mfc": face, "ls": "none", "ms": size, "mew": 0.8, "zorder": 4}
-        points = [(p.value / factor, y) for y, p in there if p.state == state]
+        points = [(p.value / factor, y) for y, p in rows if p.state == state]
         if inside := [at for at in points if low <= at[0] <= high]:
             ax.plot(*np.array(inside).T, "o", label=state, **style)
         for mark, end, sign in (("<", low, -1.0), (">", high, 1.0)):
@@ -153,16 +156,15 @@ def _draw_values(
 
 
 def _draw_others(ax: Axes, panel: Panel, tests: Sequence[str], factor: float) -> None:
-    """Draw references, and what the tests have in common: line, band, spread between specimens."""
+    """Draw references, and line, band and spread between specimens of the common value."""
     line: dict[str, Any] = {"color": VERMILION, "lw": 1.0, "zorder": 2}
-    rows = [(p, y) for y, test in enumerate(tests) if (p := panel.references.get(test))]
-    for p, y in rows:
-        ax.vlines(p.value / factor, y - 0.36, y + 0.36, label=p.state, **line)
+    for y, test in enumerate(tests):
+        if p := panel.references.get(test):
+            ax.vlines(p.value / factor, y - 0.36, y + 0.36, label=p.state, **line)
     if panel.kind in RATES:
-        x = [panel.tests[test].value / factor for test in tests if test in panel.tests]
-        ax.plot(
-            x, [y for y, test in enumerate(tests) if test in panel.tests], label="common", **line
-        )
+        rows = [row for row, test in enumerate(tests) if test in panel.tests]
+        x = [panel.tests[tests[row]].value / factor for row in rows]
+        ax.plot(x, rows, label="common", **line)
     elif panel.common is not None:
         value = panel.common.value / factor
         ax.axvline(value, label="common", **line)

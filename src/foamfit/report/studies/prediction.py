@@ -1,4 +1,4 @@
-"""What the prediction of a test says, its folder, its text and its picture."""
+"""Prediction of a test: folder, text and figure."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 PANEL = (2.6, 2.2)  # inches
-# Colour and dashes of each part of the band; dashes tell them apart in grey.
+# Colour and dashes of each part of the band; the dashes distinguish them in greyscale.
 COLOURS: dict[str, tuple[str, Any]] = {
     "parameters": (BLUE, "-"),
     "scatter": (INSIDE[1], (0, (5, 1.2))),
@@ -36,7 +36,7 @@ COLOURS: dict[str, tuple[str, Any]] = {
     "motion": (VERMILION, (0, (1, 1.2))),
     "law_error": (INSIDE[0], (0, (5, 1.2, 1, 1.2))),
 }
-# Styles of the lines and of the band; the key of the figure takes their labels.
+# Styles of the lines and of the band, with their labels in the legend.
 SEEN: Any = {"color": MEASURED, "linewidth": 1.4, "label": "measured"}
 PREDICTED: Any = {"color": VERMILION, "linewidth": 0.9, "label": "predicted"}
 BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0, "label": "95 % band"}
@@ -44,9 +44,9 @@ BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0, "label": "95 %
 
 @dataclass(frozen=True, eq=False)
 class PredictedCurve:
-    """A curve of a test with its 95 % band, one row per sample, Pa or m.
+    """A curve of a test with its 95 % band, one row per sample, in Pa or m.
 
-    `parts` has the half width (n,) that each part that is there would give the band alone.
+    `parts` contains the half width (n,) of the band due to each source of uncertainty alone.
     """
 
     channel: str  # "stress", "displacement", "displacement_1", …
@@ -56,46 +56,46 @@ class PredictedCurve:
     lo: Array
     hi: Array
     parts: dict[str, Array]
-    kept: NDArray[np.bool_]  # Samples that count: those that the channel measured, but no outliers
+    kept: NDArray[np.bool_]  # Samples that count: measured ones that are not outliers
 
     @property
     def range(self) -> float:
-        """Measured range."""
+        """Range of the measured values."""
         return float(np.ptp(self.measured))
 
     def met(self, part: slice) -> tuple[float, float]:
-        """Return misfit, over its own range, and share inside the band of a part of the samples."""
+        """Return misfit over the range, and fraction inside the band, of a part of the samples."""
         kept, measured = self.kept[part], self.measured[part]
-        off = (self.predicted[part] - measured)[kept]
+        residual = (self.predicted[part] - measured)[kept]
         within = (self.lo[part] <= measured) & (measured <= self.hi[part])
-        misfit = np.sqrt(np.mean(off**2)) / np.ptp(measured[kept])
+        misfit = np.sqrt(np.mean(residual**2)) / np.ptp(measured[kept])
         return float(misfit), float(np.mean(within[kept]))
 
     @property
     def inside(self) -> float:
-        """Share of the samples that lie inside the band."""
+        """Fraction of the samples inside the band."""
         return self.met(slice(None))[1]
 
     @property
     def half_width(self) -> float:
-        """Half of the band, mean over the samples that count."""
+        """Mean half width of the band over the samples that count."""
         return float(np.mean(0.5 * (self.hi - self.lo)[self.kept]))
 
     @property
     def widest(self) -> str:
-        """The part that makes the band widest."""
+        """The part that contributes most to the band."""
         return max(self.parts, key=self.half_width_of)
 
     def half_width_of(self, part: str) -> float:
-        """Half of the band that a part alone would give, mean over the samples that count."""
+        """Return the mean half width of the band due to a part alone."""
         return float(np.mean(self.parts[part][self.kept])) if part in self.parts else 0.0
 
 
 @dataclass(frozen=True)
 class PredictedParameter:
-    """A parameter as it is for the test: its value, and its 95 % interval."""
+    """A parameter as predicted for the test: its value and 95 % interval."""
 
-    kind: str  # As in joint.json; "shared" or "fixed" where the result is of one test
+    kind: str  # As in joint.json; "shared" or "fixed" for the result of one test
     value: float
     lo: float
     hi: float
@@ -103,46 +103,44 @@ class PredictedParameter:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A test that was not fitted, predicted from a result, SI."""
+    """Prediction, from a result, of a test that was not fitted; in SI."""
 
     source: str  #: Name of the result
-    joint: bool  #: Whether it is of several tests
-    measurement: Measurement  #: The test: its specimen, striker and motion are simulated
+    joint: bool  #: Whether the result is that of several tests
+    measurement: Measurement  #: The test, whose specimen, striker and motion are simulated
     model: str
     relaxation: int
     drive: str
     seed: int
-    curves: dict[
-        str, PredictedCurve
-    ]  # By their names in fit.json; those that the drive leaves free
+    #: Curves that the drive does not prescribe, by their names in fit.json
+    curves: dict[str, PredictedCurve]
     misfit: dict[str, float | None]  #: RMS of predicted minus measured over the measured range
     parameters: dict[str, PredictedParameter]
-    #: Mean strain rate on loading of the test and of those that were fitted, 1/s
-    rate: float | None
-    fitted_rates: tuple[float, ...]
+    rate: float | None  #: Mean strain rate of the test on loading, 1/s
+    fitted_rates: tuple[float, ...]  #: Those of the fitted tests
     extrapolated: bool  #: Whether the rate lies outside the fitted ones
-    draws: int  #: Of specimens
-    redrawn: int  #: Those more that were not admissible and were drawn again
-    held: tuple[str, ...]  #: Parameters that the result does not determine, held at their values
+    draws: int  #: Number of specimens drawn
+    redrawn: int  #: Number of further specimens, which were not admissible and were replaced
+    held: tuple[str, ...]  #: Parameters fixed at their values because they are not determined
     sentences: tuple[str, ...]
     warnings: tuple[str, ...]
-    #: What the record of the test does not say exactly (contact time, zeros, striker, time shift),
-    #: fitted to it with the springs held as predicted but for what varies between specimens: values
-    #: in its own numbers
+    #: Unknowns of the record (contact time, zeros, striker, time shift), fitted to it with the
+    #: predicted springs; parameters that vary between specimens are free in this fit. Values count
+    #: from the origins of the file.
     aligned: dict[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """Tell how well it meets the record."""
+        """Return the sentences on the prediction."""
         head = f"{self.measurement.name} predicted from {self.source}"
         return "\n  ".join((head, *self.sentences))
 
     def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
-        """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf`` whole; returns the folder.
+        """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf``; return the folder.
 
-        An older prediction there is replaced as a whole, at the end. Without `report` there is no
-        figure. It is "one" or "two" columns wide, or as wide as a length ("85 mm").
+        A complete new prediction replaces an older one. Without `report` there is no figure. Its
+        width is "one" or "two" columns or a length such as "85 mm".
         """
-        figures.inches(figure_width)  # refuses what is no width
+        figures.inches(figure_width)  # reject an invalid width
 
         def write(fresh: Path) -> None:
             results.write_json(fresh / "prediction.json", self.to_json_dict())
@@ -151,7 +149,7 @@ class Prediction:
                 figure = plot_prediction(self, width=figure_width)
                 figures.write_both(figure, fresh / "prediction")
 
-        # A result of another kind may be the one that is predicted from.
+        # A result of another kind may be the source of this prediction.
         results.check_target(folder, of="prediction.json")
         return results.save_whole(folder, write)
 
@@ -162,25 +160,25 @@ class Prediction:
 
     @property
     def inside(self) -> dict[str, float]:
-        """Share of the samples of each curve that lie inside its 95 % band."""
+        """Fraction of the samples of each curve inside its 95 % band."""
         return {name: curve.inside for name, curve in self.curves.items()}
 
     @property
     def by_cycle(self) -> dict[int, dict[str, float]]:
-        """Misfit, over its own range, and share inside the band of each of several cycles.
+        """Misfit over the range, and fraction inside the band, of each of several cycles.
 
-        They are those of the stress under a driven motion, or of the first curve.
+        The curve is the stress if the motion is prescribed, otherwise the first curve.
         """
         curve = self.curves.get("stress_time", next(iter(self.curves.values())))
         each = {n: curve.met(part) for n, part in cycles_of(self.measurement).items()}
-        return {n: {"misfit": off, "inside": inside} for n, (off, inside) in each.items()}
+        return {n: {"misfit": misfit, "inside": inside} for n, (misfit, inside) in each.items()}
 
     def to_json_dict(self) -> dict[str, Any]:
-        """Return the content of ``prediction.json``: SI, plain types, null = not there."""
+        """Return the content of ``prediction.json``: SI, plain types, None for missing values."""
         m, model = self.measurement, Model.parse(self.model)
-        asked = ("relaxation", "drive", "seed", "draws", "redrawn", "rate", "fitted_rates")
-        found = ("extrapolated", "misfit", "inside", "by_cycle")
-        told = ("parameters", "held", "aligned", "warnings", "sentences")
+        first = ["relaxation", "drive", "seed", "draws", "redrawn", "rate", "fitted_rates"]
+        first += ["extrapolated", "misfit", "inside", "by_cycle"]
+        last = ("parameters", "held", "aligned", "warnings", "sentences")
         content: dict[str, Any] = plain(
             {
                 "schema": SCHEMA,
@@ -193,7 +191,7 @@ class Prediction:
                 "joint": self.joint,
                 "model": model.words,
                 **model.options,
-                **{name: getattr(self, name) for name in (*asked, *found)},
+                **{name: getattr(self, name) for name in first},
                 "curves": {
                     name: {
                         "range": curve.range,
@@ -204,14 +202,14 @@ class Prediction:
                     }
                     for name, curve in self.curves.items()
                 },
-                **{name: getattr(self, name) for name in told},
+                **{name: getattr(self, name) for name in last},
             }
         )
         return content
 
     @property
     def columns(self) -> dict[str, Array]:
-        """The columns of prediction.csv, one value per sample, SI: all that its picture shows."""
+        """The columns of prediction.csv, one value per sample, in SI: the data of the figure."""
         m, columns = self.measurement, dict[str, Array]()
         if m.time is not None:
             columns["time (s)"] = m.time
@@ -227,11 +225,11 @@ class Prediction:
             columns[f"{channel} band high ({unit})"] = curve.hi
             for part, width in curve.parts.items():
                 columns[f"{channel} half width, {part.replace('_', ' ')} ({unit})"] = width
-            found, taken = m.outliers.get(channel), m.sampled.get(channel)
-            if found is not None and found.left_out.any():
-                columns[f"outliers of {channel} left out"] = found.left_out.astype(int)
-            if taken is not None:
-                columns[f"{channel} is measured"] = taken.astype(int)
+            outliers, sampled = m.outliers.get(channel), m.sampled.get(channel)
+            if outliers is not None and outliers.left_out.any():
+                columns[f"outliers of {channel} left out"] = outliers.left_out.astype(int)
+            if sampled is not None:
+                columns[f"{channel} is measured"] = sampled.astype(int)
         height = m.specimen.height
         if m.displacement is not None:
             columns["measured strain"] = m.displacement / height
@@ -241,22 +239,22 @@ class Prediction:
 
 
 def prediction_text(found: Prediction) -> str:
-    """Return what the command prints: misfit, share inside and half widths over the range."""
-    there = [part for part in COLOURS if any(part in one.parts for one in found.curves.values())]
-    return words("prediction", found=found, parts=there)
+    """Return the text that the command prints, with half widths relative to the range."""
+    present = [part for part in COLOURS if any(part in one.parts for one in found.curves.values())]
+    return words("prediction", found=found, parts=present)
 
 
 def plot_prediction(found: Prediction, *, width: str = TWO) -> Figure:
-    """Draw each curve with its band, the loop, and the parts of the band.
+    """Draw the loop, each curve with its band, and the parts of the band.
 
-    Above are the loop and each curve in time, below the half width that each part alone would give.
-    `width` is "one" or "two" columns, or a length such as "85 mm"; what has no room beside the
-    others stands below them.
+    Above are the loop and each curve over time, below the half width due to each part alone.
+    `width` is "one" or "two" columns, or a length such as "85 mm"; panels that do not fit side by
+    side are stacked.
     """
     curves = list(found.curves.values())
     wide = min(figures.inches(width), PANEL[0] * (1 + len(curves)))
     across = figures.abreast(wide, 1 + len(curves))
-    bands = -(-(1 + len(curves)) // across)  # each a row of panels with a lower one beneath
+    bands = -(-(1 + len(curves)) // across)  # each has an upper and a lower row of panels
     inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in curves)
     lines = figures.title_lines(
         wide,
@@ -275,25 +273,25 @@ def plot_prediction(found: Prediction, *, width: str = TWO) -> Figure:
             _in_time(upper, lower, found, curve)
         for ax in (key, *above[len(curves) :], *below[len(curves) :]):
             ax.set_axis_off()
-        told = figures.named_in(figure.axes)
-        key.legend(told.values(), told, loc="upper left", fontsize=7, borderaxespad=0.0)
+        entries = figures.named_in(figure.axes)
+        key.legend(entries.values(), entries, loc="upper left", fontsize=7, borderaxespad=0.0)
         figure.align_ylabels()
     return figure
 
 
 def _loop(ax: Axes, found: Prediction) -> None:
-    """Stress against displacement; with the band of the stress where the motion is measured."""
+    """Draw the loop; with the band of the stress if the motion is prescribed."""
     m, predicted = found.measurement, {c.channel: c for c in found.curves.values()}
     stress, moved = predicted.get("stress"), predicted.get("displacement")
     motion = m.displacement if moved is None else moved.predicted
     if m.displacement is None or motion is None or m.stress is None:
         figures.say_nothing_there(ax, "no motion")
         return
-    pressed = m.stress if stress is None else stress.predicted
+    fitted = m.stress if stress is None else stress.predicted
     height = m.specimen.height
     factor, unit = readable_unit(float(np.max(m.stress)), "Pa")
     ax.plot(m.displacement / height, m.stress / factor, **SEEN)
-    ax.plot(motion / height, pressed / factor, **PREDICTED)
+    ax.plot(motion / height, fitted / factor, **PREDICTED)
     if stress is not None and moved is None:
         turn = int(np.argmax(motion))
         for part in (slice(None, turn + 1), slice(turn, None)):
@@ -303,7 +301,7 @@ def _loop(ax: Axes, found: Prediction) -> None:
 
 
 def _in_time(above: Axes, below: Axes, found: Prediction, curve: PredictedCurve) -> None:
-    """One curve with its band, and the half width of each part."""
+    """Draw a curve with its band, and the half width of each part below."""
     x, label = np.arange(curve.measured.size, dtype=float), "sample"
     if (time := found.measurement.time) is not None:
         scale, unit = readable_unit(float(np.nanmax(np.abs(time))), "s")
@@ -318,7 +316,7 @@ def _in_time(above: Axes, below: Axes, found: Prediction, curve: PredictedCurve)
     for part, (colour, dashes) in COLOURS.items():
         if part in curve.parts and np.any(curve.parts[part]):
             style = {"color": colour, "ls": dashes, "lw": 0.9}
-            told = f"half width: {part.replace('_', ' ')}"
-            below.plot(x, curve.parts[part] / factor, label=told, **style)
+            label = f"half width: {part.replace('_', ' ')}"
+            below.plot(x, curve.parts[part] / factor, label=label, **style)
     below.set_ylim(bottom=0.0)
     below.set(xlabel=label, ylabel=f"half width ({unit})")
