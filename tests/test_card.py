@@ -75,7 +75,7 @@ def fit(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def joint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three tests whose snap stresses follow a law of rate."""
+    """Three tests whose snap stresses follow a rate law."""
     folder, b = tmp_path_factory.mktemp("joint") / "study", 0.08
     rates = {"slow": 0.01, "middle": 1.0, "fast": 100.0}
     tests = {name: write_fit(folder / name, rate, b) for name, rate in rates.items()}

@@ -1,4 +1,4 @@
-"""Parameters of several tests that follow a law of rate, scatter, or do not vary everywhere."""
+"""Parameters of several tests that follow a rate law, scatter, or do not vary everywhere."""
 
 from dataclasses import replace
 

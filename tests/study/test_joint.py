@@ -272,12 +272,12 @@ def test_a_law_of_rate_is_no_kind_where_the_rates_span_too_little(tmp_path):
     one = ff.joint(write_study(tmp_path, 's1_k0 = "auto"' + rest), jobs=1)
     assert one.parameters["s1_k0"].kind == "own"
     assert {other.kind for other in one.evidence} == {"shared", "own"}
-    (told,) = (sentence for sentence in one.sentences if "No law of rate" in sentence)
+    (told,) = (sentence for sentence in one.sentences if "No rate law" in sentence)
     assert re.search(
         r"was tried for s1_k0: over 0\.0985 to 0\.102 1/s, the values .* within ±[1-9]", told
     )
     named = ff.joint(write_study(tmp_path, 's1_k0 = "power rate"' + rest), jobs=1)
-    (told,) = (warning for warning in named.warnings if "a law of rate needs more" in warning)
+    (told,) = (warning for warning in named.warnings if "a rate law needs more" in warning)
     assert told.startswith("s1_k0 (power rate): its own values in the tests, at 0.0985 to 0.102")
 
 

@@ -532,7 +532,7 @@ def test_file_and_memory_give_the_same_numbers(tmp_path, fitted):
 
 @pytest.fixture(scope="module")
 def joint(tmp_path_factory):
-    """Four tests fitted together: one parameter scatters, one follows a law of rate, one is own."""
+    """Four tests fitted together: one parameter scatters, one follows a rate law, one is own."""
     here = tmp_path_factory.mktemp("family")
     for i, rate in enumerate((0.01, 0.03, 0.3, 1.0)):
         test = loop(rate=rate, seed=i, sigma_plus=1.1e5 * (rate / 0.1) ** 0.05, kc=4e5 + 2e4 * i)

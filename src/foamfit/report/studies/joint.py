@@ -60,9 +60,9 @@ class JointParameter:
     """One parameter of a joint fit, in SI.
 
     `kind` is one of `links.KINDS` or "fixed". `value` is the common value: for a scattering
-    parameter that of the median specimen, for a law of rate that at the rate of the median test,
+    parameter that of the median specimen, for a rate law that at the rate of the median test,
     for an own parameter the median over the tests (which has no error). `scatter` is the standard
-    deviation of its logarithm between specimens, `b` the slope of the law of rate. `tests` contains
+    deviation of its logarithm between specimens, `b` the slope of the rate law. `tests` contains
     the value in each test, unless it is the same in all.
     """
 
@@ -217,7 +217,7 @@ def between(one: JointParameter) -> str:
 
 
 def plot_joint(found: Joint, *, width: str = TWO) -> Figure:
-    """Draw the loop of each test, and the parameters with a law of rate over the rate.
+    """Draw the loop of each test, and the parameters with a rate law over the rate.
 
     Bars are 95 % intervals of the tests. At most `MOST_LOOPS` loops are drawn. `width` is "one" or
     "two" columns, or a length such as "85 mm".
@@ -270,7 +270,7 @@ def plot_compared(found: Joint, *, width: str = TWO) -> Figure:
 def _in_order(found: Joint) -> dict[str, str]:
     """Return the displayed names of the tests; if rates differ, sorted by rate and with the rate.
 
-    Rates differ if a parameter follows a law of rate, or by the factor `SEVERAL_RATES`.
+    Rates differ if a parameter follows a rate law, or by the factor `SEVERAL_RATES`.
     """
     known = [rate for rate in found.rates if rate]
     least = 1.0 if any(one.kind in RATES for one in found.parameters.values()) else SEVERAL_RATES
@@ -320,7 +320,7 @@ def _law_of_rate(ax: Axes, found: Joint, name: str, *, parted: bool) -> None:
     if one.b is not None and found.rate0 is not None:
         rates = np.geomspace(low, high, 50)
         values = law_values(one.kind, one.value, one.b, np.log(rates / found.rate0))
-        ax.plot(rates, values / factor, label="law of rate", color=VERMILION, linewidth=1.0)
+        ax.plot(rates, values / factor, label="rate law", color=VERMILION, linewidth=1.0)
         y, va = (0.05, "bottom") if one.b > 0.0 else (0.97, "top")
         slope = between(one).partition(" (")[0] if parted else between(one)
         ax.text(0.98, y, slope, ha="right", va=va, fontsize=6.5, transform=ax.transAxes)
