@@ -47,7 +47,7 @@ PAGE = """\
 
 Made by `python fits/published_cases.py`. The tests are reconstructions, not measurements: simulated
 from the published parameters in the impact drive with 1 % noise on both channels
-(`experiments/reconstruct.py`). So the published parameters are the true values here, and a deviation is
+(`experiments/reconstruct.py`). So the published parameters are the true values, and a deviation is
 an error of the identification.
 
 {finding}
@@ -116,8 +116,8 @@ def in_parts(folders: list[Path]) -> str:
             if abs(errors) > LIMIT:
                 found.append(f"- {case}, {drive} drive: {name}, {errors:+.1f} standard errors")
     if not found:
-        return f"All are also within {LIMIT:g} standard errors in SI units, before ratios are formed."
-    return "\n".join(["Outside in SI units, before ratios are formed:", "", *found])
+        return f"All are also within {LIMIT:g} standard errors in SI units, without ratios."
+    return "\n".join(["Outside in SI units, without ratios:", "", *found])
 
 
 def main() -> None:
