@@ -192,16 +192,16 @@ def write_study(
     A mapping among the settings becomes a separate table.
     """
 
-    def told(value: Any) -> str:
+    def quoted(value: Any) -> str:
         return str(value) if isinstance(value, int | float) else f'"{value}"'
 
     tables = {name: one for name, one in settings.items() if isinstance(one, Mapping)}
     plain = {"model": model} | {k: v for k, v in settings.items() if k not in tables}
-    text = [f"tests = [{', '.join(told(test) for test in tests)}]"]
-    text += [f"{name} = {told(value)}" for name, value in plain.items()]
+    text = [f"tests = [{', '.join(quoted(test) for test in tests)}]"]
+    text += [f"{name} = {quoted(value)}" for name, value in plain.items()]
     tables["parameters"] = {f"s1_{name.removeprefix('s1_')}": kind for name, kind in kinds.items()}
     for name, table in tables.items():
-        text += ["", f"[{name}]", *(f"{key} = {told(value)}" for key, value in table.items())]
+        text += ["", f"[{name}]", *(f"{key} = {quoted(value)}" for key, value in table.items())]
     path.write_text("\n".join(text) + "\n", encoding="utf-8")
     return path
 

@@ -80,8 +80,8 @@ def twin_table(table: pd.DataFrame) -> str:
             for column in SHOWN:
                 m, s = group[column].mean(), group[column].std()
                 unit = 1e3 if is_pressure(column) else 1.0
-                told = f"{significant(m / unit, 3)} ± {significant(s / unit, 2)}"
-                shown.append(f"{100 * m:.2f} ± {100 * s:.2f} %" if column in SHARES else told)
+                text = f"{significant(m / unit, 3)} ± {significant(s / unit, 2)}"
+                shown.append(f"{100 * m:.2f} ± {100 * s:.2f} %" if column in SHARES else text)
             rows.append(shown)
     head = ["", "cycle", "start strain", "dissipated (kJ/m³)", "misfit", *(n[3:] for n in NAMES)]
     return studies.markdown(head, rows) + "\n\nStiffnesses and stresses in kPa, tau1 in s."
@@ -96,7 +96,7 @@ def changed(group: pd.DataFrame, column: str, first: int, last: int) -> tuple[fl
     return float(ratio.mean()), float(ratio.std()), int((ratio > 1).sum())
 
 
-def twins_told(table: pd.DataFrame) -> str:
+def twin_changes(table: pd.DataFrame) -> str:
     """List the changes from cycle 1 to 2 and from cycle 2 to 6."""
     lines = []
     for first, last in ((1, 2), (2, 6)):
@@ -141,7 +141,7 @@ def lattice_table(table: pd.DataFrame) -> str:
     return studies.markdown(head, rows)
 
 
-def lattice_told(table: pd.DataFrame) -> str:
+def lattice_changes(table: pd.DataFrame) -> str:
     lines = []
     for first, last in ((1, 2), (2, 1000)):
         columns = ("peak_stress", "dissipated_energy")
@@ -177,8 +177,8 @@ def main() -> None:
     studies.write_csv(lattices, HERE / "lattice.csv", 6)
     draw_lattices(found)
     studies.write_page(
-        HERE, "damage.md", twins=twin_table(twins), told=twins_told(twins),
-        lattice=lattice_table(lattices), lattice_told=lattice_told(lattices),
+        HERE, "damage.md", twins=twin_table(twins), told=twin_changes(twins),
+        lattice=lattice_table(lattices), lattice_told=lattice_changes(lattices),
     )  # fmt: skip
 
 

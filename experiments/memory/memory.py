@@ -139,8 +139,8 @@ def study(data: Path) -> None:
             whole = {"cycle": "1-3", "misfit": result.misfit["stress_strain"], "seconds": seconds}
             each = [{"cycle": n, "misfit": m} for n, m in misfits(test, result).items()]
             add(specimen, HISTORY, [whole, *each], result)
-            told = [{"cycle": n, **one} for n, one in later.by_cycle.items() if n > 3]
-            add(specimen, PREDICTED, told, result)
+            cycles = [{"cycle": n, **one} for n, one in later.by_cycle.items() if n > 3]
+            add(specimen, PREDICTED, cycles, result)
             if specimen == SHOWN:
                 draw(later, HERE / "memory.png")
 
@@ -233,8 +233,8 @@ def values_table(values: pd.DataFrame) -> str:
             scatter = f" ± {foam['value'].std(ddof=1):.2g}" if len(foam) > 1 else ""
             cells.append(f"{foam['value'].mean():.3g}{scatter}")
         states = group["state"].value_counts()
-        told = " / ".join(str(states.get(s, 0)) for s in ("determined", "weak", "not determined"))
-        rows.append([name, *cells, told])
+        counts = " / ".join(str(states.get(s, 0)) for s in ("determined", "weak", "not determined"))
+        rows.append([name, *cells, counts])
     head = ["parameter", *own["foam"].unique(), "determined / weak / not"]
     return studies.markdown(head, rows)
 

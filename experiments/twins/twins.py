@@ -270,10 +270,10 @@ def batch_rows(table: pd.DataFrame) -> str:
     groups = table.groupby([table["specimen"].str.split("-").str[0], "cycle"], dropna=False)
     for (group, cycle), part in groups:
         off = part["misfit_stress_strain"].dropna()
-        told = f"{percent(off.min())} to {percent(off.max())}" if len(off) else "–"
+        spread = f"{percent(off.min())} to {percent(off.max())}" if len(off) else "–"
         acceptable = part["status"].isin(["ok", "warnings"]).sum()
         states = (part[f"s1_{name}_state"].eq("determined").sum() for name in LAW)
-        rows.append([group, cycle, f"{acceptable} of {len(part)}", told, *states])
+        rows.append([group, cycle, f"{acceptable} of {len(part)}", spread, *states])
     return studies.lines(rows)
 
 
