@@ -1,11 +1,12 @@
-"""How well do the laws fit the measurements of others, and do twins get the same states?
+"""How well do the laws fit measured foams, and do specimens of one foam get the same states?
 
 Method. Every uniaxial specimen of running-shoe foam (arXiv:2602.12694, LivingMatterLab/CANN) is
-fitted by four laws: misfit, values, and whether specimens of one foam get the same state. The
-measurements are not part of this repository; FOAMFIT_DATA holds shoe-foam/ and shoe-foam-twins/.
+fitted with four laws. Misfit, values and states of the specimens of one foam are compared. The
+measurements are not part of this repository; FOAMFIT_DATA contains shoe-foam/ and shoe-foam-twins/.
 
-Answer. Microscale springs with relaxation leave 0.43 to 0.93 % of the range: see real_foams.md.
-Beside it: real_foams.csv (every parameter of every fit) and real_foams.png (one loop, two laws).
+Answer. Microscale springs with relaxation have a misfit of 0.43 to 0.93 % of the range: see
+real_foams.md. Also written: real_foams.csv (every parameter of every fit), real_foams.png (one
+loop, two laws).
 
     FOAMFIT_DATA=path/to/data python experiments/real_foams.py     # two minutes of processor time
 """
@@ -39,7 +40,7 @@ SHOE_FOAM = {  # height and diameter of specimens whose first cycle is a file of
     "leap-comp-2": ("10.65 mm", "7.62 mm"),
     "leap-comp-3": ("10.68 mm", "7.80 mm"),
 }
-# Name of the law: model, relaxation terms, descents (None = as many as a fit makes).
+# Name of the law: model, relaxation terms, descents (None: the default of a fit).
 LAWS: dict[str, tuple[str, int, int | None]] = {
     "bistable": ("bistable", 0, None),
     "two bistable": ("bistable+bistable", 0, 12),
@@ -52,7 +53,7 @@ SOURCE = "arXiv:2602.12694 (LivingMatterLab/CANN)"
 
 
 def first_cycles(data: Path, folder: Path, foams: tuple[str, ...] = ()) -> Iterator[Measurement]:
-    """Give the first cycle of every specimen, or of those of some foams."""
+    """Yield the first cycle of every specimen, or of the specimens of some foams."""
     own = [(name, *size, f"shoe-foam/{name}_cycle1.csv", "") for name, size in SHOE_FOAM.items()]
     twins = [
         (*one, f"shoe-foam-twins/{one[0]}_raw.txt", studies.GAP)
@@ -66,13 +67,13 @@ def first_cycles(data: Path, folder: Path, foams: tuple[str, ...] = ()) -> Itera
 
 
 def varied(result: Fit) -> dict[str, ParameterEstimate]:
-    """Parameters of the springs that vary; the zeros of a record are none of the foam's."""
+    """Return the free parameters of the springs, without the zeros of the record."""
     found = result.parameters.items()
     return {name: p for name, p in found if p.vary and name not in NUISANCE}
 
 
 def rows_of(test: str, law: str, result: Fit, seconds: float) -> Iterator[dict[str, object]]:
-    """Give one row for each parameter of the springs that varies."""
+    """Return one row for each free parameter of the springs."""
     for name, p in varied(result).items():
         low, high = p.ci95 or (None, None)
         yield {
@@ -109,7 +110,7 @@ def law_table(table: pd.DataFrame) -> str:
 
 
 def draw(results: dict[str, Fit], path: Path) -> None:
-    """Draw the measured loop, both laws on it, their residuals, and the values of the better."""
+    """Draw the measured loop with both laws, their residuals, and the parameters of the better."""
     best = results[BEST]
     strain, stress = best.strain, best.curves.measured_stress
     assert strain is not None
@@ -180,7 +181,7 @@ def _write_values(side: Axes, result: Fit) -> None:
 
 
 def main() -> dict[str, Fit]:
-    """Write page and table; return the fits of which the picture is drawn."""
+    """Write page and table; return the fits for the figure."""
     data = studies.measurements("shoe-foam", "shoe-foam-twins")
     ff.fit(ff.read_test(HERE / "foam-1" / "model-1-2.0mps-reconstruction.csv"))  # compiles
     rows, shown = list[dict[str, Any]](), dict[str, Fit]()
@@ -210,5 +211,5 @@ if __name__ == "__main__":
     before = TABLE.read_bytes() if TABLE.exists() else b""
     with studies.keep_unchanged(HERE):
         both = main()
-    if TABLE.read_bytes() != before:  # its pixels would hardly tell: its numbers are small
+    if TABLE.read_bytes() != before:  # small changes of the numbers hardly change pixels
         draw(both, HERE / "real_foams.png")

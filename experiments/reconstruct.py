@@ -1,12 +1,12 @@
 """Remake the reconstructions of the paper's tests in experiments/foam-1 and experiments/foam-2.
 
-No measured curve of the paper is available. These files are simulated from the published
-parameters (Thevamaran, Fraternali & Daraio 2014, Tables 1-3) in the impact drive, with white noise
-of 1 % of each channel's range and a fixed seed. They are reconstructions, not measurements: the
-published damping, which is numerical, is left out, and the masses are the published ones.
+No measured curve of the paper is available. These files are simulated from the published parameters
+(Thevamaran, Fraternali & Daraio 2014, Tables 1-3) in the impact drive, with white noise of 1 % of
+each channel's range and a fixed seed. They are reconstructions, not measurements. They use the
+published masses and omit the published damping, which is numerical.
 
-Each model is struck at the published velocity and at a round velocity just high enough to close
-its loop: foam-1 at 1.75 m/s never leaves branch d.
+Each model is hit at the published velocity and at a round velocity just high enough to close its
+loop, because foam-1 at 1.75 m/s never leaves branch d.
 
     python experiments/reconstruct.py
 """
@@ -60,7 +60,7 @@ displacement = "{displacement:.4g} um"
 
 
 def simulate(item: PublishedSet, velocity: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time (s), base stress (Pa) and displacement (m) of an undamped impact, with a pre-trigger."""
+    """Return time (s), base stress (Pa) and displacement (m) of an impact with pre-trigger."""
     chain = ff.Chain(item.chain.springs, item.chain.heights, item.chain.area, item.chain.masses)
     drive = ff.Impact(item.striker_mass, velocity)
     end = ff.simulate(chain, drive, np.linspace(0, 20 * chain.height / velocity, 101)).contact_end
@@ -72,7 +72,7 @@ def simulate(item: PublishedSet, velocity: float) -> tuple[np.ndarray, np.ndarra
 
 
 def write(item: PublishedSet, velocity: float, place: Path = HERE) -> Path:
-    """Write the CSV and the TOML of one reconstruction, below a folder."""
+    """Write the CSV and the TOML of one reconstruction to a subfolder of `place`."""
     rng = np.random.default_rng([SEED, round(1000 * velocity), *item.name.encode()])
     time, stress, displacement = simulate(item, velocity)
     contact = stress > 0

@@ -1,15 +1,15 @@
-"""Keep tracked results as they were where remaking them changed no figure.
+"""Keep tracked results if a new run has not changed their numbers.
 
-Another machine, or another day on this one, changes last digits, run times and the pixels of a
-letter. A study that is remade inside `keep_unchanged` leaves such files as they were:
+On another machine or another day, last digits, run times and the pixels of letters change. A study
+that runs inside `keep_unchanged` keeps a file under these rules:
 
-- numbers agree to 1e-3, to one in the last digit where three or more are written, or to 1e-9 in
-  size (rounding); counts agree exactly;
+- numbers agree to 1e-3, to one unit in the last digit if three or more are written, or to 1e-9
+  absolute (rounding); counts agree exactly;
 - run times and evaluations (in a column or behind a key named for them, or followed by the unit s,
-  ms or µs) agree within a factor of ten: machines are shared, and others are faster;
-- machine and versions, which say where the figures were made, may be others;
-- pictures have the same size, and one pixel in two hundred at most has plainly changed; run times
-  are drawn from the table that was kept.
+  ms or µs) agree within a factor of ten, because machines are shared or differ in speed;
+- machine and versions may differ;
+- figures have the same size, and at most one pixel in two hundred has clearly changed; run times
+  are drawn from the kept table.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _TIMED_COLUMN = re.compile(
     r"|(median|quartile( \d)?|simulate|kernel|SciPy|fixed step) \(s\)$|^median fit \(s\)$",
     re.I,
 )
-# Where something was made, and what stands for it: versions, the architecture, the processor.
+# Machine and its placeholder: versions, architecture, processor.
 _CIRCUMSTANCES = (
     (
         re.compile(r"\b(foamfit|python|numpy|scipy|numba|lmfit)\b([\s\":]{1,4})\d+(\.\w+)+", re.I),
@@ -49,9 +49,9 @@ _CIRCUMSTANCES = (
 
 @contextmanager
 def keep_unchanged(place: Path) -> Iterator[None]:
-    """Put back, at the end, what the body wrote but did not really change: a file, or of a folder.
+    """Restore, at the end, the file or the files of a folder that have not really changed.
 
-    Also where the body ends by an exception, as a study does that found something wrong.
+    This also happens if the body raises an exception, as a study does after a failed check.
     """
     paths = place.rglob("*") if place.is_dir() else [place]
     before = {path: path.read_bytes() for path in paths if path.is_file()}
@@ -64,7 +64,7 @@ def keep_unchanged(place: Path) -> Iterator[None]:
 
 
 def same(path: Path, old: bytes, new: bytes) -> bool:
-    """Whether two versions of a file say the same."""
+    """Return whether two versions of a file are equivalent."""
     if path.suffix == ".png":
         return _same_picture(old, new)
     if path.suffix not in TEXT:
@@ -72,13 +72,13 @@ def same(path: Path, old: bytes, new: bytes) -> bool:
     if path.suffix == ".gz":
         old, new = gzip.decompress(old), gzip.decompress(new)
     one, other = old.decode("utf-8"), new.decode("utf-8")
-    if ".csv" in path.suffixes:  # as a table of Markdown: no comma is one of thousands
+    if ".csv" in path.suffixes:  # else commas would be thousands separators
         one, other = one.replace(",", "|"), other.replace(",", "|")
     return same_text(one, other)
 
 
 def same_text(one: str, other: str) -> bool:
-    """Whether two texts differ in numbers alone, and in these by no more than they mean."""
+    """Return whether two texts differ only in numbers, and these within their tolerance."""
     for pattern, name in _CIRCUMSTANCES:
         one, other = pattern.sub(name, one), pattern.sub(name, other)
     if _NUMBER.sub("0", one) != _NUMBER.sub("0", other):
@@ -92,13 +92,13 @@ def same_text(one: str, other: str) -> bool:
 
 
 def _is_timed(text: str, found: re.Match[str]) -> bool:
-    """Whether a number in a text is a run time."""
+    """Return whether a number in a text is a run time."""
     before = text[max(found.start() - 20, 0) : found.start()]
     return bool(_TIMED_KEY.search(before) or _TIMED_UNIT.match(text, found.end()))
 
 
 def _timed_columns(text: str) -> list[range]:
-    """Where in a text the cells of tables are whose columns hold run times."""
+    """Return the positions of table cells that contain run times."""
     found, head, at = list[range](), list[str](), 0
     for line in text.splitlines(keepends=True):
         if line.startswith("#") or "|" not in line:
@@ -115,13 +115,13 @@ def _timed_columns(text: str) -> list[range]:
 
 
 def _same_number(one: str, other: str, timed: bool) -> bool:
-    """Compare two numbers as they are written."""
+    """Compare two numbers given as text."""
     a, b = (float(text.replace(",", "").replace("−", "-")) for text in (one, other))
     if timed and a > 0.0 and b > 0.0:
         return max(a, b) <= RUN_TIMES * min(a, b)
     if one.isdigit() or other.isdigit():
         return a == b
-    last = min(_last_digit(one), _last_digit(other))  # one may end in zeros that are left out
+    last = min(_last_digit(one), _last_digit(other))  # trailing zeros may be omitted
     near = abs(a - b) <= max(
         DIGITS * abs(a), ROUNDING, 1.01 * last if last <= THIRD * abs(a) else 0.0
     )
@@ -129,7 +129,7 @@ def _same_number(one: str, other: str, timed: bool) -> bool:
 
 
 def _last_digit(number: str) -> float:
-    """What one in the last digit of a number is worth."""
+    """Return the value of one unit in the last digit of a number."""
     mantissa, _, power = number.lower().replace(",", "").replace("−", "-").partition("e")
     return 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))
 

@@ -1,14 +1,14 @@
-"""Remake the four published cases: fit each reconstruction, put the fit beside the published set.
+"""Remake the four published cases: fit each reconstruction and compare it with the published set.
 
 Each model of Thevamaran, Fraternali & Daraio (2014) is fitted to the reconstruction that closes its
 loop (foam-1 at 2.0 m/s, foam-2 at 4.5 m/s; see experiments/reconstruct.py) in two ways: in the
 impact drive, where nothing measured enters the simulation, and in the paper's way, where the
 measured stress drives the model and the displacement is fitted. The models are the paper's, whose
-one damper is the onsite one of the striker: it varies in the impact drive, and the springs have
-none. Between two springs the fit has no mass; the reconstruction has the specimen's.
+only damper is the onsite damper of the striker: it varies in the impact drive, and the springs have
+none. The fit has no mass between two springs; the reconstruction has the mass of the specimen.
 
-The base spring of foam-2 bears no tension. The noise of the measured stress goes below zero, where
-such a spring has no equilibrium, so in the stress drive a linear one stands in for it.
+The base spring of foam-2 bears no tension, so it has no equilibrium where noise makes the measured
+stress negative. In the stress drive a linear spring replaces it.
 
     python fits/published_cases.py
 
@@ -37,7 +37,7 @@ CASES = {
 INSTEAD = {("foam-2", "stress"): "linear+bistable"}
 DRIVES = ("impact", "stress")
 RUNS = [(case, drive) for case in CASES for drive in DRIVES]
-LEFT_OUT = (  # large, and made again by this script
+LEFT_OUT = (  # large files that this script can remake
     "curves.csv", "fit.pdf", "report.html",
 )  # fmt: skip
 LIMIT = 3.0  # standard errors
@@ -47,14 +47,14 @@ PAGE = """\
 
 Made by `python fits/published_cases.py`. The tests are reconstructions, not measurements: simulated
 from the published parameters in the impact drive with 1 % noise on both channels
-(`experiments/reconstruct.py`). So the published parameters are the truth here, and a deviation is
+(`experiments/reconstruct.py`). So the published parameters are the true values, and a deviation is
 an error of the identification.
 
 {finding}
 
-In the stress drive the measured stress is the input, and its noise would be taken for stress that
-acted: where the foam is soft, on branch e above all, the fitted slope would come out too steep. The
-driving stress is therefore smoothed. Nothing measured enters the impact drive.
+In the stress drive the measured stress is the input, so its noise would act as a real stress: where
+the foam is soft, above all on branch e, the fitted slope would be too steep. The driving stress is
+therefore smoothed. The impact drive uses no measured curve as input.
 
 ![fitted parameters beside the published ones](comparison.png)
 
@@ -65,7 +65,7 @@ driving stress is therefore smoothed. Nothing measured enters the impact drive.
 
 
 def fit(case: str, drive: str) -> Path:
-    """Fit one case in one drive and write what is kept of its result folder."""
+    """Fit one case in one drive and write the kept files of its result folder."""
     test, model = CASES[case]
     model = INSTEAD.get((case, drive), model)
     folder = HERE / case / drive
@@ -81,7 +81,7 @@ def fit(case: str, drive: str) -> Path:
 
 
 def finding(comparison: Comparison) -> str:
-    """Say how many parameters were recovered, and name those that were not."""
+    """Return the number of recovered parameters and the names of the others."""
     missed, lost, compared = [], [], 0
     for section in comparison.pairs:
         reference = section.other.label.removeprefix("published ")
@@ -97,14 +97,14 @@ def finding(comparison: Comparison) -> str:
     within = f"{compared - len(missed)} of {compared} parameters"
     lines = [f"{within} that the tests determine lie within {LIMIT:g} standard errors."]
     if missed:
-        lines += ["", "Farther off:", "", *missed]
+        lines += ["", "Outside:", "", *missed]
     if lost:
         lines += ["", "Not determined by the test:", "", *lost]
     return "\n".join(lines)
 
 
 def in_parts(folders: list[Path]) -> str:
-    """Name the parameters that are off by themselves; a ratio of two can hide it."""
+    """List the parameters that deviate in SI units, which a ratio of two parameters can hide."""
     found = []
     for (case, drive), folder in zip(RUNS, folders, strict=True):
         for name, fitted in load_result(folder)["parameters"].items():
@@ -116,8 +116,8 @@ def in_parts(folders: list[Path]) -> str:
             if abs(errors) > LIMIT:
                 found.append(f"- {case}, {drive} drive: {name}, {errors:+.1f} standard errors")
     if not found:
-        return f"All are within {LIMIT:g} also in SI units, before ratios are formed."
-    return "\n".join(["Farther off in SI units, before ratios are formed:", "", *found])
+        return f"All are also within {LIMIT:g} standard errors in SI units, without ratios."
+    return "\n".join(["Outside in SI units, without ratios:", "", *found])
 
 
 def main() -> None:

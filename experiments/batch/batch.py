@@ -1,13 +1,13 @@
-"""What does `foamfit batch` cost beside its fits? Speed-up, overhead, memory, on paper.
+"""What is the overhead of `foamfit batch`? Speed-up, overhead per test, memory, an estimate.
 
 Method. Synthetic impacts on one spring with 1 % noise are fitted by the command and by its parts.
-Other work on the machine slows everything, so processor times stand beside times of the clock.
+Other work on the machine slows everything, so processor times are given with wall-clock times.
 
-Answer. 26 ms of processor time a test, memory that does not grow, the same numbers by any number of
-processes; the figures go to batch.json and are told in README.md.
+Answer. 26 ms of processor time per test, constant memory, the same numbers with any number of
+processes. Results go to batch.json; README.md describes them.
 
-    python experiments/batch/batch.py               # all, some 15 minutes on two quiet cores
-    python experiments/batch/batch.py speedup       # one of them; see MEASURES
+    python experiments/batch/batch.py               # all, some 15 minutes on two idle cores python
+    experiments/batch/batch.py speedup       # one of them; see MEASURES
 
 """
 
@@ -45,7 +45,7 @@ FAST = ["--starts", "1", "--no-report", "--quiet"]
 
 
 def make_tests(folder: Path, count: int, samples: int, linear: bool = False) -> None:
-    """Write synthetic tests and the TOML of all."""
+    """Write synthetic tests and their common TOML."""
     folder.mkdir()
     spring = ff.LinearSpring(8e6) if linear else ff.published["foam-1/model-1"].bistable
     chain = ff.Chain([spring], [HEIGHT], AREA)
@@ -61,9 +61,9 @@ def make_tests(folder: Path, count: int, samples: int, linear: bool = False) -> 
 
 
 def called(place: Path, *words: object) -> dict[str, float]:
-    """Run the command; times of the clock and of processors: of the start, of the busiest process.
+    """Run the command; return wall time and processor times of start and busiest process.
 
-    The start is the command itself and the process from which the others part.
+    The start is the command itself and the process that forks the others.
     """
     import psutil
 
@@ -91,10 +91,10 @@ def called(place: Path, *words: object) -> dict[str, float]:
 
 
 def measure_speedup(place: Path, *words: str) -> dict[str, Any]:
-    """One process against two; the same numbers from both.
+    """Compare one process with two, and check that the numbers agree.
 
-    On a machine with other work the clock tells little. Processor time does: the way of a batch
-    through its start and its busiest process, which nothing else of it waits longer for.
+    On a busy machine wall time means little. The processor time of start plus busiest process is
+    the critical path of a batch.
     """
     make_tests(place / "tests", TESTS, 601)
     took = {}
@@ -116,7 +116,7 @@ def measure_speedup(place: Path, *words: str) -> dict[str, Any]:
 
 
 def measure_overhead(place: Path) -> dict[str, Any]:
-    """What a test costs beside its fit: read, compared, written; and the whole command."""
+    """Measure the overhead per test (read, compare, write) and the complete command."""
     make_tests(place / "tests", TINY, 601)
     recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=False)
     key, spent = recipe.key, [0.0, 0.0]
@@ -134,7 +134,7 @@ def measure_overhead(place: Path) -> dict[str, Any]:
     batch_work.fit = fit
     toml = place / "foam.toml"
     for i, path in enumerate(sorted((place / "tests").iterdir())):
-        if i == 20:  # all is loaded
+        if i == 20:  # everything is loaded
             spent[:] = [0.0, 0.0]
         began = time.process_time()
         mark = fingerprint(key, path.read_bytes(), toml.read_bytes(), None)
@@ -154,7 +154,7 @@ def measure_overhead(place: Path) -> dict[str, Any]:
 
 
 def measure_memory(place: Path) -> dict[str, Any]:
-    """Resident memory of the processes of a batch while it goes through many tests."""
+    """Measure the resident memory of the processes during a batch of many tests."""
     import psutil
 
     make_tests(place / "tests", MANY, 61, linear=True)
@@ -181,7 +181,7 @@ def measure_memory(place: Path) -> dict[str, Any]:
 
 
 def measure_parts(place: Path) -> dict[str, Any]:
-    """What the one process that leads a batch does for a test, ms, and what lies on the disk."""
+    """Measure the work of the coordinating process per test (ms) and the disk usage."""
     make_tests(place / "tests", 50, 601)
     toml, paths = place / "foam.toml", sorted((place / "tests").iterdir())
     found: dict[str, Any] = {}
@@ -209,7 +209,7 @@ def measure_parts(place: Path) -> dict[str, Any]:
 
 
 def timed(call: Callable[[int], Any], count: int) -> float:
-    """Processor time of a call, ms."""
+    """Return the processor time of a call, ms."""
     began = time.process_time()
     for i in range(count):
         call(i)

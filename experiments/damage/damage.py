@@ -1,13 +1,13 @@
 """What changes from cycle to cycle? Twins of a shoe foam, and printed lattices up to cycle 1000.
 
-Method. shoe-foam-twins/ (arXiv:2602.12694, LivingMatterLab/CANN) are five specimens each of the
-heel of a new and of a worn shoe, compressed 6 times; lattice-cycles/ (printed TPU lattices,
-mev43/FYP-Cyclic-Compression-Data-Analysis) are 1000 cycles, of which 145 are recorded. Every cycle
-is fitted on its own by a microscale spring with relaxation. The measurements are not part of this
+Method. shoe-foam-twins/ (arXiv:2602.12694, LivingMatterLab/CANN) contains five specimens each of
+the heel of a new and of a worn shoe, compressed 6 times; lattice-cycles/ (printed TPU lattices,
+mev43/FYP-Cyclic-Compression-Data-Analysis) contains 145 recorded cycles of 1000. Every cycle is
+fitted on its own with a microscale spring with relaxation. The measurements are not part of this
 repository.
 
-Answer. Snap-through and relaxation change from cycle to cycle: see damage.md. Beside it: twins.csv,
-lattice.csv and lattice.png.
+Answer. Snap-through and relaxation change from cycle to cycle: see damage.md. Also written:
+twins.csv, lattice.csv and lattice.png.
 
     FOAMFIT_DATA=path/to/data python experiments/damage/damage.py
 """
@@ -40,7 +40,7 @@ LATTICES, LATTICE_CYCLES = ("tpu87-20", "tpu87-35", "tpu87-50"), (1, 2, 10, 100,
 
 
 def is_pressure(column: str) -> bool:
-    """Whether a column is told in kPa, or in kJ/m³."""
+    """Return whether a column is shown in kPa or kJ/m³."""
     return column.removeprefix("s1_").startswith(("k", "sigma", "dissipated"))
 
 
@@ -48,7 +48,7 @@ def is_pressure(column: str) -> bool:
 
 
 def fit_twins(data: Path, toml: Path) -> pd.DataFrame:
-    """One row per specimen and cycle."""
+    """Return one row per specimen and cycle."""
     rows = []
     for name, height, diameter in studies.twins(data / "shoe-foam-twins"):
         studies.write_specimen(toml, height, diameter)
@@ -60,7 +60,7 @@ def fit_twins(data: Path, toml: Path) -> pd.DataFrame:
 
 
 def specimen_first(tables: list[pd.DataFrame]) -> pd.DataFrame:
-    """Put tables of specimens below each other, the name of the specimen first."""
+    """Concatenate the tables of specimens, with the name of the specimen first."""
     table = pd.concat(tables, ignore_index=True)
     return table[["specimen", *table.columns.drop("specimen")]]
 
@@ -70,7 +70,7 @@ def kind(table: pd.DataFrame, name: str) -> pd.DataFrame:
 
 
 def twin_table(table: pd.DataFrame) -> str:
-    """Mean and standard deviation by cycle, new and worn."""
+    """Return mean and standard deviation by cycle, new and worn."""
     rows = []
     for name in ("new", "worn"):
         for cycle, group in kind(table, name).groupby("cycle"):
@@ -80,24 +80,24 @@ def twin_table(table: pd.DataFrame) -> str:
             for column in SHOWN:
                 m, s = group[column].mean(), group[column].std()
                 unit = 1e3 if is_pressure(column) else 1.0
-                told = f"{significant(m / unit, 3)} ± {significant(s / unit, 2)}"
-                shown.append(f"{100 * m:.2f} ± {100 * s:.2f} %" if column in SHARES else told)
+                text = f"{significant(m / unit, 3)} ± {significant(s / unit, 2)}"
+                shown.append(f"{100 * m:.2f} ± {100 * s:.2f} %" if column in SHARES else text)
             rows.append(shown)
     head = ["", "cycle", "start strain", "dissipated (kJ/m³)", "misfit", *(n[3:] for n in NAMES)]
     return studies.markdown(head, rows) + "\n\nStiffnesses and stresses in kPa, tau1 in s."
 
 
 def changed(group: pd.DataFrame, column: str, first: int, last: int) -> tuple[float, float, int]:
-    """Mean ratio of a column from one cycle to another, its standard deviation, and the rises."""
+    """Return mean and standard deviation of a column's ratio of two cycles; count the rises."""
     by = group.pivot_table(index="specimen", columns="cycle", values=column)
     ratio = by[last] / by[first]
-    if not np.isfinite(ratio).all():  # a value at its limit of zero has no ratio
+    if not np.isfinite(ratio).all():  # a value at its bound of zero has no ratio
         return 1.0, math.inf, 0
     return float(ratio.mean()), float(ratio.std()), int((ratio > 1).sum())
 
 
-def twins_told(table: pd.DataFrame) -> str:
-    """What changes from the first to the second and from the second to the sixth cycle."""
+def twin_changes(table: pd.DataFrame) -> str:
+    """List the changes from cycle 1 to 2 and from cycle 2 to 6."""
     lines = []
     for first, last in ((1, 2), (2, 6)):
         parts = []
@@ -107,8 +107,9 @@ def twins_told(table: pd.DataFrame) -> str:
                 name = "dissipated energy" if "energy" in column else f"`{column[3:]}`"
                 parts.append(f"{name} × {mean:.2f} (± {spread:.2f})")
         lines.append(
-            f"- From cycle {first} to {last} these change alike in at least nine of the ten "
-            f"specimens (mean ratio ± standard deviation): {'; '.join(parts) or 'nothing'}."
+            f"- From cycle {first} to {last} these change in the same direction in at least nine "
+            "of the ten specimens (mean ratio ± standard deviation): "
+            f"{'; '.join(parts) or 'nothing'}."
         )
     lines.append("- Worn against new: see the study of [twins](../twins/README.md).")
     return "\n".join(lines)
@@ -140,7 +141,7 @@ def lattice_table(table: pd.DataFrame) -> str:
     return studies.markdown(head, rows)
 
 
-def lattice_told(table: pd.DataFrame) -> str:
+def lattice_changes(table: pd.DataFrame) -> str:
     lines = []
     for first, last in ((1, 2), (2, 1000)):
         columns = ("peak_stress", "dissipated_energy")
@@ -176,8 +177,8 @@ def main() -> None:
     studies.write_csv(lattices, HERE / "lattice.csv", 6)
     draw_lattices(found)
     studies.write_page(
-        HERE, "damage.md", twins=twin_table(twins), told=twins_told(twins),
-        lattice=lattice_table(lattices), lattice_told=lattice_told(lattices),
+        HERE, "damage.md", twins=twin_table(twins), told=twin_changes(twins),
+        lattice=lattice_table(lattices), lattice_told=lattice_changes(lattices),
     )  # fmt: skip
 
 

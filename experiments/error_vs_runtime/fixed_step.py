@@ -1,8 +1,8 @@
-"""Fixed-step schemes, compiled: what one would write by hand for the same scenes.
+"""Compiled fixed-step schemes, as one would write them by hand for the same scenes.
 
-The law is the project's own (`springs.kernels`), so that only the integration differs. A branch is
-frozen within a step and brought up to date at its end; the step is the sampling interval over a
-whole number. Velocity Verlet takes dashpots at the velocity predicted for the end of the step.
+The law is that of foamfit (`springs.kernels`), so only the integration differs. The branch is
+constant within a step and updated at its end; the step is the sampling interval divided by an
+integer. Velocity Verlet evaluates dashpots at the velocity predicted for the end of the step.
 Sources: Hairer, Lubich & Wanner, Geometric Numerical Integration (2006), I.1 and II.1.
 """
 
@@ -25,9 +25,9 @@ compiled = njit(cache=True, error_model="numpy")
 
 @compiled
 def _group(rows, branches, heights, i0, i1, u, rate, guess, freeze):
-    """Stress of the springs i0 … i1-1 between two nodes.
+    """Return the stress of the springs i0 … i1-1 between two nodes.
 
-    Several springs are massless and undamped: their common stress follows from equilibrium.
+    If there are several, they are massless and undamped, and equilibrium gives the common stress.
     """
     if i1 - i0 == 1:
         eps = u / heights[i0]
@@ -36,13 +36,13 @@ def _group(rows, branches, heights, i0, i1, u, rate, guess, freeze):
         return stress_on(rows[i0], branches[i0], eps) + rows[i0, ETA] * rate / heights[i0]
     own = branches[i0:i1].copy() if freeze else branches[i0:i1]
     eps = np.empty(i1 - i0)
-    none = np.zeros((i1 - i0, 2))  # no spring keeps a rank
+    none = np.zeros((i1 - i0, 2))  # no spring has a fixed rank
     return equilibrate(Group(rows[i0:i1], own, none, heights[i0:i1]), u, guess, eps)
 
 
 @compiled
 def _accelerate(rows, branches, heights, ends, mass, drag, w, v, freeze, group, acc):
-    """Fill accelerations (m/s²) and group stresses (Pa) at a state."""
+    """Fill in accelerations (m/s²) and group stresses (Pa) at a state."""
     last = ends.size - 1
     i0 = 0
     for g in range(last + 1):
@@ -61,8 +61,8 @@ def _accelerate(rows, branches, heights, ends, mass, drag, w, v, freeze, group, 
 def impact(rows, heights, ends, mass, drag, speed, t, substeps, scheme, out_w, out_s):
     """Integrate an impact over the samples t, in `substeps` steps between two samples.
 
-    Fills out_w (n,), the displacement of the striker, and out_s (n,), the base stress. The end of
-    contact is where the base stress, straight within its step, passes zero.
+    Fill in out_w (n,), the displacement of the striker, and out_s (n,), the base stress. Contact
+    ends where the base stress, linear within the step, passes zero.
     """
     n = ends.size
     branches = np.empty(rows.shape[0], np.int64)

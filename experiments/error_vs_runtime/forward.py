@@ -1,13 +1,13 @@
-"""What does an answer cost? Error against run time of the simulation, scene by scene.
+"""How much time does a simulation of given accuracy take? Error against run time, by scene.
 
-Method. For every scene of `scenes.py`: the error of the project's solver, of fixed-step schemes and
-of three of SciPy's integrators against the judge of the stability study (`independent.py`, some 14
-digits), over the median time of many runs. All solvers of a scene take turns in one process, and
-processor time is counted, so that a busy machine disturbs all of them alike; ratios compare medians
-of one run. A table (CSV, Markdown) and a figure per scene and a summary go to `forward/`.
+Method. For every scene of `scenes.py`, the errors of foamfit's solver, of fixed-step schemes and of
+three SciPy integrators against the judge of the stability study (`independent.py`, some 14 digits)
+are plotted over the median time of many runs. All solvers of a scene alternate in one process, and
+processor time is measured, so that a busy machine affects all of them equally; ratios compare
+medians of one run. A table (CSV, Markdown) and a figure per scene and a summary go to `forward/`.
 
-Answer. With an error below 2e-6 the project's solver takes 12 µs to 5 ms, SciPy 50 to 370 times as
-long: see forward/summary.md.
+Answer. For an error below 2e-6 foamfit takes 12 µs to 5 ms, SciPy 50 to 370 times as long: see
+forward/summary.md.
 
     python experiments/error_vs_runtime/forward.py                      # all: about 5 minutes
     python experiments/error_vs_runtime/forward.py one_spring_impact    # some scenes, no summary
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import os
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # processor time is that of one thread
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # processor time of one thread
 
 import contextlib
 import gc
@@ -46,11 +46,11 @@ HERE = Path(__file__).parent
 REFERENCE = "brute force at 1e-13 (experiments/stability/independent.py)"
 WANTED = 2e-6  # the error at which solvers are compared
 ROUNDS = 40
-SHORTEST = 2e-3  # s: shorter runs are timed several at once
-BRIEF = 1e-2  # s: shorter runs are preceded by one that is not timed
-SLOW = 1.0  # s: longer runs are made once
-FLOOR = 1e-16  # an error of zero is drawn there
-# The mark tells solvers apart where colours do not.
+SHORTEST = 2e-3  # s; shorter runs are timed in groups
+BRIEF = 1e-2  # s; shorter runs are preceded by an untimed run
+SLOW = 1.0  # s; longer runs are made once
+FLOOR = 1e-16  # a zero error is drawn here
+# Markers also distinguish solvers, besides colours.
 SOLVERS: dict[str, dict[str, Any]] = {
     PUBLIC: {"color": BLUE, "marker": "o", "linewidth": 1.6},
     KERNEL: {"color": VERMILION, "marker": "D", "linewidth": 1.6},
@@ -65,7 +65,7 @@ SOLVERS: dict[str, dict[str, Any]] = {
 
 @dataclass
 class Timed:
-    """A competitor that has run: its error and its times."""
+    """A competitor with its error and run times."""
 
     competitor: Competitor
     error: float
@@ -75,19 +75,19 @@ class Timed:
 
     @property
     def at_once(self) -> int:
-        """Runs that are timed together."""
+        """Number of runs that are timed together."""
         return max(1, round(SHORTEST / self.first))
 
     def measure(self) -> None:
         """Time one run, or several short ones together."""
-        if self.first < BRIEF:  # what ran before has taken the caches
+        if self.first < BRIEF:  # the previous run has displaced the caches
             self.competitor.run()
         self.times.append(seconds(self.competitor.run, self.at_once))
         self.runs += self.at_once
 
 
 def seconds(run: Callable[[], object], times: int = 1) -> float:
-    """Processor time of a run, s."""
+    """Return the processor time of a run, s."""
     began = time.process_time_ns()
     for _ in range(times):
         run()
@@ -115,7 +115,7 @@ def measure(scene: Scene, budget: float) -> pd.DataFrame:
 
 
 def _first_run(competitor: Competitor, truth: kinds.Answer) -> Timed | None:
-    """Error, and about how long it takes; None if it fails (unstable, or past a pole)."""
+    """Return error and approximate time; None if the run fails (unstable, or past a pole)."""
     answers: list[kinds.Answer] = []
     try:
         first = seconds(lambda: answers.append(competitor.run()))
@@ -133,16 +133,16 @@ def _first_run(competitor: Competitor, truth: kinds.Answer) -> Timed | None:
 
 
 def compile_all() -> None:
-    """Run every kind of solver once: what is measured later is compiled."""
+    """Run every kind of solver once, so that later runs do not compile."""
     for scene in kinds.scenes():
-        many = scene.name.startswith("1000")  # which only the project's own solver does quickly
+        many = scene.name.startswith("1000")  # only foamfit is fast here
         for ladder in (kinds.own(scene) | ({} if many else kinds.others(scene))).values():
             with contextlib.suppress(RuntimeError, ff.SimulationError):
                 ladder[0].run()
 
 
 def _take_turns(timed: list[Timed], budget: float) -> None:
-    """Time all competitors in turns: each as often as its share of the budget (s) allows."""
+    """Time all competitors in turn, as often as each one's share of the budget (s) allows."""
     share = budget / len(timed)
     turns = [
         min(max(round(share / (one.first * one.at_once)), 3), ROUNDS) if one.first < SLOW else 0
@@ -161,7 +161,7 @@ def _take_turns(timed: list[Timed], budget: float) -> None:
 
 
 def draw_scene(table: pd.DataFrame, title: str, path: Path) -> None:
-    """Error over median time of every solver of a scene; a bar spans the quartiles of time."""
+    """Plot error over median time of every solver of a scene, with quartiles of time."""
     with studies.sheet(path, 5.2, 3.1) as figure:
         ax = figure.add_subplot()
         ax.axhline(WANTED, color="0.75", linewidth=0.8, zorder=0)
@@ -189,13 +189,13 @@ def draw_scene(table: pd.DataFrame, title: str, path: Path) -> None:
 
 
 def cheapest(table: pd.DataFrame, family: str) -> pd.Series | None:
-    """The fastest setting of a family (the start of its name) with an error below WANTED."""
+    """Return the fastest setting of a family (name prefix) with an error below WANTED."""
     part = table[table["solver"].str.startswith(family) & (table["error"] < WANTED)]
     return part.loc[part["median (s)"].idxmin()] if len(part) else None
 
 
 def compare(scene: Scene, table: pd.DataFrame) -> dict[str, object]:
-    """One row of the summary: the project against the best of the others at WANTED."""
+    """Return one row of the summary: foamfit against the best other solvers at WANTED."""
     fixed = table[~table["solver"].str.startswith(("foamfit", "SciPy"))]
     best = {
         "simulate": cheapest(table, PUBLIC),
@@ -216,9 +216,10 @@ def compare(scene: Scene, table: pd.DataFrame) -> dict[str, object]:
 
 
 def write(table: pd.DataFrame, path: Path, heading: list[str]) -> pd.DataFrame:
-    """Write a table as CSV (comments first) and as Markdown; return what is kept.
+    """Write a table as CSV (comments first) and as Markdown; return the kept table.
 
-    That is the older table where times are much the same, so that figure and summary are, too.
+    If the times have hardly changed, the older table is kept, and so figure and summary stay the
+    same.
     """
     written, page = path.with_suffix(".csv"), path.with_suffix(".md")
     with keep_unchanged(written), written.open("w") as file:
@@ -254,10 +255,10 @@ def main() -> None:
         table = write(measure(scene, options.budget), options.out / scene.name, heading)
         draw_scene(table, scene.title, options.out / f"{scene.name}.png")
         rows.append(compare(scene, table))
-        told = (
+        ratios = (
             f"SciPy / {name} {rows[-1][f'SciPy / {name}']:.3g}" for name in ("simulate", "kernel")
         )
-        print(scene.name, *told, f"({time.perf_counter() - began:.0f} s)", file=sys.stderr)
+        print(scene.name, *ratios, f"({time.perf_counter() - began:.0f} s)", file=sys.stderr)
     if options.scenes:
         return
     summary = pd.DataFrame(rows)

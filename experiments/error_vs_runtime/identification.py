@@ -1,16 +1,16 @@
-"""Misfit reached against seconds: the project's own search and eight methods of lmfit.
+"""Misfit against run time: foamfit's search and eight methods of lmfit.
 
 Question. How many problems does a method solve in a few seconds, and how fast?
 
 Method. Every method minimises the same residual (`fitting.objective.Objective`) of the same
-problems and is stopped after the same time. What is recorded is the lowest cost so far against the
-processor time of the one thread that runs, which on an idle machine is the elapsed time. A local
-method starts at a random point of the search's box (`fitting.search.box_starts`, drawn from the
-seed) and starts again from the next one until the time is up; a global method that ends does so
-too; and so does `foamfit.fit`, with another seed. A run also ends once its cost is within 0.1 % of
-the best known, where nothing is left to gain. The eight methods are run twice: in the
-`lmfit.Parameters` of `foamfit.make_params` (SI values and bounds, what a user of lmfit would
-write), and in the coordinates of the project's own search, in which every point is admissible.
+problems and is stopped after the same time. The lowest cost so far is recorded against the
+processor time of the single thread, which equals the elapsed time on an idle machine. A local
+method starts at a random point of the search box (`fitting.search.box_starts`, drawn from the seed)
+and restarts from the next one until the time is up. A global method that ends, and `foamfit.fit`,
+restart in the same way, `foamfit.fit` with another seed. A run also ends once its cost is within
+0.1 % of the best known. The eight methods are run twice: in the `lmfit.Parameters` of
+`foamfit.make_params` (SI values and bounds, as a user of lmfit would write them), and in the
+coordinates of foamfit's search, in which every point is admissible.
 
 Answer. `foamfit.fit` solves all problems in 3 s; see identification.md.
 
@@ -20,8 +20,8 @@ Answer. `foamfit.fit` solves all problems in 3 s; see identification.md.
 
 Writes identification_runs.csv.gz (every improvement by more than 2 %, and when a problem was
 solved) and identification_runs.json (machine, versions, arguments); then identification.md and
-figures. FOAMFIT_DATA names the folder of the measurements by others; without it the shoe foam is
-left out.
+figures. FOAMFIT_DATA is the folder of third-party measurements; without it the shoe foam is
+omitted.
 """
 
 # ruff: noqa: E402  (the number of threads is read when NumPy is imported)
@@ -80,7 +80,7 @@ COORDINATES = {
     "si": "lmfit.Parameters in SI, bounds of make_params",
     "box": "lmfit.Parameters in the coordinates of foamfit's search",
 }
-# Colours that all can tell apart (Okabe & Ito, and two more); lines differ in their dashes too.
+# Colours safe for colour-blind readers (Okabe & Ito, and two more); lines also differ in dashes.
 STYLES: dict[str, tuple[str, str]] = {
     OWN: (studies.BLUE, "-"),
     "leastsq": ("black", "-"),
@@ -94,7 +94,7 @@ STYLES: dict[str, tuple[str, str]] = {
 }
 GZIP = {"method": "gzip", "mtime": 0}
 ENOUGH = 1.001  # cost over the best known at which a run ends
-RECORDED = 0.98  # cost over the last recorded one below which it is recorded
+RECORDED = 0.98  # a cost is recorded below this multiple of the last recorded one
 
 
 # ---------------------------------------------------------------- problems
@@ -102,16 +102,16 @@ RECORDED = 0.98  # cost over the last recorded one below which it is recorded
 
 @dataclass(frozen=True)
 class Case:
-    """What is to be identified: a test file, a model and a drive."""
+    """An identification problem: test file, model and drive."""
 
     title: str
-    file: str  # from experiments/, or from FOAMFIT_DATA where `specimen` is given
+    file: str  # below experiments/, or below FOAMFIT_DATA if `specimen` is given
     model: str
     drive: str
     specimen: tuple[str, str] | None = None  # height and diameter
 
     def problem(self) -> Problem:
-        """Read the test and make the problem ready, as `foamfit.fit` does."""
+        """Read the test and set up the problem, as `foamfit.fit` does."""
         if self.specimen is None:
             test = ff.read_test(HERE.parent / self.file)
         else:
@@ -146,14 +146,14 @@ CASES = {
 
 
 class RunOver(Exception):  # noqa: N818 (nothing went wrong)
-    """The time is up, or nothing is left to gain."""
+    """The time is up, or the best known cost is reached."""
 
 
 @dataclass(eq=False)
 class Recorder:
-    """The lowest cost of one run so far, against seconds and evaluations.
+    """Record of the lowest cost of one run against seconds and evaluations.
 
-    Only evaluations of the curves of `objective` count as progress. The run is over after `budget`
+    Only evaluations of the curves of `objective` count as progress. The run ends after `budget`
     seconds of processor time, or near the best `known` cost.
     """
 
@@ -168,7 +168,7 @@ class Recorder:
     ended: float = np.nan
 
     def count(self) -> float:
-        """Count an evaluation of a residual or of its derivative; returns the seconds so far."""
+        """Count an evaluation of a residual or its derivative; return the seconds so far."""
         seconds = time.process_time() - self.began
         if seconds > self.budget:
             raise RunOver
@@ -176,7 +176,7 @@ class Recorder:
         return seconds
 
     def note(self, objective: Objective, values: Array, residual: Array) -> None:
-        """Take down an evaluation, and end the run (`RunOver`) where nothing is left to gain."""
+        """Record an evaluation; raise `RunOver` near the best known cost."""
         seconds = self.count()
         if objective.measurement is self.objective.measurement:
             cost = float(residual @ residual)
@@ -189,7 +189,7 @@ class Recorder:
             raise RunOver
 
     def finished(self) -> list[tuple[float, int, float]]:
-        """Rows of the run, the last one at its end, if the cost is that of the recorded point."""
+        """Return the rows of the run, with a last one at its end; check the recorded cost."""
         if self.values is not None:
             residual = self.objective.residual(self.values)
             if not np.isclose(float(residual @ residual), self.cost, rtol=1e-6):
@@ -199,9 +199,9 @@ class Recorder:
 
 @contextmanager
 def recorded(recorder: Recorder) -> Iterator[None]:
-    """Have every residual of any objective noted, and its derivatives counted.
+    """Record every residual of any objective, and count its derivatives.
 
-    Ends quietly when the run is over.
+    `RunOver` is caught here.
     """
     plain, derivative = Objective.residual, Objective.jacobian
 
@@ -224,7 +224,7 @@ def recorded(recorder: Recorder) -> Iterator[None]:
 
 
 def run_own(case: Case, problem: Problem, seed: int) -> None:
-    """Fit by the project's own search, over and over with other seeds."""
+    """Fit repeatedly by foamfit's search, each time with another seed."""
     for again in range(1000):
         ff.fit(
             problem.measurement, model=case.model, drive=case.drive, seed=1000 * seed + again,
@@ -233,21 +233,21 @@ def run_own(case: Case, problem: Problem, seed: int) -> None:
 
 
 def random_points(space: Space, rng: np.random.Generator) -> Iterator[Array]:
-    """Points of the box, without end; the same ones for every method of the same seed."""
+    """Yield endless points of the box, the same for every method with the same seed."""
     while True:
         yield from box_starts(space, rng, 32)
 
 
 @dataclass(frozen=True)
 class Variables:
-    """What a method of lmfit varies, in "si" or "box", and the way to the problem's flat vector."""
+    """Variables of an lmfit method, "si" or "box", and their map to the problem's vector."""
 
     problem: Problem
     space: Space
     coordinates: str
 
     def params(self, point: Array) -> lmfit.Parameters:
-        """Parameters at a point of the box, off their bounds, where least_squares wants them."""
+        """Return parameters at a point of the box, inside their bounds for least_squares."""
         if self.coordinates == "box":
             params = lmfit.Parameters()
             for j, (low, high) in enumerate(zip(*self.space.box, strict=True)):
@@ -264,11 +264,11 @@ class Variables:
         return params
 
     def residual(self, params: lmfit.Parameters) -> Array:
-        """Residual of the problem."""
+        """Return the residual of the problem."""
         return self.problem.objective.residual(self._vector(params))
 
     def jacobian(self, params: lmfit.Parameters) -> Array:
-        """Derivative of the residual by what varies, (n_data, n_free)."""
+        """Return the derivative of the residual by the free parameters, (n_data, n_free)."""
         slopes = self.problem.slopes(self._vector(params), self.problem.free())
         if self.coordinates == "si":
             return slopes
@@ -293,7 +293,7 @@ def _values(params: lmfit.Parameters) -> Array:
 
 
 def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int) -> None:
-    """Minimise by a method of lmfit, over and over from other points of the box."""
+    """Minimise repeatedly by a method of lmfit, each time from another point of the box."""
     variables = Variables(problem, problem.space(), coordinates)
     rng = np.random.default_rng(seed)
     for point in random_points(variables.space, rng):
@@ -301,18 +301,18 @@ def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int) -> Non
         if method in LEAST_SQUARES:
             options |= {"Dfun" if method == "leastsq" else "jac": variables.jacobian}
         with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")  # of lmfit's covariances, which nobody reads here
+            warnings.simplefilter("ignore")  # about covariances of lmfit, not used here
             try:
                 lmfit.minimize(
                     variables.residual, variables.params(point), method=method, calc_covar=False,
                     max_nfev=10**9, **options,
                 )  # fmt: skip
             except (ValueError, np.linalg.LinAlgError):
-                continue  # a method that breaks down starts again, on its own time
+                continue  # a method that fails restarts within its time
 
 
 def _options(method: str, seed: int) -> dict[str, object]:
-    """What a knowing user would set: chance from the seed, scales of least_squares."""
+    """Return the options of an experienced user: random seed, scales of least_squares."""
     if method == "least_squares":
         return {"x_scale": "jac"}
     if method in ("differential_evolution", "basinhopping", "dual_annealing"):
@@ -326,7 +326,7 @@ def _options(method: str, seed: int) -> dict[str, object]:
 
 
 def best_known(case: Case, problem: Problem) -> float:
-    """Lowest cost of three long searches, which also compile whatever there is to compile."""
+    """Return the lowest cost of three long searches, which also compile everything."""
     costs = []
     for seed in range(9000, 9003):
         result = ff.fit(
@@ -339,7 +339,7 @@ def best_known(case: Case, problem: Problem) -> float:
 
 
 def run_all(options: argparse.Namespace, log: Path, notes: Path) -> None:
-    """Run every method on every problem and seed; writes what was run after each problem."""
+    """Run every method on every problem and seed; save the runs after each problem."""
     where = f"{studies.processor()}, {os.cpu_count()} cores, {platform.machine()}"
     versions = studies.versions("foamfit", "lmfit", "scipy", "numpy", "numba")
     known, frames = dict[str, float](), list[pd.DataFrame]()
@@ -377,7 +377,7 @@ def run_all(options: argparse.Namespace, log: Path, notes: Path) -> None:
 
 
 def solved_after(runs: pd.DataFrame, known: dict[str, float]) -> pd.DataFrame:
-    """One row for each run: seconds until it was solved (inf if never)."""
+    """Return one row for each run: seconds to solution (inf if never)."""
     solved = runs["cost"] <= SOLVED * runs["problem"].map(known)
     first = runs[solved].groupby(RUN)["seconds"].first()
     every = pd.MultiIndex.from_frame(runs[RUN].drop_duplicates())
@@ -387,7 +387,7 @@ def solved_after(runs: pd.DataFrame, known: dict[str, float]) -> pd.DataFrame:
 def draw_curves(
     runs: pd.DataFrame, coordinates: str, known: dict[str, float], budget: float, path: Path
 ) -> None:
-    """Misfit over the best known against seconds: median and quartiles over the seeds."""
+    """Plot misfit over the best known against seconds: median and quartiles over the seeds."""
     elapsed = np.geomspace(0.01, budget, 200)
     among = runs[runs["coordinates"].isin(("own", coordinates))]
     with studies.sheet(path, 7.0, 1.7 * len(known) + 0.9) as figure:
@@ -406,43 +406,45 @@ def draw_curves(
             row[len(GROUPS) // 2].set_title(CASES[key].title)
         for axes, title in zip(grid[-1], GROUPS, strict=True):
             axes.set_xlabel(f"processor time (s): {title}")
-        told = f"{COORDINATES[coordinates]}: median and quartiles of {runs['seed'].nunique()} seeds"
-        figure.suptitle(told, fontsize=8)
+        heading = (
+            f"{COORDINATES[coordinates]}: median and quartiles of {runs['seed'].nunique()} seeds"
+        )
+        figure.suptitle(heading, fontsize=8)
         names = [name for name in STYLES if name in set(among["method"])]
         handles = [Line2D([], [], label=name, **_line(name)) for name in names]
         figure.legend(handles=handles, loc="outside lower center", ncols=5, handlelength=3.2)
 
 
 def _band(axes: Axes, elapsed: Array, runs: pd.DataFrame, known: float, name: str) -> None:
-    """Draw one method: what each seed had reached at each second, as median and quartiles."""
+    """Draw one method: median and quartiles over the seeds at each time."""
     reached = []
     for _, run in runs.groupby("seed", sort=False):
         at = np.searchsorted(run["seconds"].to_numpy(), elapsed, side="right") - 1
         misfit = np.sqrt(run["cost"].to_numpy() / known)
         reached.append(np.where(at >= 0, misfit[at], np.inf))
     low, middle, high = np.quantile(reached, (0.25, 0.5, 0.75), axis=0, method="inverted_cdf")
-    there = list(np.isfinite(high))  # from when on three quarters of the seeds have anything
+    there = list(np.isfinite(high))  # true once three quarters of the seeds have a result
     line = _line(name)
     axes.fill_between(elapsed, low, high, where=there, color=line["color"], alpha=0.15, linewidth=0)
     axes.plot(elapsed, middle, **line)
 
 
 def _line(name: str) -> dict[str, Any]:
-    """Colour, dashes and width of a method's line."""
+    """Return colour, dashes and width of a method's line."""
     colour, dash = STYLES[name]
     return {"color": colour, "linestyle": dash, "linewidth": 2.0 if name == OWN else 1.1}
 
 
 def summary(ends: pd.DataFrame, known: dict[str, float]) -> str:
-    """Markdown: one row for each method, one column for each problem."""
+    """Return a Markdown table: one row for each method, one column for each problem."""
     rows = []
     for (coordinates, method), own in ends.groupby(["coordinates", "method"], sort=False):
         cells = []
         for key in known:
             after = own.loc[own["problem"] == key, "solved_after_s"]
             median = np.quantile(after, 0.5, method="inverted_cdf")
-            told = f"{median:.2f} s" if np.isfinite(median) else "never"
-            cells.append(f"{np.isfinite(after).sum()} of {len(after)}, {told}")
+            shown = f"{median:.2f} s" if np.isfinite(median) else "never"
+            cells.append(f"{np.isfinite(after).sum()} of {len(after)}, {shown}")
         solved = np.isfinite(own["solved_after_s"])
         rows.append([method, coordinates, *cells, f"{solved.sum()} of {len(own)}"])
     titles = [CASES[key].title for key in known]

@@ -1,9 +1,10 @@
-"""SciPy's integrators as the outside yardstick, restarted at every switch of a branch.
+"""SciPy's integrators as an external reference, restarted at every switch of a branch.
 
-Made as strong as is sensible: right-hand sides, Jacobians and switching functions are compiled, the
-solver objects are stepped directly (`solve_ivp` costs more per step), a switch is a root of the
-solver's own dense output, and massless springs in series enter through their common stress, for
-which everything is explicit: C(s) ds/dt = dw/dt with the compliance C = Σ h_i/k_i of eq. 2.
+They are made as fast as is sensible: right-hand sides, Jacobians and switching functions are
+compiled, the solver objects are stepped directly (`solve_ivp` costs more per step), and a switch is
+a root of the solver's dense output. Massless springs in series are integrated in their common
+stress, which makes everything explicit: C(s) ds/dt = dw/dt with the compliance C = Σ h_i/k_i of eq.
+2.
 """
 
 from __future__ import annotations
@@ -25,18 +26,18 @@ TINY = 4 * np.finfo(float).eps
 compiled = njit(cache=True, error_model="numpy")
 
 
-# The project's loops that only other loops call have no bridge to Python; here it is.
+# Compiled loops of foamfit without a Python interface are wrapped here.
 
 
 @compiled
 def at_rest(row):
-    """Branch of a spring at rest."""
+    """Return the branch of a spring at rest."""
     return law.first_branch(row)
 
 
 @compiled
 def entered(branch, rising):
-    """Branch that a spring enters when it leaves another."""
+    """Return the branch that a spring enters when it leaves another."""
     return law.above(branch) if rising else law.below(branch)
 
 
@@ -45,7 +46,7 @@ def entered(branch, rising):
 
 @compiled
 def nodes_rate(y, rows, branches, heights, mass, drag):
-    """d/dt of (displacements, velocities) of the nodes."""
+    """Return d/dt of (displacements, velocities) of the nodes."""
     n = mass.size
     out = np.empty(2 * n)
     over = -drag * y[2 * n - 1]
@@ -66,7 +67,7 @@ def nodes_rate(y, rows, branches, heights, mass, drag):
 
 @compiled
 def nodes_jacobian(y, rows, branches, heights, mass, drag):
-    """Derivative of `nodes_rate` by the state, (2n, 2n)."""
+    """Return the derivative of `nodes_rate` by the state, (2n, 2n)."""
     n = mass.size
     out = np.zeros((2 * n, 2 * n))
     out[2 * n - 1, 2 * n - 1] = -drag / mass[n - 1]
@@ -86,10 +87,11 @@ def nodes_jacobian(y, rows, branches, heights, mass, drag):
 
 @compiled
 def nodes_room(states, rows, branches, heights, pressed):
-    """First of some states (2n, samples) at which a spring has left its branch, or contact ended.
+    """Find the first state (2n, samples) where a spring has left its branch or contact ended.
 
-    Returns its index (-1 = none), the least room left there in strain (base stress over k0 for
-    contact), the spring (-1 = contact) and the side; the last state's where there is none.
+    Return its index (-1 = none), the smallest distance there to a switch in strain (base stress
+    over k0 for contact), the spring (-1 = contact) and the side. Without a switch these describe
+    the last state.
     """
     n = heights.size
     least, who, side = np.inf, -1, 0
@@ -115,7 +117,7 @@ def nodes_room(states, rows, branches, heights, pressed):
 
 @compiled
 def nodes_output(states, rows, branches, heights, out_w, out_s):
-    """Displacement of the top and base stress at states (2n, samples)."""
+    """Fill in displacement of the top and base stress at states (2n, samples)."""
     n = heights.size
     for j in range(states.shape[1]):
         eps = states[0, j] / heights[0]
@@ -129,7 +131,7 @@ def nodes_output(states, rows, branches, heights, out_w, out_s):
 
 @compiled
 def series_compliance(s, rows, branches, heights):
-    """C = Σ h_i dε_i/ds (m/Pa) of springs under one stress, and dC/ds; k/(k+s)² where curved."""
+    """Return C = Σ h_i dε_i/ds (m/Pa) of springs in series, and dC/ds; k/(k+s)² if curved."""
     soft, change = 0.0, 0.0
     for i in range(heights.size):
         curved, k, _, _ = law.branch_shape(rows[i], branches[i])
@@ -141,7 +143,7 @@ def series_compliance(s, rows, branches, heights):
 
 @compiled
 def series_rate(y, rows, branches, heights, mass, drag):
-    """d/dt of (common stress, velocity of the striker)."""
+    """Return d/dt of (common stress, velocity of the striker)."""
     out = np.empty(2)
     out[0] = y[1] / series_compliance(y[0], rows, branches, heights)[0]
     out[1] = -(y[0] + drag * y[1]) / mass[0]
@@ -150,7 +152,7 @@ def series_rate(y, rows, branches, heights, mass, drag):
 
 @compiled
 def series_jacobian(y, rows, branches, heights, mass, drag):
-    """Derivative of `series_rate` by the state, (2, 2)."""
+    """Return the derivative of `series_rate` by the state, (2, 2)."""
     soft, change = series_compliance(y[0], rows, branches, heights)
     out = np.empty((2, 2))
     out[0, 0], out[0, 1] = -y[1] * change / soft**2, 1.0 / soft
@@ -160,9 +162,9 @@ def series_jacobian(y, rows, branches, heights, mass, drag):
 
 @compiled
 def series_limits(rows, branches, pressed):
-    """Stresses between which no spring leaves its branch, and which spring is at either.
+    """Return the stresses between which no spring leaves its branch, and the limiting springs.
 
-    Below lies the end of contact (-1) at the latest, once there has been one.
+    After first contact the lower limit is at least the end of contact (-1).
     """
     low, high, who_low, who_high = (0.0 if pressed else -np.inf), np.inf, -1, -1
     for i in range(branches.size):
@@ -185,7 +187,7 @@ def series_limits(rows, branches, pressed):
 
 @compiled
 def series_room(states, low, high, who_low, who_high):
-    """See `nodes_room`; the room is one of stress."""
+    """See `nodes_room`; the distance is a stress."""
     left, who, side = np.inf, -1, 0
     for j in range(states.shape[1]):
         s = states[0, j]
@@ -200,7 +202,7 @@ def series_room(states, low, high, who_low, who_high):
 
 @compiled
 def series_output(states, rows, branches, heights, out_w, out_s):
-    """Displacement of the top and base stress at states (2, samples)."""
+    """Fill in displacement of the top and base stress at states (2, samples)."""
     for j in range(states.shape[1]):
         out_s[j] = states[0, j]
         out_w[j] = 0.0
@@ -213,7 +215,7 @@ def series_output(states, rows, branches, heights, out_w, out_s):
 
 @dataclass
 class System:
-    """An impact for SciPy: its state, and what the branches of the moment make of it."""
+    """An impact for SciPy: its state and the current branches."""
 
     rows: np.ndarray
     heights: np.ndarray
@@ -222,7 +224,7 @@ class System:
     speed: float
 
     def __post_init__(self) -> None:
-        """Choose the state: nodes where every spring has a mass law.above it, else the stress."""
+        """Choose the state: nodes if every spring has a mass above it, else the stress."""
         self.series = self.mass.size == 1 and self.heights.size > 1
         assert self.series or self.mass.size == self.heights.size
         self.branches = np.array([at_rest(row) for row in self.rows])
@@ -242,17 +244,18 @@ class System:
             self.rate, self.slope, self.output = nodes_rate, nodes_jacobian, nodes_output
 
     def still(self) -> tuple[Any, ...]:
-        """What the compiled functions want to know besides the state."""
+        """Arguments of the compiled functions besides the state."""
         return self.rows, self.branches, self.heights, self.mass, self.drag
 
     def enter(self, who: int, side: int) -> None:
-        """Change the branch of a spring that has come to an end of it."""
+        """Change the branch of a spring that has reached the end of its branch."""
         self.branches[who] = entered(self.branches[who], side > 0)
 
     def room(self) -> Callable[[np.ndarray], tuple[int, float, int, int]]:
-        """Return the function that looks for the first of some states (size, n) past a switch.
+        """Return the function that finds the first state (size, n) past a switch.
 
-        It gives the index (-1 = none), the room left there, the spring (-1 = contact) and side.
+        It returns the index (-1 = none), the distance there, the spring (-1 = contact) and the
+        side.
         """
         if not self.series:
             still = self.rows, self.branches, self.heights, self.pressed
@@ -261,15 +264,15 @@ class System:
         return lambda states: series_room(states, *limits)
 
     def write(self, states: np.ndarray, out_w: np.ndarray, out_s: np.ndarray) -> None:
-        """Fill displacement of the striker and base stress at states (size, n)."""
+        """Fill in displacement of the striker and base stress at states (size, n)."""
         self.output(states, self.rows, self.branches, self.heights, out_w, out_s)
 
 
-MOST_SWITCHES = 100_000  # of 1000 springs every one goes through four
+MOST_SWITCHES = 100_000  # each of 1000 springs makes four
 
 
 class Impact(Protocol):
-    """What `impact` wants of a system: `System`, or that of springs with memory."""
+    """Interface of a system for `impact`."""
 
     y: np.ndarray
     scale: np.ndarray
@@ -287,10 +290,10 @@ class Impact(Protocol):
 def impact(
     system: Impact, t: np.ndarray, method: str, rtol: float, looks: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement of the striker and base stress, (n,) each, of an impact at the samples t.
+    """Return displacement of the striker and base stress (n,) of an impact at the samples t.
 
-    A switch is looked for at the samples, at the ends of steps, and at `looks` points inside them:
-    where masses ring, a spring may leave its branch and come back within a step.
+    Switches are detected at the samples, at the ends of steps, and at `looks` points inside steps:
+    with vibrating masses, a spring may leave its branch and return within a step.
     """
     out_w, out_s = np.zeros(t.size), np.zeros(t.size)
     now, done = float(t[0]), 0
@@ -299,7 +302,7 @@ def impact(
             now, done, who, side = _phase(system, now, t, done, method, rtol, looks, out_w, out_s)
         if who is None:
             return out_w, out_s
-        if who == -1:  # contact ends: the striker flies
+        if who == -1:  # contact ends and the striker flies off
             last_w, last_s = np.empty(1), np.empty(1)
             system.write(system.y[:, None], last_w, last_s)
             out_w[done:] = last_w[0] + system.y[-1] * (t[done:] - now)
@@ -319,7 +322,7 @@ def _phase(
     out_w: np.ndarray,
     out_s: np.ndarray,
 ) -> tuple[float, int, int | None, int]:
-    """Go on from `now` to the next switch: its time, samples done, spring (None = none), side."""
+    """Continue from `now` to the next switch: return time, samples done, spring or None, side."""
     still, room = system.still(), system.room()
     options: dict[str, Any] = {}
     if method != "DOP853":
@@ -369,8 +372,8 @@ def _phase(
 
 
 def _root(gap: Callable[[float], float], low: float, high: float) -> float:
-    """Time at which `gap` becomes negative; it is so at `high`."""
-    if gap(low) <= 0.0:  # on a switch just made, up to rounding: look for where it is inside
+    """Return the time at which `gap` becomes negative; it is negative at `high`."""
+    if gap(low) <= 0.0:  # at a previous switch up to rounding: find a point after it
         for part in (0.01, 0.1, 0.3, 0.6, 0.9):
             if gap(low + part * (high - low)) > 0.0:
                 low += part * (high - low)
@@ -381,9 +384,9 @@ def _root(gap: Callable[[float], float], low: float, high: float) -> float:
 
 
 def along(solver: Any, points: np.ndarray, done: int, out: np.ndarray) -> tuple[int, np.ndarray]:
-    """Step a solver to its end; fills `out` at the points from `done` on that it passes.
+    """Step a solver to its end; fill in `out` at the points from `done` on that it passes.
 
-    Returns how many points are done, and the last state.
+    Return the number of points done and the last state.
     """
     while solver.status == "running":
         message = solver.step()

@@ -1,12 +1,12 @@
-"""SciPy's integrators, and schemes by hand, for one microscale spring with a relaxation term.
+"""SciPy's integrators and hand-written schemes for a microscale spring with relaxation.
 
-As strong as `restarted.py`: the state of an impact is the equilibrium stress s, in which the law
-is explicit (no root is looked for), what relaxes, z = q - g s, and the velocity of the striker;
-right sides and switching functions are compiled, and the solver is restarted where the spring
-turns, snaps again, or contact ends. A linear spring may lie under the microscale one: both carry
-one stress. Along a prescribed displacement only z is integrated, and s is the compiled root of the
-law at its strain, so that what an integrator meets is as smooth as the history. The law is written
-out here: it is shared with none of the others.
+As in `restarted.py`, right-hand sides and switching functions are compiled. The state of an impact
+is the equilibrium stress s, in which the law is explicit (no root finding), the relaxing part z = q
+- g s, and the velocity of the striker. The solver is restarted where the spring reverses, snaps
+again, or contact ends. A linear spring may lie under the microscale one; both carry the same
+stress. Under a prescribed displacement only z is integrated, and s is the compiled root of the law
+at the given strain, so that the integrand is as smooth as the history. The law is implemented here
+independently of all others.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ROOT_2, DENSITY = math.sqrt(2.0), 1.0 / math.sqrt(2.0 * math.pi)
 
 
 def row_of(chain: ff.Chain, mass: float = 0.0) -> np.ndarray:
-    """Parameters of a microscale spring, alone or above a linear one without a dashpot."""
+    """Return the parameters of a microscale spring, alone or above an undamped linear one."""
     spring, height, soft = chain.springs[-1], chain.heights[-1], 0.0
     assert isinstance(spring, ff.MicroscaleSpring)
     if len(chain.springs) == 2:
@@ -47,7 +47,7 @@ def row_of(chain: ff.Chain, mass: float = 0.0) -> np.ndarray:
 
 @compiled
 def strain(row, branch, rank, s):
-    """Strain at an equilibrium stress, and dε/ds."""
+    """Return the strain at an equilibrium stress, and dε/ds."""
     u, wide = rank, 0.0
     if branch != HELD:
         wide = row[WIDE_PLUS] if branch == SNAP else row[WIDE_MINUS]
@@ -63,14 +63,14 @@ def strain(row, branch, rank, s):
 
 @compiled
 def limits(row, rank):
-    """Stresses between which a spring is held."""
+    """Return the stresses between which the rank of a spring is constant."""
     low = math.exp(row[LOG_MINUS] + row[WIDE_MINUS] * rank)
     return low, math.exp(row[LOG_PLUS] + row[WIDE_PLUS] * rank)
 
 
 @compiled
 def turned(row, branch, s):
-    """Rank at which a spring is held that turns at a stress."""
+    """Return the constant rank of a spring after a reversal at a stress."""
     if s <= 0.0:
         return -math.inf
     if branch == SNAP:
@@ -80,7 +80,7 @@ def turned(row, branch, s):
 
 @compiled
 def rate(y, row, branch, rank):
-    """d/dt of (s, z, velocity)."""
+    """Return d/dt of (s, z, velocity)."""
     out = np.empty(3)
     s, z, v = y
     out[1] = -(z + row[G] * s) / row[TAU]
@@ -92,7 +92,7 @@ def rate(y, row, branch, rank):
 
 @compiled
 def slope(y, row, branch, rank):
-    """Derivative of `rate` by the state, (3, 3); that of dε/ds by a central difference."""
+    """Return the derivative of `rate` by the state, (3, 3); dε/ds by a central difference."""
     s, z, v = y
     out = np.zeros((3, 3))
     out[1, 0], out[1, 1] = -row[G] / row[TAU], -1.0 / row[TAU]
@@ -109,7 +109,7 @@ def slope(y, row, branch, rank):
 
 @compiled
 def room(states, row, branch, rank, speed, pressed):
-    """First of some states (3, n) past a turn, a limit or contact; see `restarted.nodes_room`."""
+    """Find the first state (3, n) past a turn, limit or contact; see `restarted.nodes_room`."""
     least, who, side = np.inf, 0, 0
     low, high = limits(row, rank) if branch == HELD else (0.0, 0.0)
     for j in range(states.shape[1]):
@@ -134,7 +134,7 @@ def room(states, row, branch, rank, speed, pressed):
 
 @compiled
 def output(states, row, branch, rank, out_w, out_s):
-    """Displacement of the striker and base stress at states (3, n)."""
+    """Fill in displacement of the striker and base stress at states (3, n)."""
     for j in range(states.shape[1]):
         s = states[0, j]
         out_s[j] = (1.0 + row[G]) * s + states[1, j]
@@ -154,7 +154,7 @@ class MemorySystem:
         self.rate, self.slope = rate, slope
 
     def still(self) -> tuple[Any, ...]:
-        """What the compiled functions want to know besides the state."""
+        """Arguments of the compiled functions besides the state."""
         return self.row, self.branch, self.rank
 
     def enter(self, who: int, side: int) -> None:
@@ -177,7 +177,7 @@ class MemorySystem:
 
 @compiled
 def _advance(y, h, row, branch, rank):
-    """One step of Runge and Kutta's classical scheme."""
+    """Take one step of the classical Runge-Kutta scheme."""
     a = rate(y, row, branch, rank)
     b = rate(y + 0.5 * h * a, row, branch, rank)
     c = rate(y + 0.5 * h * b, row, branch, rank)
@@ -187,7 +187,7 @@ def _advance(y, h, row, branch, rank):
 
 @compiled
 def runge_kutta(row, speed, t, substeps, out_w, out_s):
-    """An impact in fixed steps; a branch is brought up to date at the end of each."""
+    """Integrate an impact in fixed steps; update the branch at the end of each step."""
     y = np.array([0.0, 0.0, speed])
     branch, rank = SNAP, -math.inf
     one_w, one_s = np.zeros(1), np.zeros(1)
@@ -198,7 +198,7 @@ def runge_kutta(row, speed, t, substeps, out_w, out_s):
             before, last = y, (1.0 + row[G]) * y[0] + y[1]
             y = _advance(y, h, row, branch, rank)
             base = (1.0 + row[G]) * y[0] + y[1]
-            if base <= 0.0 < last:  # contact has ended: the striker flies
+            if base <= 0.0 < last:  # contact has ended and the striker flies off
                 part = last / (last - base)
                 y = before + part * (y - before)
                 output(y.reshape(3, 1), row, branch, rank, one_w, one_s)
@@ -225,7 +225,7 @@ def runge_kutta(row, speed, t, substeps, out_w, out_s):
 
 @compiled
 def stress_at(row, branch, rank, eps, guess):
-    """Equilibrium stress at a strain on a branch, by guarded Newton steps."""
+    """Return the equilibrium stress at a strain on a branch, by guarded Newton steps."""
     low, high, s = 0.0, np.inf, max(guess, 1e-12 * row[K0])
     if eps <= 0.0:
         return 0.0
@@ -246,7 +246,7 @@ def stress_at(row, branch, rank, eps, guess):
 
 @compiled
 def follow(row, state, eps):
-    """Equilibrium stress at the next strain of a history; `state` is (branch, rank, strain, s)."""
+    """Return the stress at the next strain of a history; `state` is (branch, rank, strain, s)."""
     branch, rank, last, s = int(state[0]), state[1], state[2], state[3]
     if (branch == SNAP and eps < last) or (branch == BACK and eps > last):
         branch, rank = HELD, turned(row, branch, s)
@@ -263,7 +263,7 @@ def follow(row, state, eps):
 
 @compiled
 def samples_of(row, eps, out):
-    """Equilibrium stress (n,) and (branch, rank) (n, 2) at the samples of a history from rest."""
+    """Return stress (n,) and (branch, rank) (n, 2) in equilibrium along a history from rest."""
     state = np.array([SNAP, -math.inf, 0.0, 0.0])
     kept = np.zeros((eps.size, 2))
     for j in range(eps.size):
@@ -274,7 +274,7 @@ def samples_of(row, eps, out):
 
 @compiled
 def relaxing_rate(now, z, row, t, eps, equilibrium, kept):
-    """dz/dt at a time; the strain is linear between samples."""
+    """Return dz/dt at a time; the strain is linear between samples."""
     j = min(max(np.searchsorted(t, now) - 1, 0), t.size - 2)
     part = (now - t[j]) / (t[j + 1] - t[j])
     state = np.array([kept[j, 0], kept[j, 1], eps[j], equilibrium[j]])
@@ -285,7 +285,7 @@ def relaxing_rate(now, z, row, t, eps, equilibrium, kept):
 def along_displacement(
     row: np.ndarray, t: np.ndarray, eps: np.ndarray, method: str, rtol: float
 ) -> np.ndarray:
-    """Stress (n,) along a history of strain; restarted where the strain turns."""
+    """Return the stress (n,) along a history of strain; restart at its turning points."""
     equilibrium = np.zeros(t.size)
     kept = samples_of(row, eps, equilibrium)
     z = np.zeros(t.size)
@@ -305,7 +305,7 @@ def along_displacement(
 
 @compiled
 def recursion(row, t, eps, substeps, out):
-    """The same by hand: q follows exactly an equilibrium stress that is linear between points."""
+    """Integrate q exactly for an equilibrium stress that is linear between points."""
     state = np.array([SNAP, -math.inf, 0.0, 0.0])
     out[0] = last = q = 0.0
     for j in range(1, t.size):

@@ -1,4 +1,4 @@
-"""The scenes whose error is set against run time, and every way in which one can be computed."""
+"""Scenes of the study of error against run time, and all solvers for them."""
 
 from __future__ import annotations
 
@@ -32,18 +32,12 @@ PUBLIC, KERNEL = "foamfit simulate", "foamfit kernel"
 
 @dataclass(frozen=True)
 class Scene:
-    """A chain under a drive, and how far each solver is taken.
+    """A chain under a drive, and the settings of each solver.
 
-    Attributes
-    ----------
-    own, outside : sequences of float
-        Tolerances of the project's solver and of SciPy's.
-    substeps : sequence of int
-        Steps of the fixed-step schemes between two samples.
-    longest : float
-        A ladder of settings ends after the first that takes longer, s.
-    looks : int
-        See `restarted.impact`.
+    Attributes ---------- own, outside : sequences of float Tolerances of foamfit and of SciPy.
+    substeps : sequence of int Steps of the fixed-step schemes between two samples. longest : float
+    Time limit, s: no further setting is tried after one that takes longer. looks : int See
+    `restarted.impact`.
     """
 
     name: str
@@ -59,9 +53,9 @@ class Scene:
 
 
 def graded(count: int, mass: float = 0.0, eta: float = 0.0) -> ff.Chain:
-    """Springs of foam-1/model-2, of which k0, k_c, Δσ, k_h± and ε_a, ε_c vary by ±10 %, shuffled.
+    """Return springs of foam-1/model-2 with k0, k_c, Δσ, k_h±, ε_a, ε_c varied by ±10 %, shuffled.
 
-    No two of them switch at one stress. `mass` (kg) is shared by the nodes between them.
+    No two of them switch at the same stress. `mass` (kg) is divided among the nodes between them.
     """
     rng = np.random.default_rng(count)
     steps = 0.1 * (2.0 * (np.arange(count) + 0.5) / count - 1.0)
@@ -78,14 +72,14 @@ def graded(count: int, mass: float = 0.0, eta: float = 0.0) -> ff.Chain:
 
 
 def loop(spring: ff.BistableSpring, samples: int, by_stress: bool) -> Array:
-    """A history past C1 and back: stress (Pa) or strain, (samples,)."""
+    """Return a history past C1 and back: stress (Pa) or strain, (samples,)."""
     most = 1.15 * spring.sigma_hat_c if by_stress else 1.05 * spring.eps_hat_c
     s = np.linspace(0.0, 1.0, samples)
     return most * np.where(s < 0.5, np.sin(np.pi * s) ** 2, np.sin(np.pi * s) ** 4)
 
 
 def scenes() -> list[Scene]:
-    """Return all scenes, the small ones first."""
+    """Return all scenes, small ones first."""
     t = np.linspace(0.0, LENGTH, SAMPLES)
     spring = MODEL_2.bistable
     one = ff.Chain([spring], [HEIGHT], AREA)
@@ -115,7 +109,7 @@ def scenes() -> list[Scene]:
 
 
 def _with_memory() -> list[Scene]:
-    """A microscale spring like shoe foam; two of three scenes have a relaxation term."""
+    """Return scenes of a microscale spring like shoe foam; two of three with relaxation."""
     law = (5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
     height, area = 25e-3, 1.6e-3
     plain = ff.MicroscaleSpring(*law)
@@ -154,7 +148,7 @@ class Competitor:
 
 
 def own(scene: Scene) -> dict[str, list[Competitor]]:
-    """The project's solver: `simulate`, and the bare `Plan.run` that the fit calls."""
+    """Return foamfit's solvers: `simulate`, and the bare `Plan.run` that a fit calls."""
     made = plan(scene.chain, scene.drive, scene.time)
     rows, heights = scene.chain.arrays.rows, scene.chain.arrays.heights
 
@@ -180,7 +174,7 @@ def own(scene: Scene) -> dict[str, list[Competitor]]:
 
 
 def others(scene: Scene) -> dict[str, list[Competitor]]:
-    """The fixed-step schemes and SciPy's integrators."""
+    """Return the fixed-step schemes and SciPy's integrators."""
     if isinstance(scene.chain.springs[-1], ff.MicroscaleSpring):
         return _memory(scene)
     rows = np.array([spring.row for spring in scene.chain.springs])
@@ -207,7 +201,7 @@ def _impact(scene: Scene, made: Plan, rows: Array, heights: Array) -> dict[str, 
 
 
 def _memory(scene: Scene) -> dict[str, list[Competitor]]:
-    """One microscale spring, alone or on a linear one: impact, or along a displacement."""
+    """Return solvers of a microscale spring, alone or on a linear one: impact or displacement."""
     t, drive = scene.time, scene.drive
     if isinstance(drive, ff.Impact):
         row = restarted_memory.row_of(scene.chain, drive.mass)
@@ -260,7 +254,7 @@ def _ladders(
 
 
 def reference(scene: Scene) -> Answer:
-    """Return the answer of the judge of the stability study, some 14 digits."""
+    """Return the result of the judge of the stability study, some 14 digits."""
     most = 10_000_000 * len(scene.chain.springs)
     truth = independent.follow(scene.chain, scene.drive, scene.time, most=most)
     assert not truth.why
@@ -268,7 +262,7 @@ def reference(scene: Scene) -> Answer:
 
 
 def error(answer: Answer, truth: Answer) -> float:
-    """Largest error over range, of displacement of the top and of base stress."""
+    """Return the largest error over range of top displacement and base stress."""
     worst = 0.0
     for got, want in zip(answer, truth, strict=True):
         miss = np.abs(got - want).max() / np.ptp(want)

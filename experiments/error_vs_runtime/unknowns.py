@@ -1,11 +1,11 @@
-"""What do contact, zeros and the noise of a motion cost a fit?
+"""How much time do unknown contact, zeros and motion noise cost in a fit?
 
-Method. Each synthetic record (`experiments/recovery/rig.py`) is fitted twice, in turns: as it
-stands, and with what it does not say exactly taken for exact (contact time and zeros held; the
-motion as it was sampled). The time of a fit over that of the other is the price of what the record
-leaves open. The numbers of the second kind are wrong: it is there for its time alone.
+Method. Each synthetic record (`experiments/recovery/rig.py`) is fitted twice, alternately: with
+these unknowns, and with them taken as exact (contact time and zeros fixed; the motion as sampled).
+The ratio of the times is the cost of the unknowns. The results of the second fit are wrong: only
+its time is used.
 
-Answer. 0.28 to 1.7 times the other's time: see unknowns.md.
+Answer. The fit with unknowns takes 0.28 to 1.7 times as long: see unknowns.md.
 
     python experiments/error_vs_runtime/unknowns.py        # prints and writes unknowns.md
 """
@@ -34,7 +34,12 @@ from foamfit.fitting.problem import make_params  # noqa: E402
 from foamfit.springs.parameters import NUISANCE  # noqa: E402
 
 SEEDS = range(1, 9)
-HEAD = "# What do contact, zeros and the noise of a motion cost a fit?"
+HEAD = """\
+# Cost of unknown contact, zeros and motion noise
+
+**Question.** How much time do unknown contact, zeros and motion noise cost in a fit?
+**Method.** `python experiments/error_vs_runtime/unknowns.py` fits each synthetic record with these
+unknowns, and with them taken as exact. **Answer.** The ratio of the times, in the last column."""
 RECORDS: dict[str, rig.Impact | rig.Slow] = {
     "impact that begins at the contact": rig.Impact(samples=500, trimmed=True),
     "impact from before the contact, any zero": rig.Impact(samples=500),
@@ -45,7 +50,7 @@ RECORDS: dict[str, rig.Impact | rig.Slow] = {
 
 
 def timed(fit: Callable[[], Any]) -> float:
-    """Processor time of a fit, s, that finds the motion itself."""
+    """Return the processor time (s) of a fit, including the smoothing of the motion."""
     motion._found.cache_clear()
     began = time.process_time()
     fit()
@@ -53,7 +58,7 @@ def timed(fit: Callable[[], Any]) -> float:
 
 
 def pair(setup: rig.Impact | rig.Slow, seed: int) -> tuple[float, float]:
-    """Time of the fit of one record, and of the fit that takes it for exact."""
+    """Return the times of the fit of one record and of the fit that takes it as exact."""
     slow = isinstance(setup, rig.Slow)
     record = rig.slow(setup, seed) if slow else rig.impact(setup, seed)
     with tempfile.TemporaryDirectory() as folder:
@@ -67,7 +72,7 @@ def pair(setup: rig.Impact | rig.Slow, seed: int) -> tuple[float, float]:
     keywords["drive"] = drive
     ff.fit(test, starts=1, **keywords)  # compiles
     own = timed(lambda: ff.fit(test, **keywords))
-    with patch.object(objective, "driving_motion", lambda *_, **__: None):  # goes as it was sampled
+    with patch.object(objective, "driving_motion", lambda *_, **__: None):  # motion as sampled
         return own, timed(lambda: ff.fit(test, params=held, **keywords))
 
 
@@ -80,9 +85,9 @@ def main() -> None:
         ratio = statistics.median(a / b for a, b in times)
         rows.append((name, f"{own:.2f} s", f"{exact:.2f} s", f"{ratio:.2f}"))
         print(rows[-1], flush=True)
-    told = f"Medians of {len(SEEDS)} records, processor time, fits in turns."
-    table = studies.markdown("synthetic record | fit | taken for exact | ratio", rows)
-    (HERE / "unknowns.md").write_text(f"{HEAD}\n\n{table}\n\n{told}\n", encoding="utf-8")
+        note = f"Medians of {len(SEEDS)} records, processor time, alternating fits."
+    table = studies.markdown("synthetic record | fit | taken as exact | ratio", rows)
+    (HERE / "unknowns.md").write_text(f"{HEAD}\n\n{table}\n\n{note}\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""Does a change of the code change its results? Fits, simulations, a joint fit, a prediction.
+"""Does a code change alter results? Fits, simulations, a joint fit and a prediction.
 
-The reconstructions of the repository and synthetic records (`experiments/recovery/rig.py`, whose
-integrator is its own) go the way of a user: CSV, TOML, `foamfit.read_test`, the defaults of
-`foamfit.fit`. Kept are values, standard errors, ends of intervals and states, misfits, and marks of
-simulated curves. A simulation is unchanged within 1e-9 of its size, a fitted number within a
-hundredth of its standard error and anything else within 1e-3. What differs is listed.
+Method. The reconstructions of the repository and synthetic records (`experiments/recovery/rig.py`,
+with an independent integrator) are processed like those of a user: CSV, TOML, `foamfit.read_test`,
+the defaults of `foamfit.fit`. Values, standard errors, ends of intervals, states, misfits, and
+features of simulated curves are compared with frozen.csv. The tolerance is 1e-9 (relative) for a
+simulation, a hundredth of the standard error for a fitted number and 1e-3 for the rest.
+
+Answer. The list of differences, if any.
 
     python experiments/frozen/frozen.py            # compare with frozen.csv; exit code 1 if changed
     python experiments/frozen/frozen.py --renew    # write frozen.csv
@@ -63,7 +65,7 @@ KINDS = dict.fromkeys(SHARED, "shared") | {"sigma_plus": "scatter"}
 
 
 def of_fit(name: str, result: ff.FitResult) -> Iterator[Row]:
-    """What is kept of a fit."""
+    """Yield the reference numbers of a fit."""
     yield name, "status", result.status
     for curve, misfit in result.misfit.items():
         if misfit is not None:
@@ -78,7 +80,7 @@ def of_fit(name: str, result: ff.FitResult) -> Iterator[Row]:
 
 
 def fits(folder: Path) -> Iterator[Row]:
-    """Fits of the reconstructions and of synthetic records."""
+    """Yield the numbers of fits of the reconstructions and of synthetic records."""
     for name, (model, drive) in FITS.items():
         test = ff.read_test(ROOT / f"{name}-reconstruction.csv")
         yield from of_fit(f"{name}, {model}, {drive}", ff.fit(test, model=model, drive=drive))
@@ -90,7 +92,7 @@ def fits(folder: Path) -> Iterator[Row]:
 
 
 def simulations() -> Iterator[Row]:
-    """Marks of simulated curves: the published chains, relaxation, masses, under each drive."""
+    """Yield features of simulated curves: published chains, relaxation, masses, all drives."""
     time = np.linspace(0.0, 2e-3, 401)
     shape = np.sin(np.pi * time / time[-1]) ** 2
     relaxing = ff.MicroscaleSpring(
@@ -118,7 +120,7 @@ def simulations() -> Iterator[Row]:
 
 
 def together(folder: Path) -> Iterator[Row]:
-    """A joint fit of three synthetic loops, and a fourth predicted from it."""
+    """Yield numbers of a joint fit of three synthetic loops and the prediction of a fourth."""
     time = np.linspace(0.0, 2.0, 201)
     moved = 5e-3 * (1.0 - np.abs(time - 1.0))
     rng = np.random.default_rng(5)
@@ -139,14 +141,14 @@ def together(folder: Path) -> Iterator[Row]:
         yield "joint", f"{name} value", repr(float(one.value))
         if one.ci95 is not None:
             yield "joint", f"{name} stderr", repr(float(one.ci95[1] - one.ci95[0]) / 3.92)
-    told = ff.predict(found, folder / "other.csv")
-    for curve, share in told.inside.items():
+        prediction = ff.predict(found, folder / "other.csv")
+    for curve, share in prediction.inside.items():
         yield "prediction", f"inside {curve}", repr(float(share))
-        yield "prediction", f"band {curve}", repr(float(told.curves[curve].half_width))
+        yield "prediction", f"band {curve}", repr(float(prediction.curves[curve].half_width))
 
 
 def changed(before: dict[tuple[str, str], str], now: dict[tuple[str, str], str]) -> list[str]:
-    """Sentences on what is not as it was."""
+    """Return a sentence for each difference."""
     out = [f"{' '.join(key)}: gone" for key in before if key not in now]
     for (name, what), value in now.items():
         old = before.get((name, what))
@@ -180,9 +182,9 @@ def main() -> int:
     kept = pd.read_csv(FILE, dtype=str, keep_default_na=False).itertuples(index=False)
     before = {(name, what): value for name, what, value in kept}
     now = {(name, what): value for name, what, value in rows}
-    told = changed(before, now)
-    print("\n".join(told) or f"All {len(now)} numbers are as they were.")
-    return 1 if told else 0
+    differences = changed(before, now)
+    print("\n".join(differences) or f"All {len(now)} numbers are unchanged.")
+    return 1 if differences else 0
 
 
 if __name__ == "__main__":

@@ -1,17 +1,17 @@
-"""Do the intervals of joint fits hold, and what do they cost? Synthetic studies, from files.
+"""Do the intervals of joint fits contain the true values? How small are standard errors?
 
-Method. Each study goes the way of a user: its tests are written as CSV with one TOML, a STUDY.toml
-says what the parameters are, and `foamfit.joint` fits them (search included, no knowledge of the
-truth). The foam is a microscale spring under a slow triangle to 50 % strain, 101 samples, with
-white noise of 0.25 % of the largest stress, which the TOML states.
+Method. Each synthetic study works like a user: the tests are written as CSV with one TOML, a
+STUDY.toml defines the kinds of the parameters, and `foamfit.joint` fits them (search included, true
+values unknown). The foam is a microscale spring under a slow triangle to 50 % strain, 101 samples,
+with white noise of 0.25 % of the largest stress, which the TOML states.
 
-- four: four tests of one specimen against the first of them alone: standard errors over each other.
+- four: standard errors of four tests of one specimen over those of the first test alone.
 - scatter: groups of 8 specimens whose k0 is log-normal (spread 10 % or 3 %): do the intervals of
-  the common value and of the spread hold the truth?
-- log, power: 5 tests over two decades of rate, sigma_plus following a law: bias of value and slope
-  over the standard error, coverage of their intervals, and what the evidence chooses.
+  the common value and of the spread contain the true values?
+- log, power: 5 tests over two decades of rate with a rate law of sigma_plus: bias of value and
+  slope over the standard error, coverage of their intervals, and the choice of the evidence (BIC).
 
-Answer. Four tests have half the standard errors of one; intervals hold in 92 to 98 %: README.md.
+Answer. Four tests have half the standard errors of one; coverage is 92 to 98 %: README.md.
 
     python experiments/joint/joint.py                 # all; writes joint.csv and joint.md
     python experiments/joint/joint.py --only log --draws 20 --out FOLDER
@@ -46,7 +46,7 @@ Row = dict[str, Any]
 
 
 def write_test(path: Path, rate: float, rng: np.random.Generator, **own: float) -> None:
-    """Write a test of the foam with some parameters of its own."""
+    """Write a test of the foam with some changed parameters."""
     spring = ff.MicroscaleSpring(**SPRING | own)
     up = np.linspace(0.0, TOP, SAMPLES // 2 + 1)
     strain = np.concatenate([up, up[::-1][1:]])
@@ -66,18 +66,18 @@ def write_study(folder: Path, kinds: dict[str, str]) -> Path:
 
 
 def off_and_held(one: Any, slope: float) -> tuple[float, bool]:
-    """How far a slope is off in standard errors, and whether its interval holds the truth."""
+    """Return the error of a slope in standard errors, and whether its interval covers it."""
     return (one.b - slope) / one.b_stderr, bool(one.b_ci95[0] <= slope <= one.b_ci95[1])
 
 
 def in_errors(study: str, what: str, off: list[float], hits: list[bool]) -> Row:
-    """Mean and spread of what is off, in standard errors, and coverage of the intervals."""
+    """Return mean and spread of the errors, in standard errors, and interval coverage."""
     row = {"study": study, "what": what, "draws": len(hits), "mean": float(np.mean(off))}
     return row | {"spread": float(np.std(off))} | studies.share(hits)
 
 
 def four(draws: int, folder: Path) -> Iterator[Row]:
-    """Standard errors of four tests of one specimen over those of one."""
+    """Return the standard errors of four tests of one specimen over those of one."""
     ratios = []
     for draw in range(draws):
         rng = np.random.default_rng([1, draw])
@@ -93,7 +93,7 @@ def four(draws: int, folder: Path) -> Iterator[Row]:
 
 
 def scatter(draws: int, folder: Path, spread: float) -> Iterator[Row]:
-    """Coverage of common value and spread over groups of 8 specimens."""
+    """Return the coverage of common value and spread over groups of 8 specimens."""
     common, hits, spreads = [], [], []
     kinds = SHARED | {"k0": "scatter", "sigma_plus": "own"}
     for draw in range(draws):
@@ -111,7 +111,7 @@ def scatter(draws: int, folder: Path, spread: float) -> Iterator[Row]:
 
 
 def rates(draws: int, folder: Path, kind: str, slope: float) -> Iterator[Row]:
-    """Bias and coverage of value and slope of a law of rate, and what the evidence is for."""
+    """Return bias and coverage of value and slope of a rate law, and the kind chosen."""
     off, hits, value_off, value_hits, chosen = [], [], [], [], []
     truth = SPRING["sigma_plus"]
     for draw in range(draws):

@@ -1,14 +1,14 @@
-"""Does `--model auto` find the structure that made a test?
+"""Does `--model auto` find the true structure of a test?
 
 Method. Synthetic impacts on chains of known structure, 401 samples, white noise of 0.5-1 % of the
-range on stress and displacement; springs, heights and velocities are random. Twenty tests of
-each structure are climbed by `foamfit.fit(test, model="auto")` with its defaults. A test is clear,
-by the simulation alone and before it is climbed, if
+range on stress and displacement; springs, heights and velocities are random. Twenty tests of each
+structure are fitted by `foamfit.fit(test, model="auto")` with its defaults. A test is called clear,
+from the simulation alone and before the fit, if
 
-- every bistable spring goes through branches a, d, c and e;
+- every bistable spring passes through branches a, d, c and e;
 - with damping, dashpots dissipate at least 5 % of the striker's energy;
-- every simpler model, fitted to the curves without noise, keeps a misfit (RMS over both
-  curves) of at least half the noise, so that chi-square is at least a quarter above the floor.
+- every simpler model, fitted to the noise-free curves, has a misfit (RMS over both curves) of at
+  least half the noise, so that chi-square is at least a quarter above the floor.
 
 Answer. It finds 82 of 83 clear tests: see README.md.
 
@@ -53,7 +53,7 @@ def name_of(model: str, damped: bool) -> str:
 
 
 def bistable(rng: np.random.Generator, sigma_a: float, late: bool) -> ff.BistableSpring:
-    """A random spring; `late`: one that densifies late, as those of the paper's chains."""
+    """Draw a spring; `late`: one that densifies late, like those of the paper's chains."""
     eps_a = rng.uniform(0.15, 0.4) if late else rng.uniform(0.05, 0.35)
     eps_c = eps_a + (rng.uniform(0.25, 0.4) if late else rng.uniform(0.1, 0.45))
     k0 = sigma_a * (1 - eps_a) / eps_a
@@ -70,7 +70,7 @@ def bistable(rng: np.random.Generator, sigma_a: float, late: bool) -> ff.Bistabl
 
 
 def random_chain(rng: np.random.Generator, model: str) -> tuple[list, list[float]]:
-    """Springs and heights of a model: a line 2-8 times as stiff, or σ_a 2-4 times as high."""
+    """Draw springs and heights: a linear spring 2-8 times as stiff, or σ_a 2-4 times as high."""
     sigma_a = 10 ** rng.uniform(5.5, 6.5)
     share = rng.uniform(0.35, 0.65)
     heights = [HEIGHT * share, HEIGHT * (1 - share)]
@@ -84,7 +84,7 @@ def random_chain(rng: np.random.Generator, model: str) -> tuple[list, list[float
 
 
 def quasi_static_work(springs: list, heights: list[float], stress: float) -> float:
-    """Work (J) that presses a chain to a stress (Pa), slowly."""
+    """Return the quasi-static work (J) that loads a chain to a stress (Pa)."""
     history = np.linspace(0, stress, 4000)
     work = 0.0
     for spring, height in zip(springs, heights, strict=True):
@@ -96,19 +96,19 @@ def quasi_static_work(springs: list, heights: list[float], stress: float) -> flo
 def random_test(
     rng: np.random.Generator, model: str, damped: bool
 ) -> tuple[Measurement, Measurement, float, float, bool] | None:
-    """A test without noise, the same with noise, the noise, the share of damping, loops closed."""
+    """Return a test without and with noise, the noise, the share of damping, loops closed."""
     try:
         springs, heights = random_chain(rng, model)
-    except ValueError:  # not admissible: drawn again
+    except ValueError:  # inadmissible, so draw again
         return None
     loops = {i: one for i, one in enumerate(springs) if isinstance(one, ff.BistableSpring)}
     top = rng.uniform(1.2, 2.0) * max(spring.sigma_hat_c for spring in loops.values())
     velocity = float(np.sqrt(2 * quasi_static_work(springs, heights, top) / MASS))
     site = 0.0
     if damped:
-        share = 10 ** rng.uniform(-1.5, -0.6)  # of the largest stress, at the first touch
+        share = 10 ** rng.uniform(-1.5, -0.6)  # of the largest stress, at first contact
         eta = share * top * HEIGHT / velocity
-        velocity *= np.sqrt(1 + 4 * share)  # about what the dashpot takes
+        velocity *= np.sqrt(1 + 4 * share)  # compensates for the dashpot approximately
         if len(springs) == 1:
             springs = [replace(springs[0], eta=eta)]
         else:
@@ -121,7 +121,7 @@ def random_test(
     run = ff.simulate(chain, drive, times)
     entered = {(int(row[1]), int(row[3])) for row in run.switches}
     closed = all({(i, 1), (i, 2), (i, 3)} <= entered for i in loops)  # branches d, c, e
-    # Over the area, η ẇ²/H is dissipated, in the dashpot of one spring as in the onsite damper.
+    # Dissipated power per area: η ẇ²/H, in the dashpot of one spring and in the onsite damper.
     speed = np.gradient(run.displacement[-1], times)
     rate = (site + (springs[0].eta if len(springs) == 1 else 0.0)) / HEIGHT * speed**2
     contact = times <= end
@@ -139,7 +139,7 @@ def random_test(
 
 
 def best_simpler_misfit(clean: Measurement, model: str, damped: bool) -> float:
-    """Least RMS misfit, over both curves, of the simpler models on the curves without noise."""
+    """Return the least RMS misfit of the simpler models to both curves without noise."""
     ladder, least = [(name, with_) for name in MODELS for with_ in (False, True)], np.inf
     for name, with_ in ladder[: ladder.index((model, damped))]:
         params = make_params(clean, name)
@@ -153,7 +153,7 @@ def best_simpler_misfit(clean: Measurement, model: str, damped: bool) -> float:
 
 
 def climb(seed: int, kind: int, case: int) -> dict[str, Any]:
-    """Draw a test of a structure and climb it: a row of structures.csv."""
+    """Draw a test of a structure and fit it; return a row of structures.csv."""
     (model, damped), rng = STRUCTURES[kind], np.random.default_rng([seed, kind, case])
     made = None
     while made is None:
@@ -190,13 +190,13 @@ def structure_table(table: pd.DataFrame) -> str:
 
 
 def confusion(table: pd.DataFrame) -> str:
-    """Counts of chosen against true structure, of all tests."""
+    """Return the counts of chosen against true structure for all tests."""
     counts = pd.crosstab(table["structure"], table["chosen"]).reset_index()
     return studies.markdown(counts.columns, counts.to_numpy())
 
 
 def write_page(folder: Path) -> None:
-    """Write the page from the table that lies in the folder."""
+    """Write the page from the table in the folder."""
     table = pd.read_csv(folder / "structures.csv")
     clear = table[table["clear"]]
     studies.write_page(
@@ -211,7 +211,7 @@ def write_page(folder: Path) -> None:
 
 def main() -> None:
     parser = studies.arguments(__doc__, HERE, tests=(20, "tests of each structure"), seed=2014)
-    parser.add_argument("--page", action="store_true", help="write the page of what was run")
+    parser.add_argument("--page", action="store_true", help="only write the page")
     options = parser.parse_args()
     if not options.page:
         ff.fit(random_test(np.random.default_rng(0), "bistable", False)[1])  # compiles

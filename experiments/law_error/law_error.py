@@ -1,12 +1,12 @@
-"""What do intervals, ranges and states say where the law is not that of the foam?
+"""Does `ci95` contain the best noise-free fit of a law if the foam follows another law?
 
 Method. Synthetic tests of one law are fitted by another, a bistable spring: a microscale spring
 with relaxation, a bistable spring whose kinks are rounded, and one whose stress depends on the
-rate. Each is measured again and again with fresh noise, written to CSV and TOML, read and fitted
-with the defaults. `ci95` is to hold the best fit of the curves without noise; tests of the own law
-show what is the same without an error of the law.
+rate. Each is measured repeatedly with new noise, written to CSV and TOML, read and fitted with the
+defaults. `ci95` should contain the best fit of the curves without noise. Tests of the bistable
+spring itself show the result without model error.
 
-Answer. Intervals hold in 92 to 98 % of the draws of each kind: README.md.
+Answer. Yes, in 92 to 98 % of the draws of each kind: README.md.
 
     python experiments/law_error/law_error.py                # 200 draws each
     python experiments/law_error/law_error.py --draws 20
@@ -61,7 +61,7 @@ SPRING = ff.BistableSpring(
 
 
 def branches(width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Strain, and the loading and unloading stress there with kinks rounded over a width."""
+    """Return strain, loading stress and unloading stress, with kinks rounded over a width."""
     top = 1.12 * SPRING.eps_hat_c
     strain = np.linspace(0.0, top + 0.08, 6001)
     up = SPRING.stress(strain)
@@ -77,7 +77,7 @@ def branches(width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def impact(width: float, rate: float, samples: int = 501) -> Curves:
-    """A striker on a foam with rounded kinks, or whose stress rises by `rate` per e-fold."""
+    """Simulate an impact on a foam with rounded kinks or a stress rise of `rate` per e-fold."""
     height, area, mass = 1.2e-3, 1.9635e-5, 7e-3
     strain, up, down = branches(width)
     last = 1.12 * SPRING.eps_hat_c
@@ -108,11 +108,11 @@ def impact(width: float, rate: float, samples: int = 501) -> Curves:
 
 @cache
 def curves(kind: str) -> Curves:
-    """The test of one kind, without noise."""
+    """Return the test of one kind, without noise."""
     if kind == "microscale and relaxation":
         height, area = 10e-3, 4.6e-5
         clock = np.linspace(0.0, 5.0, 1000)
-        turn, most = clock[499:501], 2e-3 * clock[499]  # the samples beside the turn
+        turn, most = clock[499:501], 2e-3 * clock[499]  # the samples next to the turning point
         motion = Motion((0.0, *turn, 5.0), (0.0, most, most, 0.0), ("line",) * 3)
         foam = Microscale(5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77, terms=((0.5, 0.2),))
         course = Rig((foam,), (height,), area, motion=motion).run(0.0, 5.0)
@@ -122,7 +122,7 @@ def curves(kind: str) -> Curves:
         return impact(width=0.03, rate=0.0)
     if kind == "rate effect":
         return impact(width=1e-4, rate=0.02)
-    return impact(width=1e-4, rate=0.0)  # the own law
+    return impact(width=1e-4, rate=0.0)  # the fitted law itself
 
 
 KINDS = {  # and the autocorrelation of the noise from sample to sample
@@ -135,7 +135,7 @@ KINDS = {  # and the autocorrelation of the noise from sample to sample
 
 
 def drawn(kind: str, draw: int) -> tuple[np.ndarray, np.ndarray]:
-    """Noise of the stress and of the displacement, over its standard deviation."""
+    """Draw the noise of stress and displacement, over its standard deviation."""
     rng = np.random.default_rng([draw, list(KINDS).index(kind)])
     white = rng.standard_normal((2, curves(kind.split(",")[0]).time.size + 500))
     rho = KINDS[kind]
@@ -144,7 +144,7 @@ def drawn(kind: str, draw: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read(kind: str, draw: int | None) -> ff.Measurement:
-    """Write a test with fresh noise, or with none, as a user would have it, and read it."""
+    """Write a test with new noise, or without noise, as files of a user, and read it."""
     test = curves(kind.split(",")[0])
     stress, motion = test.stress, test.displacement
     if draw is not None:
@@ -161,7 +161,7 @@ def read(kind: str, draw: int | None) -> ff.Measurement:
 
 
 def draws_of(kind: str, draws: int) -> pd.DataFrame:
-    """A row for each parameter and draw."""
+    """Yield a row for each parameter and draw."""
     rows = list[dict[str, Any]]()
     without = ff.fit(read(kind, None))
     for draw in range(draws):
@@ -184,7 +184,7 @@ def draws_of(kind: str, draws: int) -> pd.DataFrame:
 
 
 def coverage(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """How often `ci95` holds the best fit without noise, and its width over what refits scatter."""
+    """Count how often `ci95` contains the best noise-free fit; compare its width with refits."""
     for (kind, name), own in rows.groupby(["kind", "parameter"], sort=False):
         given = own[own["low"].notna()]
         truth = given["best without noise"]
@@ -203,7 +203,7 @@ def coverage(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
 
 
 def summary_of(table: pd.DataFrame) -> pd.DataFrame:
-    """A line for each kind."""
+    """Return a row for each kind."""
     groups = table.groupby("kind", sort=False)
     holds = 100 * groups["holds"].agg(["mean", "min", "max"])
     width = groups["width over scatter"].agg(["min", "max"])
@@ -211,13 +211,13 @@ def summary_of(table: pd.DataFrame) -> pd.DataFrame:
         {
             "test": list(groups.groups),
             "draws": groups["draws"].max(),
-            "ci95 holds the best fit without noise (%)": [
+            "ci95 contains the best fit without noise (%)": [
                 f"{mean:.1f} ({low:.1f} to {high:.1f})" for mean, low, high in holds.to_numpy()
             ],
             "width of ci95 over the scatter of refits": [
                 f"{low:.2f} to {high:.2f}" for low, high in width.to_numpy()
             ],
-            "error of the law found (%)": (100 * groups["error of the law found"].mean()).round(1),
+            "law error detected (%)": (100 * groups["error of the law found"].mean()).round(1),
             "median fit (s)": groups["seconds"].median().round(2),
         }
     )

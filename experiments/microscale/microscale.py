@@ -1,11 +1,11 @@
 """Do discrete micro-springs converge to the microscale spring, and do their inner loops close?
 
 Method. n micro-springs in series, at the ranks (j - 1/2)/n, each with branches a and c of one
-spring and snap stresses of its own (`recovery/cycles.py`), are followed along a prescribed stress,
-with partial unloading and partial reloading. The law of `foamfit.MicroscaleSpring` is what they
-should come to.
+spring and individual snap stresses (`recovery/cycles.py`), follow a prescribed stress with partial
+unloading and partial reloading. They should converge to the law of `foamfit.MicroscaleSpring`.
 
-Answer. Their largest difference in strain falls as 1/n, and inner loops close to 1e-15: README.md.
+Answer. Yes: the largest difference in strain falls as 1/n, and inner loops close to 1e-15:
+README.md.
 
     python experiments/microscale/microscale.py
 """
@@ -37,13 +37,13 @@ VALUES = {
 SPRING = ff.MicroscaleSpring(**VALUES)
 NUMBERS = (2, 3, 5, 10, 20, 30, 50, 100, 200, 300, 500, 1000)
 SHOWN = 10
-# Turning points of the stress, Pa: a loop, two inner loops in it, one in an inner loop, and on.
+# Turning points of the stress, Pa: a loop with two inner loops, one nested, and continuation.
 TURNS = (0.0, 1.6e5, 6e4, 1.2e5, 8e4, 1.2e5, 6e4, 1.6e5, 2.5e5, 1.5e4, 1.2e5, 4e4, 2.5e5, 0.0)
-BETWEEN = 400  # samples between turning points, for comparing
+BETWEEN = 400  # samples between turning points, for the comparison
 
 
 def followed(n: int, history: Array) -> Array:
-    """Strain of n micro-springs at each stress of a history."""
+    """Return the strain of n micro-springs at each stress of a history."""
     row, out = Ensemble(VALUES, n), np.empty(history.size)
     for j, stress in enumerate(history):
         row.stress, row.snapped = float(stress), row.after(float(stress))
@@ -52,34 +52,34 @@ def followed(n: int, history: Array) -> Array:
 
 
 def history(between: int = BETWEEN) -> Array:
-    """Stresses through all turning points."""
+    """Return the stresses through all turning points."""
     legs = [np.linspace(a, b, between + 1)[1:] for a, b in pairwise(TURNS)]
     return np.concatenate([[0.0], *legs])
 
 
 def errors(n: int) -> tuple[float, float]:
-    """Largest and RMS difference of strain between n micro-springs and the law."""
+    """Return largest and RMS difference of strain between n micro-springs and the law."""
     stress = history()
     miss = followed(n, stress) - SPRING.strain(stress)
     return float(np.abs(miss).max()), float(np.sqrt(np.mean(miss**2)))
 
 
 def returns(n: int | None) -> float:
-    """Largest difference of strain where an inner loop comes back to the stress it left at."""
+    """Return the largest difference of strain where an inner loop closes in stress."""
     turns = np.array(TURNS)
     strain = SPRING.strain(turns) if n is None else followed(n, turns)
-    # the second visit of a turning point, with nothing beyond it in between
+    # second visit of a turning point that was not exceeded in between
     return max(abs(strain[b] - strain[a]) for a, b in ((1, 7), (2, 6), (3, 5), (8, 12)))
 
 
 def rate(table: list[tuple[int, float, float]], column: int) -> float:
-    """Slope of a straight line through the logarithms of an error and of n."""
+    """Return the slope of log error over log n."""
     n, error = np.log([row[0] for row in table]), np.log([row[column] for row in table])
     return float(np.polyfit(n, error, 1)[0])
 
 
 def draw(table: list[tuple[int, float, float]], path: Path) -> None:
-    """The loops of a few micro-springs on those of the law, and the error against their number."""
+    """Draw loops of a few micro-springs on those of the law, and the error against n."""
     black, blue, vermilion, grey = studies.BLACK, studies.BLUE, studies.VERMILION, studies.GREY
     with studies.sheet(path, 7.0, 3.0, 150) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.35, 1.0))

@@ -1,10 +1,10 @@
-"""How well is the motion found behind a noisy displacement, and how well are its errors known?
+"""How accurately is a motion recovered from a noisy displacement? Are its uncertainties right?
 
-Method. Synthetic motions of known turns are sampled with white noise; `foamfit.data.motion.follow`
-gives the motion, its turns and its modes, which are compared with the truth.
+Method. Synthetic motions with known turning points are sampled with white noise. Motion, turning
+points and modes from `foamfit.data.motion.follow` are compared with the true motion.
 
-Answer. 95 % intervals hold the truth at 93 to 97 % of the samples of each kind of motion; no turn
-is invented. README.md has the tables.
+Answer. 95 % intervals contain the true motion at 93 to 97 % of the samples of each kind; there are
+no false turning points. README.md has the tables.
 
     python experiments/motion/motion.py                # 225 draws a class, a minute; README.md
     python experiments/motion/motion.py --draws 4      # prints the tables only
@@ -32,13 +32,13 @@ sys.path.insert(0, str(HERE.parent))
 import studies  # noqa: E402
 
 ROWS, NOISE = (300, 1000, 5000), (0.0005, 0.001, 0.003)
-NEAR = 0.01  # of the duration, on both sides of a turn
+NEAR = 0.01  # of the duration, on both sides of a turning point
 Z95 = 1.959964
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion over the times 0 to 1, its turns in order, and holds at which it stands."""
+    """A motion over the times 0 to 1, its turning points in order, and its holds."""
 
     at: Callable[[np.ndarray], np.ndarray]
     turns: np.ndarray
@@ -46,7 +46,7 @@ class Motion:
 
 
 def straight(places: list[float], heights: list[float]) -> Motion:
-    """Return straight lines; a turn at a hold lies in its middle."""
+    """Return straight lines; the turning point of a hold is at its middle."""
     places, heights = np.array(places), np.array(heights)
     moves = np.flatnonzero(np.diff(heights))
     up = np.sign(np.diff(heights)[moves])
@@ -108,7 +108,7 @@ def slow_start(rng: np.random.Generator) -> Motion:
 
 
 def inner_loop(rng: np.random.Generator) -> Motion:
-    """A triangle that goes back by 0.5 to 20 % of its range on its way up or down."""
+    """Return a triangle with one reversal by 0.5 to 20 % of its range on the way up or down."""
     size, level = float(np.exp(rng.uniform(np.log(0.005), np.log(0.2)))), rng.uniform(0.3, 0.75)
     heights = [0.0, level, level - size, 1.0, 0.0]
     if rng.random() < 0.5:
@@ -118,7 +118,7 @@ def inner_loop(rng: np.random.Generator) -> Motion:
 
 
 def random_smooth(rng: np.random.Generator) -> Motion:
-    """A half sine on a clock that runs unevenly, with waves that may turn it."""
+    """Return a half sine with uneven time scale and waves that may add turning points."""
     phase, size = rng.uniform(0.0, 2.0 * np.pi, 4), rng.normal(0.0, 1.0, 4)
     wave, number = rng.uniform(0.0, 0.08), rng.integers(2, 6)
 
@@ -141,7 +141,7 @@ CLASSES = {
 
 
 def sampled(rng: np.random.Generator, rows: int) -> np.ndarray:
-    """Times of samples: even, or uneven by up to a third of a step."""
+    """Return sample times: even, or uneven by up to a third of a step."""
     t = np.linspace(0.0, 1.0, rows)
     if rng.random() < 0.3:
         t[1:-1] += rng.uniform(-0.33, 0.33, rows - 2) / rows
@@ -149,7 +149,7 @@ def sampled(rng: np.random.Generator, rows: int) -> np.ndarray:
 
 
 def matched(motion: Motion, turns: np.ndarray, t: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of true and found turns of the same kind, none further off than the next true turn."""
+    """Pair true and found turning points of one kind, each closer than the next true one."""
     ends = np.concatenate([[0.0], motion.turns, [1.0]])
     pairs, taken = [], set()
     for i, true in enumerate(motion.turns):
@@ -163,7 +163,7 @@ def matched(motion: Motion, turns: np.ndarray, t: np.ndarray) -> list[tuple[int,
 
 
 def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterator[dict]:
-    """Follow one noisy motion; a row for it and one for each true turn."""
+    """Smooth one noisy motion; yield a row for it and one for each true turning point."""
     motion = CLASSES[name](rng)
     t = sampled(rng, rows)
     true = motion.at(t)
@@ -215,7 +215,7 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
 
 
 def table(data: pd.DataFrame, by: str) -> pd.DataFrame:
-    """Means over draws."""
+    """Return means over draws."""
     motions, turns = data[data.what == "motion"], data[data.what == "turn"]
     m, found = motions.groupby(by, sort=False), turns[turns.found.eq(True)]
     f = found.groupby(by, sort=False)
@@ -237,7 +237,7 @@ def table(data: pd.DataFrame, by: str) -> pd.DataFrame:
         "height: RMS (σ)": f.height.apply(rms),
         "height held (%)": f.height_z.apply(held),
         "instant: RMS (samples)": f.late.apply(rms),
-        "invented turns (%)": 100.0 * m.invented.apply(lambda v: np.mean(v > 0)),
+        "false turns (%)": 100.0 * m.invented.apply(lambda v: np.mean(v > 0)),
         "largest reversal (σ)": m.back.max(),
         "modes": m.modes.median(),
         "median time (ms)": m.ms.median(),
@@ -246,9 +246,9 @@ def table(data: pd.DataFrame, by: str) -> pd.DataFrame:
 
 
 def found_by_size(data: pd.DataFrame) -> pd.DataFrame:
-    """Share of the turns of inner loops that are found, by how far they show above the noise."""
+    """Return the share of detected inner-loop turning points, by size relative to the noise."""
     turns = data[(data.what == "turn") & (data["class"] == "inner loop")]
-    turns = turns[turns["size"] * turns.noise < 0.3]  # those of the triangle itself are larger
+    turns = turns[turns["size"] * turns.noise < 0.3]  # larger ones are of the triangle itself
     names = ["0 to 5", "5 to 10", "10 to 15", "15 to 20", "20 to 30", "above 30"]
     shows = pd.cut(turns["size"] * turns.samples**0.5, [0, 5, 10, 15, 20, 30, 1e9], labels=names)
     long = turns.samples.gt(3.0).map({True: "of 3 samples and more", False: "of fewer"})

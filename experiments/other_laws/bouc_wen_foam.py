@@ -2,8 +2,8 @@
 
     dz/dε = 1 - |z/limit|^n  where z grows in the direction of the motion, else 1;  z = 0 at rest
 
-(Bouc-Wen with β = γ.) σ_0 is the Ogden curve (`ogden.py`), so the law bears a plateau and
-densification, which the linear spring of `notebooks/bouc_wen.py` does not.
+(Bouc-Wen with β = γ.) σ_0 is the Ogden curve (`ogden.py`), so the law has a plateau and
+densification, unlike `notebooks/bouc_wen.py` with its linear spring.
 
 Wen 1976, J. Eng. Mech. Div. ASCE 102, 249; Ismail, Ikhouane & Rodellar 2009, Arch. Comput. Methods
 Eng. 16, 161.
@@ -19,30 +19,30 @@ EPS, SIGMA, BRANCH, Z = range(4)
 
 
 def fill(values, row):
-    """Copy the parameters; refuse what no spring has."""
+    """Copy the parameters; return whether they are admissible."""
     for j in range(7):
         row[j] = values[j]
     return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4:].min() > 0.0
 
 
 def begin(row, state):
-    """Rest."""
+    """Set the state at rest."""
     state[:] = 0.0
 
 
 def leaves(row, state, strain):
-    """Whether the strain turns."""
+    """Return whether the strain reverses."""
     return strain != state[EPS] and (strain > state[EPS]) != (state[BRANCH] == 0.0)
 
 
 def switch(row, state, up):
-    """Loading is branch 0, unloading branch 1."""
+    """Set branch 0 for loading, 1 for unloading."""
     state[BRANCH] = 0.0 if up else 1.0
 
 
 @njit
 def slope(z, step, limit, n):
-    """dz/dε."""
+    """Return dz/dε."""
     return 1.0 - min(abs(z) / limit, 1.0) ** n if z * step > 0.0 else 1.0
 
 
@@ -50,10 +50,10 @@ def settle(row, state, strain):
     """Follow z to a strain on the same branch."""
     limit, n, z = row[5], row[6], state[Z]
     left = strain - state[EPS]
-    if z * left < 0.0:  # as far as z = 0 its slope is 1
+    if z * left < 0.0:  # up to z = 0 the slope is 1
         free = min(abs(left), abs(z)) * (1.0 if left > 0.0 else -1.0)
         z, left = z + free, left - free
-    count = int(min(abs(left), 40.0 * limit) / (0.05 * limit)) + 1  # beyond it is z = ±limit
+    count = int(min(abs(left), 40.0 * limit) / (0.05 * limit)) + 1  # beyond, z = ±limit
     step = left / count
     for _ in range(count):  # the classical Runge-Kutta method
         one = slope(z, step, limit, n)
@@ -67,7 +67,7 @@ def settle(row, state, strain):
 
 
 def read_off(loop, marks, scales, way):
-    """The elastic curve is midway; half the width of the loop is k·limit."""
+    """Read the elastic curve midway; half the width of the loop is k·limit."""
     half = 0.5 * scales.strain
     width = loop.at(half, loading=True) - loop.at(half, loading=False)
     limit = scales.strain * 10.0 ** (1.5 * marks[2] - 2.0)

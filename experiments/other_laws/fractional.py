@@ -2,13 +2,14 @@
 
     Σ = σ_0(ε) + g d^a σ_0/dt^a = ∫ (1 + g (t - s)^-a / Γ(1-a)) dσ_0(s)        (t in s, 0 < a < 1)
 
-A spring-pot of order a acts on the stress of the Ogden curve (`ogden.py`), as quasi-linear
-viscoelasticity does with exponentials. The kernel is the integral
+A spring-pot of order a acts on the stress of the Ogden curve (`ogden.py`), in the same way as the
+exponentials of quasi-linear viscoelasticity. The kernel is the integral
 
     t^-a / Γ(1-a) = sin(πa)/π ∫ s^(a-1) exp(-s t) ds
 
-by the trapezoidal rule in ln s: N = 17 exponentials of rates from 1e-4 to 2^32 1e-4 1/s, each four
-times the one before, the slower ones as one spring. Between 1e-5 and 1e3 s it is within 0.3 %.
+by the trapezoidal rule in ln s: N = 17 exponentials with rates from 1e-4 to 2^32 1e-4 1/s, each
+four times the previous one; slower ones are lumped into one spring. The error is below 0.3 % from
+1e-5 to 1e3 s.
 
 Koeller 1984, J. Appl. Mech. 51, 299; Doehring, Freed, Carew & Vesely 2005, J. Biomech. Eng. 127,
 700; for foam: Deng, Davies & Bajaj 2006, Signal Process. 86, 2728.
@@ -26,7 +27,7 @@ N, SLOWEST, RATIO = 17, 1e-4, 4.0
 
 
 def fill(values, row):
-    """Copy the parameters, then the strength of each exponential."""
+    """Copy the parameters and compute the strength of each exponential."""
     for j in range(6):
         row[j] = values[j]
     g, a = values[4], values[5]
@@ -34,7 +35,7 @@ def fill(values, row):
         return False
     for j in range(N):
         row[6 + j] = g * math.sin(math.pi * a) / math.pi * (SLOWEST * RATIO**j) ** a
-    row[6] *= 0.5  # its other half belongs to the spring
+    row[6] *= 0.5  # the other half belongs to the spring
     row[6 + N] = row[6] * 2.0 / a  # the integral from zero to the slowest rate
     for j in range(N):
         row[6 + j] *= math.log(RATIO)
@@ -47,7 +48,7 @@ def settle(row, state, strain):
 
 
 def viscous(row, state, rate, h):
-    """Let each exponential relax, the stress of the curve being linear in time."""
+    """Relax each exponential; the stress of the curve is linear in time."""
     kept, rising = FIRST + N, FIRST + 2 * N  # of each exponential, for steps of this length
     if abs(h - state[TIME]) > 1e-7 * h:
         state[TIME] = h
@@ -65,7 +66,7 @@ def viscous(row, state, rate, h):
 
 
 def read_off(loop, marks, scales, way):
-    """The curve is below the loop's middle; the overstress is half the width of the loop."""
+    """Read the curve below the middle of the loop; the overstress is half the loop width."""
     order = 0.05 * 12.0 ** marks[2]
     g = 0.5 * 4.0 ** (marks[3] - 0.5) * scales.duration**order
     curve_of = read_curve(loop, marks, scales, 0.5)

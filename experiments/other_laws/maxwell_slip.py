@@ -1,12 +1,12 @@
-"""Maxwell-slip (Iwan): an elastic foam beside N sliders, each behind a spring of its own.
+"""Maxwell-slip (Iwan): an elastic foam in parallel with N sliders, each with its own spring.
 
     σ = σ_0(ε) + (k/N) Σ e_j,   de_j = dε  as long as |e_j| < y_j,   y_j = slip ((j - ½)/N)^spread
 
-σ_0 is the Ogden curve (`ogden.py`), e_j the elastic strain of slider j and all that it remembers.
+σ_0 is the Ogden curve (`ogden.py`), e_j the elastic strain of slider j, its only state variable.
 The slip strains are those of Segalman's power law, spread = 1/(1 + χ), in N = 24 equal shares of
-the stiffness k. For N → ∞ loading from rest adds k ε (1 - u spread/(1 + spread)) with
-u = (ε/slip)^(1/spread) as long as ε <= slip, and unloading takes off twice this curve at half the
-way (Masing).
+the stiffness k. For N → ∞ loading from rest adds k ε (1 - u spread/(1 + spread)) with u =
+(ε/slip)^(1/spread) as long as ε <= slip, and unloading subtracts twice this curve at half the
+strain (Masing).
 
 Iwan 1966, J. Appl. Mech. 33, 893; Segalman 2005, J. Appl. Mech. 72, 752.
 """
@@ -22,7 +22,7 @@ N = 24
 
 
 def fill(values, row):
-    """Copy the parameters, then the slip strains."""
+    """Copy the parameters and compute the slip strains."""
     for j in range(7):
         row[j] = values[j]
     for j in range(N):
@@ -31,7 +31,7 @@ def fill(values, row):
 
 
 def settle(row, state, strain):
-    """Move each slider, and let slip those at their limit."""
+    """Move each slider; those at their limit slip."""
     step, total = strain - state[EPS], 0.0
     for j in range(N):
         limit = row[7 + j]
@@ -42,7 +42,7 @@ def settle(row, state, strain):
 
 
 def read_off(loop, marks, scales, way):
-    """The elastic curve is midway; half the width of the loop is the stress of all sliders."""
+    """Read the elastic curve midway; half the loop width is the stress of all sliders."""
     half = 0.5 * scales.strain
     width = loop.at(half, loading=True) - loop.at(half, loading=False)
     slip, spread = scales.strain * 10.0 ** (1.2 * marks[2] - 1.2), 0.5 * 8.0 ** marks[3]

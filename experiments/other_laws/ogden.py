@@ -1,18 +1,16 @@
 """Quasi-linear viscoelasticity on an Ogden curve: the hyperfoam of Storåkers with a Prony series.
 
-A highly compressible Ogden solid of two terms whose Poisson's ratio is zero. With the stretch
-λ = 1 - ε, nominal stress and stored energy in compression are
+A highly compressible Ogden solid with two terms and zero Poisson's ratio. With the stretch λ = 1 -
+ε, nominal stress and stored energy in compression are
 
     σ(ε) = p(λ; mu, alpha) + p(λ; nu, -beta),   p(λ; m, a) = (2 m / a) (1/λ - λ^(a-1))
     W(ε) = w(λ; mu, alpha) + w(λ; nu, -beta),   w(λ; m, a) = (2 m / a) ((λ^a - 1) / a - ln λ)
 
-The first term is the plateau, alpha being its sharpness, the second densifies
-(beta >= -3). In
-tension the curve goes on as a straight line of slope 2 (mu + nu).
+The first term is the plateau, with sharpness alpha, the second densification (beta >= -3). In
+tension the curve continues as a straight line of slope 2 (mu + nu).
 
-The curve alone has no loop. `relaxation=N` adds the Prony series, dq/dt = -q/τ + g dσ/dt for each
-of N terms, which makes it quasi-linear viscoelasticity; the other laws of this folder use the same
-curve.
+The curve alone has no loop. `relaxation=N` adds a Prony series, dq/dt = -q/τ + g dσ/dt for each of
+N terms, which gives quasi-linear viscoelasticity. Other laws of this folder use the same curve.
 
 Storåkers 1986, J. Mech. Phys. Solids 34, 125; Fung 1981, Biomechanics, chapter 7.
 """
@@ -39,7 +37,7 @@ CURVE = (
 
 @njit
 def curve(strain, mu, alpha, nu, beta):
-    """Stress (Pa) and energy (J/m³) of the elastic curve."""
+    """Return stress (Pa) and energy (J/m³) of the elastic curve."""
     if strain >= 1.0:
         return math.inf, math.inf
     if strain <= 0.0:
@@ -47,7 +45,7 @@ def curve(strain, mu, alpha, nu, beta):
     log = math.log(1.0 - strain)
     stress, energy = 0.0, 0.0
     for m, a in ((mu, alpha), (nu, -beta)):
-        if abs(a * log) < 1e-4:  # the limit a = 0, with its first terms
+        if abs(a * log) < 1e-4:  # series about a = 0
             stress -= 2.0 * m * log * (1.0 + 0.5 * a * log)
             energy += m * log**2 * (1.0 + a * log / 3.0)
         else:
@@ -58,7 +56,7 @@ def curve(strain, mu, alpha, nu, beta):
 
 
 def read_curve(loop, marks, scales, share):
-    """Read mu, alpha, nu and beta off the loop, `share` of the way from unloading to loading."""
+    """Read mu, alpha, nu, beta off the loop at a fraction `share` from unloading to loading."""
     alpha, beta = 3.0 * 20.0 ** marks[0], 8.0 * marks[1] - 2.0
     strain = np.linspace(0.05, 1.0, 20) * scales.strain
     up = np.array([loop.at(e, loading=True) for e in strain])
@@ -72,24 +70,24 @@ def read_curve(loop, marks, scales, share):
 
 
 def fill(values, row):
-    """Copy the parameters; refuse what no spring has."""
+    """Copy the parameters; return whether they are admissible."""
     for j in range(4):  # `row[:] = values` takes two seconds to compile
         row[j] = values[j]
     return values[:3].min() > 0.0 and values[3] >= -3.0
 
 
 def begin(row, state):
-    """Rest."""
+    """Set the state at rest."""
     state[:] = 0.0
 
 
 def leaves(row, state, strain):
-    """There is one branch."""
+    """Return False: there is only one branch."""
     return False
 
 
 def switch(row, state, up):
-    """There is no other branch."""
+    """Do nothing: there is no other branch."""
 
 
 def settle(row, state, strain):
@@ -98,7 +96,7 @@ def settle(row, state, strain):
 
 
 def read_off(loop, marks, scales, way):
-    """Start anywhere between unloading and loading."""
+    """Start from a random curve between unloading and loading."""
     return np.array([*read_curve(loop, marks, scales, marks[2]), 0.0])
 
 

@@ -1,10 +1,10 @@
-"""Ogden-Roxburgh softening: a pseudo-elastic foam that unloads below the curve it was loaded along.
+"""Ogden-Roxburgh softening: a pseudo-elastic foam that unloads below its loading curve.
 
     σ = η σ_0(ε),   η = 1 - (1/r) erf((W_m - W_0(ε)) / m)
 
 σ_0 and W_0 are stress and energy of the Ogden curve (`ogden.py`), W_m is the largest energy so far,
-the one number that the spring remembers. On the curve η = 1; unloading and reloading below the
-largest strain share one softer path. r >= 1 and m > 0 (J/m³).
+the only state variable. On the loading curve η = 1; unloading and reloading below the largest
+strain follow the same softer path. r >= 1 and m > 0 (J/m³).
 
 Ogden & Roxburgh 1999, Proc. R. Soc. A 455, 2861, equation (51).
 """
@@ -20,7 +20,7 @@ EPS, SIGMA, BRANCH, LARGEST = range(4)
 
 
 def fill(values, row):
-    """Copy the parameters; refuse what no spring has."""
+    """Copy the parameters; return whether they are admissible."""
     for j in range(6):
         row[j] = values[j]
     return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4] >= 1.0 and values[5] > 0.0
@@ -36,7 +36,7 @@ def settle(row, state, strain):
 
 
 def read_off(loop, marks, scales, way):
-    """Loading is the curve; the softening at half the strain is that of the loop."""
+    """Read the curve off loading, and the softening off the loop at half the strain."""
     elastic = read_curve(loop, marks, scales, 1.0)
     half = 0.5 * scales.strain
     lost = 1.0 - loop.at(half, loading=False) / loop.at(half, loading=True)

@@ -1,15 +1,16 @@
-"""How do the laws of this project compare with those of the literature?
+"""How do the laws of foamfit compare with laws of the literature?
 
 Method. Running-shoe foams (arXiv:2602.12694), a mycelium, printed lattices and an impact on
-cartilage are fitted by our laws and by those of this folder, each with nine parameters at most, by
-the same search, objective and intervals (`foamfit.fit`, displacement drive: the measured motion is
-prescribed, the stress compared). Then a test that was not fitted (another specimen of the same
-foam, of a lattice a later cycle, of the cartilage a faster impact) is predicted with the values
-found: as it is, and with the predicted stress multiplied by the factor that suits best, for
-specimens differ in stiffness. Records are thinned to at most 320 rows, for all laws alike. The
-measurements are not part of this repository.
+cartilage are fitted by the laws of foamfit and of this folder, each with nine parameters at most,
+by the same search, objective and intervals (`foamfit.fit`, displacement drive: the measured motion
+is prescribed, the stress compared). Then an unseen test (another specimen of the same foam, a later
+cycle of a lattice, a faster impact on the cartilage) is predicted with the fitted values: directly,
+and with the predicted stress scaled by the best factor, since specimens differ in stiffness.
+Records are thinned to at most 320 rows for all laws. The measurements are not part of this
+repository.
 
-Answer. See README.md, which this script writes; beside it other_laws.csv (a row per fit) and
+Answer. Microscale springs with relaxation have the smallest misfit; Ogden-Roxburgh predicts the
+impact and the mycelium better. The script writes README.md, other_laws.csv (a row per fit) and
 other_laws.png (loops side by side).
 
     FOAMFIT_DATA=path/to/data python experiments/other_laws/other_laws.py    # with --jobs 2 faster
@@ -72,8 +73,8 @@ LAWS = (
     Compared("Maxwell-slip beside Ogden, relaxation", "maxwell-slip", 1, "maxwell_slip"),
     Compared("fractional element on Ogden, relaxation", "fractional", 1, "fractional"),
 )
-DRAWN = (1, 2, 6, 7, 9, 10, 11)  # laws of the picture
-# Group, test and the test held out; of a lattice their cycles.
+DRAWN = (1, 2, 6, 7, 9, 10, 11)  # laws in the figure
+# Group, test and unseen test; for a lattice, the cycles.
 FOAM, MYCELIUM, LATTICE, IMPACT = "shoe foams", "mycelium", "lattices", "impact"
 TESTS = (
     (FOAM, "turbo-comp-1", "turbo-comp-2"),
@@ -94,7 +95,7 @@ VELOCITY = {"test_1_impact": 0.785, "test_3_impact": 0.905}  # m/s
 
 
 def read(group: str, name: str, data: Path, folder: Path) -> Measurement:
-    """Read a test as a user would, and thin it."""
+    """Read a test like a user, and thin it."""
     toml, cycle = folder / "specimen.toml", None
     if name in SHOE_FOAM:
         path = data / "shoe-foam" / f"{name}_cycle1.csv"
@@ -136,7 +137,7 @@ def thinned(test: Measurement, path: Path) -> Measurement:
 
 
 def fit_all(case: tuple[str, str, str], data: Path, starts: int) -> list[dict[str, Any]]:
-    """Fit one test by every law and predict the test held out: a row for each, with its curves."""
+    """Fit one test by every law and predict the unseen test; return rows with curves."""
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         folder, (group, name, other) = Path(temporary), case
@@ -146,16 +147,16 @@ def fit_all(case: tuple[str, str, str], data: Path, starts: int) -> list[dict[st
                 ff.register(importlib.import_module(law.file).LAW)
             options: dict[str, Any] = law.more | {"relaxation": law.relaxation}
             ff.fit(test, model=law.model, starts=1, max_time=0.2, intervals="local", **options)
-            began = time.process_time()  # what is compiled is compiled
+            began = time.process_time()  # after compilation
             result = ff.fit(test, model=law.model, drive="displacement", starts=starts, **options)
             seconds = time.process_time() - began
-            told = [p.state for n, p in result.parameters.items() if p.vary and n not in NUISANCE]
+            states = [p.state for n, p in result.parameters.items() if p.vary and n not in NUISANCE]
             strain, curves = result.strain, result.curves
             rows.append({
                 "group": group, "test": name, "held_out": other, "law": law.name,
-                "parameters": len(told), "misfit": result.misfit["stress_strain"],
+                "parameters": len(states), "misfit": result.misfit["stress_strain"],
                 **predicted(result, held_out),
-                **{state: told.count(state) for state in ("determined", "weak", "not determined")},
+                **{s: states.count(s) for s in ("determined", "weak", "not determined")},
                 "seconds": seconds, "rows": test.stress.size,
                 "curves": (strain, curves.measured_stress, curves.stress),
             })  # fmt: skip
@@ -165,7 +166,7 @@ def fit_all(case: tuple[str, str, str], data: Path, starts: int) -> list[dict[st
 
 
 def predicted(result: Any, test: Measurement) -> dict[str, float]:
-    """Misfit of a test that was not fitted: as predicted, and up to one factor of the stress."""
+    """Return the misfit of an unseen test: as predicted, and after scaling the stress."""
     one = ff.predict(result, test).curves["stress_strain"]
     factor = one.predicted @ one.measured / (one.predicted @ one.predicted)
     off = {"predicted": one.predicted, "scaled": factor * one.predicted}
@@ -179,7 +180,7 @@ def predicted(result: Any, test: Measurement) -> dict[str, float]:
 
 
 def law_table(table: pd.DataFrame) -> str:
-    """Write the table of the README: a row for each law, misfit and predicted misfit by group."""
+    """Return the table of the README: for each law, misfit and predicted misfit by group."""
     rows = []
     groups = list(dict.fromkeys(group for group, *_ in TESTS))
     fitted = {group: set(table[table["group"] == group]["test"]) or {""} for group in groups}
@@ -244,7 +245,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def main() -> None:
-    """Fit, and write page, table and picture."""
+    """Fit, and write page, table and figure."""
     numbers = {"starts": (6, "descents of each fit"), "jobs": (1, "processes")}
     parser = studies.arguments(__doc__, out=HERE, **numbers)
     parser.add_argument("--only", default="", help="tests whose name contains this")
@@ -261,7 +262,7 @@ def main() -> None:
 
 
 def fit_tests(given: argparse.Namespace) -> None:
-    """Fit all tests; write the table and the picture."""
+    """Fit all tests; write the table and the figure."""
     data = studies.measurements(
         "shoe-foam", "shoe-foam-twins", "mycelium-rates", "lattice-cycles", "cartilage-impact"
     )
@@ -269,7 +270,7 @@ def fit_tests(given: argparse.Namespace) -> None:
     rows = list[dict[str, Any]]()
     with ProcessPoolExecutor(given.jobs) as pool:
         for task in [pool.submit(fit_all, case, data, given.starts) for case in cases]:
-            rows += task.result()  # an interrupted study keeps what it has
+            rows += task.result()  # an interrupted study keeps its rows
             table = pd.DataFrame(rows).drop(columns="curves")
             studies.write_csv(table, given.out / "other_laws.csv")
             draw(rows, given.out / "other_laws.png")

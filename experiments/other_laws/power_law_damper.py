@@ -1,7 +1,7 @@
-"""The paper's bistable spring beside a power-law damper: Σ = σ(ε) + c |dε/dt|^n sign(dε/dt).
+"""The paper's bistable spring parallel to a power-law damper: Σ = σ(ε) + c |dε/dt|^n sign(dε/dt).
 
-σ is the law of Thevamaran, Fraternali & Daraio 2014 (J. Appl. Mech. 81, 121006, eqs. 2-5), the
-damper that of its reference 22. c (Pa) is the stress at a strain rate of 1 1/s; n = 1 is the
+σ is the law of Thevamaran, Fraternali & Daraio 2014 (J. Appl. Mech. 81, 121006, eqs. 2-5); the
+damper is that of their reference 22. c (Pa) is the stress at a strain rate of 1 1/s; n = 1 is a
 dashpot, n near 0 dry friction.
 
 Carretero-González, Khatri, Porter, Kevrekidis & Daraio 2009, Phys. Rev. Lett. 102, 024102.
@@ -22,19 +22,19 @@ paper_fill = PAPER_FUNCTIONS.fill
 
 
 def fill(values, row):
-    """Fill the row of the paper's spring, then that of the damper."""
+    """Fill in the row of the paper's spring, then the damper."""
     row[COLUMNS], row[COLUMNS + 1] = values[7], values[8]
     return paper_fill(values[:7], row[:COLUMNS]) and values[7] >= 0.0 and values[8] > 0.0
 
 
 def viscous(row, state, rate, h):
-    """The stress of the damper."""
+    """Return the stress of the damper."""
     force = row[COLUMNS] * abs(rate) ** row[COLUMNS + 1]
     return force if rate > 0.0 else -force
 
 
 def read_off(loop, marks, scales, way):
-    """Read the spring off as ever; the damper bears up to a tenth of the stress."""
+    """Read the spring off the loop; the damper bears up to a tenth of the stress."""
     spring, n = PAPER.read_off(loop, marks, scales, way), 0.1 * 10.0 ** marks[5]
     rate = max(scales.rate, 1e-6)
     c = 0.1 * scales.stress * 10.0 ** (-1.5 * marks[6]) / rate**n

@@ -1,15 +1,17 @@
-"""Is it so, what the paper says? The claims of its section 4 that can be tested without its data.
+"""Are the claims of the paper correct that can be tested without its data?
 
-Question. Does a foam's own mass oscillate, and does a small damper end it (1)? Is the literal
-reading, the striker's mass under its own measured stress, a model (2)? Do the damping ratios follow
-from the tables (3)? Do striker and loop agree in energy (4)? Do micro-springs make branches (5)?
+Question. Does the foam's own mass cause oscillation, and does a small damper remove it (1)? Is the
+literal reading, the striker's mass under its own measured stress, a valid model (2)? Do the damping
+ratios follow from the tables (3)? Do striker and loop agree in energy (4)? Can micro-springs
+produce the published branches (5)?
 
-Method. No measured curve of the paper is available: all is simulated from the published parameters
-(Thevamaran, Fraternali & Daraio 2014, Tables 1-3). A stress drive is the base stress of a simulated
-impact, to which the exact answer is known.
+Method. No measured curve of the paper is available: everything is simulated from the published
+parameters (Thevamaran, Fraternali & Daraio 2014, Tables 1-3). A stress drive is the base stress of
+a simulated impact, so the exact response is known.
 
-Answer. 1: yes; 2: no, it misses the displacement by half; 3: two of three; 4: foam-1 lacks a fifth
-of the energy, foam-2 just closes its loop; 5: no. README.md has every number, each computed here.
+Answer. 1: yes; 2: no, the displacement error is half the peak; 3: two of three; 4: foam-1 lacks a
+fifth of the energy, foam-2 just closes its loop; 5: no. README.md has every number, each computed
+here.
 
     python experiments/paper_claims/paper_claims.py
 """
@@ -44,10 +46,10 @@ STRIKER, OWN_MASS = 7e-3, ff.published[MODEL_1].specimen_mass  # kg
 ETA = 1e4  # Pa·s, published for model-2 and foam-2
 
 DRIVE_VELOCITY = 2.0  # m/s, just fast enough to close the loop of foam-1
-OTHER_VELOCITIES = (1.75, 1.9, 2.0, 2.1, 2.3, 2.5)  # m/s, for how much the drive matters
+OTHER_VELOCITIES = (1.75, 1.9, 2.0, 2.1, 2.3, 2.5)  # m/s, to show the influence of the drive
 SAMPLES = 4001  # of a drive, over the contact
 RTOL = 1e-9
-TURN = 1e-3  # of the range: a smaller turn of a curve is not counted
+TURN = 1e-3  # of the range; smaller turns of a curve are not counted
 
 
 # ------------------------------------------------------------------- stress drive: claims 1, 2
@@ -55,7 +57,7 @@ TURN = 1e-3  # of the range: a smaller turn of a curve is not counted
 
 @dataclass(frozen=True)
 class Drive:
-    """A simulated base-stress history and the motion that belongs to it, SI."""
+    """A simulated base-stress history and the corresponding motion, SI."""
 
     spring: ff.BistableSpring
     height: float
@@ -68,7 +70,7 @@ class Drive:
 def drive_of_impact(
     name: str = MODEL_2, velocity: float = DRIVE_VELOCITY, samples: int = SAMPLES
 ) -> Drive:
-    """Base stress and motion while a 7 g striker is on an undamped one-spring model."""
+    """Return base stress and motion of an undamped one-spring model hit by a 7 g striker."""
     item = ff.published[name]
     chain = ff.Chain(item.chain.springs, item.chain.heights, item.chain.area)
     hit = ff.Impact(STRIKER, velocity)
@@ -82,18 +84,18 @@ def drive_of_impact(
 
 
 def driven(drive: Drive, mass: float, damper: float, rtol: float = RTOL) -> ff.Response:
-    """The spring of the drive under its stress, with a mass (kg) and an onsite damper (Pa·s)."""
+    """Simulate the drive's spring under its stress, with a mass (kg) and onsite damper (Pa·s)."""
     chain = ff.Chain([drive.spring], [drive.height], drive.area, [mass], site_damping=damper)
     return ff.simulate(chain, ff.StressDrive(drive.stress), drive.time, rtol=rtol)
 
 
 def rms(difference: Array, reference: Array) -> float:
-    """RMS of a difference over the samples of the contact, in % of the peak of the reference."""
+    """Return the RMS of a difference over the contact, in % of the peak of the reference."""
     return float(100.0 * np.sqrt(np.mean(difference**2)) / np.max(reference))
 
 
 def displacement_error(drive: Drive, mass: float, damper: float) -> float:
-    """RMS error of the displacement, % of its peak."""
+    """Return the RMS error of the displacement, % of its peak."""
     got = driven(drive, mass, damper)
     return rms(got.displacement[-1] - drive.displacement, drive.displacement)
 
@@ -109,10 +111,10 @@ def extra_turns(curve: Array, reference: Array, share: float = TURN) -> int:
 
 
 def oscillation(drive: Drive, mass: float, damper: float) -> dict[str, float]:
-    """Deviation from equilibrium, parted into vibration and lag; all in % of the peak.
+    """Return the deviation from equilibrium, split into vibration and lag, in % of the peak.
 
-    Vibration is what the mass adds to the massless answer with the same damper; lag is what the
-    damper does to the massless answer.
+    Vibration is the difference between the responses with and without mass, with the same damper;
+    lag is the error of the massless response due to the damper.
     """
     got, massless = driven(drive, mass, damper), driven(drive, 0.0, damper)
     w, w_0 = got.displacement[-1], massless.displacement[-1]
@@ -132,7 +134,7 @@ def oscillation(drive: Drive, mass: float, damper: float) -> dict[str, float]:
 
 
 def damper_needed(drive: Drive, mass: float = OWN_MASS, share: float = TURN) -> float:
-    """Least onsite damper (Pa·s) with which stress and displacement no longer turn to and fro."""
+    """Return the least onsite damper (Pa·s) that removes extra turns of stress and motion."""
 
     def turns(damper: float) -> int:
         got = driven(drive, mass, damper)
@@ -148,7 +150,7 @@ def damper_needed(drive: Drive, mass: float = OWN_MASS, share: float = TURN) -> 
 
 
 def vibration_by_branch(drive: Drive, mass: float = OWN_MASS) -> dict[str, float]:
-    """Largest deviation of the stress from the drive on each branch, undamped, % of the peak."""
+    """Return the largest stress deviation from the drive on each branch, undamped, % of peak."""
     got = driven(drive, mass, 0.0)
     branches = drive.spring.branches(got.strain)
     off = 100.0 * abs(got.base_stress - drive.stress) / np.max(drive.stress)
@@ -156,15 +158,15 @@ def vibration_by_branch(drive: Drive, mass: float = OWN_MASS) -> dict[str, float
 
 
 def free_period(drive: Drive, mass: float, slope: float) -> float:
-    """Period of free vibration of a mass on the spring at a slope dσ/dε (Pa), s."""
+    """Return the period (s) of free vibration of a mass on the spring at a slope dσ/dε (Pa)."""
     return 2.0 * math.pi * math.sqrt(mass * drive.height / (drive.area * slope))
 
 
 def slowed(drive: Drive, damper: float, slower: float) -> float:
-    """Displacement error (%) of 7 g and a damper if the drive is played so many times slower.
+    """Return the displacement error (%) of 7 g and a damper for a drive slowed by a factor.
 
-    Time in units of the drive: a drive played s times slower on a mass m with a damper η is the
-    drive itself on m/s² with η/s.
+    By scaling of time, a drive slowed by a factor s on a mass m with a damper η is equivalent to
+    the original drive on m/s² with η/s.
     """
     return displacement_error(drive, STRIKER / slower**2, damper / slower)
 
@@ -197,7 +199,7 @@ READINGS = {
 
 
 def quantities(item: PublishedSet) -> dict[str, float]:
-    """What a reading of the damping ratio may be made of, SI."""
+    """Return the quantities for readings of the damping ratio, SI."""
     s, chain = item.bistable, item.chain
     other = ff.published[MODEL_1 if item.name == FOAM_2 else FOAM_2].chain.height
     return {
@@ -224,19 +226,19 @@ def quantities(item: PublishedSet) -> dict[str, float]:
 def ratio(
     q: dict[str, float], stiffness: float, mass: float = STRIKER, height: float | None = None
 ) -> float:
-    """ζ = η/(2 H √(ρ k)) with ρ = m/(A H)."""
+    """Return ζ = η/(2 H √(ρ k)) with ρ = m/(A H)."""
     height = q["H"] if height is None else height
     return q["eta"] / (2.0 * height * math.sqrt(mass / (q["A"] * height) * stiffness))
 
 
 def ratio_readings() -> dict[str, dict[str, float]]:
-    """ζ of the three damped sets by each reading."""
+    """Return ζ of the three damped sets by each reading."""
     sets = {name: quantities(ff.published[name]) for name in SETS}
     return {label: {name: read(q) for name, q in sets.items()} for label, read in READINGS.items()}
 
 
 def ratio_wanted() -> dict[str, float]:
-    """What one printed number of model-2 would have to be for its ratio to be the paper's, SI."""
+    """Return, for single numbers of model-2, the value that would give the paper's ratio, SI."""
     item = ff.published[MODEL_2]
     by_formula, printed = item.damping_ratio_by_formula(), item.damping_ratio
     assert by_formula is not None
@@ -255,14 +257,14 @@ def ratio_wanted() -> dict[str, float]:
 
 
 def impact_scene(name: str, interior: bool = True, **spring: float) -> ff.Chain:
-    """The chain of a published set without its numerical damper, with or without interior mass."""
+    """Return the chain of a published set without its numerical damper."""
     chain = ff.published[name].chain
     springs = [replace(s, **spring) for s in chain.springs]
     return ff.Chain(springs, chain.heights, chain.area, chain.masses if interior else None)
 
 
 def struck(chain: ff.Chain, velocity: float, samples: int = 101) -> ff.Response:
-    """An impact of the 7 g striker, long enough to see it fly off."""
+    """Simulate an impact of the 7 g striker until after the end of contact."""
     time = np.linspace(0.0, 4.0 * chain.height / velocity, samples)
     got = ff.simulate(chain, ff.Impact(STRIKER, velocity), time, rtol=RTOL)
     assert got.contact_end is not None
@@ -271,18 +273,18 @@ def struck(chain: ff.Chain, velocity: float, samples: int = 101) -> ff.Response:
 
 
 def spring_strain(chain: ff.Chain, got: ff.Response) -> Array:
-    """Strain of the bistable spring, the uppermost, (n_t,)."""
+    """Return the strain of the uppermost, bistable spring, (n_t,)."""
     below = got.displacement[-2] if len(chain.heights) > 1 else 0.0
     return (got.displacement[-1] - below) / chain.heights[-1]
 
 
 def closes(chain: ff.Chain, velocity: float) -> bool:
-    """Tell whether the bistable spring reaches branch c."""
+    """Return whether the bistable spring reaches branch c."""
     return bool(np.any(struck(chain, velocity).switches[:, 3] == BRANCH_NAMES.index("c")))
 
 
 def closing_velocity(name: str, interior: bool = True) -> float:
-    """Least velocity (m/s) at which the simulated impact reaches C1, by bisection."""
+    """Return the least velocity (m/s) at which the impact reaches C1, by bisection."""
     chain = impact_scene(name, interior)
     low, high = 1.0, 8.0
     while high - low > 1e-6:
@@ -292,7 +294,7 @@ def closing_velocity(name: str, interior: bool = True) -> float:
 
 
 def work_to_c1(name: str) -> float:
-    """Work per cross-section (J/m²) to bring massless springs in series to C1, closed form."""
+    """Return the work per cross-section (J/m²) to load massless springs to C1, closed form."""
     item, total = ff.published[name], 0.0
     top = item.bistable.sigma_hat_c
     for s, h in zip(item.chain.springs, item.chain.heights, strict=True):
@@ -305,12 +307,12 @@ def work_to_c1(name: str) -> float:
 
 
 def closing_velocity_by_energy(name: str) -> float:
-    """Velocity (m/s) whose kinetic energy is the work to C1."""
+    """Return the velocity (m/s) whose kinetic energy is the work to C1."""
     return math.sqrt(2.0 * ff.published[name].chain.area * work_to_c1(name) / STRIKER)
 
 
 def loop_area(name: str) -> float:
-    """Work lost per cross-section (J/m²) by the smallest closed loop: to C1, back to σ = 0."""
+    """Return the area (J/m²) of the smallest closed loop, to C1 and back to σ = 0."""
     item = ff.published[name]
     top = item.bistable.eps_hat_c
     strain = np.concatenate([np.linspace(0, top, 20001), np.linspace(top * (1 + 1e-12), 0, 20001)])
@@ -319,7 +321,7 @@ def loop_area(name: str) -> float:
 
 
 def energy_row(name: str, interior: bool = True) -> dict[str, float]:
-    """The published impact of one set, simulated, against its loop; SI."""
+    """Compare the simulated published impact of one set with its loop; SI."""
     item, chain = ff.published[name], impact_scene(name, interior)
     velocity = item.striker_velocity
     got = struck(chain, velocity, 4001)
@@ -343,14 +345,14 @@ def energy_row(name: str, interior: bool = True) -> dict[str, float]:
 
 
 def lost_share(chain: ff.Chain, velocity: float) -> float:
-    """Share (%) of the striker's energy that it does not get back."""
+    """Return the share (%) of the striker's energy that is lost."""
     got = struck(chain, velocity)
     flight = np.diff(got.displacement[-1])[-1] / np.diff(got.time)[-1]
     return float(100.0 * (1.0 - (flight / velocity) ** 2))
 
 
 def published_viscosity() -> dict[str, float]:
-    """What η = 1e4 Pa·s would do as a real-time dashpot in the published impact of model-2; SI."""
+    """Return effects of η = 1e4 Pa·s as a real-time dashpot in model-2's published impact; SI."""
     item = ff.published[MODEL_2]
     got = struck(impact_scene(MODEL_2, eta=ETA), item.striker_velocity, 2001)
     return {
@@ -366,7 +368,7 @@ def published_viscosity() -> dict[str, float]:
 
 
 def mark(ax: Any, x: float, text: str, y: float = 0.03, dx: int = 3, **more: Any) -> None:
-    """Draw a dotted line at an abscissa, and a word beside it."""
+    """Draw a dotted line at an abscissa with a label."""
     ax.axvline(x, color=GREY, lw=0.8, ls=":")
     ax.annotate(
         text, (x, y), xycoords=("data", "axes fraction"), xytext=(dx, 0), color="0.35",
@@ -375,7 +377,7 @@ def mark(ax: Any, x: float, text: str, y: float = 0.03, dx: int = 3, **more: Any
 
 
 def draw_oscillation(drive: Drive, needed: float, path: Path) -> None:
-    """Stress and displacement with the foam's own mass, with and without damper; errors over η."""
+    """Draw stress and displacement with the foam's mass, with and without damper; errors over η."""
     t = 1e3 * drive.time
     free, damped = driven(drive, OWN_MASS, 0.0), driven(drive, OWN_MASS, needed)
     with studies.sheet(path, 7.0, 4.9) as figure:
@@ -416,7 +418,7 @@ def draw_oscillation(drive: Drive, needed: float, path: Path) -> None:
 
 
 def draw_energy(path: Path) -> None:
-    """Published loops and how far the published impact goes; energy lost over velocity."""
+    """Draw published loops with the published impact, and energy lost over velocity."""
     with studies.sheet(path, 7.0, 2.9) as figure:
         axes = figure.subplots(1, 3)
         for ax, name, title in (
@@ -470,12 +472,12 @@ def main() -> None:
 
 
 def subscripts(text: str) -> str:
-    """Set k_c, ε_a, … of a page as GitHub does subscripts."""
+    """Write k_c, ε_a, … with HTML subscripts."""
     return re.sub(r"(?<=[kε\u0302])_(h[+−]|[ac*])", r"<sub>\1</sub>", text)
 
 
 def of_oscillation() -> dict[str, Any]:
-    """Numbers and table of the first claim."""
+    """Return numbers and table of the first claim."""
     drive, first = drive_of_impact(MODEL_2), drive_of_impact(MODEL_1)
     needed = damper_needed(drive)
     free, damped = oscillation(drive, OWN_MASS, 0.0), oscillation(drive, OWN_MASS, needed)
@@ -493,10 +495,10 @@ def of_oscillation() -> dict[str, Any]:
         ("model-2, published damper of model-3", drive, 3e2),
         ("model-2, its published damper", drive, ETA),
     ):
-        told = (
+        cells = (
             "{stress:.2f} | {displacement:.2f} | {vibration:.3f} | {lag:.2f} | {turns} | {turns_w}"
         )
-        row = told.format(**oscillation(given, OWN_MASS, damper))
+        row = cells.format(**oscillation(given, OWN_MASS, damper))
         rows.append((label, f"{float(f'{damper:.3g}'):g}", row))
     published = quantities(ff.published[MODEL_2]) | {"eta": needed}
     slopes = {"": drive.spring.k0, "_c": drive.spring.kc}
@@ -583,7 +585,7 @@ def of_energy() -> dict[str, Any]:
     massless = {label: row for label, row in rows.items() if "between" not in label}
     m2, m3, f2 = (list(rows.values())[i] for i in (1, 3, 4))
     eta = published_viscosity()
-    told = "{velocity:.2f} | {strain:.4f} | {c1:.4f} | {mpa:.2f} | {rebound:.3f} | {needed:.4f}"
+    cells = "{velocity:.2f} | {strain:.4f} | {c1:.4f} | {mpa:.2f} | {rebound:.3f} | {needed:.4f}"
     works = "{brought:.0f} | {work:.0f} | {loop:.0f}"
     return {
         "m2": m2, "m3": m3, "f2": f2, "f2_left": f2["left"], "f2_spare": -f2["excess"],
@@ -595,7 +597,7 @@ def of_energy() -> dict[str, Any]:
         "eta_foam_2": 1e-6 * eta["foam_2"],
         "check_energy": max(abs(r["needed"] / r["needed_energy"] - 1) for r in massless.values()),
         "table_energy": studies.lines(
-            (label, told.format(mpa=1e-6 * row["peak"], **row), f"{row['excess']:+.1f}")
+            (label, cells.format(mpa=1e-6 * row["peak"], **row), f"{row['excess']:+.1f}")
             for label, row in rows.items()
         ).replace("| -", "| −"),
         "table_work": studies.lines(

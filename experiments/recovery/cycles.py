@@ -1,14 +1,14 @@
-"""Do the intervals hold where springs remember, on records of three cycles?
+"""Do the intervals of springs that remember contain the true values on three cycles?
 
-Method. A synthetic foam is a row of discrete micro-springs (model.md, section 8), each with a flag
-"has snapped once", and one relaxation term; a machine comes from before contact, with zeros of its
-own, and presses it three times without leaving it. Nothing of this comes from foamfit: the stress
-at a strain is found by bisection over the row. Each record goes the way of a user: a CSV with noise
-on force and motion, `foamfit.read_test` with `cycles=(1, 3)`, `foamfit.fit` with stiffening and the
-Mullins effect. It counts the 95 % intervals that hold the truth, and the determined values that lie
-further outside than their interval is wide ("far").
+Method. A synthetic foam is a chain of discrete micro-springs (docs/theory.md), each with a flag
+"has snapped once", and one relaxation term. The machine starts before contact, with arbitrary
+zeros, and compresses it three times without losing contact. Nothing here comes from foamfit: the
+stress at a strain is found by bisection over the chain. Each record is processed like a user's: a
+CSV with noise on force and motion, `foamfit.read_test` with `cycles=(1, 3)`, `foamfit.fit` with
+stiffening and the Mullins effect. Counted are the 95 % intervals that contain the true value, and
+the determined values whose true value is outside by more than the width of the interval ("far").
 
-Answer. 93.8 % of 480 intervals hold the truth, no value lies far outside: README.md.
+Answer. 93.8 % of 480 intervals contain the true value, none is far outside: README.md.
 
     python experiments/recovery/cycles.py --tests 50 --raw rows.csv     # resumable; 15 s a test
 """
@@ -31,22 +31,22 @@ from truth import Array
 
 import foamfit as ff
 
-MICRO_SPRINGS, STEPS, CYCLE = 4000, 2000, 4.0  # springs; steps of a leg; s of a cycle
+MICRO_SPRINGS, STEPS, CYCLE = 4000, 2000, 4.0  # springs; steps per leg; s per cycle
 HEIGHT, AREA = 10e-3, 4.5e-5  # m, m²
-ROWS, NOISE = 1200, 1e-3  # samples; noise of each channel over its range
-LEAST = 0.02  # share of the peak stress at which the machine turns back
-DEEPEST, BACK = 0.82, 0.3  # largest strain; what is left of it where it turns back, at most
+ROWS, NOISE = 1200, 1e-3  # samples; noise of each channel relative to its range
+LEAST = 0.02  # fraction of the peak stress at which the machine reverses
+DEEPEST, BACK = 0.82, 0.3  # largest strain; largest fraction left at the reversal
 
 
 @dataclass
 class Ensemble:
-    """Micro-springs in a row at one stress, with what each remembers."""
+    """Micro-springs in series at one stress, with the state of each."""
 
     values: dict[str, float]
     count: int = MICRO_SPRINGS
 
     def __post_init__(self) -> None:
-        """Begin unloaded; ranks are those of equal shares."""
+        """Start unloaded, with ranks of equal shares."""
         v, ranks = self.values, ndtri((np.arange(self.count) + 0.5) / self.count)
         self.first = v["sigma_plus"] * np.exp(v["spread_plus"] * ranks)
         self.back = v["sigma_minus"] * np.exp(v["spread_minus"] * ranks)
@@ -55,14 +55,14 @@ class Ensemble:
         self.stress = 0.0
 
     def after(self, stress: float) -> Array:
-        """Which micro-springs are snapped once the stress has come here."""
+        """Return which micro-springs are snapped after the stress has reached this value."""
         through = np.where(self.ever, self.first * math.exp(-self.values["weakening"]), self.first)
         if stress >= self.stress:
             return self.snapped | (stress >= through)
         return self.snapped & (stress >= np.minimum(self.back, through))
 
     def strain(self, stress: float, snapped: Array) -> float:
-        """Mean strain of the row."""
+        """Return the mean strain of the chain."""
         v, n = self.values, self.values["stiffening"]
         soft = v["k0"] * math.exp(-v["softening"])
         virgin, worn = (1.0 - (1.0 + n * stress / k) ** (-1.0 / n) for k in (v["k0"], soft))
@@ -71,7 +71,7 @@ class Ensemble:
         return (1.0 - ever) * virgin + (ever - p) * worn + p * compressed
 
     def press(self, strain: float) -> float:
-        """Bring the row to a strain; returns its stress."""
+        """Bring the chain to a strain; return the stress."""
         rising = strain > self.strain(self.stress, self.snapped)
         low, high = (self.stress, 20.0 * self.first[-1]) if rising else (0.0, self.stress)
         for _ in range(50):
@@ -84,7 +84,7 @@ class Ensemble:
 
 
 def draw(rng: np.random.Generator) -> tuple[dict[str, float], float]:
-    """Draw a foam, and the stress of its largest compression."""
+    """Draw a foam and the stress at its largest compression."""
     names = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
     while True:
         spring, most = draw_microscale(rng)
@@ -111,7 +111,7 @@ def draw(rng: np.random.Generator) -> tuple[dict[str, float], float]:
 
 
 def pressed(values: dict[str, float], top: float) -> tuple[list[float], list[float]]:
-    """Press a foam three times, to `top` and a little further each; its strains and stresses."""
+    """Compress a foam three times, to `top` and slightly beyond; return strains and stresses."""
     row, g, tau = Ensemble(values), values["g1"], values["tau1"]
     step = 0.5 * CYCLE / STEPS
     fade, gain = math.exp(-step / tau), g * tau / step * (1.0 - math.exp(-step / tau))
@@ -132,7 +132,7 @@ def pressed(values: dict[str, float], top: float) -> tuple[list[float], list[flo
 
 
 def record(seed: int) -> tuple[dict[str, float], pd.DataFrame]:
-    """Make the true parameters and the noisy record of one test."""
+    """Return the true parameters and the noisy record of one test."""
     rng = np.random.default_rng([seed, 11])
     values, top = draw(rng)
     strains, stresses = pressed(values, top)
@@ -153,7 +153,7 @@ def record(seed: int) -> tuple[dict[str, float], pd.DataFrame]:
 
 
 def run_test(family: str, name: str, seed: int) -> list[Row]:
-    """Make, write, read and fit one test: a row for each parameter, or one for the failure."""
+    """Simulate, write, read and fit one test; return a row per parameter, or for a failure."""
     about: Row = {"family": family, "class": name, "test": seed}
     truth, table = record(seed)
     began = time.perf_counter()
@@ -182,8 +182,8 @@ def main() -> None:
     given = rows[rows["low"].notna()]
     for name, group in [*given.groupby("parameter", sort=False), ("all", given)]:
         holds, low, high = percents(group["holds"])
-        told = f"{holds:.1f} % ({low:.1f} to {high:.1f}) of {len(group)}, far {group['far'].sum()}"
-        print(f"{name:16} {told}")
+        shown = f"{holds:.1f} % ({low:.1f} to {high:.1f}) of {len(group)}, far {group['far'].sum()}"
+        print(f"{name:16} {shown}")
     print("states:", rows["state"].value_counts().to_dict())
     print("status:", rows.drop_duplicates(JOB)["status"].value_counts().to_dict())
     for row in rows[rows["error"].notna()].itertuples():

@@ -1,12 +1,12 @@
-"""Synthetic records as a rig writes them, with the parameters that made them.
+"""Synthetic records like those of a test rig, with their true parameters.
 
-`impact` and `slow` draw springs and a test and make a `Record`; `write` puts it into a CSV and its
-TOML. Nothing here or in `truth`, which follows the springs, comes from foamfit.
+`impact` and `slow` draw springs and a test and return a `Record`; `write` writes it to a CSV and
+its TOML. Nothing here or in `truth`, which integrates the springs, comes from foamfit.
 
-An impact is recorded by an oscilloscope from before the contact until after it. Each channel has a
-zero of its own, the clock starts anywhere, and contact lies between two samples. A slow test
-follows a given motion, whose record has noise, until the stress is back at zero. One seed draws the
-same springs and striker for one law, and the same noise of a channel, whatever else is recorded.
+An impact is recorded by an oscilloscope from before to after contact. Each channel has an arbitrary
+zero, the clock starts at an arbitrary time, and contact lies between two samples. A slow test
+follows a given motion, recorded with noise, until the stress returns to zero. For one law, a seed
+always draws the same springs, striker and noise of a channel, whatever else is recorded.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ GRAVITY = 9.80665
 DURATION = 4.0  # s, of a slow motion
 MOST_STRAIN = 0.93
 UNITS = {"force": ("N", 1.0), "displacement": ("mm", 1e3), "acceleration": ("m/s^2", 1.0)}
-# Height (m), cross-section (m²) and striker (kg): the paper's bench, and a drop tower.
+# Height (m), cross-section (m²) and striker (kg): the paper's rig, and a drop tower.
 BENCH, TOWER = (1.2e-3, 1.9635e-5, 7e-3), (20e-3, 1e-3, 5.0)
 SLOW_HEIGHT, SLOW_AREA = 10e-3, 0.25 * math.pi * 7.6e-3**2
 
 
 @dataclass(frozen=True)
 class Impact:
-    """How an impact is made and recorded.
+    """Settings of a synthetic impact and its record.
 
-    `zero` says whether the motion's zero is arbitrary, `sensor` whether those of force and
-    acceleration are. `noise` is a share of each channel's range during contact, of autocorrelation
-    time `tau` in samples. `before` is the share of the record before contact (None: drawn up to
-    0.6), `samples` those during contact (None: 150 to 3000, where 20 kHz to 2 MHz allow it). A
-    record that is `trimmed` begins at contact, at time zero, with all zeros right. A `gauge` on the
-    specimen rests until contact. `gravity` acts on the striker before, during and after contact;
-    the TOML says so if it is `said`. `velocity_sd` is what the TOML says of its velocity, as a
-    share: the velocity there is off by so much, at random.
+    With `zero` the zero of the motion is arbitrary, with `sensor` the zeros of force and
+    acceleration. `noise` is relative to each channel's range during contact, with autocorrelation
+    time `tau` in samples. `before` is the fraction of the record before contact (None: drawn up to
+    0.6), `samples` the number during contact (None: 150 to 3000, within 20 kHz to 2 MHz). A
+    `trimmed` record starts at contact, at time zero, with correct zeros. A `gauge` on the specimen
+    rests until contact. `gravity` acts on the striker before, during and after contact; if `said`,
+    the TOML states it. `velocity_sd` is the relative standard deviation of the velocity in the
+    TOML, which has a random error of this size.
     """
 
     law: str = "bistable"
@@ -63,13 +63,13 @@ class Impact:
 
 @dataclass(frozen=True)
 class Slow:
-    """How a slow test is made and recorded.
+    """Settings of a synthetic slow test and its record.
 
-    `law` is "bistable", "microscale" or bistable springs joined by "+", all of one height. With
-    `dashpot` an only spring has an eta. `motion` is "triangle", "sine", "trapezoid" (a short hold)
-    or "ramp" (a slow start). `inner` is the size of a partial unloading, as a share of the peak.
-    `noise` is a share of the range, of displacement and force alike; `noise_given` writes it into
-    the TOML, and with `exact` the displacement has none. With `early` the motion begins before
+    `law` is "bistable", "microscale" or bistable springs joined by "+", all of the same height.
+    With `dashpot` a single spring has an eta. `motion` is "triangle", "sine", "trapezoid" (a short
+    hold) or "ramp" (a slow start). `inner` is the size of a partial unloading relative to the peak.
+    `noise` is relative to the range of displacement and of force; `noise_given` writes it to the
+    TOML, and with `exact` the displacement has no noise. With `early` the motion starts before
     contact; with `zero` its zero is arbitrary.
     """
 
@@ -88,11 +88,11 @@ class Slow:
 
 @dataclass(frozen=True)
 class Record:
-    """A record in SI, compression positive: `time` as the file counts it, noisy and clean channels.
+    """A record in SI, compression positive: `time` of the file, noisy and clean channels.
 
-    `truth` has the true parameters by foamfit's names, and contact_time (s) and displacement_zero
-    (m): what the file's clock and its displacement say at contact; of an impact also velocity and
-    striker_mass.
+    `truth` contains the true parameters by foamfit's names, and contact_time (s) and
+    displacement_zero (m), the values of the file's time and displacement at contact; for an impact
+    also velocity and striker_mass.
     """
 
     setup: Impact | Slow
@@ -107,13 +107,13 @@ class Record:
 
     @property
     def model(self) -> str:
-        """What `--model` is."""
+        """Value of `--model`."""
         return self.setup.law
 
     def written_so(self, zero: float = 0.0, clock: float = 0.0, skip: int = 0) -> Record:
         """Return the same samples with another zero of the motion (m, added) and clock (s, added).
 
-        The first `skip` rows are left out.
+        The first `skip` rows are omitted.
         """
         shift = {"displacement": zero}
         channels = {c: (v + shift.get(c, 0.0))[skip:] for c, v in self.channels.items()}
@@ -126,7 +126,7 @@ class Record:
 
 
 def draw_bistable(rng: np.random.Generator) -> Bistable:
-    """Draw a bistable spring, over the range of the paper's and beyond."""
+    """Draw a bistable spring from a range that includes those of the paper."""
     k0, eps_a = 10 ** rng.uniform(6.0, 7.5), rng.uniform(0.05, 0.35)
     eps_c, drop = eps_a + rng.uniform(0.1, 0.45), rng.uniform(0.05, 0.8)
     sigma_a = k0 * eps_a / (1.0 - eps_a)
@@ -142,7 +142,7 @@ def draw_bistable(rng: np.random.Generator) -> Bistable:
 
 
 def draw_microscale(rng: np.random.Generator) -> tuple[Microscale, float]:
-    """Draw a microscale spring, and the stress that snaps 70 to 98 % of it."""
+    """Draw a microscale spring and the stress that snaps 70 to 98 % of it."""
     while True:
         k0 = 10 ** rng.uniform(5.0, 7.0)
         kc = k0 * 10 ** rng.uniform(-0.5, 1.0)
@@ -163,7 +163,7 @@ def draw_microscale(rng: np.random.Generator) -> tuple[Microscale, float]:
 
 
 def draw_terms(rng: np.random.Generator, count: int, lasts: float) -> Terms:
-    """Draw relaxation terms for a test of so many seconds, the fastest first."""
+    """Draw relaxation terms for a test of duration `lasts` (s), fastest first."""
     decades = [(-2.0, -0.5)] if count == 1 else [(-2.2, -1.5), (-1.0, -0.3)]
     return tuple(
         (rng.uniform(0.1, 1.0), lasts * 10 ** rng.uniform(*decade)) for decade in decades[:count]
@@ -171,7 +171,7 @@ def draw_terms(rng: np.random.Generator, count: int, lasts: float) -> Terms:
 
 
 def work(spring: Law, most: float) -> float:
-    """Work per volume of a first loading to a stress, J/m³."""
+    """Return the work per volume of a first loading to a stress, J/m³."""
     cuts = [s for s in spring.points[:3:2] if s < most] if isinstance(spring, Bistable) else []
     ends = [0.0, *cuts, most]
     return math.fsum(
@@ -181,7 +181,7 @@ def work(spring: Law, most: float) -> float:
 
 
 def parameters(springs: tuple[Law, ...]) -> dict[str, float]:
-    """Parameters of springs by foamfit's names."""
+    """Return the parameters of springs by foamfit's names."""
     named: dict[str, float] = {}
     for i, spring in enumerate(springs, start=1):
         own = [item.name for item in fields(spring) if item.name != "terms"]
@@ -194,7 +194,7 @@ def parameters(springs: tuple[Law, ...]) -> dict[str, float]:
 def noisy(
     clean: dict[str, Array], ranges: dict[str, float], share: float, tau: float, seed: int
 ) -> tuple[dict[str, Array], dict[str, float]]:
-    """Add noise to channels, drawn for each by itself; return its standard deviations too."""
+    """Add independent noise to each channel; return its standard deviations too."""
     rho, out = (tau - 1.0) / (tau + 1.0), {}
     for name, values in clean.items():
         rng = np.random.default_rng([seed, 3, list(UNITS).index(name)])
@@ -205,7 +205,7 @@ def noisy(
 
 
 def drawn_impact(setup: Impact, rng: np.random.Generator) -> Course:
-    """Draw a spring and a striker that closes its loop and does not press it flat; follow it."""
+    """Draw a spring and a striker that closes the loop without flattening it; simulate."""
     while True:
         height, area, mass = BENCH if rng.random() < 0.5 else TOWER
         if setup.law == "bistable":
@@ -229,7 +229,7 @@ def drawn_impact(setup: Impact, rng: np.random.Generator) -> Course:
 
 
 def impact(setup: Impact, seed: int) -> Record:
-    """Make the record of an impact."""
+    """Return the record of an impact."""
     course = drawn_impact(setup, np.random.default_rng([seed, 1]))
     rng = np.random.default_rng([seed, 2])
     rig, lasts = course.rig, course.end
@@ -276,7 +276,7 @@ def impact(setup: Impact, seed: int) -> Record:
 
 
 def slow_motion(setup: Slow, peak: float, rng: np.random.Generator) -> Motion:
-    """Draw a motion to a displacement and back, with what its shape asks for."""
+    """Draw a motion to a displacement and back, with the parameters of its shape."""
     gap = peak * rng.uniform(0.02, 0.1) if setup.early else 0.0
     at, unloading = rng.uniform(0.4, 0.8), rng.random() < 0.5
     up, down = [-gap, peak], [peak, 0.0]
@@ -299,7 +299,7 @@ def slow_motion(setup: Slow, peak: float, rng: np.random.Generator) -> Motion:
 
 
 def drawn_slow(setup: Slow, rng: np.random.Generator) -> Course:
-    """Draw springs and a motion that closes their loops, and follow them."""
+    """Draw springs and a motion that closes their loops; simulate."""
     kinds = setup.law.split("+")
     while True:
         springs = list[Law]()
@@ -311,7 +311,7 @@ def drawn_slow(setup: Slow, rng: np.random.Generator) -> Course:
             tops = sorted(spring.points[0] for spring in springs)
             most = max(spring.points[2] for spring in springs) * rng.uniform(1.1, 1.6)
             if not all(1.5 < b / a < 4.0 for a, b in pairwise(tops)):
-                continue  # of one foam, but no twins: those cannot be told apart
+                continue  # springs of one foam must be similar, but distinguishable
         heights = (SLOW_HEIGHT / len(kinds),) * len(kinds)
         strains = [spring.strain(most, spring.loading(most))[0] for spring in springs]
         if max(strains) > MOST_STRAIN:
@@ -329,7 +329,7 @@ def drawn_slow(setup: Slow, rng: np.random.Generator) -> Course:
 
 
 def slow(setup: Slow, seed: int) -> Record:
-    """Make the record of a slow test."""
+    """Return the record of a slow test."""
     course = drawn_slow(setup, np.random.default_rng([seed, 1]))
     rng = np.random.default_rng([seed, 2])
     rig, own = course.rig, np.linspace(0.0, course.end, setup.rows)

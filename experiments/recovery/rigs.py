@@ -1,17 +1,18 @@
-"""Do the 95 % intervals hold on records as rigs write them?
+"""Do the 95 % intervals contain the true values on records like those of a test rig?
 
-Method. `rig` makes synthetic impacts, recorded by an oscilloscope from before the contact, and
-synthetic slow tests, whose motion drives the fit and has noise. Each goes the way of a user: a CSV,
-its TOML, `foamfit.read_test`, the defaults of `foamfit.fit`. A row for each parameter keeps truth
-and interval; a test that cannot be read or fitted is a row with its sentence. Intervals of the
-springs' parameters are counted, those of contact time, zero, velocity and mass apart. A value is
-far if it is called determined and its interval misses the truth by more than its own width. The
-search has missed the minimum of a slow test where the true springs follow its stress better.
+Method. `rig` generates synthetic impacts, recorded from before contact, and synthetic slow tests
+with a prescribed, noisy motion. Each is processed like a user's: CSV, TOML, `foamfit.read_test`,
+the defaults of `foamfit.fit`. A row for each parameter contains true value and interval; a test
+that cannot be read or fitted gets a row with the message. Coverage is counted for the parameters of
+the springs, and separately for contact time, zero, velocity and mass. A determined value is far if
+the true value is outside its interval by more than the width of the interval. The search has missed
+the minimum of a slow test if the true springs fit the stress better.
 
-Answer. 94.9 % hold of impacts, 94.5 % of slow tests of one spring, 95.5 % of two: see README.md.
+Answer. Coverage is 94.9 % for impacts, 94.5 % for slow tests of one spring, 95.5 % for two springs:
+see README.md.
 
-With `--invariance` each impact is written several ways: with another zero of the motion, another
-clock, fewer rows before contact. The moves of its parameters are counted in standard errors.
+With `--invariance` each impact is written in several ways: with another zero of the motion, another
+clock, fewer rows before contact. The changes of the parameters are measured in standard errors.
 
     python experiments/recovery/rigs.py --raw rows.csv         # 200 tests of each class, resumable
     python experiments/recovery/rigs.py --family slow --classes microscale --tests 20
@@ -52,7 +53,7 @@ COLUMNS = [
     "far", "move", "status", "over truth", "seconds", "error",
 ]  # fmt: skip
 AS_RECORDED = "as recorded"
-MISSED = 1.1  # with so much more misfit than the true springs have, the search missed the minimum
+MISSED = 1.1  # misfit over that of the true springs at which a minimum was missed
 
 BOTH = ("force", "displacement")
 IMPACTS = {
@@ -111,13 +112,13 @@ FAMILIES: dict[str, dict[str, Any]] = {"impact": IMPACTS, "slow": SLOW}
 
 
 def make(family: str, name: str, seed: int) -> Record:
-    """Make one record of a class."""
+    """Return one record of a class."""
     setup = FAMILIES[family][name]
     return impact(setup, seed) if family == "impact" else slow(setup, seed)
 
 
 def chain_of(made: Rig) -> ff.Chain:
-    """The true springs as foamfit knows them."""
+    """Return the true springs as a chain of foamfit."""
     springs = []
     for spring in made.springs:
         values = {f.name: getattr(spring, f.name) for f in fields(spring) if f.name != "terms"}
@@ -127,22 +128,22 @@ def chain_of(made: Rig) -> ff.Chain:
 
 
 def over_truth(record: Record, test: Any, chain: ff.Chain) -> float:
-    """Misfit of a slow test's stress along its measured motion, over that of the true springs."""
+    """Return the misfit of a slow test's stress over that of the true springs."""
     drive = ff.DisplacementDrive(test.displacement)
     each = [ff.simulate(springs, drive, test.time) for springs in (chain, chain_of(record.rig))]
     return float(np.divide(*[np.std(found.base_stress - test.stress) for found in each]))
 
 
 def fitted(record: Record) -> tuple[Any, Any, dict[str, Any]]:
-    """Write, read and fit a record; return test, result and the estimates of what has a truth.
+    """Write, read and fit a record; return test, result and estimates with a true value.
 
-    The rig numbers springs by the stress at which they begin to snap and relaxation terms by their
-    time, as the fit does.
+    The rig numbers springs by the stress at which they start to snap, and relaxation terms by their
+    time, like the fit.
     """
     with tempfile.TemporaryDirectory() as folder:
         test = ff.read_test(write(record, Path(folder)))
     terms, params = record.setup.relaxation, None
-    if getattr(record.setup, "dashpot", False):  # held at zero under a driven motion by default
+    if getattr(record.setup, "dashpot", False):  # fixed at zero by default
         params = ff.make_params(test, record.model, "displacement", relaxation=terms)
         params["s1_eta"].vary = True
     result = ff.fit(test, model=record.model, relaxation=terms, params=params, seed=0)
@@ -150,16 +151,16 @@ def fitted(record: Record) -> tuple[Any, Any, dict[str, Any]]:
 
 
 def sentence(error: Exception) -> str:
-    """What a fit that failed says; of what is no refusal also where it was raised."""
-    told = f"{type(error).__name__}: {error}"
+    """Return the message of a failed fit; for an unexpected error also its location."""
+    text = f"{type(error).__name__}: {error}"
     if isinstance(error, InputError | SimulationError):
-        return told
+        return text
     last = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{told} ({Path(last.filename).name}:{last.lineno})"
+    return f"{text} ({Path(last.filename).name}:{last.lineno})"
 
 
 def judged(parameter: str, truth: float, estimate: Any) -> Row:
-    """Hold an estimate against the truth."""
+    """Compare an estimate with the true value."""
     low, high = map(float, estimate.ci95 or (np.nan, np.nan))
     outside = max(low - truth, truth - high)
     return {
@@ -171,7 +172,7 @@ def judged(parameter: str, truth: float, estimate: Any) -> Row:
 
 
 def run_test(family: str, name: str, seed: int) -> list[Row]:
-    """Make, write, read and fit one test: a row for each free parameter, or one for the failure."""
+    """Simulate, write, read and fit one test; return a row per parameter, or for a failure."""
     about: Row = {"family": family, "class": name, "test": seed}
     began = time.perf_counter()
     try:
@@ -190,7 +191,7 @@ def run_test(family: str, name: str, seed: int) -> list[Row]:
 
 
 def ways(record: Record) -> Iterator[tuple[str, Record]]:
-    """Write an impact several ways, the first as it was recorded."""
+    """Write an impact in several ways, first as recorded."""
     yield AS_RECORDED, record
     if "displacement" in record.channels:
         yield "zero", record.written_so(zero=0.7 * record.rig.height)
@@ -202,7 +203,7 @@ def ways(record: Record) -> Iterator[tuple[str, Record]]:
 
 
 def run_invariance(family: str, name: str, seed: int) -> list[Row]:
-    """Fit one impact written several ways: a row for each parameter and way, or the failure."""
+    """Fit one impact written in several ways; return a row per parameter and way, or failure."""
     setup = FAMILIES[family][name]
     record = impact(replace(setup, before=setup.before or 0.4), seed)
     first: dict[str, Any] = {}
@@ -226,7 +227,7 @@ def run_invariance(family: str, name: str, seed: int) -> list[Row]:
 def run(
     work: Callable[[str, str, int], list[Row]], jobs: list[Job], raw: Path | None, processes: int
 ) -> pd.DataFrame:
-    """Do the jobs that `raw` does not hold yet; it is kept up after each."""
+    """Run the jobs that are not yet in `raw`, and update it after each."""
     old = pd.read_csv(raw) if raw is not None and raw.exists() else pd.DataFrame(columns=COLUMNS)
     done = set(zip(*(old[key] for key in JOB), strict=True))
     left = [job for job in jobs if job not in done]
@@ -244,14 +245,14 @@ def run(
 
 
 def percents(held: pd.Series) -> list[float]:
-    """Per cent of what holds, and its binomial 95 % interval."""
+    """Return the coverage in per cent and its binomial 95 % interval."""
     if not len(held):
         return [np.nan] * 3
     return [100.0 * part for part in studies.share(held.astype(bool).tolist()).values()]
 
 
 def coverage(rows: pd.DataFrame, by: str) -> pd.DataFrame:
-    """Count the intervals that hold, for each value of a column and for all together."""
+    """Return the coverage for each value of a column and for all together."""
     fits = rows[rows["parameter"].notna()]
     own = fits["parameter"].astype(str).str.match(r"s\d_")
     out = []
@@ -285,7 +286,7 @@ def coverage(rows: pd.DataFrame, by: str) -> pd.DataFrame:
 
 
 def moves(rows: pd.DataFrame, by: str) -> pd.DataFrame:
-    """Count the moves beyond 0.3 standard errors, for each value of a column and all together."""
+    """Count changes beyond 0.3 standard errors, for each value of a column and all together."""
     out, rows = [], rows[rows["way"] != AS_RECORDED]
     for name, group in [*rows.groupby(by, sort=False), ("all", rows)]:
         given = group[group["move"].notna()]

@@ -1,8 +1,8 @@
-"""What springs under a striker or a given motion do: an independent judge of foamfit.
+"""Response of springs to a striker or a given motion: an independent reference for foamfit.
 
-Nothing here comes from foamfit: no code, and no method. The laws (model.md, sections 1, 2, 6 and 7)
-are written by stress instead of strain; the stress that snapping follows is part of the state.
-SciPy's DOP853 integrates to 11 digits, from switch to switch (its events).
+Neither code nor method comes from foamfit. The laws (docs/theory.md) are functions of stress
+instead of strain; the stress that governs snapping is part of the state. SciPy's DOP853 integrates
+to 11 digits, from switch to switch (its events).
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from scipy.optimize import brentq
 
 Array = NDArray[np.float64]
 Terms = tuple[tuple[float, float], ...]  # pairs (g, tau in s)
-Mode = tuple[str, float]  # what a spring follows; the second is the rank that a held one keeps
+Mode = tuple[str, float]  # branch of a spring, and the constant rank of a held one
 
 
 def soft(s: float, k: float) -> tuple[float, float]:
-    """Strain s/(k + s) of an elastic branch, and its derivative."""
+    """Return the strain s/(k + s) of an elastic branch, and its derivative."""
     return s / (k + s), k / (k + s) ** 2
 
 
 @dataclass(frozen=True)
 class Bistable:
-    """Eqs. 1 to 5, by stress. `terms` are pairs (g, tau)."""
+    """Eqs. 1 to 5 as functions of stress. `terms` are pairs (g, tau)."""
 
     k0: float
     kc: float
@@ -66,7 +66,7 @@ class Bistable:
         return top, low, brentq(above, top, far, xtol=1e-12 * top), back, star
 
     def strain(self, s: float, mode: Mode) -> tuple[float, float]:
-        """Strain and compliance on a branch."""
+        """Return strain and compliance on a branch."""
         top, low, _, _, star = self.points
         if mode[0] == "d":
             return self.eps_a + (s - top) / self.kh_plus, 1.0 / self.kh_plus
@@ -76,29 +76,29 @@ class Bistable:
         return (on if mode[0] == "a" else star + on), slope
 
     def ends(self, mode: Mode) -> tuple[float, float]:
-        """Stresses between which a mode holds."""
+        """Return the stresses between which a mode is valid."""
         top, low, high, back, _ = self.points
         inf = math.inf
         return {"a": (-inf, top), "d": (top, high), "c": (low, inf), "e": (back, low)}[mode[0]]
 
     def leave(self, mode: Mode, upwards: bool) -> Mode:
-        """What follows where a mode ends."""
+        """Return the mode that follows at an end of a mode."""
         return {"a": "d", "d": "c" if upwards else "a", "c": "e", "e": "c" if upwards else "a"}[
             mode[0]
         ], 0.0
 
     def turn(self, mode: Mode, s: float, rising: bool) -> Mode:
-        """What follows where the motion turns: the same branch, backwards."""
+        """Return the mode after a reversal: the same branch, backwards."""
         return mode
 
     def loading(self, s: float) -> Mode:
-        """Branch of the first loading at a stress."""
+        """Return the branch of first loading at a stress."""
         return ("a" if s < self.points[0] else "d" if s < self.points[2] else "c"), 0.0
 
 
 @dataclass(frozen=True)
 class Microscale:
-    """Micro-springs with log-normal snap stresses, by stress. `terms` are pairs (g, tau).
+    """Micro-springs with log-normal snap stresses as functions of stress; `terms`: (g, tau).
 
     Modes: "plus" follows P+ up, "back" follows it down (where snapping is reversible), "minus"
     follows P- down, and "held" keeps the rank that has snapped.
@@ -117,13 +117,13 @@ class Microscale:
     start = ("plus", 0.0)
 
     def rank(self, s: float, sign: str) -> float:
-        """Standard normal score of the ranks that snap at a stress."""
+        """Return the standard normal score of the ranks that snap at a stress."""
         if s <= 0.0:
             return -math.inf
         return math.log(s / getattr(self, f"sigma_{sign}")) / getattr(self, f"spread_{sign}")
 
     def strain(self, s: float, mode: Mode) -> tuple[float, float]:
-        """Strain and compliance in a mode."""
+        """Return strain and compliance in a mode."""
         sign = "minus" if mode[0] == "minus" else "plus"
         z, density = mode[1], 0.0
         if mode[0] != "held":
@@ -138,7 +138,7 @@ class Microscale:
 
     @cached_property
     def crossing(self) -> float:
-        """Stress at which one rank snaps through and back; infinite if none does."""
+        """Return the stress at which a rank snaps both through and back; infinite if none does."""
         m, p = self.spread_minus, self.spread_plus
         if m == p:
             return math.inf
@@ -146,7 +146,7 @@ class Microscale:
         return math.exp(min(at, 700.0))
 
     def ends(self, mode: Mode) -> tuple[float, float]:
-        """Stresses between which a mode holds."""
+        """Return the stresses between which a mode is valid."""
         if mode[0] == "held":
             low = self.sigma_minus * math.exp(self.spread_minus * mode[1])
             return low, self.sigma_plus * math.exp(self.spread_plus * mode[1])
@@ -155,11 +155,11 @@ class Microscale:
         return (self.crossing if ends.get(mode[0], False) else -math.inf), math.inf
 
     def leave(self, mode: Mode, upwards: bool) -> Mode:
-        """What follows where a mode ends."""
+        """Return the mode that follows at an end of a mode."""
         return ("plus" if upwards else "back" if mode[0] == "minus" else "minus"), 0.0
 
     def turn(self, mode: Mode, s: float, rising: bool) -> Mode:
-        """What follows where the motion turns."""
+        """Return the mode after a reversal."""
         if mode[0] == "held":
             return mode
         if rising:
@@ -168,7 +168,7 @@ class Microscale:
         return ("back", 0.0) if self.rank(s, "minus") <= plus else ("held", plus)
 
     def loading(self, s: float) -> Mode:
-        """Mode of the first loading."""
+        """Return the mode of first loading."""
         return self.start
 
 
@@ -177,9 +177,9 @@ Law = Bistable | Microscale
 
 @dataclass(frozen=True)
 class Motion:
-    """A prescribed motion of the top: turns at `times` (s) and `levels` (m), joined by `shapes`.
+    """A prescribed motion of the top through `levels` (m) at `times` (s), joined by `shapes`.
 
-    A "line" is straight, a "cosine" half a wave, a "ramp" gets evenly faster in its first half.
+    A "line" is straight, a "cosine" half a wave, a "ramp" accelerates uniformly in its first half.
     """
 
     times: tuple[float, ...]
@@ -187,17 +187,17 @@ class Motion:
     shapes: tuple[str, ...]
 
     def contact(self) -> float:
-        """Time at which it first passes zero."""
+        """Return the time at which the motion first passes zero."""
         if self.levels[0] == 0.0:
             return self.times[0]
         return float(brentq(lambda t: self.at(t, 0)[0], *self.times[:2], xtol=1e-14))
 
     def leg(self, t: float) -> int:
-        """Number of the leg that a time lies in, or begins."""
+        """Return the number of the leg that contains or starts at a time."""
         return int(np.clip(np.searchsorted(self.times, t, "right") - 1, 0, len(self.shapes) - 1))
 
     def at(self, t: float, leg: int | None = None) -> tuple[float, float]:
-        """Displacement and velocity at a time."""
+        """Return displacement and velocity at a time."""
         i = self.leg(t) if leg is None else leg
         lasts, rise = self.times[i + 1] - self.times[i], self.levels[i + 1] - self.levels[i]
         x = (t - self.times[i]) / lasts
@@ -212,10 +212,10 @@ class Motion:
 
 @dataclass(frozen=True)
 class Rig:
-    """Springs in series on a base (height of each, m; area, m²), and what moves their top.
+    """Springs in series on a base (height of each, m; area, m²) and the drive of the top.
 
-    That is a striker (mass in kg, velocity at contact in m/s, its acceleration by gravity in m/s²)
-    or a motion. Springs in a row of several have no memory but that of snapping.
+    The drive is a striker (mass in kg, velocity at contact in m/s, gravity in m/s²) or a motion.
+    Several springs in series have no relaxation.
     """
 
     springs: tuple[Law, ...]
@@ -228,25 +228,25 @@ class Rig:
 
     @property
     def height(self) -> float:
-        """Overall height, m."""
+        """Total height, m."""
         return math.fsum(self.heights)
 
     @property
     def memory(self) -> Terms:
-        """Relaxation terms of the only spring."""
+        """Relaxation terms of a single spring."""
         return self.springs[0].terms
 
     def speed(self, t: float, y: Array, leg: int | None = None) -> float:
-        """Velocity of the top during contact."""
+        """Return the velocity of the top during contact."""
         return self.motion.at(t, leg)[1] if self.motion else float(y[1])
 
     def total(self, t: float, y: Array, leg: int | None = None) -> float:
-        """Stress at the base during contact."""
+        """Return the stress at the base during contact."""
         eta = self.springs[0].eta
         return float(y[2:].sum()) + (eta * self.speed(t, y, leg) / self.height if eta else 0.0)
 
     def freed(self, y: Array, soft: float) -> tuple[float, float]:
-        """Velocity of a top that nothing touches, and rate of the stress that snapping follows."""
+        """Return velocity of a free top, and rate of the stress that governs snapping."""
         eta = self.springs[0].eta
         if eta > 0.0:
             v = -float(y[2:].sum()) / eta * self.height
@@ -256,10 +256,10 @@ class Rig:
         return ds * soft, ds
 
     def run(self, start: float, last: float, before: Course | None = None) -> Course:
-        """Follow the top from contact at `start` until the stress at the base is back at zero.
+        """Integrate from contact at `start` until the stress at the base returns to zero.
 
-        With the course `before` nothing touches the top any more. The state is displacement and
-        velocity of the top, the stress that snapping follows, and that of each relaxation term.
+        If the course `before` is given, the top is free. The state is displacement and velocity of
+        the top, the stress that governs snapping, and the stress of each relaxation term.
         """
         pieces = list[tuple[float, Any]]()
         t, y = start, np.array([0.0, self.velocity, 0.0, *(0.0 for _ in self.memory)])
@@ -295,7 +295,7 @@ class Rig:
     def _piece(
         self, t: float, y: Array, until: float, modes: list[Mode], rising: bool, free: bool
     ) -> tuple[tuple[Any, ...], Any]:
-        """Integrate until a switch, a turn, the end of contact or a time; say which it was."""
+        """Integrate to a switch, a reversal, the end of contact or a time; return which it was."""
         springs, leg = self.springs, self.motion.leg(0.5 * (t + until)) if self.motion else None
         events, what = list[Callable[[float, Array], float]](), list[tuple[Any, ...]]()
 
@@ -340,7 +340,7 @@ class Rig:
 
 @dataclass(frozen=True)
 class Course:
-    """What a top does from contact (s) to its end (s), and the state there."""
+    """Solution from contact (s) to the end of contact (s), and the state there."""
 
     rig: Rig
     start: float
@@ -350,7 +350,7 @@ class Course:
     modes: list[Mode]
 
     def states(self, time: Array) -> Array:
-        """States at times within the course, shape (k, n)."""
+        """Return the states at times within the course, shape (k, n)."""
         which = np.searchsorted([end for end, _ in self.pieces], time)
         which = np.minimum(which, len(self.pieces) - 1)
         out = np.empty((len(self.state), len(time)))
@@ -359,14 +359,14 @@ class Course:
         return out
 
     def stress(self, time: Array) -> Array:
-        """Stress at the base, zero outside contact."""
+        """Return the stress at the base, zero outside contact."""
         inside, out = (time >= self.start) & (time <= self.end), np.zeros(len(time))
         pairs = zip(time[inside], self.states(time[inside]).T, strict=True) if inside.any() else ()
         out[inside] = [self.rig.total(t, y) for t, y in pairs]
         return out
 
     def top(self, time: Array, gauge: bool) -> Array:
-        """Displacement of the striker, or of a gauge on the specimen, zero at contact."""
+        """Return the displacement of striker or gauge, zero at contact."""
         rig, inside = self.rig, (time >= self.start) & (time <= self.end)
         if rig.motion is not None:
             return np.array([rig.motion.at(t)[0] for t in time])

@@ -1,12 +1,13 @@
-"""Does the band of a prediction hold the next specimen of a foam, and is it as narrow as can be?
+"""Does the band of a prediction contain an unseen specimen, and is it narrow enough?
 
-Method. shoe-foam-twins/ (not part of this repository) are compressions of five specimens of a new
-and of a worn heel (arXiv:2602.12694, LivingMatterLab/CANN on GitHub). Each specimen is predicted
-from a joint fit of the other four of its heel, all parameters "scatter", and then three specimens
-from two, most parameters "own". Beside the band stands the t interval of the measured curves.
+Method. shoe-foam-twins/ (not part of this repository) contains compressions of five specimens each
+of a new and a worn heel (arXiv:2602.12694, LivingMatterLab/CANN on GitHub). Each specimen is
+predicted from a joint fit of the other four of its heel, all parameters "scatter", and then three
+specimens from two, most parameters "own". The band is compared with the t interval of the measured
+curves.
 
-Answer. 95.7 % of the samples are inside; the band is 1.27 times as wide as the t interval. Writes
-README.md and scatter.csv. About ten minutes.
+Answer. 95.2 % of the samples are inside; the band is 1.26 times as wide as the t interval. The
+study writes README.md and scatter.csv and takes about ten minutes.
 
     FOAMFIT_DATA=path/to/data python experiments/scatter/scatter.py
 """
@@ -36,14 +37,14 @@ OPEN = {"k0": "scatter", "sigma_plus": "shared"}  # the others are own
 
 
 def name_of(group: str, number: int) -> str:
-    """Name of the file of a specimen."""
+    """Return the file name of a specimen."""
     return f"{group}-heel-comp-{number}_raw.txt"
 
 
 def predicted(
     folder: Path, group: str, fitted: list[int], left: list[int], kinds: dict[str, str]
 ) -> list[dict[str, Any]]:
-    """Fit some specimens together and predict others: one row for each."""
+    """Fit some specimens jointly and predict others; return one row for each."""
     study = studies.write_study(
         folder / "study.toml", [name_of(group, i) for i in fitted], "microscale", kinds,
         relaxation=1, drive="displacement", name=f"{group} heel",
@@ -72,7 +73,7 @@ def predicted(
 
 
 def along(test: Any, other: Any) -> np.ndarray:
-    """Stress of a test where another one has the same share of its largest strain, same branch."""
+    """Return a test's stress at the relative strains and branches of another test."""
     strain, at = test.displacement / test.displacement.max(), other.displacement
     turn, at = int(np.argmax(strain)), at / at.max()
     back = int(np.argmax(at)) + 1
@@ -82,7 +83,7 @@ def along(test: Any, other: Any) -> np.ndarray:
 
 
 def page(frame: pd.DataFrame) -> None:
-    """Write the page of all rows."""
+    """Write the page from all rows."""
     four, two = frame[frame.fitted == COUNT - 1], frame[frame.fitted == 2]
     ratio = four.half_width / four.half_width_simple
     worst, t_alone = ratio.idxmax(), np.sqrt(1.0 + 1.0 / (COUNT - 1))

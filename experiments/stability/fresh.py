@@ -1,31 +1,31 @@
-"""Is an answer of the solver wrong anywhere? Fresh scenes, and a judge that shares nothing with it.
+"""Is any result of the solver wrong? Random scenes and a judge that shares no code with it.
 
-Method. Each scene is answered by the solver and by brute force or root finding. Fifteen
-families are drawn at random from a seed (every scene is synthetic):
+Method. Each scene is solved by the solver and by brute force or root finding. Fifteen families are
+drawn at random from a seed (every scene is synthetic):
 
 - study: the ranges of scenes.py;
 - base: impacts on a chain whose base spring has a dashpot, with a mass above it; windows from 1e-7
-  s on, shorter than the contact or longer;
-- gap: unilateral springs that open, with derivatives by parameters;
-- turns: displacement and stress histories that turn round at random places;
-- long: chains of 3 to 10 springs with masses inside and few or no dashpots;
+  s up, shorter or longer than the contact;
+- gap: unilateral springs that open, with derivatives with respect to parameters;
+- turns: displacement and stress histories with random turning points;
+- long: chains of 3 to 10 springs with interior masses and few or no dashpots;
 - microscale: one to three microscale springs, in all three drives, with spreads from 1e-3 to 2;
 - relaxation: one to three bistable springs with one to three relaxation terms each;
 - microscale+relaxation: both;
 - mixed: two to five springs of all kinds, with and without relaxation, dashpots and masses;
 - motion: two to four springs under a known motion, at least one of them microscale, with spreads
-  from 1e-6 to 5, times from anywhere and steps that differ up to 1e8-fold, by root finding;
+  from 1e-6 to 5, arbitrary time origins and steps that differ up to 1e8-fold, by root finding;
 - motion+relaxation: the same with relaxation and dashpots, by brute force;
 - worn: one to three microscale springs that remember what has snapped (stiffening, softening,
   weakening), in all three drives; worn+relaxation: the same with relaxation;
 - worn chain: two to five springs of all kinds, most with masses between them;
-- worn motion: as motion and motion+relaxation in turn.
+- worn motion: motion and motion+relaxation alternately.
 
-A tenth of those with memory ask for derivatives.
+A tenth of the scenes with memory request derivatives.
 
-Answer. None of those that can be judged is over `rtol`, and no derivative is wrong: README.md.
+Answer. No: every scene that can be judged is within `rtol`, and no derivative is wrong: README.md.
 
-One command runs them and writes a line per scene and rtol:
+One command runs them and writes a row per scene and rtol:
 
     python experiments/stability/fresh.py --scenes 400 --out fresh.csv
     python experiments/stability/fresh.py --page          # README.md of fresh.csv and worn.csv
@@ -69,10 +69,10 @@ Spec = dict[str, Any]
 
 SEED = 2027
 RTOLS = (1e-4, 1e-6, 1e-8)
-MOST = {"base": 10_000_000, "long": 20_000_000}  # steps times springs of the judge
+MOST = {"base": 10_000_000, "long": 20_000_000}  # limit of the judge: steps times springs
 USUAL_MOST = 4_000_000
 BAD, POOR = 3.0, 1.0  # error over rtol
-SLOPE_BAR = 1e-3  # error of a derivative over its range, at an rtol of up to 1e-5
+SLOPE_BAR = 1e-3  # allowed error of a derivative over its range, for rtol up to 1e-5
 
 
 # ------------------------------------------------------------------------------------- the scenes
@@ -83,7 +83,7 @@ def log(rng: Generator, low: float, high: float) -> float:
 
 
 def bistable(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
-    """Draw a bistable spring of a first slope."""
+    """Draw a bistable spring with a given initial slope."""
     eps_a = log(rng, 0.02, 0.5)
     sigma_a = k0 * eps_a / (1.0 - eps_a)
     return {
@@ -99,7 +99,7 @@ def bistable(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
 
 
 def foam(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
-    """Draw a bistable spring near one of the published ones, of another first slope."""
+    """Draw a bistable spring near a published one, with another initial slope."""
     names = list(ff.published)
     item = ff.published[names[int(rng.integers(len(names)))]].bistable
     near = {
@@ -113,7 +113,7 @@ def foam(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
 
 
 def linear(rng: Generator, k0: float, eta: float = 0.0, unilateral: bool | None = None) -> Spec:
-    """Draw a linear spring in series with bistable ones of a first slope."""
+    """Draw a linear spring in series with bistable ones of a given initial slope."""
     one_sided = bool(rng.random() < 0.5) if unilateral is None else unilateral
     return {"k0": k0 * log(rng, 1.0, 50.0), "eta": eta, "unilateral": one_sided}
 
@@ -121,7 +121,7 @@ def linear(rng: Generator, k0: float, eta: float = 0.0, unilateral: bool | None 
 def chain_of(
     rng: Generator, springs: list[Spec], height: float, masses: list[float], site: float = 0.0
 ) -> Spec:
-    """Write a chain with heights that differ."""
+    """Return a chain with different heights."""
     share = rng.uniform(0.5, 1.5, len(springs))
     return {
         "springs": springs,
@@ -133,13 +133,13 @@ def chain_of(
 
 
 def bounce(spec: Spec, mass: float) -> float:
-    """Half a period of a mass on a chain at rest, roughly."""
+    """Return roughly half a period of a mass on a chain at rest."""
     soft = sum(h / s["k0"] for s, h in zip(spec["springs"], spec["heights"], strict=True))
     return math.pi * math.sqrt(mass * soft / spec["area"])
 
 
 def struck(rng: Generator, spec: Spec, low: float, high: float) -> None:
-    """Add a striker that brings so much of what the chain takes on its first branches."""
+    """Add a striker with a fraction (low to high) of the energy of the first branches."""
     mass = log(rng, 1e-3, 2e-2)
     k0 = min(s["k0"] for s in spec["springs"])
     energy = 0.05 * k0 * log(rng, low, high) * spec["area"] * sum(spec["heights"])
@@ -152,7 +152,7 @@ def study(number: int) -> Spec:
 
 @cache
 def _designed() -> list[Point]:
-    # what brute force can follow: not the longest chains and histories
+    # limits for brute force: no very long chains and histories
     return [
         replace(p, springs=min(p.springs, 12), samples=min(p.samples, 2001))
         for p in designed(1000, SEED)
@@ -160,7 +160,7 @@ def _designed() -> list[Point]:
 
 
 def base(rng: Generator, number: int) -> Spec:
-    """Half of them the published foam-2, half any spring; the base spring has a dashpot."""
+    """Draw an impact with a base dashpot: half published foam-2, half random springs."""
     if number % 2 == 0:
         item = ff.published["foam-2"]
         springs = [asdict(s) for s in item.chain.springs]
@@ -187,14 +187,14 @@ def base(rng: Generator, number: int) -> Spec:
         spec["site"] = log(rng, 1.0, 1e5)
     spec["impact"] = [log(rng, 1e-3, 2e-2), log(rng, 0.1, 30.0)]
     whole = bounce(spec, spec["impact"][0])
-    for i in range(count):  # damping that may stop what is above within the contact, or hardly acts
+    for i in range(count):  # from damping that stops the mass above within contact to hardly any
         if i == 0 or rng.random() < 0.3:
             springs[i]["eta"] = springs[i]["k0"] * whole * log(rng, 1e-4, 1e3)
     return spec | {"stop": log(rng, min(1e-7, 0.1 * whole), 2.0 * whole), "samples": 201}
 
 
 def path(rng: Generator, top: float, turns: int) -> tuple[list[float], list[float]]:
-    """Turn round at random levels and times, from rest."""
+    """Return a history from rest with random turning points and times."""
     levels = [0.0]
     for turn in range(turns):
         up = turn % 2 == 0
@@ -204,7 +204,7 @@ def path(rng: Generator, top: float, turns: int) -> tuple[list[float], list[floa
 
 
 def gap(rng: Generator, number: int) -> Spec:
-    """A unilateral spring at the base, inside or on top, pulled or thrown open."""
+    """Draw a unilateral spring at the base, inside or on top that is pulled or thrown open."""
     k0 = log(rng, 5e5, 3e7)
     count = int(rng.integers(2, 4))
     springs = [bistable(rng, k0) for _ in range(count)]
@@ -236,7 +236,7 @@ def gap(rng: Generator, number: int) -> Spec:
 
 
 def turns(rng: Generator, number: int) -> Spec:
-    """Histories of displacement and of stress that turn round anywhere."""
+    """Draw histories of displacement or stress with arbitrary turning points."""
     k0 = log(rng, 3e5, 3e7)
     count = int(rng.integers(1, 4))
     springs = [
@@ -268,7 +268,7 @@ def turns(rng: Generator, number: int) -> Spec:
 
 
 def long(rng: Generator, number: int) -> Spec:
-    """Three to ten springs with a mass above each, light or heavy; most without a dashpot."""
+    """Draw three to ten springs with a light or heavy mass on each; most without dashpot."""
     k0 = log(rng, 5e5, 3e7)
     count = int(rng.integers(3, 11))
     draw = foam if rng.random() < 0.5 else bistable
@@ -290,7 +290,7 @@ def long(rng: Generator, number: int) -> Spec:
         else:
             spec["stress"] = [way[0], [k0 * log(rng, 0.1, 1.0) * max(x, 0.0)
                                        / (0.7 * sum(spec["heights"])) for x in way[1]]]  # fmt: skip
-    # masses that vibrate through so many radians meanwhile
+    # masses whose vibration covers this many radians
     radians = log(rng, 30.0, 3e5)
     stiff = 4.0 * k0 * spec["area"] * count / sum(spec["heights"])
     heavy = min(stiff * (spec["stop"] / radians) ** 2, 3e-3)
@@ -311,7 +311,7 @@ WORN = ("stiffening", "softening", "weakening")
 
 
 def microscale(rng: Generator, k0: float) -> Spec:
-    """Draw a microscale spring of a first slope: narrow and wide spreads, loops and none."""
+    """Draw a microscale spring: narrow and wide spreads, with and without a loop."""
     kc = k0 * log(rng, 0.05, 100.0)
     least = max(0.0, (math.sqrt(kc) - math.sqrt(k0)) / (math.sqrt(kc) + math.sqrt(k0)))
     wide = [log(rng, 1e-3, 2.0) if rng.random() < 0.3 else log(rng, 0.05, 1.0) for _ in range(2)]
@@ -339,7 +339,7 @@ def worn(rng: Generator, k0: float) -> Spec:
     spec["weakening"] = 0.0 if rng.random() < 0.15 else rng.uniform(0.0, s)
     k, kc, n = k0 * math.exp(-spec["softening"]), spec["kc"], spec["stiffening"]
 
-    def excess(log_s: float) -> float:  # of branch a over branch c
+    def excess(log_s: float) -> float:  # strain of branch a minus that of branch c
         return -math.expm1(-math.log1p(n * math.exp(log_s)) / n) - 1.0 / (
             1.0 + kc / k / math.exp(log_s)
         )
@@ -353,7 +353,7 @@ def worn(rng: Generator, k0: float) -> Spec:
 
 
 def terms(rng: Generator, stop: float) -> list[list[float]]:
-    """Draw one to three relaxation terms; one in ten has no strength."""
+    """Draw one to three relaxation terms; one in ten has zero strength."""
     return [
         [0.0 if rng.random() < 0.1 else log(rng, 1e-3, 5.0), stop * log(rng, 1e-4, 1e3)]
         for _ in range(int(rng.integers(1, 4)))
@@ -361,7 +361,7 @@ def terms(rng: Generator, stop: float) -> list[list[float]]:
 
 
 def room(spring: Spec) -> float:
-    """Strain up to which a spring can be compressed at all, or 1."""
+    """Return the largest possible compressive strain of a spring, or 1."""
     return 1.0 + spring.get("eps_star", 0.0)
 
 
@@ -421,7 +421,7 @@ def remembering(
 
 
 def alike(draw: Callable[[Generator, float], Spec], relaxes: bool) -> Callable[..., Spec]:
-    """Draw one to three springs of a kind; the first slopes of bistable ones are near k0."""
+    """Draw one to three springs of a kind; bistable ones have initial slopes near k0."""
 
     def family(rng: Generator, number: int) -> Spec:
         k0 = log(rng, 1e5, 3e7)
@@ -437,7 +437,7 @@ def mixed(
     rng: Generator, number: int, draw: Callable[[Generator, float], Spec] = microscale,
     heavy: float = 0.3,
 ) -> Spec:  # fmt: skip
-    """Springs of all kinds; at least one has memory."""
+    """Draw springs of all kinds; at least one has memory."""
     k0 = log(rng, 1e5, 3e7)
     count = int(rng.integers(2, 6))
     at = int(rng.integers(count))
@@ -458,9 +458,9 @@ def mixed(
 def known_motion(
     rng: Generator, number: int, draw: Callable[[Generator, float], Spec] = microscale
 ) -> Spec:
-    """Springs in series, some alike, under a motion whose samples lie anywhere in time.
+    """Draw springs in series, some identical, under a motion with arbitrary sample times.
 
-    A third starts at 0, a third at another time, and a third at 1.7e9 s with least steps of 1 µs.
+    A third starts at 0, a third at another time, a third at 1.7e9 s with smallest steps of 1 µs.
     """
     k0, count = log(rng, 1e5, 3e7), int(rng.integers(2, 5))
     springs = []
@@ -483,7 +483,7 @@ def known_motion(
     steps = ratio ** rng.random(samples - 1)
     at, levels = path(rng, rng.uniform(0.1, 0.75), int(rng.integers(1, 8)))
     floor = -math.inf if rng.random() < 0.3 else 0.0
-    if number % 5 == 2:  # and holds for a while
+    if number % 5 == 2:  # with a hold
         at.append(at[-1] + 0.5)
         levels.insert(len(levels) // 2, levels[len(levels) // 2])
     spec["displacement"] = [at, [most * max(level, floor) for level in levels]]
@@ -501,7 +501,7 @@ def known_motion(
 def relaxing_motion(
     rng: Generator, number: int, draw: Callable[[Generator, float], Spec] = microscale
 ) -> Spec:
-    """Let springs of `known_motion` relax, and give some of them dashpots."""
+    """Add relaxation, and to some a dashpot, to the springs of `known_motion`."""
     spec = known_motion(rng, number, draw)
     for key in ("sensitivities", "judge"):
         spec.pop(key, None)
@@ -531,7 +531,7 @@ MEMORY, REMEMBERING = FAMILIES[5:11], FAMILIES[11:]
 
 
 def spec_of(family: str, number: int) -> Spec:
-    """Draw what a scene is made of."""
+    """Draw the specification of a scene."""
     if family == "study":
         return study(number)
     rng = np.random.default_rng([SEED, FAMILIES.index(family), number])
@@ -539,7 +539,7 @@ def spec_of(family: str, number: int) -> Spec:
 
 
 def scene_from(spec: Spec) -> Scene:
-    """Make chain, drive and samples."""
+    """Return chain, drive and samples."""
     if "point" in spec:
         return scene_of(Point(**spec["point"]))
     springs = [
@@ -562,9 +562,9 @@ def scene_from(spec: Spec) -> Scene:
 
 
 def follower(scene: Scene, spec: Spec) -> Callable[[Any, Any, Array, float, int], Truth]:
-    """Choose the program that judges a scene."""
+    """Return the judge of a scene."""
     if spec.get("judge") == "roots":
-        import roots  # the only one that needs mpmath
+        import roots  # only this judge needs mpmath
 
         return roots.follow
     if isinstance(scene[1], ff.Impact):
@@ -576,7 +576,7 @@ def follower(scene: Scene, spec: Spec) -> Callable[[Any, Any, Array, float, int]
 
 
 def moved(spec: Spec, name: str, factor: float) -> tuple[Spec, float]:
-    """Multiply a parameter; returns the scene and the parameter as it was."""
+    """Multiply a parameter; return the scene and the original value."""
     other: Spec = json.loads(json.dumps(spec))
     prefix, _, short = name.partition("_")
     i = int(prefix[1:]) - 1
@@ -589,16 +589,16 @@ def moved(spec: Spec, name: str, factor: float) -> tuple[Spec, float]:
     return other, value
 
 
-STEPS = (1e-4, 1e-5)  # of the differences, relative to the parameter
-LEAST_SLOPE = 1e-3  # range of a derivative that counts, over the range of the curve per parameter
+STEPS = (1e-4, 1e-5)  # of the finite differences, relative to the parameter
+LEAST_SLOPE = 1e-3  # smallest range of a judged derivative, over curve range per parameter
 
 
 def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[np.bool_]] | None:
-    """Derivatives of base stress and displacements by differences of the judge's own runs.
+    """Return derivatives of base stress and displacements by differences of judge runs.
 
-    (curves, n_t), with the range over which each counts, and the samples that count: not those
-    between two ends of contact, or where the differences of two lengths do not agree. None where
-    the judge has nothing to say.
+    The shape is (curves, n_t). Also return the range of each and the valid samples: not those
+    between two ends of contact, or where two step lengths disagree. Return None if there is no
+    judgement.
     """
     found, ends = [], []
     span = np.zeros(0)
@@ -608,7 +608,7 @@ def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[n
             other, value = moved(spec, name, 1.0 + sign * step)
             try:
                 scene = scene_from(other)
-            except ValueError:  # the scene is at the end of what is admissible
+            except ValueError:  # the scene is at the limit of admissible parameters
                 return None
             truth = follower(scene, spec)(*scene, LOOSE, most)
             if truth.why:
@@ -618,7 +618,7 @@ def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[n
         found.append((sides[0] - sides[1]) / (2.0 * step * value))
         reach = np.abs(sides[0]).max(axis=1) * LEAST_SLOPE / value
         span = np.maximum(np.abs(found[-1]).max(axis=1), reach)
-        span[1:] = span[1:].max()  # displacements count together
+        span[1:] = span[1:].max()  # displacements share one range
     grid = scene_from(spec)[2]
     counts = np.ones(grid.size, bool)
     if not np.isnan(ends).all():
@@ -629,12 +629,12 @@ def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[n
 
 
 def slope_bar(rtol: float) -> float:
-    """Error of a derivative, over its range, from which on it is wrong."""
+    """Return the error of a derivative over its range beyond which it is wrong."""
     return max(SLOPE_BAR, 100.0 * rtol)
 
 
 def slope_error(spec: Spec, scene: Scene, rtol: float, most: int, known: dict[str, Any]) -> float:
-    """Largest error of the solver's derivatives over the range of each; NaN if not judged."""
+    """Return the largest error of the solver's derivatives over their range; NaN if unjudged."""
     names = spec.get("sensitivities", [])
     if not names:
         return math.nan
@@ -673,7 +673,7 @@ REASONS = {
 def lines_of(
     task: tuple[str, int, tuple[float, ...]], most: int | None = None
 ) -> list[dict[str, Any]]:
-    """Answer and judge a scene at each rtol; `most` bounds the judge's steps times springs."""
+    """Solve and judge a scene at each rtol; `most` limits the judge's steps times springs."""
     family, number, rtols = task
     spec, most = spec_of(family, number), most or MOST.get(family, USUAL_MOST)
     scene = scene_from(spec)
@@ -688,14 +688,14 @@ def lines_of(
         }
         for rtol in rtols
     ]  # fmt: skip
-    for line in lines:  # those of the others follow from the name and the seed
-        told = line["outcome"] != "answer" or line["error"] > POOR
-        line["parameters"] = json.dumps(spec) if told else ""
+    for line in lines:  # the others can be redrawn from name and seed
+        kept = line["outcome"] != "answer" or line["error"] > POOR
+        line["parameters"] = json.dumps(spec) if kept else ""
     return lines
 
 
 def finest_of(spec: Spec) -> float:
-    """Smallest error of a strain that brute force, which follows rounded stresses, can see."""
+    """Return the smallest strain error that brute force with rounded stresses can resolve."""
     springs = spec.get("springs", [])
     spreads = [spring.get(f"spread_{side}", 1.0) for spring in springs for side in SIDES]
     return OF_STRESSES / min(spreads, default=1.0)
@@ -704,7 +704,7 @@ def finest_of(spec: Spec) -> float:
 def judged(
     spec: Spec, scene: Scene, truth: Truth, rtol: float, most: int, known: dict[str, Any]
 ) -> dict[str, Any]:
-    """Hold the solver's answer to one scene against the truth: errors over rtol."""
+    """Compare the solver's result for a scene with the true solution: errors over rtol."""
     finest = 0.0 if spec.get("judge") == "roots" else finest_of(spec)
     sure = not truth.why and max(truth.unsure, finest) <= 0.1 * rtol
     found: dict[str, Any] = {
@@ -722,7 +722,7 @@ def judged(
         found["reason"] = reason_of(refusal)
         found["outcome"] = "refused"
         return found
-    except Exception as wrong:  # a run of hundreds of scenes tells of it and goes on
+    except Exception as wrong:  # reported; a run of hundreds of scenes continues
         return found | {"outcome": "failure", "reason": f"{type(wrong).__name__}: {wrong}"[:200]}
     found["seconds"] = time.perf_counter() - began
     found |= {"method": answer.method, "steps": answer.steps}
@@ -748,12 +748,12 @@ def judged(
 
 
 def reason_of(refusal: ff.SimulationError) -> str:
-    """Return in a word why a scene was refused."""
+    """Return a keyword for the reason of a refusal."""
     return next((key for key, part in REASONS.items() if part in str(refusal)), "other")
 
 
 def summary(lines: pd.DataFrame) -> pd.DataFrame:
-    """Count per family and rtol."""
+    """Return counts per family and rtol."""
     rows = []
     for (family, rtol), group in lines.groupby(["family", "rtol"], sort=False):
         known = group[group.judge == "judged"]
@@ -779,7 +779,7 @@ def summary(lines: pd.DataFrame) -> pd.DataFrame:
 
 
 def wrong(lines: pd.DataFrame) -> pd.DataFrame:
-    """Lines of the scenes that the solver gets wrong."""
+    """Return the rows of the scenes with wrong results."""
     return lines[(lines.error > POOR) | (lines.slope > np.maximum(SLOPE_BAR, 100.0 * lines.rtol))]
 
 
@@ -787,7 +787,7 @@ def wrong(lines: pd.DataFrame) -> pd.DataFrame:
 
 
 def write_page() -> None:
-    """Write README.md of the scenes that are kept."""
+    """Write README.md from the stored scenes."""
     lines = pd.concat([pd.read_csv(HERE / name) for name in ("fresh.csv", "worn.csv")])
     lines["reason"] = lines.reason.fillna("")
     table, plain = summary(lines), set(FAMILIES) - {*MEMORY, *REMEMBERING}
@@ -807,7 +807,7 @@ def write_page() -> None:
 
 
 def compile_all(families: tuple[str, ...]) -> None:
-    """Take a few scenes of each family, so that none of those that are timed compiles."""
+    """Run a few scenes of each family, so that no timed scene compiles."""
     for family in families:
         for number in range(6):
             scene = scene_from(spec_of(family, number))

@@ -1,31 +1,31 @@
-"""A judge that shares neither code nor method with the solver: brute force by Runge-Kutta steps.
+"""Judge that shares neither code nor method with the solver: brute-force Runge-Kutta steps.
 
 It reads the public attributes of springs, chain and drive and imports nothing else. The law is
-written out branch by branch, the derived points of a bistable spring are roots found by bracketing,
-and the motion is an ordinary differential equation; no algebraic equation is solved. The state are
-the velocities of the nodes with mass, the strain of each linear or bistable spring, the equilibrium
-stress s of each microscale spring, and z = q - g s of each relaxation term. In s the microscale law
-is explicit: its strain is (1-p) s/(k0+s) + p (eps_star + s/(kc+s)), and ds/dt = (dε/dt)/(dε/ds). A
-spring carries T = (1 + Σ g) s + Σ z and its dashpot. Springs between two nodes that have mass, are
-clamped or are driven carry one stress S:
+implemented branch by branch, the derived points of a bistable spring are roots found by bracketing,
+and the motion is an ordinary differential equation; no algebraic equation is solved. The state
+consists of the velocities of the nodes with mass, the strain of each linear or bistable spring, the
+equilibrium stress s of each microscale spring, and z = q - g s of each relaxation term. In s the
+microscale law is explicit: its strain is (1-p) s/(k0+s) + p (eps_star + s/(kc+s)), and ds/dt =
+(dε/dt)/(dε/ds). A spring carries T = (1 + Σ g) s + Σ z and its dashpot. Springs between two nodes
+that have mass, are clamped or are prescribed carry one stress S:
 
 - every spring has a dashpot: S = (v_top - v_bottom + Σ h T/η)/(Σ h/η), dε/dt = (S - T)/η;
 - some have none: S is the T of one of these; those with a dashpot follow as above, and the others
-  share the rest of the elongation's rate by dε/dt = (dε/ds) (dS/dt - Σ dz/dt)/(1 + Σ g); a flat
-  branch takes all of it;
+  share the remaining rate of elongation by dε/dt = (dε/ds) (dS/dt - Σ dz/dt)/(1 + Σ g); a flat
+  branch takes all of the rate;
 - the stress on a massless top is prescribed: S is that stress.
 
-The rank of a microscale spring that is held is a normal score w: it snaps through again where
-ln s = ln sigma_plus + spread_plus w, and back where ln s = ln sigma_minus + spread_minus w. Where
-it remembers, W is the largest w ever: up to W it snaps through at ln s = ln sigma_plus - weakening
-+ spread_plus w, beyond it as before; and branch a is σ = k ((1 - ε)^-n - 1)/n, with the softer k
-of what has snapped once for the share Φ(W) - Φ(w).
+The rank of a microscale spring between snaps is a constant normal score w: it snaps through again
+at ln s = ln sigma_plus + spread_plus w, and back at ln s = ln sigma_minus + spread_minus w. For
+springs that remember, W is the largest w ever: up to W they snap through at ln s = ln sigma_plus -
+weakening + spread_plus w, beyond W as before. Branch a is σ = k ((1 - ε)^-n - 1)/n, with the
+softened k for the share Φ(W) - Φ(w) that has snapped once.
 
 The method of Dormand and Prince of order 8(5,3) takes explicit steps with compensated sums. A step
 ends at each sample, kink of the drive, end of a branch and turning point of s on a branch that
-snaps; these are found by taking the same step again and again with another length. The normal
-distribution is crossed in steps of at most one standard deviation. Stiff scenes take many steps:
-past a bound there is no judgement.
+snaps; these are found by repeating the step with other lengths. The normal distribution is crossed
+in steps of at most one standard deviation. Stiff scenes take many steps: beyond a limit there is no
+judgement.
 """
 
 from __future__ import annotations
@@ -46,32 +46,32 @@ Integers = NDArray[np.int64]
 
 TIGHT, LOOSE = 1e-13, 1e-12  # local error of a step relative to the largest values so far
 MOST_WORK = 30_000_000  # steps times springs of one run
-# Base stress over the largest stress so far from which on it has risen, and can return to zero.
+# Base stress over the largest stress so far above which a return to zero counts.
 RISEN = 1e-11
 FAR = 8.0  # standard deviations beyond which the normal distribution is 0 or 1 to rounding
 
 _A, _B, _C = DOP853.A[:12, :12].copy(), DOP853.B.copy(), DOP853.C[:12].copy()
 _E3, _E5 = DOP853.E3[:12].copy(), DOP853.E5[:12].copy()
 
-# Columns of a spring; those of a microscale spring beside K0, KC, ETA and H.
+# Columns of a spring; then those of a microscale spring besides K0, KC, ETA and H.
 K0, KC, EPS_A, EPS_C, STAR, SIG_A, SIG_C, UP, DOWN, HAT_A, HAT_C, ETA, H = range(13)
 EPS_STAR, LOG_PLUS, WIDE_PLUS, LOG_MINUS, WIDE_MINUS, N, K_WORN, LOG_AGAIN = range(2, 10)
 # Branches; of a microscale spring: p is held; p = P+; p = raw P-; both are the same; and p = P+ of
 # what has snapped once. Where nothing differs then, P+ is followed on SNAP and BOTH.
 A, D, C, E, LINE, ONE_SIDED, GAP, HELD, SNAP, BACK, BOTH, AGAIN = range(12)
-# What is known of the top.
+# Drive of the top.
 MASS, DAMPER, STRESS, MOTION = range(4)
-# How a run ended.
+# End of a run.
 DONE, TOO_LONG, NO_STEP, FLAT = range(4)
 WHY = ("", "too many steps", "no step is short enough", "stress prescribed on a flat branch")
 SHARED = "several gaps or flat branches share an elongation, and the law does not say how"
 
-# What only other loops call is compiled once, as a part of them.
+# Functions called only by compiled loops are compiled as part of them.
 inner = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 class System(NamedTuple):
-    """A chain under a drive: what does not change along a run."""
+    """A chain under a drive: the constants of a run."""
 
     springs: Array  # (n, 13)
     relax: Array  # (n, terms, 2): g and tau
@@ -85,7 +85,7 @@ class System(NamedTuple):
 
 
 class Flags(NamedTuple):
-    """Branch of each spring, and the ranks up to which it has snapped, and ever had."""
+    """Branch of each spring, and its ranks snapped now and snapped ever."""
 
     branch: Integers
     ranks: Array
@@ -93,7 +93,7 @@ class Flags(NamedTuple):
 
 
 class Tried(NamedTuple):
-    """A step: rates of its stages, its end, what it adds, and scales of its error."""
+    """A step: rates of its stages, end state, increment, and error scales."""
 
     k: Array
     y1: Array
@@ -117,7 +117,7 @@ def bistable_row(spring: Any, height: float) -> list[float]:
     # C2 lies on branch c: x/(1-x) = σ_c/k_c
     star = eps_c - (sigma_c / kc) / (1.0 + sigma_c / kc)
 
-    def c_over_d(eps: float) -> float:  # times the room that is left to the end of branch c
+    def c_over_d(eps: float) -> float:  # times the distance to the end of branch c
         x = eps - star
         return kc * x - (1.0 - x) * (sigma_a + up * (eps - eps_a))
 
@@ -141,7 +141,7 @@ def bistable_row(spring: Any, height: float) -> list[float]:
 
 
 def row_of(spring: Any, height: float) -> tuple[list[float], int]:
-    """Parameters of a spring, and the branch on which it starts."""
+    """Return the parameters of a spring and its initial branch."""
     if hasattr(spring, "kc") and not hasattr(spring, "sigma_plus"):
         return bistable_row(spring, height), A
     row = [0.0] * 13
@@ -185,7 +185,7 @@ def _slope(p: Array, branch: int, eps: float) -> float:
 
 @inner
 def _bounds(p: Array, branch: int) -> tuple[float, float, int, int]:
-    """Strains at which a branch ends, below and above, and the branches that follow there."""
+    """Return the lower and upper strain limits of a branch, and the following branches."""
     if branch == A:
         return -math.inf, p[EPS_A], A, D
     if branch == D:
@@ -203,7 +203,7 @@ def _bounds(p: Array, branch: int) -> tuple[float, float, int, int]:
 
 @inner
 def _score(p: Array, branch: int, rank: float, s: float) -> tuple[float, float]:
-    """Normal score of what is snapped, and the spread by which it follows ln s (0 = held)."""
+    """Return the normal score of the snapped share, and its spread over ln s (0 = constant)."""
     if branch == HELD:
         return rank, 0.0
     if s <= 0.0:
@@ -216,13 +216,13 @@ def _score(p: Array, branch: int, rank: float, s: float) -> tuple[float, float]:
 
 @inner
 def _remembers(p: Array) -> bool:
-    """Whether what has snapped once differs from what has not."""
+    """Return whether a first snap changes the spring."""
     return p[K_WORN] < p[K0] or p[LOG_AGAIN] < p[LOG_PLUS]
 
 
 @inner
 def _on_a(n: float, k: float, s: float) -> tuple[float, float]:
-    """Strain of branch a at a stress, and its slope; infinite past the pole."""
+    """Return strain and slope of branch a at a stress; infinite past the pole."""
     if k + n * s <= 0.0:
         return -math.inf, math.nan
     if n == 1.0:
@@ -233,7 +233,7 @@ def _on_a(n: float, k: float, s: float) -> tuple[float, float]:
 
 @inner
 def _mixture(p: Array, branch: int, rank: float, most: float, s: float) -> tuple[float, float]:
-    """Strain of a microscale spring at a stress, and dε/ds; infinite past the pole."""
+    """Return strain and dε/ds of a microscale spring at a stress; infinite past the pole."""
     u, wide = _score(p, branch, rank, s)
     snapped, whole = 0.5 * math.erfc(-u / math.sqrt(2.0)), 0.5 * math.erfc(u / math.sqrt(2.0))
     a, slope = _on_a(p[N], p[K0], s)
@@ -255,7 +255,7 @@ def _mixture(p: Array, branch: int, rank: float, most: float, s: float) -> tuple
 
 @inner
 def _meets(p: Array) -> tuple[float, bool]:
-    """Stress at which snap-through and snap-back have one score; whether a loop lies above it."""
+    """Return the stress of equal snap-through and snap-back scores; is there a loop above it?"""
     slope = 1.0 / p[WIDE_MINUS] - 1.0 / p[WIDE_PLUS]
     constant = p[LOG_AGAIN] / p[WIDE_PLUS] - p[LOG_MINUS] / p[WIDE_MINUS]
     if slope == 0.0:
@@ -268,7 +268,7 @@ def _meets(p: Array) -> tuple[float, bool]:
 
 @inner
 def _ends(p: Array, branch: int, rank: float, most: float) -> tuple[float, float, int, int]:
-    """What a branch is followed between (stress or strain), and the branches beyond."""
+    """Return the limits of a branch (stress or strain), and the branches beyond."""
     if branch < HELD:
         return _bounds(p, branch)
     if branch == SNAP and _remembers(p):
@@ -309,8 +309,8 @@ def _rates(
 ) -> bool:
     """Fill the rates `out` of a state and the `stress` of each group.
 
-    `value` and `rate` are those of the drive (stress or displacement). False on a flat branch under
-    a prescribed stress, and past the pole of a law.
+    `value` and `rate` describe the drive (stress or displacement). Return False on a flat branch
+    under a prescribed stress, and past the pole of a law.
     """
     springs, relax, ends, top = system.springs, system.relax, system.ends, system.top
     groups, count, terms = ends.size, springs.shape[0], relax.shape[1]
@@ -343,7 +343,7 @@ def _rates(
         low = y[g - 1] if g > 0 else 0.0
         prescribed = g == groups - 1 and top == STRESS
         damper = g == groups - 1 and top == DAMPER
-        high = y[g] if g < moving else rate  # of a driven top
+        high = y[g] if g < moving else rate  # of a prescribed top
         flow = pull = 0.0
         free = -1  # the softest spring without a dashpot
         for i in range(i0, i1):
@@ -407,9 +407,9 @@ def _rates(
 def _over(
     y: Array, rates: Array, paces: Array, flags: Flags, system: System, base: float, peak: float
 ) -> float:
-    """By how much a state is past the end of a branch, a turn, or contact; negative if not.
+    """Return the overshoot of a state past a branch end, turn or contact; negative if none.
 
-    `peak` is the largest base stress so far, or 0 where contact cannot end.
+    `peak` is the largest base stress so far, or 0 if contact cannot end.
     """
     moving, worst = y.size - system.relax[:, :, 0].size - flags.branch.size, -math.inf
     for i in range(flags.branch.size):
@@ -427,7 +427,7 @@ def _over(
 
 @inner
 def _leaps(y: Array, y1: Array, moving: int, flags: Flags, springs: Array) -> bool:
-    """Whether a step crosses more than a standard deviation of what snaps."""
+    """Return whether a step crosses more than one standard deviation of the snap stresses."""
     for i in range(flags.branch.size):
         if flags.branch[i] > HELD:
             u0 = _score(springs[i], flags.branch[i], flags.ranks[i], y[moving + i])[0]
@@ -439,7 +439,7 @@ def _leaps(y: Array, y1: Array, moving: int, flags: Flags, springs: Array) -> bo
 
 @inner
 def _enter(y: Array, rates: Array, moving: int, flags: Flags, springs: Array) -> int:
-    """Change the branch of each spring that is at an end, or turns, on its way out; how many."""
+    """Change the branch of each spring that leaves it or reverses; return their number."""
     moved = 0
     for i in range(flags.branch.size):
         before = flags.branch[i]
@@ -456,7 +456,7 @@ def _enter(y: Array, rates: Array, moving: int, flags: Flags, springs: Array) ->
             flags.branch[i] = HELD
             if before == SNAP:
                 flags.most[i] = flags.ranks[i]
-            # within the ends of what is held: a rate that is 0 to rounding turns nothing to and fro
+            # a rate of zero within rounding must not reverse the spring repeatedly
             low, high, _, _ = _ends(springs[i], HELD, flags.ranks[i], flags.most[i])
             near = 4e-16 if before == BACK else -4e-16
             y[moving + i] = (max(x, low) if before == BACK else min(x, high)) * (1.0 + near)
@@ -469,9 +469,9 @@ def _step(
     y: Array, h: float, one: Tried, flags: Flags, system: System, value: float, rate: float,
     tol: float,
 ) -> float:  # fmt: skip
-    """Take a step of length h from y, whose rates are one.k[0]; fills y1 and, in `some`, y1 - y.
+    """Take a step of length h from y with rates one.k[0]; fill in y1 and, in `some`, y1 - y.
 
-    Returns the error over the tolerance; infinite where something is not finite.
+    Return the error over the tolerance; infinite if a value is not finite.
     """
     k, y1, some, scale = one.k, one.y1, one.some, one.scale
     size = y.size
@@ -512,7 +512,7 @@ def _past(
     y: Array, h: float, one: Tried, flags: Flags, system: System, value: float, rate: float,
     tol: float, peak: float,
 ) -> float:  # fmt: skip
-    """Take a step, and tell by how much its end is past a switch; see `_over`."""
+    """Take a step and return its overshoot past a switch; see `_over`."""
     _step(y, h, one, flags, system, value, rate, tol)
     _rates(one.y1, one.rates, one.stress, flags, system, value + rate * h, rate)
     return _over(one.y1, one.rates, one.paces, flags, system, one.stress[0], peak)
@@ -520,9 +520,9 @@ def _past(
 
 @inner
 def _turn(g0: float, d0: float, g1: float, d1: float, h: float) -> float:
-    """Where in a step a quantity that rises at first and falls at last is largest; 1 if nowhere.
+    """Return where in a step a quantity has an interior maximum; 1 if it has none.
 
-    By the cubic through its values and rates at both ends.
+    Uses the cubic through its values and rates at both ends.
     """
     if not (d0 > 0.0 > d1):
         return 1.0
@@ -539,7 +539,7 @@ def _suspect(
     y: Array, stress: Array, h: float, one: Tried, flags: Flags, system: System, value: float,
     rate: float, lifts: bool,
 ) -> float:  # fmt: skip
-    """Share of a step at which a switch may have come and gone within it; 1 if none may have."""
+    """Return the share of a step at which a switch may be passed and repassed; 1 if none."""
     k, y1, f1, first = one.k, one.y1, one.rates, 1.0
     moving = y.size - system.relax[:, :, 0].size - flags.branch.size
     for i in range(flags.branch.size):
@@ -559,7 +559,7 @@ def _suspect(
             for stage in range(1, 12):
                 if way * k[stage, moving + i] < 0.0:
                     first = min(first, _C[stage])
-    if lifts:  # rates of the base stress at both ends, by differences
+    if lifts:  # rates of the base stress at both ends, by finite differences
         tiny, base0, base1, other = 1e-5 * h, stress[0], one.stress[0], np.empty(stress.size)
         _rates(y + tiny * k[0], one.scale, other, flags, system, value + tiny * rate, rate)
         d0 = (other[0] - base0) / tiny
@@ -578,7 +578,7 @@ def _record(
     y: Array, moving: int, flags: Flags, springs: Array, times: Array, now: float, done: int,
     pressure: float, nodes: Array, base: Array,
 ) -> int:  # fmt: skip
-    """Write the samples that are due; returns how many are done."""
+    """Write the samples that are due; return the number done."""
     while done < times.size and times[done] <= now:
         place = 0.0
         for i in range(springs.shape[0]):
@@ -595,10 +595,10 @@ def _follow(
     system: System, kinds: Integers, times: Array, tol: float, most: int,
     nodes: Array, base: Array,
 ) -> tuple[int, int, int, float, float]:  # fmt: skip
-    """Follow a chain over the samples; fills displacements and base stress.
+    """Follow a chain over the samples; fill in displacements and base stress.
 
-    Returns how it ended, the steps, the switches, the end of contact (NaN if none) and the least
-    minimum of the base stress before it over its maximum.
+    Return the kind of end, the number of steps and switches, the end of contact (NaN if none), and
+    the least minimum of the base stress before it over its maximum.
     """
     springs, values, top = system.springs, system.values, system.top
     count, groups = springs.shape[0], system.ends.size
@@ -627,15 +627,15 @@ def _follow(
     knot, steps, switches, peak, largest = 0, 0, 0, 0.0, 0.0
     pressed, least, last_base, falling = False, math.inf, 0.0, False
     h = value = rate = 0.0
-    late = 0.0  # what the clock has lost to rounding
+    late = 0.0  # rounding error of the clock
     fresh, since = True, now
     while True:
-        # samples that are due, by the rate of the drive that led to them
+        # samples that are due, with the preceding rate of the drive
         if done < times.size and times[done] <= now and not fresh:
             value += rate * (now - since)
             if _rates(y, one.k[0], stress, flags, system, value, rate):
                 done = _record(y, moving, flags, springs, times, now, done, stress[0], nodes, base)
-        # what the drive does from here on
+        # the drive from here on
         since = now
         if not struck:
             while knot + 2 < times.size and now >= times[knot + 1]:
@@ -646,7 +646,7 @@ def _follow(
             value = values[knot] + rate * (now - times[knot])
         if not _rates(y, one.k[0], stress, flags, system, value, rate):
             return DONE if done == times.size else FLAT, steps, switches, math.nan, least
-        if fresh and not struck and knot > 0 and top == MOTION:  # dashpots feel the mean rate
+        if fresh and not struck and knot > 0 and top == MOTION:  # dashpots see the mean rate
             a, b = times[knot] - times[knot - 1], times[knot + 1] - times[knot]
             base[knot] += a / (a + b) * (stress[0] - base[knot])
         fresh = False
@@ -695,7 +695,7 @@ def _follow(
                 return NO_STEP, steps, switches, math.nan, least
         grow = min(0.9 * max(error, 1e-30) ** -0.125, 6.0)
         following = max(full, h * grow) if h < full else h * grow
-        # does a branch, or contact, end in it?
+        # does a branch or contact end in this step?
         if not _rates(one.y1, one.rates, one.stress, flags, system, value + rate * h, rate):
             return FLAT, steps, switches, math.nan, least
         lifts = peak if pressed and stress[0] > 0.0 else 0.0
@@ -708,7 +708,7 @@ def _follow(
                 steps += 1
                 high_at, lands = first, False
         hit = past > 0.0
-        if hit:  # the length at which it happens: false position and bisection in turn
+        if hit:  # find its length by false position and bisection alternately
             lands, low_at = False, 0.0
             low_past = min(_over(y, one.k[0], one.paces, flags, system, stress[0], lifts), 0.0)
             high_past = past
@@ -728,10 +728,10 @@ def _follow(
                 else:
                     low_at, low_past = mid, past
         length = high_at * h
-        if high_at < 1.0:  # what was tried last may have another length
+        if high_at < 1.0:  # the last trial may have another length
             _step(y, length, one, flags, system, value, rate, tol)
             steps += 1
-        # the step is taken, with what rounding takes off it
+        # accept the step, with compensated rounding
         for j in range(size):
             more = one.some[j] - lost[j]
             total = y[j] + more
@@ -757,7 +757,7 @@ def _follow(
                         y[moving + i], lost[moving + i] = bound, 0.0
             if lifts > 0.0 and one.stress[0] <= 1e-15 * peak:
                 break
-    # after contact the chain moves with the striker, and nothing presses
+    # after contact the chain moves with the striker, without load
     for j in range(done, times.size):
         _record(
             y, moving, flags, springs, times[j : j + 1], math.inf, 0, 0.0, nodes[:, j:], base[j:]
@@ -771,27 +771,15 @@ def _follow(
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What the judge found of a scene.
+    """Result of the judge for a scene.
 
-    Attributes
-    ----------
-    displacement : (n_springs, n_t) array
-        m.
-    base_stress : (n_t,) array
-        Pa.
-    contact_end : float or None
-        s.
-    unsure : float
-        Largest difference from the run at the looser tolerance, over the range of each curve.
-    unsure_end : float
-        Difference of the ends of contact over their time; infinite where only one run has one.
-    dip : float
-        Least minimum of the base stress before the end of contact, over its maximum: where it is
-        below a tolerance, an answer to that tolerance may end contact there.
-    steps, switches : int
-        Of the run at the tighter tolerance.
-    why : str
-        Why there is no judgement; "" if there is one.
+    Attributes ---------- displacement : (n_springs, n_t) array m. base_stress : (n_t,) array Pa.
+    contact_end : float or None s. unsure : float Largest difference from the run at the looser
+    tolerance, over the range of each curve. unsure_end : float Difference of the ends of contact
+    over their time; infinite if only one run has an end. dip : float Least minimum of the base
+    stress before the end of contact, over its maximum. If it is below a tolerance, a solution
+    within this tolerance may end contact there. steps, switches : int Of the run at the tighter
+    tolerance. why : str Reason if there is no judgement, else "".
     """
 
     displacement: Array
@@ -806,7 +794,7 @@ class Truth:
 
 
 def over_range(one: Array, other: Array) -> float:
-    """Largest difference of two curves over the range of the second, rest included."""
+    """Return the largest difference of two curves over the range of the second, including 0."""
     span = max(float(other.max()), 0.0) - min(float(other.min()), 0.0)
     miss = float(np.abs(one - other).max())
     if miss == 0.0:
@@ -815,7 +803,7 @@ def over_range(one: Array, other: Array) -> float:
 
 
 def _fastest(rows: Array, ends: Integers, mass: Array, top: int) -> float:
-    """Largest rate (1/s) at which dashpots stop a mass: explicit steps are a few times shorter."""
+    """Return the largest rate (1/s) at which dashpots stop a mass; it limits explicit steps."""
     hold = []
     for first, last in zip([0, *ends[:-1]], ends, strict=True):
         eta, height = rows[first:last, ETA], rows[first:last, H]
@@ -828,10 +816,10 @@ def _fastest(rows: Array, ends: Integers, mass: Array, top: int) -> float:
 
 
 def _shares(chain: Any, drive: Any, ends: Integers) -> bool:
-    """Whether a prescribed motion may meet gaps or flat branches of several springs at one stress.
+    """Return whether a motion may meet gaps or flat branches of several springs at one stress.
 
-    They carry one stress whichever of them moves: the law leaves open which does, and a spring that
-    has moved through its flat branch alone has snapped, while one that has shared it has not.
+    The stress is the same whichever spring moves, so the law does not define which one moves. A
+    spring that alone passes its flat branch has snapped; one that shares the motion has not.
     """
     if not hasattr(drive, "displacement"):
         return False
@@ -852,12 +840,12 @@ def _shares(chain: Any, drive: Any, ends: Integers) -> bool:
 
 
 def has_memory(chain: Any) -> bool:
-    """Whether a spring of a chain is microscale, or relaxes."""
+    """Return whether a spring of a chain is microscale or relaxes."""
     return any(hasattr(s, "sigma_plus") or getattr(s, "relaxation", ()) for s in chain.springs)
 
 
 def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = MOST_WORK) -> Truth:
-    """Follow a scene once, at one tolerance; its own uncertainty is not known then."""
+    """Follow a scene once, at one tolerance, without an estimate of the uncertainty."""
     count = len(chain.springs)
     pairs = [row_of(s, h) for s, h in zip(chain.springs, chain.heights, strict=True)]
     rows, kinds = np.array([row for row, _ in pairs]), np.array([kind for _, kind in pairs])

@@ -1,10 +1,10 @@
-"""The judge of chains without rates under a known motion: root finding at 30 digits.
+"""Judge of rate-independent chains under a known motion: root finding at 30 digits.
 
-Undamped, massless springs that do not relax bear one stress, and along a monotone stretch of it
-the strain of each is a monotone function of that stress. At every sample the stress is sought at
-which their elongations add up to the prescribed displacement; then each spring takes down what it
-remembers: the flag of a bistable spring, the ranks of a microscale one. Nothing is integrated, so
-neither the times of the samples nor the width of a snap matter. Law: model.md, sections 1, 6, 8.
+Undamped, massless springs without relaxation bear one stress, and as long as the stress is
+monotone, the strain of each is a monotone function of it. At every sample the judge finds the
+stress at which the elongations add up to the prescribed displacement; then each spring updates its
+state: the flag of a bistable spring, the ranks of a microscale one. Nothing is integrated, so
+neither the times of the samples nor the width of a snap matter. Laws: docs/theory.md.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class _Linear:
         return s / self.k0
 
     def keep(self, s: Any) -> None:
-        """Take down what the spring remembers at a stress."""
+        """Update the state of the spring at a stress."""
 
 
 class _Bistable(_Linear):
-    """Four branches, and a flag that tells whether the spring has snapped."""
+    """Four branches, and a flag for a spring that has snapped."""
 
     def __init__(self, spring: Any) -> None:
         names = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
@@ -65,7 +65,7 @@ class _Bistable(_Linear):
 
 
 class _Microscale(_Linear):
-    """The ranks up to which micro-springs have snapped, and ever had, as normal scores."""
+    """Ranks of micro-springs snapped now and snapped ever, as normal scores."""
 
     def __init__(self, spring: Any) -> None:
         names = ("k0", "kc", "eps_star", "spread_plus", "spread_minus", "stiffening", "weakening")
@@ -76,7 +76,7 @@ class _Microscale(_Linear):
         self.soft, self.rank, self.most = self.k0 * exp(-mpf(spring.softening)), -inf, -inf
 
     def moved(self, s: Any) -> tuple[Any, Any]:
-        """Return both ranks at a stress, from those that are remembered."""
+        """Return both ranks at a stress, from the stored ones."""
         if s <= 0:
             return -inf, self.most
         plus = (log(s) - self.at_plus) / self.plus
@@ -106,7 +106,7 @@ def _spring(spring: Any) -> _Linear:
 
 
 def _root(springs: list[_Linear], heights: list[Any], top: Any, s: Any) -> Any:
-    """Stress at which the elongations add up, by bisection of a bracket about the last one."""
+    """Return the stress at which the elongations add up, by bisection from the last stress."""
 
     def miss(at: Any) -> Any:
         return sum(h * p.strain(at) for h, p in zip(heights, springs, strict=True)) - top
@@ -117,7 +117,7 @@ def _root(springs: list[_Linear], heights: list[Any], top: Any, s: Any) -> Any:
     low = high = s
     low_miss = high_miss = here
     step = max(abs(s), min(p.k0 for p in springs)) / 1000
-    # no spring but a linear one can be pulled further
+    # only a linear spring can be pulled further
     floor = -min(min(p.k0, getattr(p, "soft", p.k0) / getattr(p, "n", 1)) for p in springs)
     while here * (high_miss if here < 0 else low_miss) > 0:
         if here < 0:
@@ -134,7 +134,7 @@ def _root(springs: list[_Linear], heights: list[Any], top: Any, s: Any) -> Any:
 
 
 def follow(chain: Any, drive: Any, time: Array, tol: float = 0.0, most: int = 0) -> Truth:
-    """Follow a chain over the samples of a known displacement of its top, whatever `tol` asks."""
+    """Follow a chain over the samples of a known displacement of its top; `tol` has no effect."""
     with mp.workdps(DIGITS):
         springs = [_spring(spring) for spring in chain.springs]
         heights = [mpf(h) for h in chain.heights]

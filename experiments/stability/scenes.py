@@ -1,6 +1,6 @@
 """Stiff and extreme scenes of bistable and linear springs: a Latin hypercube over all axes.
 
-Everything is made from a seed; all is SI. Springs, histories and durations are synthetic.
+Everything is generated from a seed, in SI units. Springs, histories and durations are synthetic.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ DRIVES = ("impact", "stress", "displacement")
 
 @dataclass(frozen=True)
 class Point:
-    """Where a scene lies on the axes of the study; see `AXES` for the ranges."""
+    """Coordinates of a scene on the axes of the study; see `AXES` for the ranges."""
 
     drive: str = "impact"
     kinds: str = "bistable"  # repeated from the base up
-    history: str = "all branches"  # where the stress or displacement turns round
+    history: str = "all branches"  # where the stress or displacement reverses
     k0: float = 5e6  # Pa
     kc_ratio: float = 15.0  # k_c/k0
     dsigma_ratio: float = -0.3  # Δσ/σ_a
@@ -44,11 +44,11 @@ class Point:
     height: float = 1e-3  # m, overall
     springs: int = 1
     samples: int = 201
-    duration: float = 1.0  # over the time that the scene takes by itself; see `duration_of`
+    duration: float = 1.0  # relative to the natural duration; see `duration_of`
 
 
 def spring_of(point: Point) -> ff.BistableSpring:
-    """Make the bistable spring of a scene."""
+    """Return the bistable spring of a scene."""
     sigma_a = point.k0 * point.eps_a / (1.0 - point.eps_a)
     return ff.BistableSpring(
         k0=point.k0,
@@ -63,7 +63,7 @@ def spring_of(point: Point) -> ff.BistableSpring:
 
 
 def chain_of(point: Point) -> ff.Chain:
-    """Make the chain of a scene; its springs differ a little in height, so that none is a twin."""
+    """Return the chain of a scene; slightly different heights make all springs different."""
     bistable = spring_of(point)
     linear = ff.LinearSpring(10.0 * point.k0, point.eta, point.kinds.startswith("unilateral"))
     pattern = (bistable,) if point.kinds == "bistable" else (linear, bistable)
@@ -78,7 +78,7 @@ def chain_of(point: Point) -> ff.Chain:
 
 
 def duration_of(point: Point) -> float:
-    """Time that a scene takes by itself: a bounce, or what masses and dashpots need to follow."""
+    """Return the natural duration of a scene: a bounce, or the time of masses and dashpots."""
     mass = STRIKER if point.drive == "impact" else point.mass * point.springs + point.top_mass
     swing = math.pi * math.sqrt(mass * point.height / (AREA * point.k0))
     relax = (point.eta + point.site_eta) / point.k0
@@ -86,13 +86,13 @@ def duration_of(point: Point) -> float:
         return point.duration * max(20.0 * swing, relax, 1e-6)
     crossing = 4.0 * point.height / point.velocity
     stop = mass * point.height / (AREA * (point.eta + point.site_eta + 1e-300))
-    if relax > swing and stop < crossing:  # the dashpots stop the striker, then it creeps back
+    if relax > swing and stop < crossing:  # dashpots stop the striker, which then creeps back
         return point.duration * min(relax, 1e6 * swing)
     return point.duration * min(swing, crossing)
 
 
 def turns_of(point: Point) -> Array:
-    """Strains of the bistable spring between which the history goes to and fro, from rest."""
+    """Return the strains of the bistable spring at the turning points of the history."""
     spring = spring_of(point)
     low, high = spring.eps_a, spring.eps_hat_c
     back = 0.0 if spring.eps_hat_a is None else max(spring.eps_hat_a, 0.0)
@@ -115,7 +115,7 @@ def turns_of(point: Point) -> Array:
 def scene_of(
     point: Point,
 ) -> tuple[ff.Chain, ff.Impact | ff.StressDrive | ff.DisplacementDrive, Array]:
-    """Make the chain, the drive and the samples of a scene."""
+    """Return chain, drive and samples of a scene."""
     chain = chain_of(point)
     time = np.linspace(0.0, duration_of(point), point.samples)
     if point.drive == "impact":
@@ -131,7 +131,7 @@ def scene_of(
         return chain, ff.StressDrive(np.interp(time, along, levels)), time
     along = np.linspace(0.0, duration_of(point), len(fine))
     share = 1.0
-    if point.springs > 1 and point.kinds != "bistable":  # what the linear springs do not take
+    if point.springs > 1 and point.kinds != "bistable":  # share of the linear springs excluded
         bistable = [isinstance(s, ff.BistableSpring) for s in chain.springs]
         share = math.fsum(h for h, is_b in zip(chain.heights, bistable, strict=True) if is_b)
         share = share / chain.height
@@ -147,12 +147,12 @@ def _log(u: float, low: float, high: float) -> float:
 
 
 def _or_zero(u: float, low: float, high: float, share: float) -> float:
-    """Zero for a share of the design, else between low and high on a logarithmic scale."""
+    """Return zero for a share of the design, else a log-scaled value between low and high."""
     return 0.0 if u < share else _log((u - share) / (1.0 - share), low, high)
 
 
 def designed(count: int, seed: int) -> list[Point]:
-    """Scenes of a Latin hypercube over all axes at once; most chains are short, some long."""
+    """Return scenes of a Latin hypercube over all axes; most chains are short, some long."""
     design = qmc.LatinHypercube(19, rng=seed).random(count)
     points = []
     for u in design:

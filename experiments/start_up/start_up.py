@@ -1,13 +1,13 @@
-"""From the command to the report: how long does it take, warm and at first use, and where?
+"""How long does `foamfit fit` take to the report, warm and at first use, and where is time spent?
 
 Method. A synthetic impact (published foam-1/model-1 at 2 m/s, 1 % white noise) is fitted by
 `foamfit fit`, each time in a new process. "First use" is the first fit after installation: nothing
-is compiled (an empty NUMBA_CACHE_DIR). The parts are those of one more process, which calls in turn
-what the command calls; in the last part, figures are drawn in other processes where there are two
-cores, as by the command.
+is compiled (an empty NUMBA_CACHE_DIR). The parts are measured in another process, which calls the
+same functions in turn; in the last part, figures are drawn in other processes if there are two
+cores, as in the command.
 
-Answer. 600 rows: 5.4 s once compiled, 18 s at first use; README.md says where the time goes. A
-million rows: 6.2 s, 384 MiB.
+Answer. 600 rows: 5.4 s after compilation, 18 s at first use; README.md lists the parts. A million
+rows: 6.2 s, 384 MiB.
 
     python experiments/start_up/start_up.py                            # the table of README.md
     python experiments/start_up/start_up.py --rows 1000000 --warm 1 --first 0
@@ -42,26 +42,14 @@ PARTS = (
     "figures, report, result folder",
 )
 PROBE = """
-import gc, sys, time
-gc.set_threshold(100_000, 20, 10)  # as the command
-marks = [time.perf_counter()]
-import foamfit.cli
-marks.append(time.perf_counter())
-import foamfit
-test = foamfit.read_test(sys.argv[1])
-marks.append(time.perf_counter())
-from foamfit import api
-from contextlib import closing
-from foamfit.cli.options import Drawers
-with closing(Drawers()) as drawers:
-    drawers.begin()
-    marks.append(time.perf_counter())
-    result = api.fit(test)
-    marks.append(time.perf_counter())
-    result.save(sys.argv[2], mapped=drawers.map)
-    marks.append(time.perf_counter())
-print(*(after - before for before, after in zip(marks, marks[1:])))
-gc.freeze()  # as the command: what is left goes with the process
+import gc, sys, time gc.set_threshold(100_000, 20, 10)  # as the command marks =
+[time.perf_counter()] import foamfit.cli marks.append(time.perf_counter()) import foamfit test =
+foamfit.read_test(sys.argv[1]) marks.append(time.perf_counter()) from foamfit import api from
+contextlib import closing from foamfit.cli.options import Drawers with closing(Drawers()) as
+drawers: drawers.begin() marks.append(time.perf_counter()) result = api.fit(test)
+marks.append(time.perf_counter()) result.save(sys.argv[2], mapped=drawers.map)
+marks.append(time.perf_counter()) print(*(after - before for before, after in zip(marks,
+marks[1:]))) gc.freeze()  # as in the command
 """
 
 
@@ -80,7 +68,7 @@ def write(folder: Path, rows: int) -> Path:
 
 
 def run(command: list[str], cache: str | None = None) -> tuple[float, float, str]:
-    """Wall time and processor time of a command, s, and its output; with a cache of its own."""
+    """Run a command with its own cache; return wall and processor time (s) and output."""
     variables = os.environ | {"MPLBACKEND": "Agg"} | ({"NUMBA_CACHE_DIR": cache} if cache else {})
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     began = time.perf_counter()
@@ -92,7 +80,7 @@ def run(command: list[str], cache: str | None = None) -> tuple[float, float, str
 
 
 def measure(test: Path, folder: str, first: int, warm: int) -> dict[str, float]:
-    """Medians: first use, warm, its processor time, and the parts."""
+    """Return medians of first use, warm use, its processor time, and the parts."""
     out = f"{folder}/result"
     fit = [sys.executable, "-m", "foamfit", "fit", str(test), "--quiet", "--out", out]
     probe = [sys.executable, "-c", PROBE, str(test), out]
@@ -104,7 +92,7 @@ def measure(test: Path, folder: str, first: int, warm: int) -> dict[str, float]:
     for _ in range(first):
         with tempfile.TemporaryDirectory() as cache:
             keep(f"first use, from command to report (median of {first})", run(fit, cache)[0])
-    run(fit)  # what is not compiled yet
+    run(fit)  # compiles the rest
     for _ in range(warm):
         wall, used, _ = run(fit)
         keep(f"warm, from command to report (median of {warm})", wall)

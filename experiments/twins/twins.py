@@ -1,13 +1,13 @@
-"""What does wear do to a running-shoe foam? Five specimens of a new heel against five of a worn.
+"""How does wear change a running-shoe foam? Five specimens each of a new and a worn heel.
 
 Method. The measurements (arXiv:2602.12694, LivingMatterLab/CANN on GitHub; not part of this
-repository) are compressions of ten specimens, six to seven cycles each. The study goes the way of a
+repository) are compressions of ten specimens, six to seven cycles each. The study works like a
 user: a TOML beside each test, `foamfit.batch` over all tests and cycles, `foamfit.joint` of the new
-and of the worn ones. Common values are compared by Welch's test of their logarithms, all
-comparisons of a cycle counted together (Holm).
+and of the worn specimens. Common values are compared by Welch's test of their logarithms, with
+Holm's correction for all comparisons of a cycle.
 
-Answer. The worn heel dissipates less, but no parameter changes by more than the specimens of one
-heel differ: see README.md, which this writes with batch.csv, wear.csv and a picture.
+Answer. The worn heel dissipates less, but no parameter changes by more than the scatter within a
+heel. The study writes README.md, batch.csv, wear.csv and a figure.
 
     FOAMFIT_DATA=path/to/data python experiments/twins/twins.py    # --page: from the tables alone
 """
@@ -37,16 +37,16 @@ import studies  # noqa: E402
 
 SOURCE = "Measurements: arXiv:2602.12694, LivingMatterLab/CANN"
 GROUPS, COLOURS = ("new", "worn"), {"new": BLUE, "worn": VERMILION}
-FIRST, LATER = 1, 5  # cycles that the page has tables of
+FIRST, LATER = 1, 5  # cycles with tables on the page
 OWN = ["k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus"]
 LAW = [*OWN, "g1", "tau1"]
-# No test tells kc from eps_star (r = 1.00), and all ten say that eps_star is one value by evidence:
-# it is found from all of them and held in the fits of the groups, so that their kc compare.
+# A single test cannot separate kc and eps_star (r = 1.00), but the evidence of all ten favours one
+# common eps_star. It is fitted to all tests and fixed in the groups, so that kc can be compared.
 HELD = "s1_eps_star"
 SCATTERING = tuple(f"s1_{name}" for name in LAW if f"s1_{name}" != HELD)
 ENERGY, PEAK = "dissipated energy", "peak stress"
 UNITS = {ENERGY: (1e3, "kJ/m³"), PEAK: (1e3, "kPa")}
-LEVEL = 0.05  # of what is said to stand out, all comparisons of a cycle together
+LEVEL = 0.05  # significance level, for all comparisons of a cycle together
 POINTS = 200  # of a mean loop
 # Measured strain and stress of each specimen by group.
 Loops = Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]]
@@ -56,7 +56,7 @@ Loops = Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]]
 
 
 def measure(folder: Path) -> None:
-    """Fit each cycle of each test, then each group together; writes batch.csv and wear.csv."""
+    """Fit each cycle of each test, then each group jointly; write batch.csv and wear.csv."""
     found = ff.batch(
         folder, out=folder / "runs", model="microscale", relaxation=1, drive="displacement",
         cycle="all", intervals="local", report=False,
@@ -66,7 +66,7 @@ def measure(folder: Path) -> None:
     errors = [name for name in table if name.endswith("_stderr")]
     studies.write_csv(table.drop(columns=errors), HERE / "batch.csv", 5)
     counts = table["cycle"].dropna().astype(int).value_counts()
-    # A cycle that few records have is no group.
+    # Ignore a cycle that only few records contain.
     full = sorted(n for n, count in counts.items() if count == table["specimen"].nunique())
     frames = [wear(fit_together(folder, n), loops(folder, n)).assign(cycle=n) for n in full]
     rows = pd.concat(frames)
@@ -74,7 +74,7 @@ def measure(folder: Path) -> None:
 
 
 def fit_together(folder: Path, cycle: int) -> dict[str, dict[str, Any]]:
-    """Fit one cycle of all specimens, of the new and of the worn together; joint.json of each."""
+    """Fit one cycle of all, new and worn specimens jointly; return each joint.json."""
     found = {"all": fit_study(folder, "*", cycle, "auto")}
     held = found["all"]["parameters"][HELD]
     if held["kind"] != "shared":
@@ -86,7 +86,7 @@ def fit_together(folder: Path, cycle: int) -> dict[str, dict[str, Any]]:
 
 
 def fit_study(folder: Path, group: str, cycle: int, held: str | float) -> dict[str, Any]:
-    """Fit one study; content of joint.json."""
+    """Fit one study; return the content of joint.json."""
     study = studies.write_study(
         folder / "study.toml", [f"{group}-heel-comp-*_raw.txt"], "microscale",
         dict.fromkeys(SCATTERING, "scatter") | {HELD: held}, relaxation=1, drive="displacement",
@@ -96,7 +96,7 @@ def fit_study(folder: Path, group: str, cycle: int, held: str | float) -> dict[s
 
 
 def loops(folder: Path, cycle: int) -> Loops:
-    """Measured strain and stress of one cycle of each specimen, by group."""
+    """Return measured strain and stress of one cycle of each specimen, by group."""
     out = {}
     for group in GROUPS:
         tests = [ff.read_test(p, cycle=cycle) for p in sorted(folder.glob(f"{group}-*_raw.txt"))]
@@ -105,7 +105,7 @@ def loops(folder: Path, cycle: int) -> Loops:
 
 
 def mean_loop(group: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, ...]:
-    """Mean strain, mean stress and its standard deviation, at equal shares of the largest strain.
+    """Return mean strain, mean stress and its standard deviation at equal relative strains.
 
     The first half is the loading, the second the unloading.
     """
@@ -116,7 +116,7 @@ def mean_loop(group: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarra
         up = np.interp(share, np.maximum.accumulate(strain[: turn + 1]) / top, stress[: turn + 1])
         back = np.maximum.accumulate(strain[turn:][::-1]) / top
         down = np.interp(share, back, stress[turn:][::-1])
-        # Below where the unloading ends there is nothing to interpolate.
+        # There is nothing to interpolate below the end of unloading.
         down[share < back[0]] = np.nan
         strains.append(top * np.concatenate([share, share[::-1]]))
         stresses.append(np.concatenate([up, down[::-1]]))
@@ -124,7 +124,7 @@ def mean_loop(group: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarra
 
 
 def lost(loop: tuple[np.ndarray, np.ndarray]) -> float:
-    """Energy that a loop dissipates, J/m³."""
+    """Return the energy dissipated by a loop, J/m³."""
     return float(np.trapezoid(loop[1], loop[0]))
 
 
@@ -132,7 +132,7 @@ def lost(loop: tuple[np.ndarray, np.ndarray]) -> float:
 
 
 class Group(NamedTuple):
-    """A quantity of a group, of its logarithm: mean, standard error, spread between specimens."""
+    """Logarithm of a quantity of a group: mean, standard error, spread between specimens."""
 
     mean: float
     stderr: float
@@ -141,19 +141,19 @@ class Group(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Group:
-        """Measured values, whose errors are nothing beside their spread."""
+        """Make a group from measured values, whose errors are negligible against their spread."""
         logs = np.log(values)
         spread = float(np.std(logs, ddof=1))
         return cls(float(np.mean(logs)), spread / math.sqrt(len(logs)), spread, len(logs))
 
     @classmethod
     def of_joint(cls, item: Mapping[str, Any]) -> Group:
-        """A scattering parameter of joint.json, its spread apart from errors of measurement."""
+        """Make a group from a scattering parameter of joint.json, without measurement error."""
         value, error = item["value"], item["stderr"]
         return cls(math.log(value), error / value, item["scatter"], len(item["tests"]))
 
     def row(self, name: str) -> dict[str, float]:
-        """Common value (the median specimen's), its 95 % interval (Student's t) and the spread."""
+        """Return the common (median) value, its 95 % interval (Student's t) and the spread."""
         half = float(stats.t.ppf(0.975, self.count - 1)) * self.stderr
         low, high = math.exp(self.mean - half), math.exp(self.mean + half)
         ends = {f"{name}_lo": low, f"{name}_hi": high}
@@ -161,7 +161,7 @@ class Group(NamedTuple):
 
 
 def change_of(quantity: str, new: Group, worn: Group) -> dict[str, Any]:
-    """Compare two groups by Welch's test of the logarithms: the worn over the new one, less one."""
+    """Compare two groups by Welch's test of the logarithms; the change is worn over new minus 1."""
     difference, error = worn.mean - new.mean, math.hypot(new.stderr, worn.stderr)
     freedom = error**4 / sum(g.stderr**4 / (g.count - 1) for g in (new, worn))
     half = float(stats.t.ppf(0.975, freedom)) * error
@@ -176,7 +176,7 @@ def change_of(quantity: str, new: Group, worn: Group) -> dict[str, Any]:
 
 
 def counted_together(changes: pd.DataFrame) -> pd.DataFrame:
-    """The changes by their size, largest first, with p adjusted for their number (Holm 1979)."""
+    """Sort the changes by size, largest first, and adjust p for their number (Holm 1979)."""
     found = changes.sort_values("p", kind="stable")
     left = len(found) - np.arange(len(found))
     found["p_adjusted"] = np.maximum.accumulate(np.minimum(left * found["p"], 1.0))
@@ -184,7 +184,7 @@ def counted_together(changes: pd.DataFrame) -> pd.DataFrame:
 
 
 def wear(found: Mapping[str, Mapping[str, Any]], measured: Loops) -> pd.DataFrame:
-    """What differs between the joint fits of two groups, and what their loops say without a law."""
+    """Compare the joint fits of two groups, and their measured loops."""
     rows = [
         change_of(name, *(Group.of([one(loop) for loop in measured[g]]) for g in GROUPS))
         for name, one in ((ENERGY, lost), (PEAK, lambda loop: float(loop[1].max())))
@@ -199,21 +199,21 @@ def wear(found: Mapping[str, Mapping[str, Any]], measured: Loops) -> pd.DataFram
 
 
 def shown_change(one: Any) -> str:
-    """Write a change with its 95 % interval."""
+    """Return a change with its 95 % interval as text."""
     ends = (one.change, one.change_lo, one.change_hi)
     value, low, high = (f"{100 * end:+.0f}".replace("-", "−") for end in ends)
     return f"{value} % ({low} to {high} %)"
 
 
 def verdict(one: Any) -> str:
-    """Whether a change stands out of the scatter between specimens."""
+    """Return whether a change is significant against the scatter between specimens."""
     if one.p_adjusted < LEVEL:
-        return "stands out"
+        return "significant"
     return f"a hint, p = {significant(one.p, 1)}" if one.p < LEVEL else "within scatter"
 
 
 def draw(changes: pd.DataFrame, measured: Loops, path: Path) -> None:
-    """The mean loops of the first cycle, and the change of each quantity in two cycles."""
+    """Draw the mean loops of the first cycle and the change of each quantity in two cycles."""
     with studies.sheet(path, 7.4, 3.4) as figure:
         left, right = figure.subplots(1, 2)
         for group, colour in COLOURS.items():
@@ -247,7 +247,7 @@ def draw(changes: pd.DataFrame, measured: Loops, path: Path) -> None:
 
 
 def change_rows(changes: pd.DataFrame) -> str:
-    """Rows of the page's table of changes."""
+    """Return the rows of the table of changes."""
 
     def cells(one: Any) -> Iterator[str]:
         factor, unit = UNITS.get(one.quantity) or readable_unit(one.new, unit_of(one.quantity))
@@ -265,20 +265,20 @@ def change_rows(changes: pd.DataFrame) -> str:
 
 
 def batch_rows(table: pd.DataFrame) -> str:
-    """By group and cycle: fits, misfits, states that are determined."""
+    """Return, by group and cycle, numbers of fits, misfits and determined parameters."""
     rows = []
     groups = table.groupby([table["specimen"].str.split("-").str[0], "cycle"], dropna=False)
     for (group, cycle), part in groups:
         off = part["misfit_stress_strain"].dropna()
-        told = f"{percent(off.min())} to {percent(off.max())}" if len(off) else "–"
+        spread = f"{percent(off.min())} to {percent(off.max())}" if len(off) else "–"
         acceptable = part["status"].isin(["ok", "warnings"]).sum()
         states = (part[f"s1_{name}_state"].eq("determined").sum() for name in LAW)
-        rows.append([group, cycle, f"{acceptable} of {len(part)}", told, *states])
+        rows.append([group, cycle, f"{acceptable} of {len(part)}", spread, *states])
     return studies.lines(rows)
 
 
 def write(measured: Loops) -> None:
-    """Write picture and page of the tables."""
+    """Write figure and page from the tables."""
     table, changes = pd.read_csv(HERE / "batch.csv"), pd.read_csv(HERE / "wear.csv")
     draw(changes, measured, HERE / "new_against_worn.png")
     off, out = table["misfit_stress_strain"], changes["p_adjusted"] < LEVEL
