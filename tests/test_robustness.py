@@ -249,7 +249,7 @@ def test_a_stopped_fit_is_marked_everywhere(tmp_path, monkeypatch):
     assert "stopped by the time limit" in head
     text = comparison_text(compare([tmp_path / "stopped"], "foam-1/model-1"))
     assert "stopped by the time limit)" in text.splitlines()[0]
-    assert "not the end of a fit" in " ".join(text.split())
+    assert "not those of a finished fit" in " ".join(text.split())
 
 
 def test_sigterm_keeps_the_best_so_far(tmp_path, monkeypatch):

@@ -71,7 +71,7 @@ def test_a_bistable_fit_says_what_partial_unloading_leaves() -> None:
     squares = (fit.curves.stress_along - test.stress) ** 2
     inside = sum(squares[a:b].sum() for a, b in ((60, 143), (240, 321))) / squares.sum()
     assert inside > 0.5
-    assert f"these 45 % of the samples hold {100.0 * inside:.2g} % of the squared" in told
+    assert f"these 45 % of the samples account for {100.0 * inside:.2g} % of the squared" in told
     assert "microscale springs do" in told
     assert told in " ".join(summary_text(fit, verbose=True).split())
 

@@ -44,7 +44,7 @@ def test_a_prior_draws_the_value_and_narrows_the_interval(impact: ff.Measurement
         ("s1_k0", "5.5 ± 0.1 mm", "wrong dimension"),
         ("s1_k0", 5e6, "positive standard deviation"),
         ("site_eta", "1 ± 0.1 Pa s", "is held fixed"),
-        ("velocity", "2 ± 0.1 m/s", "its ± in the TOML"),
+        ("velocity", "2 ± 0.1 m/s", "give its ± there"),
     ],
 )
 def test_a_wrong_prior_is_refused_in_one_sentence(impact, name, value, words) -> None:

@@ -281,7 +281,7 @@ def test_a_test_that_kills_its_process_is_a_row_and_is_tried_again_when_called(
 ):
     monkeypatch.setattr(module, "work", failing)
     frame = again(executor=None, jobs=2).set_index("test")
-    assert "its process ended each time" in frame.loc["b", "error"]
+    assert "its process ended in every attempt" in frame.loc["b", "error"]
     assert list(numbers("out")) == ["a", "c"]
     assert not [name for name in names("out") if name.startswith(".")]
     before = stamps("out")

@@ -349,7 +349,7 @@ def test_draws_lie_within_the_limits_of_a_fit_of_the_test():
 def test_draws_that_are_never_admissible_are_refused():
     content = fit_content()
     content["parameters"]["s1_kc"] |= {"value": 4e9}  # eps_star = 0.3 is too small for it
-    with pytest.raises(SimulationError, match="fitted: its common values are no admissible"):
+    with pytest.raises(SimulationError, match="fitted: neither its common values"):
         ff.predict(InMemory(content), loop(seed=0), draws=DRAWS)
 
 
@@ -472,7 +472,7 @@ BROKEN = {
     "stderr": (lambda c: c["parameters"]["s1_kc"].update(stderr=-1.0), "stderr is -1.0"),
     "ci95": (lambda c: c["parameters"]["s1_kc"].update(ci95=[1.0]), "parameter s1_kc: "),
     "matrix": (lambda c: c["correlation"].update(matrix=[[1.0, 0.0]]), "cannot reshape"),
-    "names": (lambda c: c["correlation"].update(names=["s1_zeta"]), "correlation has s1_zeta"),
+    "names": (lambda c: c["correlation"].update(names=["s1_zeta"]), "correlation contains s1_zeta"),
 }
 
 
@@ -507,7 +507,7 @@ def test_what_is_no_result_is_refused(tmp_path):
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
         with pytest.raises(InputError, match=r"fit\.json"):
             ff.predict(tmp_path, loop(seed=0))
-    with pytest.raises(InputError, match="not from a int"):
+    with pytest.raises(InputError, match="or its path, not int"):
         ff.predict(3, loop(seed=0))
     (tmp_path / "fit.json").unlink()
     (tmp_path / "cycles.json").write_text("{}")

@@ -149,7 +149,7 @@ def read_source(result: HasContent | str | Path) -> Source:
         where = str(content.get("test") or content.get("name") or "the result")
     else:
         kind = type(result).__name__
-        raise InputError(f"a prediction needs a result of fit or joint, or its path, not a {kind}")
+        raise InputError(f"a prediction needs a result of fit or joint, or its path, not {kind}")
     if not isinstance(content.get("parameters"), Mapping) or "model" not in content:
         raise InputError(f"{where} is not the result of a fit or joint fit (fit.json, joint.json)")
     try:
