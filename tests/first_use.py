@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -47,6 +48,14 @@ def struck() -> None:
     assert response.method == "Taylor series"
 
 
+def judge() -> None:
+    """The brute-force judge of the stability study."""
+    sys.path.append(str(Path(__file__).parents[1] / "experiments" / "stability"))
+    from independent import follow
+
+    follow(microscale(), ff.Impact(7e-3, 2.0), 1e-3 * TIME, 1e-6)
+
+
 if __name__ == "__main__":
     gc.disable()  # what compiling makes stays
-    {"many": many, "along": along, "struck": struck}[sys.argv[1]]()
+    {"many": many, "along": along, "struck": struck, "judge": judge}[sys.argv[1]]()

@@ -69,7 +69,7 @@ def judge(point: Point, answer: ff.Response) -> None:
         )
         resolved = (motion for motion in finer if motion.unresolved <= RTOL)
         assert any(difference(answer, motion) <= RTOL for motion in resolved), point
-    truth = independent.judge(*scene_of(point), 300_000)
+    truth = independent.judge(*scene_of(point), 180_000)
     if not truth.why and truth.unsure <= 0.1 * RTOL:
         assert difference(answer, truth) <= RTOL, point
 
