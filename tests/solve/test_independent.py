@@ -155,7 +155,9 @@ DAMPED = Bistable(5.75e6, 230e6, -3.07e6, 0.40, 0.70, 34.5e6, 1.15e6, 40.0)
 def test_impacts_of_the_reference(springs: tuple, masses: tuple | None, site: float) -> None:
     time = np.linspace(0.0, 1.2e-3, 60)
     made, drive = chain(*springs, masses=masses, site=site), Impact(7e-3, 4.44)
-    want, got = reference.reference_impact(made, drive, time, steps=300), follow(made, drive, time)
+    steps = 300 if site else 200  # the onsite damper needs more for an error far below 1e-9
+    want = reference.reference_impact(made, drive, time, steps=steps)
+    got = follow(made, drive, time)
     assert got.contact_end == pytest.approx(want.contact_end, rel=1e-9)
     assert over_range(got.base_stress, want.base_stress) <= 1e-9
     assert over_range(got.displacement, want.displacement) <= 1e-9
