@@ -3,14 +3,12 @@
 Question. How many problems does a method solve in a few seconds, and how fast?
 
 Method. Every method minimises the same residual (`fitting.objective.Objective`) of the same
-problems and is stopped after the same time. The lowest cost so far is recorded against the
-processor time of the single thread, which equals the elapsed time on an idle machine. A local
-method starts at a random point of the search box (`fitting.search.box_starts`, drawn from the seed)
-and restarts from the next one until the time is up. A global method that ends, and `foamfit.fit`,
-restart in the same way, `foamfit.fit` with another seed. A run also ends once its cost is within
-0.1 % of the best known. The eight methods are run twice: in the `lmfit.Parameters` of
-`foamfit.make_params` (SI values and bounds, as a user of lmfit would write them), and in the
-coordinates of foamfit's search, in which every point is admissible.
+problems for the same time. The lowest cost so far is recorded against the processor time of the
+single thread. Local methods start at random points of the search box (`fitting.search.box_starts`),
+one after the other until the time is up; global methods and `foamfit.fit` restart likewise. A run
+also ends once its cost is within 0.1 % of the best known. The eight methods run twice: in the
+`lmfit.Parameters` of `foamfit.make_params` (SI values and bounds, as a user of lmfit would write
+them), and in the coordinates of foamfit's search, in which every point is admissible.
 
 Answer. `foamfit.fit` solves all problems in 3 s; see identification.md.
 

@@ -3,23 +3,19 @@
 Method. Each scene is solved by the solver and by brute force or root finding. Fifteen families are
 drawn at random from a seed (every scene is synthetic):
 
-- study: the ranges of scenes.py;
-- base: impacts on a chain whose base spring has a dashpot, with a mass above it; windows from 1e-7
-  s up, shorter or longer than the contact;
+- study: the ranges of scenes.py; long: 3 to 10 springs with interior masses, few dashpots;
+- base: impacts on a chain with a base dashpot and a mass above it, from 1e-7 s to several contacts;
 - gap: unilateral springs that open, with derivatives with respect to parameters;
 - turns: displacement and stress histories with random turning points;
-- long: chains of 3 to 10 springs with interior masses and few or no dashpots;
-- microscale: one to three microscale springs, in all three drives, with spreads from 1e-3 to 2;
-- relaxation: one to three bistable springs with one to three relaxation terms each;
-- microscale+relaxation: both;
+- microscale: one to three of them, in all three drives, with spreads from 1e-3 to 2;
+- relaxation: one to three bistable springs with one to three relaxation terms; both together;
 - mixed: two to five springs of all kinds, with and without relaxation, dashpots and masses;
 - motion: two to four springs under a known motion, at least one of them microscale, with spreads
   from 1e-6 to 5, arbitrary time origins and steps that differ up to 1e8-fold, by root finding;
-- motion+relaxation: the same with relaxation and dashpots, by brute force;
-- worn: one to three microscale springs that remember what has snapped (stiffening, softening,
-  weakening), in all three drives; worn+relaxation: the same with relaxation;
-- worn chain: two to five springs of all kinds, most with masses between them;
-- worn motion: motion and motion+relaxation alternately.
+  motion+relaxation: the same with relaxation and dashpots, by brute force;
+- worn: one to three microscale springs with stiffening, softening and weakening, in all three
+  drives; worn+relaxation; worn chain: two to five springs of all kinds, most with masses; worn
+  motion: motion and motion+relaxation alternately.
 
 A tenth of the scenes with memory request derivatives.
 

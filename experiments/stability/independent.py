@@ -294,12 +294,6 @@ def _ends(p: Array, branch: int, rank: float, most: float) -> tuple[float, float
     return low, high, under, BOTH if branch != BOTH else AGAIN if differs else SNAP
 
 
-@inner
-def _strain(x: float, flags: Flags, i: int, p: Array) -> float:
-    branch = flags.branch[i]
-    return _mixture(p, branch, flags.ranks[i], flags.most[i], x)[0] if branch >= HELD else x
-
-
 # ----------------------------------------------------------------------------- the equations
 
 
@@ -582,7 +576,9 @@ def _record(
     while done < times.size and times[done] <= now:
         place = 0.0
         for i in range(springs.shape[0]):
-            x = _strain(y[moving + i], flags, i, springs[i])
+            x, branch = y[moving + i], flags.branch[i]
+            if branch >= HELD:
+                x = _mixture(springs[i], branch, flags.ranks[i], flags.most[i], x)[0]
             place += springs[i, H] * x
             nodes[i, done] = place
         base[done] = pressure
