@@ -323,21 +323,24 @@ def _group_term(
     if g > 0:
         u_n -= s[W, g - 1, n]
         rate_n -= s[V, g - 1, n]
-    single = i1 - i0 == 1
-    if single:
+    if i1 - i0 == 1:
         eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])  # the quotient depends on no result
+        sig[i0, n] = _stress_term(law, i0, eps, sig, n, memory)
+        if law[i0, DASHPOT] == 0.0:
+            return sig[i0, n]
+        return _damped_term(law, i0, i1, sig, rate_n, push_n, drag, n)
     damped, first = 0, -1
     for i in range(i0, i1):
         if law[i, DASHPOT] > 0.0:
             damped += 1
         elif first < 0 or (law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0):
             first = i  # on a flat branch the stress is exact (0 in an open gap)
-        if single or n == 0 or law[i, DASHPOT] > 0.0:
+        if n == 0 or law[i, DASHPOT] > 0.0:
             sig[i, n] = _stress_term(law, i, eps, sig, n, memory)
     if damped == i1 - i0:
         return _damped_term(law, i0, i1, sig, rate_n, push_n, drag, n)
-    if single or n == 0:
-        return sig[first, n]
+    if n == 0:
+        return sig[first, 0]
     return _share_elongation(law, i0, i1, eps, sig, u_n, n, memory)
 
 
@@ -396,17 +399,18 @@ def expand_bare(links: Links, s: Array, push: Array, order: int, memory: Memory 
             u_n, i0, i1 = w[g, n] - (w[g - 1, n] if g > 0 else 0.0), g, g + 1
             if memory is not None:
                 i0, i1 = springs_of(links.ends, g)
-            single, common = memory is None or i1 - i0 == 1, i0
-            if single:
+            if memory is None or i1 - i0 == 1:
                 eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])
+                sig[i0, n] = group[g, n] = _stress_term(law, i0, eps, sig, n, memory)
             elif n > 0:
                 group[g, n] = _share_elongation(law, i0, i1, eps, sig, u_n, n, memory)
-                continue
-            for i in range(i0, i1):
-                sig[i, n] = _stress_term(law, i, eps, sig, n, memory)
-                if not single and law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0:
-                    common = i  # see `_group_term`
-            group[g, n] = sig[common, n]
+            else:
+                common = i0
+                for i in range(i0, i1):
+                    sig[i, n] = _stress_term(law, i, eps, sig, n, memory)
+                    if law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0:
+                        common = i  # see `_group_term`
+                group[g, n] = sig[common, n]
         _accelerate(links, s, push, n)
 
 
