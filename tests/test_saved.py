@@ -118,7 +118,7 @@ def test_what_is_damaged_is_refused_in_one_sentence(name, change, words, tmp_pat
     with pytest.raises(ff.InputError, match=words) as caught:
         ff.load(tmp_path / "x")
     assert "\n" not in str(caught.value)
-    with pytest.raises(ff.InputError, match="is no folder"):
+    with pytest.raises(ff.InputError, match="is not a folder"):
         ff.load(tmp_path / "nowhere")
 
 

@@ -44,7 +44,7 @@ def load(folder: str | Path) -> FitResult | SavedJoint | CycleFits | pd.DataFram
     """
     place = Path(folder)
     if not place.is_dir():
-        raise InputError(f"{folder} is no folder; name a result folder that foamfit has written")
+        raise InputError(f"{folder} is not a folder; name a result folder of foamfit")
     if (place / "joint.json").is_file():
         return _joint(place)
     if (place / "cycles.json").is_file():
