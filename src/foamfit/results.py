@@ -248,7 +248,7 @@ class Check:
     question: str
     answer: bool | None  # None if unknown
     sentence: str  # evidence for the answer
-    warnings: tuple[str, ...] = ()  # for the reader, if the answer is no
+    warnings: tuple[str, ...] = ()  # shown if the answer is negative
     fatal: bool = False  # whether a "no" means that no acceptable fit was found
 
 
