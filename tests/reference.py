@@ -132,7 +132,7 @@ class BistableLaw:
         self.kh_plus, self.kh_minus = float(spring.kh_plus), float(spring.kh_minus)
         self.sigma_a = self.sigma("a", self.eps_a)
         self.sigma_c = self.sigma_a + float(spring.dsigma)
-        # find the start of branch c for which C2 lies on that branch
+        # Find the start of branch c for which C2 lies on that branch.
         part = root(lambda x: self.kc * x - self.sigma_c * (1 - x), 0.0, 1.0)
         self.eps_star = self.eps_c - part
         self.limit = 1.0 + self.eps_star

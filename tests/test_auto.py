@@ -284,7 +284,7 @@ def test_the_model_that_predicts_best_for_its_parameters_is_chosen():
 
 
 def test_no_model_twice_as_bad_with_no_fewer_parameters_is_chosen():
-    """This must be true for random criteria and predictions."""
+    """This is true for any criteria and predictions, here random numbers."""
     rng = np.random.default_rng(5)
     for _ in range(500):
         table = [

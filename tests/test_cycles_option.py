@@ -158,7 +158,7 @@ def test_a_branch_of_the_first_sample_was_reached(record: Path) -> None:
 
 @pytest.fixture(scope="module")
 def lifted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Chain]:
-    """Write two cycles of a spring that recovers more slowly than the platen, with a preload."""
+    """Write two cycles, after a preload, of a spring that recovers more slowly than the platen."""
     folder, rng = tmp_path_factory.mktemp("lifted"), np.random.default_rng(3)
     spring = replace(TRUTH, relaxation=((0.8, 0.5),))
     chain = ff.Chain([spring], [HEIGHT], AREA)

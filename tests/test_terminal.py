@@ -207,7 +207,7 @@ def test_what_springs_and_chains_refuse_is_an_input_error() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_in_code_that_cannot_raise_is_not_lost(number: signal.Signals) -> None:
-    """Callbacks with which numba loads compiled code are an example."""
+    """A signal may arrive in such code, as in the callbacks with which numba loads functions."""
     callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))
     hook = sys.unraisablehook
 

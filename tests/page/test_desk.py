@@ -460,7 +460,7 @@ def test_a_test_without_stress_and_motion_is_refused():
         Turning(bare, "bistable")
 
 
-# ------------------------------------------------------------------- what is fixed and varied
+# ------------------------------------------------------------- fixed and varied parameters
 
 
 def test_the_notebook_shows_a_history_and_its_chain(tmp_path):

@@ -29,7 +29,7 @@ KINDS = {
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory) -> JointResult:
-    """Run a joint fit of three loops from the true values; one test name contains HTML."""
+    """Fit three loops jointly, starting at the true values; one test name contains HTML."""
     up = np.linspace(0.0, 0.5, 50)
     strain, names = np.concatenate([up, up[::-1][1:]]), ("first", "second", "<i>third</i>")
     problems, vectors, x = [], [], np.log(np.array(RATES) / 0.1)
