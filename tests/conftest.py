@@ -1,4 +1,4 @@
-"""Shared synthetic tests: simulated impacts and loops with stated noise."""
+"""Shared synthetic tests: simulated impacts and loops with known noise."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-# Each process of the tests computes with one thread: small matrices gain nothing by more, and
-# threads that wait for a busy core take thirty times as long. NumPy reads this when imported.
+# Each test process uses one thread: more threads do not speed up small matrices, and threads that
+# wait for a busy core take thirty times as long. NumPy reads these variables when it is imported.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
@@ -29,19 +29,19 @@ ROOT = Path(__file__).parent.parent
 EXPERIMENTS = ROOT / "experiments"
 DATA = Path(os.environ.get("FOAMFIT_DATA", ROOT.parent / "shared" / "data"))
 
-gc.disable()  # what is imported and collected stays
+gc.disable()  # imported modules and collected tests live until exit
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
-os.environ["COLUMNS"] = "100"  # of what commands print, whatever the terminal of the tests
+os.environ["COLUMNS"] = "100"  # the same output width in every terminal
 
 needs_data = pytest.mark.skipif(
     not DATA.is_dir(), reason="the measurements of others are not beside this checkout"
 )
 
 
-# What compiles, in a process of its own, loops that a first fit does not need, and these loops.
+# This script compiles, in a separate process, the loops that a first fit does not need.
 FIRST_USE = Path(__file__).with_name("first_use.py")
 LOOPS = {
-    "struck": "integrate_with_memory",  # takes longest
+    "struck": "integrate_with_memory",  # first because it takes longest
     "along": "relaxed_along",
     "many": "integrate_aggregate",
 }
@@ -49,25 +49,25 @@ BEGUN = pytest.StashKey[list[subprocess.Popen[bytes]]]()
 
 
 def first_use(part: str) -> subprocess.Popen[bytes]:
-    """Begin to compile a part of what many tests need."""
+    """Start a process that compiles one group of loops."""
     return subprocess.Popen([sys.executable, str(FIRST_USE), part])
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Folders, and so the whole suite, are tested by all cores; single files in this process."""
+    """Use all cores to test folders or the full suite, and only this process for single files."""
     cores = min(os.cpu_count() or 1, 8)
     files = all(Path(arg.partition("::")[0]).is_file() for arg in config.args)
     return 0 if files or cores == 1 else cores
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile what several processes will need, once and on all cores.
+    """Compile the loops shared by the test processes once, on all cores.
 
-    The loops of a first fit before these processes start, the others while they collect the tests.
+    The loops of a first fit are compiled before the processes start, the others during collection.
     """
     if hasattr(session.config, "workerinput"):
-        # One of several is begun without Ctrl-C, and would begin others without it in the tests.
+        # A worker starts with Ctrl-C disabled, and processes started by tests would inherit this.
         signal.signal(signal.SIGINT, signal.default_int_handler)
     asked = session.config.option
     if asked.collectonly or not getattr(asked, "numprocesses", None):
@@ -76,28 +76,29 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         with precompile.side_by_side() as compile_rest:
             compile_rest()
     missing = [part for part, loop in LOOPS.items() if not cache.compiled(loop)]
-    judge = ["judge"] if missing else []  # of the stability study, which has a cache of its own
+    judge = ["judge"] if missing else []  # the stability study has a separate cache
     session.config.stash[BEGUN] = [first_use(part) for part in missing + judge]
 
 
 def pytest_collection_finish() -> None:
-    """Look for garbage in what the tests make, not in what was collected."""
+    """Restrict garbage collection to objects created by the tests."""
     gc.freeze()
     gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_node_collection_finished(node: Any) -> None:
-    """Let no process begin with its tests before all is compiled."""
+    """Wait until everything is compiled before any process starts its tests."""
     for process in node.config.stash.get(BEGUN, []):
         assert process.wait() == 0
 
 
 @pytest.fixture(scope="session", autouse=True)
 def compiled() -> Iterator[None]:
-    """Compile once, in two processes, what most tests need; no command then says that it does.
+    """Compile once, in two processes, the loops that most tests need.
 
-    The loops of many springs are compiled beside the first tests.
+    Commands then print no message about compiling. The loops for many springs are compiled while
+    the first tests run.
     """
     if cache.compiled():
         yield
@@ -109,7 +110,7 @@ def compiled() -> Iterator[None]:
 
 
 def thinned(path: Path, folder: Path, every: int) -> Path:
-    """Write each so-many-th row of a record into a folder."""
+    """Write every n-th row of a record into a folder (n is `every`)."""
     head, *rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
     (folder / path.name).write_text("".join([head, *rows[::every]]), encoding="utf-8")
     return folder / path.name
@@ -117,7 +118,7 @@ def thinned(path: Path, folder: Path, every: int) -> Path:
 
 @pytest.fixture(scope="session")
 def thin_foams(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Every fourth row of the shoe foams: each fit of them takes a quarter of the time."""
+    """Keep every fourth row of the shoe foams, so that each fit takes a quarter of the time."""
     place = tmp_path_factory.mktemp("thin")
     for folder in ("shoe-foam", "shoe-foam-twins"):
         (place / folder).mkdir()
@@ -127,18 +128,18 @@ def thin_foams(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a result folder be written with pictures of a few bytes."""
+    """Replace the pictures of result folders by files of a few bytes."""
     monkeypatch.setattr(result_folder, "draw_all", lambda *_: fabricated.no_figures().items())
 
 
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a result folder be written with pictures of a few bytes and an empty page."""
+    """Replace the pictures of result folders by files of a few bytes, and empty the page."""
     small_pictures(monkeypatch)
     monkeypatch.setattr(result_folder, "render_report", lambda *_, **__: "")
 
 
 def few_bytes(figure: object, place: Path, *_: object) -> bytes:
-    """Write what stands for a PNG and a PDF of a study."""
+    """Write placeholders for the PNG and the PDF of a study."""
     for suffix in (".png", ".pdf"):
         place.with_suffix(suffix).write_bytes(b"\x89PNG")
     return b"\x89PNG"
@@ -148,7 +149,7 @@ def few_bytes(figure: object, place: Path, *_: object) -> bytes:
 def synthetic_impact(
     velocity: float = 2.0, noise: float = 0.01, seed: int = 0, eta: float = 0.0, samples: int = 401
 ) -> tuple[ff.BistableSpring, Measurement]:
-    """A simulated impact on a spring with the published parameters of foam-1, time zero known."""
+    """Simulate an impact on a spring with the published values of foam-1 and known time zero."""
     spring = ff.published["foam-1/model-1"].bistable
     spring = ff.BistableSpring(*spring.seven, eta=eta)
     chain = ff.Chain([spring], [HEIGHT], AREA)
@@ -174,7 +175,7 @@ def synthetic_impact(
 
 @functools.cache
 def refused(path: Path, *words: str, specimen: Path | None = None) -> None:
-    """A test is refused in one sentence that has these words."""
+    """Check that a test is rejected with one sentence that contains these words."""
     with pytest.raises(ff.InputError) as caught:
         ff.read_test(path, specimen)
     message = str(caught.value)
@@ -184,7 +185,7 @@ def refused(path: Path, *words: str, specimen: Path | None = None) -> None:
 
 
 def synthetic_loop(noise: float = 0.005) -> tuple[ff.BistableSpring, Measurement]:
-    """A quasi-static loop without time and without striker."""
+    """Simulate a quasi-static loop without time and without a striker."""
     spring = ff.published["foam-1/model-1"].bistable
     strain = np.concatenate([np.linspace(0, 0.38, 200), np.linspace(0.38, 0.02, 200)[1:]])
     stress = spring.stress(strain)
@@ -196,7 +197,7 @@ def synthetic_loop(noise: float = 0.005) -> tuple[ff.BistableSpring, Measurement
 def loop_measurement(
     stress: np.ndarray, motion: np.ndarray, specimen: Specimen, time: np.ndarray | None = None
 ) -> Measurement:
-    """A measured loop: stress (Pa) along a motion (m), with its time (s) or without."""
+    """Return a measured loop of stress (Pa) and displacement (m), with or without time (s)."""
     return Measurement(
         name="synthetic loop",
         path=None,

@@ -1,8 +1,8 @@
-"""Run scenes without compilation and count what the compiled loops do; prints JSON.
+"""Run scenes without compilation, count the operations of the compiled loops, and print JSON.
 
-`NUMBA_DISABLE_JIT=1 python tests/counted.py`, by tests/test_counting.py. Nothing is asked of the
-loops themselves: springs and masses are arrays that note what is read of them, dashpots are numbers
-that note the arithmetic done with them, and `sys.setprofile` and `sys.settrace` see every call and
+`tests/test_counting.py` runs `NUMBA_DISABLE_JIT=1 python tests/counted.py`. The loops need no
+changes: springs and masses are arrays that count reads of their entries, dashpots are numbers that
+count the arithmetic done with them, and `sys.setprofile` and `sys.settrace` observe every call and
 every line.
 """
 
@@ -33,13 +33,13 @@ PACKAGE = Path(ff.__file__).parent
 
 @functools.cache
 def _module(filename: str) -> str:
-    """The project's module of a file; empty for any other file."""
+    """Return the name of the project's module in a file, or "" for any other file."""
     path = Path(filename)
     return path.stem if path.is_relative_to(PACKAGE) else ""
 
 
 def _caller() -> str:
-    """The project's module that is at work."""
+    """Return the project's module that is being executed."""
     frame: Any = sys._getframe(1)
     while not _module(frame.f_code.co_filename):
         frame = frame.f_back
@@ -47,7 +47,7 @@ def _caller() -> str:
 
 
 class Counted(np.float64):
-    """A number that counts the arithmetic done with it (comparisons are free)."""
+    """A number that counts the arithmetic done with it (comparisons are not counted)."""
 
     tag = "dashpot arithmetic"
 
@@ -57,7 +57,7 @@ class Counted(np.float64):
 
 
 class CountedDrag(Counted):
-    """The onsite damper, counted apart."""
+    """The onsite damper, counted separately."""
 
     tag = "onsite arithmetic"
 
@@ -72,7 +72,7 @@ for _name in ("add", "radd", "sub", "rsub", "mul", "rmul", "truediv", "rtruediv"
 
 
 class Springs(np.ndarray):
-    """Rows of springs that count which columns are read, by kind of spring."""
+    """Rows of springs that count the reads of each column, by kind of spring."""
 
     def __getitem__(self, key: Any) -> Any:
         value = super().__getitem__(key)
@@ -102,7 +102,7 @@ class Masses(np.ndarray):
 
 
 class Numbers(np.ndarray):
-    """The numbers that explicit steps take in one array: the onsite damper is the first."""
+    """The array of scalar inputs of the explicit steps; the onsite damper comes first."""
 
     def __getitem__(self, key: Any) -> Any:
         value = super().__getitem__(key)
@@ -110,26 +110,26 @@ class Numbers(np.ndarray):
 
 
 def integrate(*given: Any) -> Any:
-    """Take explicit steps with an onsite damper that is counted."""
+    """Take explicit steps and count the use of the onsite damper."""
     return _integrate(*given[:4], given[4].view(Numbers), *given[5:])
 
 
 _integrate, taylor.integrate = taylor.integrate, integrate
 
 
-# Dashpots are kept with the branches of their springs: the lines that reckon with them are seen.
+# Dashpots are stored in the rows of their springs, so the lines that compute with them are counted.
 DASHPOT = re.compile(r"[*/] *\(?[\w.]*(rows\[\w+, ETA|law\[\w+, DASHPOT)|, (ETA|DASHPOT)\] *[*/]")
 
 
 @functools.cache
 def _dashpot_lines(filename: str) -> frozenset[int]:
-    """Lines of a module of the project on which something is reckoned with a dashpot."""
+    """Return the line numbers of a project module that compute with a dashpot."""
     lines = Path(filename).read_text().splitlines() if _module(filename) else []
     return frozenset(n for n, line in enumerate(lines, start=1) if DASHPOT.search(line))
 
 
 def tracer(frame: Any, event: str, _: Any) -> Any:
-    """Count the lines run on which something is reckoned with a dashpot."""
+    """Count the executed lines that compute with a dashpot."""
     lines = _dashpot_lines(frame.f_code.co_filename)
     if not lines or _module(frame.f_code.co_filename) in ("steps", "control", "rates"):
         return None
@@ -156,7 +156,7 @@ def profiler(frame: Any, event: str, _: Any) -> None:
 
 
 def run(chain: ff.Chain, drive: Drive, t: np.ndarray) -> dict[str, Any]:
-    """Counts of one run, the sizes of what has a state, and the steps taken."""
+    """Return the counts of one run, the sizes of the state, and the number of steps."""
     made = plan(chain, drive, t)
     made = made._replace(mass=made.mass.view(Masses))
     rows = np.array([spring.row for spring in chain.springs]).view(Springs)
@@ -186,9 +186,10 @@ KNOWN = ("contact_time", "displacement_zero")
 
 
 def slopes(held: tuple[str, ...], way: str) -> dict[str, Any]:
-    """Counts of one derivative of a residual where some parameters are held, and its columns.
+    """Return the counts and columns of one residual derivative with some parameters fixed.
 
-    `way` is that of the refinement ("fit"), of the search ("search"), or "none": a residual alone.
+    `way` selects the derivative of the refinement ("fit") or of the search ("search"), or only the
+    residual ("none").
     """
     spring, height, area = ff.published["foam-1/model-1"].bistable, 1.19e-3, 1.9635e-5
     time = np.linspace(0.0, 0.75e-3, 21)

@@ -11,12 +11,12 @@ HEIGHT, AREA = 10e-3, 1e-4
 FRESH = ff.BistableSpring(
     k0=5.5e6, kc=20e6, dsigma=-0.3e6, eps_a=0.14, eps_c=0.27, kh_plus=2e6, kh_minus=2.2e6
 )
-# What changes from cycle to cycle, and nothing else: where snapping starts, and the start strain.
+# Only the onset of snapping and the strain at the start change from cycle to cycle.
 ONSETS, SETS = (0.14, 0.11, 0.10), (0.0, 0.02, 0.03)
 
 
 def write_record(folder: Path) -> Path:
-    """Write a record of three cycles on a foam whose snapping starts earlier each time."""
+    """Write a record of three cycles on a foam that starts to snap earlier in each cycle."""
     springs = [replace(FRESH, eps_a=onset) for onset in ONSETS]
     strain, stress = [], []
     for spring, gone in zip(springs, SETS, strict=True):

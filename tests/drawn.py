@@ -1,4 +1,4 @@
-"""Figures of every kind, made of results that were never fitted, or in no time."""
+"""Figures of every kind, drawn from fabricated results and fast simulations."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def response() -> Any:
 
 @functools.cache
 def figures(width: str = "two") -> tuple[tuple[str, Figure], ...]:
-    """All figures that can be made of little; they are not to be changed."""
+    """Return all figures that are quick to draw; callers must not modify these shared figures."""
     return tuple(_figures(width))
 
 

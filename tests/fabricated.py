@@ -1,4 +1,4 @@
-"""A fit that was never made: the spring law along a half-sine motion, with a little noise."""
+"""A fabricated fit: the spring law along a half-sine motion, with a little noise."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ UNITS = {
 def half_sine(
     spring: BistableSpring = SPRING, top: float = 0.35, n: int = 601
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[Switch, ...]]:
-    """Time (s), strain, stress (Pa) and switches of the spring pressed to `top` and let go."""
+    """Return time (s), strain, stress (Pa) and switches of one loading to `top` and unloading."""
     time = np.linspace(0.0, 0.9e-3, n)
     strain = top * np.sin(np.pi * time / time[-1])
     stress, flag, branch, switches = np.empty(n), "a", "a", []
@@ -108,7 +108,7 @@ def parameters() -> dict[str, ParameterEstimate]:
 
 
 def result(**changed: Any) -> FitResult:
-    """Return a whole result of a one-spring impact fit; anything can be replaced."""
+    """Return the complete result of a one-spring impact fit; any field can be replaced."""
     time, strain, stress, switches = half_sine()
     random = np.random.default_rng(0)
     measured_stress = stress + 0.03e6 * random.standard_normal(time.size)
@@ -163,7 +163,7 @@ def result(**changed: Any) -> FitResult:
 
 
 def budget(**shares: float) -> Budget:
-    """An uncertainty budget of two parameters, its sources over the value."""
+    """Return an uncertainty budget of two parameters; sources are given relative to the value."""
     given = {"noise": 0.01} | {name.replace("_", " "): share for name, share in shares.items()}
     row = dict.fromkeys(SOURCES, 0.0) | given
     values = {"s1_k0": SPRING.k0, "s1_eps_a": SPRING.eps_a}
@@ -174,7 +174,7 @@ def budget(**shares: float) -> Budget:
 
 
 def chain_result() -> FitResult:
-    """Return a result of linear+bistable, with names that must stay apart."""
+    """Return a result of linear+bistable, whose parameter names must not be confused."""
     one = result()
     springs = [LinearSpring(k0=60e6), SPRING]
     switches = tuple(
@@ -191,7 +191,7 @@ def chain_result() -> FitResult:
 
 
 def microscale_result(**changed: Any) -> FitResult:
-    """Return a result of a microscale spring that relaxes, along a slow triangle to 60 %."""
+    """Return a result of a relaxing microscale spring under a slow triangular strain up to 60 %."""
     time = np.linspace(0.0, 5.0, 401)
     strain = 0.6 * (1.0 - np.abs(time / 2.5 - 1.0))
     stress = np.asarray(MICRO.stress(strain))
@@ -200,7 +200,7 @@ def microscale_result(**changed: Any) -> FitResult:
     def at(place: int, source: str, target: str) -> Switch:
         return Switch(1, source, target, time[place], strain[place] * HEIGHT, stress[place])
 
-    back = 214  # where the largest held stress has come down to the first snap-back
+    back = 214  # sample at which unloading reaches the first snap-back
     switches = (
         at(3, "a", "snap-through"), at(50, "snap-through", "held"), at(51, "held", "snap-through"),
         at(200, "snap-through", "held"), at(back, "held", "snap-back"),
@@ -231,7 +231,7 @@ def microscale_result(**changed: Any) -> FitResult:
 
 
 def no_figures() -> dict[str, Images | None]:
-    """What stands for the figures of a report, of which drawing takes longest."""
+    """Return placeholders for the figures of a report, whose drawing takes most of the time."""
     few = b"\x89PNG" + bytes(20)
     there = {"fit": Images(few, 250, b"%PDF")} | dict.fromkeys(
         ("shown", "narrow"), Images(few, 250)

@@ -1,6 +1,6 @@
-"""Compile loops that a first fit does not need and many tests do: `python first_use.py many`.
+"""Compile loops that many tests need but a first fit does not: `python first_use.py many`.
 
-Called in processes of their own by conftest.py, side by side, before or beside the tests.
+conftest.py runs this script in parallel processes, before or during the tests.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ TIME = np.linspace(0.0, 1.0, 50)
 
 
 def many() -> None:
-    """Springs that count as one."""
+    """Compile the aggregate of many springs, which is solved as one spring."""
     spring = ff.published["foam-1/model-1"].bistable
     chain = ff.Chain([spring] * 12, [1e-3] * 12, 2e-5)
     response = ff.simulate(chain, ff.Impact(7e-3, 2.0), 1e-3 * TIME)
@@ -25,13 +25,13 @@ def many() -> None:
 
 
 def microscale(*relaxation: tuple[float, float]) -> ff.Chain:
-    """A microscale spring."""
+    """Return a chain of one microscale spring."""
     spring = ff.MicroscaleSpring(5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77, relaxation=relaxation)
     return ff.Chain([spring], [1e-2], 1e-4)
 
 
 def along() -> None:
-    """A microscale spring without and with relaxation, along a motion and a stress."""
+    """Compile a microscale spring, with and without relaxation, under displacement and stress."""
     moved = ff.DisplacementDrive(3e-3 * np.sin(np.pi * TIME))
     pressed = ff.StressDrive(1e5 * np.sin(np.pi * TIME))
     for chain, drive in (
@@ -41,7 +41,7 @@ def along() -> None:
 
 
 def struck() -> None:
-    """A microscale spring that relaxes, struck."""
+    """Compile the impact on a relaxing microscale spring."""
     response = ff.simulate(
         microscale((0.5, 0.2)), ff.Impact(7e-3, 2.0), 1e-3 * TIME, sensitivities=["s1_kc"]
     )
@@ -49,7 +49,7 @@ def struck() -> None:
 
 
 def judge() -> None:
-    """The brute-force judge of the stability study."""
+    """Compile the brute-force reference of the stability study."""
     sys.path.append(str(Path(__file__).parents[1] / "experiments" / "stability"))
     from independent import follow
 
@@ -57,5 +57,5 @@ def judge() -> None:
 
 
 if __name__ == "__main__":
-    gc.disable()  # what compiling makes stays
+    gc.disable()  # compiled objects live until exit
     {"many": many, "along": along, "struck": struck, "judge": judge}[sys.argv[1]]()

@@ -1,4 +1,4 @@
-"""An executor without processes: to start one takes seconds."""
+"""An executor without processes, because starting a process takes seconds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 class Inline(Executor):
-    """Calls at once, in this process, with what would arrive in another one."""
+    """Call immediately in this process, with arguments pickled as for another process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future = Future[Any]()

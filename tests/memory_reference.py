@@ -1,7 +1,8 @@
-"""An independent integrator of chains in which springs remember: SciPy, from event to event.
+"""An independent integrator for chains of springs with memory: SciPy, from event to event.
 
-Unlike foamfit, it has no series, no strains as state and no least rank: the state are the
-equilibrium stresses of the springs, ds/dt = (dε/dt)/(dε/ds), what relaxes, and the masses.
+Unlike foamfit, it uses no power series, no strains as state variables and no lowest rank. The state
+consists of the equilibrium stresses of the springs, ds/dt = (dε/dt)/(dε/ds), the relaxation
+variables, and the motion of the masses.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from foamfit.springs.chain import Drive
 Array = NDArray[np.float64]
 PLUS, MINUS, HELD, BOTH, VIRGIN = "plus", "minus", "held", "both", "virgin"
 FIRST = "first"
-LEAST = -12.0  # rank below which a share of 2e-33 has snapped
+LEAST = -12.0  # rank at which the snapped fraction is 2e-33
 
 
 class Linear:
@@ -33,14 +34,14 @@ class Linear:
         return s / self.spring.k0, 1.0 / self.spring.k0
 
     def bears(self, s: float) -> float:
-        """Stress that the spring passes on."""
+        """Return the stress that the spring transmits."""
         return s
 
     def ends(self) -> tuple[float, float]:
         return -math.inf, math.inf
 
     def turns(self) -> int:
-        """Sign of ds/dt with which the mode ends; 0 if with neither."""
+        """Return the sign of ds/dt that ends the mode, or 0 if neither sign does."""
         return 0
 
     def leave(self, s: float, side: int) -> None:
@@ -51,7 +52,7 @@ class Linear:
 
 
 class Unilateral(Linear):
-    """Alone between two masses: what is followed is k ε also where the gap is open."""
+    """A unilateral spring alone between two masses; its state s = k ε also covers an open gap."""
 
     def bears(self, s: float) -> float:
         return max(s, 0.0)
@@ -64,7 +65,7 @@ class Unilateral(Linear):
 
 
 class Bistable(Linear):
-    """Eqs. 1 to 3, by stress."""
+    """Eqs. 1 to 3 as functions of stress."""
 
     def __init__(self, spring: Any) -> None:
         self.spring, self.mode = spring, "a"
@@ -94,7 +95,7 @@ class Bistable(Linear):
 
 
 class Microscale(Linear):
-    """Section 6 of the model: p in ranks, from p = 0 on."""
+    """Section 6 of the model, with p expressed by ranks, starting from p = 0."""
 
     def __init__(self, spring: Any) -> None:
         self.spring, self.rank, self.mode = spring, LEAST, VIRGIN
@@ -104,7 +105,7 @@ class Microscale(Linear):
         return (p.sigma_minus, p.spread_minus) if minus else (p.sigma_plus, p.spread_plus)
 
     def _cross(self) -> float:
-        """Stress at which P₊ = P₋ as they stand."""
+        """Return the stress at which P₊ = P₋ for the current parameters."""
         (plus, spread), (minus, other) = self._of(False), self._of(True)
         if spread == other:
             return math.inf if minus < plus else 0.0
@@ -123,7 +124,7 @@ class Microscale(Linear):
         p = self.spring
         middle, spread = self._of(self.mode == MINUS)
         u, steep = self.rank if self.mode == HELD else -math.inf, 0.0
-        if self.mode not in (HELD, VIRGIN) and s > 0.0:  # a trial may go past the event
+        if self.mode not in (HELD, VIRGIN) and s > 0.0:  # a trial step may pass 0
             u = math.log(s / middle) / spread
             steep = math.exp(-0.5 * u * u) / math.sqrt(2.0 * math.pi) / (spread * s)
         snapped, rest = ndtr(u), ndtr(-u)
@@ -133,7 +134,7 @@ class Microscale(Linear):
 
     def ends(self) -> tuple[float, float]:
         p, cross = self.spring, self._cross()
-        below = p.spread_minus >= p.spread_plus  # hysteretic below the crossing
+        below = p.spread_minus >= p.spread_plus  # True if the law is hysteretic below the crossing
         plus, minus = (m * math.exp(w * self.rank) for m, w in (self._of(False), self._of(True)))
         if self.mode == HELD:
             return min(plus, minus), plus
@@ -164,11 +165,11 @@ class Microscale(Linear):
 
 
 class Remembering(Microscale):
-    """Section 8 of the model: what has snapped once is softer and snaps through earlier."""
+    """Section 8 of the model: micro-springs that have snapped are softer and snap earlier."""
 
     def __init__(self, spring: Any) -> None:
         super().__init__(spring)
-        self.most = LEAST  # the rank up to which micro-springs have ever snapped
+        self.most = LEAST  # highest rank that has ever snapped
 
     def _of(self, minus: bool) -> tuple[float, float]:
         middle, spread = super()._of(minus)
@@ -247,7 +248,7 @@ def law_of(spring: Any) -> Linear:
 def follow(
     chain: ff.Chain, drive: Drive, t: Array, tol: float = 1e-12, method: str = "DOP853"
 ) -> tuple[Array, Array, float, int]:
-    """Displacements (springs, n), base stress (n,), end of contact or NaN, and events."""
+    """Return displacements (springs, n), base stress (n,), end of contact or NaN, and events."""
     laws, h, count = [law_of(s) for s in chain.springs], np.array(chain.heights), len(chain.springs)
     eta = np.array([s.eta for s in chain.springs])
     terms = [(i, g, tau) for i, s in enumerate(chain.springs) for g, tau in s.relaxation if g > 0.0]
@@ -259,7 +260,7 @@ def follow(
     struck = isinstance(drive, ff.Impact)
     if isinstance(drive, ff.Impact):
         mass[-1] += drive.mass / chain.area
-        if isinstance(laws[0], Unilateral):  # contact ends where it opens
+        if isinstance(laws[0], Unilateral):  # contact ends when the top spring opens
             laws[0] = Linear(chain.springs[0])
     moved = isinstance(drive, ff.DisplacementDrive)
     heavy = [i for i in range(count) if mass[i] > 0.0 and not (moved and i == count - 1)]
@@ -273,7 +274,7 @@ def follow(
     knot, _free, pressed = 0, bool(heavy) and heavy[-1] == count - 1, not struck and not moved
 
     def rates(now: float, y: Array) -> tuple[Array, float]:
-        """Derivative of the state [s, z, w and v of masses], and the base stress."""
+        """Return the derivative of the state [s, z, w and v of masses] and the base stress."""
         s, z, w = y[:count], y[count : count + len(terms)], y[count + len(terms) :]
         v = dict(zip(heavy, w[1::2], strict=True))
         slope = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot]) if not struck else 0.0
@@ -381,7 +382,7 @@ def follow(
                 laws[i].leave(laws[i].ends()[0 if side < 0 else 1], side)
         if not struck and now >= t[knot + 1] and knot < t.size - 2:
             knot += 1
-            if moved:  # a dashpot feels the mean rate
+            if moved:  # at a kink a dashpot uses the mean of the rates on both sides
                 share = (now - t[knot - 1]) / (t[knot + 1] - t[knot - 1])
                 out_s[knot] += share * (rates(now, y)[1] - out_s[knot])
     return out_w, out_s, end, events

@@ -1,10 +1,10 @@
-"""An independent reference for the spring law and for the chain: slow, plain and trustworthy.
+"""An independent reference for the spring law and for the chain: slow, simple and reliable.
 
 Nothing here uses the package. Springs and chains are any objects with the attributes of `Bistable`,
-`Linear` and `Chain` below. Derived points are roots of the branch functions found by bracketing;
-motions are integrated with DOP853 and frozen branches, stopped exactly at every switch, and
-restarted there. Springs between two nodes that carry mass (or are clamped or driven) form a group:
-they are in series and carry one stress, found from the group's state.
+`Linear` and `Chain` below. Derived points are roots of the branch functions, found by bracketing.
+Motions are integrated with DOP853 on fixed branches; the integration stops exactly at every switch
+and restarts there. Springs between two nodes that have mass (or are clamped or driven) form a
+group: they are in series and carry the same stress, which follows from the group's state.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -59,7 +59,7 @@ class Impact:
 
 @dataclass
 class Motion:
-    """Motion of the nodes; `velocity` is given for those with mass, and zero for the others."""
+    """Motion of the nodes; `velocity` is zero for nodes without mass."""
 
     time: Array
     displacement: Array
@@ -121,10 +121,10 @@ class LinearLaw:
 
 
 class BistableLaw:
-    """The seven-parameter law, written down branch by branch."""
+    """The seven-parameter law, branch by branch."""
 
     start = "a"
-    nearly_parallel = False  # rounding alone decides whether a and e meet
+    nearly_parallel = False  # if True, rounding decides whether a and e meet
 
     def __init__(self, spring: Any) -> None:
         self.k0, self.kc = float(spring.k0), float(spring.kc)
@@ -132,7 +132,7 @@ class BistableLaw:
         self.kh_plus, self.kh_minus = float(spring.kh_plus), float(spring.kh_minus)
         self.sigma_a = self.sigma("a", self.eps_a)
         self.sigma_c = self.sigma_a + float(spring.dsigma)
-        # C2 lies on branch c: where that branch would have to start for it to do so
+        # Find the start of branch c for which C2 lies on that branch.
         part = root(lambda x: self.kc * x - self.sigma_c * (1 - x), 0.0, 1.0)
         self.eps_star = self.eps_c - part
         self.limit = 1.0 + self.eps_star
@@ -143,7 +143,7 @@ class BistableLaw:
     def _find_hat_c(self) -> float:
         part = self.eps_c - self.eps_star
 
-        def gap(beyond: float) -> float:  # c − d beyond C2, multiplied by the room to the pole
+        def gap(beyond: float) -> float:  # c − d beyond C2, multiplied by the distance to the pole
             x = part + beyond
             return self.kc * x - (1 - x) * self.sigma("d", self.eps_c + beyond)
 
@@ -194,7 +194,7 @@ class BistableLaw:
         return self.eps_c + (sigma - self.sigma_c) / self.kh_minus
 
     def bounds(self, branch: str) -> list[tuple[float, int, str]]:
-        """Where a branch ends: (strain, direction in which it is left, branch that follows)."""
+        """Return the ends of a branch: (strain, direction of leaving, next branch)."""
         if branch == "a":
             return [(self.eps_a, +1, "d")]
         if branch == "d":
@@ -226,7 +226,7 @@ class BistableLaw:
         return np.array([self.sigma(branch, eps) for branch, eps in pairs])
 
     def strain_at(self, flag: str, sigma: float) -> float:
-        """Strain at a stress, by bracketing on the whole monotone curve that the flag allows."""
+        """Return the strain at a stress by bracketing on the monotone curve that `flag` selects."""
 
         def gap(eps: float) -> float:
             return self.sigma(self.branch(flag, eps), eps) - sigma
@@ -250,7 +250,7 @@ class BistableLaw:
         return np.array(out)
 
     def pieces(self, history: ArrayLike) -> Iterator[list[tuple[str, float, float]]]:
-        """For each sample, the pieces of branch on the way to it from the one before."""
+        """Yield for each sample the branch segments traversed since the previous sample."""
         branch, here = "a", 0.0
         for there in np.asarray(history, float):
             out, sense = [], 1 if there >= here else -1
@@ -268,13 +268,13 @@ class BistableLaw:
         return 0.5 * (stop - start) * float(w @ [self.sigma(branch, e) for e in eps])
 
     def work(self, history: ArrayLike) -> Array:
-        """∫σ dε along a history that starts from rest."""
+        """Return ∫σ dε along a history that starts from rest."""
         steps = [sum(self.integral(*piece) for piece in way) for way in self.pieces(history)]
         return np.cumsum(steps)
 
     @property
     def loop(self) -> float:
-        """Energy per volume that one closed loop takes."""
+        """Return the energy per volume dissipated in one closed loop."""
         if self.eps_hat_a is None:
             raise ValueError("this loop is not closed by branch a")
         corners = [
@@ -292,7 +292,7 @@ def _law(spring: Any) -> BistableLaw | LinearLaw:
 
 
 def law(spring: Any) -> Any:
-    """The law of any object that has a spring's attributes."""
+    """Return the law of any object that has the attributes of a spring."""
     return _law(spring)
 
 
@@ -301,7 +301,7 @@ def law(spring: Any) -> Any:
 
 @dataclass
 class _Group:
-    """Springs in series between two nodes of known motion; they carry one stress."""
+    """Springs in series between two nodes of known motion; all carry the same stress."""
 
     springs: list[int]  # indices, base first
     bottom: int  # index of the node below (0 is the base)
@@ -309,11 +309,11 @@ class _Group:
 
 
 class _System:
-    """Right-hand side and outputs of a chain, with the branches frozen in `self.branch`.
+    """Right-hand side and outputs of a chain on the fixed branches `self.branch`.
 
-    The state is: strains of the springs with a dashpot, then displacement and velocity of every
-    node with mass, then, in the stress drive, the displacement of a top node that has no mass but
-    a damper to the ground.
+    The state contains the strains of the springs with a dashpot, then displacement and velocity of
+    every node with mass, then, under a prescribed stress, the displacement of a top node that has
+    no mass but a damper to the ground.
     """
 
     def __init__(self, chain: Any, striker: float, drive: str) -> None:
@@ -347,14 +347,14 @@ class _System:
         self.size = k + (1 if self.damped_top else 0)
         self.branch = [lw.start for lw in self.laws]
         self.guess = [0.0] * len(self.groups)
-        # set for each interval between samples: value at its start and rate
+        # drive in the current interval between samples: start time, start value and rate
         self.t0 = self.value = self.rate = 0.0
 
     def driven(self, t: float) -> float:
         return self.value + self.rate * (t - self.t0)
 
     def series(self, springs: Sequence[int], length: float, guess: float) -> float:
-        """Stress at which springs without dashpots, in series, shorten by `length` together."""
+        """Return the stress at which springs in series without dashpots shorten by `length`."""
         if len(springs) == 1:
             i = springs[0]
             return float(self.laws[i].sigma(self.branch[i], length / self.h[i]))
@@ -369,7 +369,7 @@ class _System:
         soft += [self.laws[i].kc for i in springs if self.branch[i] == "c"]
         floor = -min(soft, default=np.inf)
         s = guess
-        for _ in range(30):  # Newton; the bracket below is for where it fails
+        for _ in range(30):  # Newton's method; if it fails, the bracketing below takes over
             if s <= floor:
                 break
             eps = [self.laws[i].inverse(self.branch[i], s) for i in springs]
@@ -380,7 +380,7 @@ class _System:
             )
             step = miss / soften
             s -= step
-            if abs(step) <= 1e-14 * abs(s) + 1e-9:  # the step just taken leaves its square
+            if abs(step) <= 1e-14 * abs(s) + 1e-9:  # the remaining error is of second order
                 return s
         scale = max(self.laws[i].k0 for i in springs)
         high = scale
@@ -392,7 +392,7 @@ class _System:
         return root(gap, low, high)
 
     def solve(self, t: float, y: Any) -> tuple[list[float], list[float], list[float], float]:
-        """Strains, group stresses, node positions at group ends, and the velocity of the top."""
+        """Return strains, group stresses, node positions at group ends, and the top velocity."""
         strain = [0.0] * self.n
         for i, k in self.at_strain.items():
             strain[i] = y[k]
@@ -421,7 +421,7 @@ class _System:
                 rest = sum(self.h[i] * sigma[i] / self.eta[i] for i in dashed)
                 if group.top in speed:
                     s = (speed[group.top] - speed[group.bottom] + rest) / flow
-                else:  # the top's own damper takes what the springs do not
+                else:  # the damper of the top node carries the rest of the stress
                     push = self.driven(t) - self.site * (speed[group.bottom] - rest)
                     s = push / (1.0 + self.site * flow)
             if free and not loaded and any(self.branch[i] == "off" for i in free):
@@ -504,7 +504,7 @@ def _integrate(
     rtol: float,
     steps: int,
 ) -> Motion:
-    """Integrate from t[0] to t[-1]; `knots` are where the drive has kinks, `samples` its values."""
+    """Integrate from t[0] to t[-1]; the drive has kinks at `knots` with the values `samples`."""
     n_t = len(t)
     out = Motion(t, np.zeros((system.n, n_t)), np.zeros((system.n, n_t)), np.zeros(n_t), t * 0)
 
@@ -523,7 +523,7 @@ def _integrate(
             system.rate = float(samples[j + 1] - samples[j]) / (stop - here)
         if j == 0:
             record(0, here, y)
-        elif system.drive == "displacement":  # the rate has just jumped; knots are samples here
+        elif system.drive == "displacement":  # the rate jumps at each knot, which is a sample here
             out.base_stress[j] = 0.5 * (out.base_stress[j] + system.output(here, y)[2])
         while here < stop:
             functions, meaning = system.events()
@@ -562,7 +562,7 @@ def _integrate(
                     system.branch[i] = following
                     flipped.add(i)
                     out.switches.append((here, i, following))
-            # springs that switch at the very same time
+            # other springs may switch at the same instant
             strain = system.solve(here, y.tolist())[0]
             for i in set(range(system.n)) - flipped:
                 for where, sense, following in system.laws[i].bounds(system.branch[i]):
@@ -574,7 +574,7 @@ def _integrate(
 
 
 def _missed(found: Any, functions: Sequence[Any], meaning: Sequence[tuple[int, str]]) -> bool:
-    """Tell whether an event came and went within one step, where its sign at the ends is silent."""
+    """Return whether an event was missed because its function changed sign twice in a step."""
     for start, stop in pairwise(found.t):
         for part in (0.25, 0.5, 0.75):
             at = start + part * (stop - start)
@@ -586,7 +586,7 @@ def _missed(found: Any, functions: Sequence[Any], meaning: Sequence[tuple[int, s
 
 
 def _fly(system: _System, out: Motion, here: float, y: Array) -> None:
-    """After the end of contact everything moves as the striker does at that time."""
+    """Let all nodes follow the free flight of the striker after the end of contact."""
     nodes, speeds, _ = system.output(here, y)
     out.contact_end, out.rebound = here, -speeds[-1]
     for k in np.flatnonzero(out.time > here):
@@ -615,7 +615,7 @@ def _scale(system: _System, speed: float) -> Array:
 def reference_impact(
     chain: Any, drive: Any, t: ArrayLike, rtol: float = 1e-12, steps: int = 800
 ) -> Motion:
-    """Striker on top with its velocity at t[0], all else at rest, until contact ends."""
+    """Simulate an impact at t[0] on a chain at rest until contact ends."""
     t = np.asarray(t, float)
     system = _System(chain, float(drive.mass), "impact")
     y = np.zeros(system.size)
@@ -625,7 +625,7 @@ def reference_impact(
 
 
 def reference_stress(chain: Any, stress: ArrayLike, t: ArrayLike, rtol: float = 1e-12) -> Motion:
-    """Stress history on top, straight between samples; from rest."""
+    """Simulate a stress history on top, linear between samples, starting from rest."""
     t, load = np.asarray(t, float), np.asarray(stress, float)
     system = _System(chain, 0.0, "stress")
     if system.size == 0:
@@ -639,10 +639,10 @@ def reference_stress(chain: Any, stress: ArrayLike, t: ArrayLike, rtol: float = 
 def reference_displacement(
     chain: Any, displacement: ArrayLike, t: ArrayLike, rtol: float = 1e-12
 ) -> Motion:
-    """Displacement of the top prescribed, straight between samples; from rest.
+    """Simulate a prescribed displacement of the top, linear between samples, starting from rest.
 
-    Where a dashpot makes the base stress follow the velocity, which jumps at a sample, the stress
-    at the sample is the mean of its limits from both sides (at either end, the one there is).
+    The velocity jumps at samples. If a dashpot makes the base stress depend on the velocity, the
+    stress at a sample is the mean of the limits from both sides (at the ends, the only limit).
     """
     t, w = np.asarray(t, float), np.asarray(displacement, float)
     system = _System(chain, 0.0, "displacement")
@@ -670,7 +670,7 @@ def _quasi_static(system: _System, w: Array, t: Array) -> Motion:
                 return sum(h * lw.strain_at(f, s) for h, lw, f in parts) - total
 
             slack = [i for i, lw in enumerate(system.laws) if getattr(lw, "unilateral", False)]
-            if slack and gap(0.0) > 0.0:  # longer than at rest: a gap opens, nothing is carried
+            if slack and gap(0.0) > 0.0:  # longer than at rest: a gap opens and the stress is zero
                 base[k] = 0.0
                 eps = [lw.strain_at(f, 0.0) for lw, f in zip(system.laws, flags, strict=True)]
                 open_by = gap(0.0) / sum(system.h[i] for i in slack)
@@ -694,11 +694,11 @@ def _quasi_static(system: _System, w: Array, t: Array) -> Motion:
 def energy_balance(
     chain: Any, drive: Any, displacement: ArrayLike, velocity: ArrayLike
 ) -> dict[str, Array]:
-    """Energies of an undamped impact, in J, at the given samples of the motion.
+    """Return the energies of an undamped impact, in J, at the given samples of the motion.
 
-    `brought` is the striker's kinetic energy at contact; `kinetic` that of all masses; `work` what
-    the springs have taken, of which `dissipated` is what closed loops have kept and `stored` the
-    rest. `brought` = `kinetic` + `work` while contact lasts.
+    `brought` is the kinetic energy of the striker at contact and `kinetic` the kinetic energy of
+    all masses. `work` is the work done on the springs: `dissipated` is the part lost in closed
+    loops, `stored` the rest. During contact, `brought` = `kinetic` + `work`.
     """
     w, v = np.atleast_2d(displacement), np.atleast_2d(velocity)
     n = len(chain.springs)

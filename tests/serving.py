@@ -1,4 +1,4 @@
-"""The page as it is served: the command in a process of its own."""
+"""The page served by the command in a separate process."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ from conftest import EXPERIMENTS
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
-    """Serve the page; its address, process and folder of files."""
+    """Serve the page and yield its address, process and folder of files."""
     files = tmp_path_factory.mktemp("files")
     process = subprocess.Popen(
         [sys.executable, "-m", "foamfit", "page", "--no-browser"],
@@ -30,4 +30,4 @@ def served(tmp_path_factory):
     _, errors = process.communicate(timeout=20)
     assert process.returncode == 0, errors
     assert "Traceback" not in errors, errors
-    assert list(files.iterdir()) == []  # nothing stays behind
+    assert list(files.iterdir()) == []  # no files are left behind

@@ -9,7 +9,7 @@ from reference import law
 
 @st.composite
 def admissible_parameters(draw: st.DrawFn, least: float = 0.0) -> dict[str, float]:
-    """The seven parameters of a random admissible spring, SI, with k_h± of `least` k0 or more."""
+    """Draw seven parameters of an admissible spring in SI units, with k_h± ≥ `least` times k0."""
     k0 = 10.0 ** draw(st.floats(5.0, 9.0))
     eps_a = draw(st.floats(0.02, 0.5))
     eps_c = draw(st.floats(eps_a + 0.02, 0.9))
@@ -29,19 +29,19 @@ def admissible_parameters(draw: st.DrawFn, least: float = 0.0) -> dict[str, floa
 
 @st.composite
 def admissible_springs(draw: st.DrawFn, sloped: bool = False) -> ff.BistableSpring:
-    """A random admissible spring; `sloped` ones have no flat branch, so stress gives strain."""
+    """Draw an admissible spring; if `sloped`, no branch is flat, so stress determines strain."""
     return ff.BistableSpring(**draw(admissible_parameters(2e-3 if sloped else 0.0)))
 
 
 def strain_history(
     spring: ff.BistableSpring, seed: int, turns: int = 12, fine: int = 7
 ) -> np.ndarray:
-    """A random reversing strain history that reaches past C1, sampled `fine` times per stroke."""
+    """Return a random strain history with reversals, beyond C1, with `fine` samples per stroke."""
     rng = np.random.default_rng(seed)
     points = law(spring)
     top = points.eps_hat_c + 0.5 * (points.limit - points.eps_hat_c)
     ends = rng.uniform(0.0, top, turns)
-    ends[rng.integers(turns)] = top  # both flags are seen at least once
+    ends[rng.integers(turns)] = top  # so that both flags occur
     corners = np.concatenate([[0.0], ends])
     at = np.linspace(0.0, turns, fine * turns + 1)
     return np.interp(at, np.arange(turns + 1), corners)

@@ -1,4 +1,4 @@
-"""The ladder: runs test, effective parameters, known structures, interruption, what is written."""
+"""The ladder: runs test, effective parameters, known structures, interruption and output."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ HEIGHT, AREA = 1.2e-3, 1.9635e-5
 
 
 def short_loop():
-    """The loop of conftest with every second sample."""
+    """Return the loop of conftest with every second sample."""
     _, loop = synthetic_loop()
     return replace(loop, stress=loop.stress[::2], displacement=loop.displacement[::2])
 
 
 def groups(*names, relaxation=0):
-    """Models to compare, each a group of its own."""
+    """Return models to compare, each in a separate group."""
     return tuple((Model.parse(name, relaxation),) for name in names)
 
 
@@ -46,7 +46,7 @@ def groups(*names, relaxation=0):
 
 
 def exact_p(positive: int, negative: int, runs: int) -> float:
-    """Chance of so few runs or fewer, counted over all orders of the signs."""
+    """Return the probability of at most `runs` runs by counting all orders of the signs."""
     n = positive + negative
     orders = list(itertools.combinations(range(n), positive))
     few = 0
@@ -75,7 +75,7 @@ def test_the_runs_test_holds_its_level_and_sees_waves():
     wave = np.sin(np.linspace(0, 20, 400))
     assert runs_test(wave + 0.5 * rng.standard_normal(400)) < 1e-6
     assert runs_test(np.ones(11)) == pytest.approx(2.0**-10)
-    assert runs_test(np.array([1.0, -1.0] * 50)) > 0.999  # alternating is no structure
+    assert runs_test(np.array([1.0, -1.0] * 50)) > 0.999  # alternating signs count as random
     assert runs_test(np.zeros(5)) == 1.0
 
 
@@ -92,7 +92,7 @@ def test_the_neighbours_test_holds_its_level_and_sees_a_short_wave():
 
 
 def tried(residual, columns):
-    """A model of one curve, as far as the evidence looks at it."""
+    """Return a fitted model of one curve with only the fields that `evidence` uses."""
     return SimpleNamespace(
         residual=residual,
         sizes=(residual.size,),
@@ -110,7 +110,7 @@ def test_combinations_are_not_counted_as_parameters():
     noise = tried(rng.standard_normal(600), np.ones((600, 1)))
     apart = np.column_stack([np.ones_like(x), x, x**2])
     same = np.column_stack([apart, apart[:, 0] - apart[:, 1]])
-    vague = np.column_stack([apart, 0.01 * x**3])  # its interval is ±13
+    vague = np.column_stack([apart, 0.01 * x**3])  # the interval of its coefficient is about ±13
     counted = [
         evidence.effective_parameters(np.array([columns.T @ columns]), noise)
         for columns in (apart, same, vague)
@@ -119,7 +119,7 @@ def test_combinations_are_not_counted_as_parameters():
 
 
 def test_the_criteria_are_those_of_closed_form():
-    """White noise: AICc and BIC of n samples; k = 2."""
+    """For white noise, AICc and BIC follow from n samples and k = 2 parameters."""
     residual = np.random.default_rng(2).standard_normal(500)
     columns = np.column_stack([np.ones(500), np.linspace(-1, 1, 500)])
     one = tried(residual, columns)
@@ -131,7 +131,7 @@ def test_the_criteria_are_those_of_closed_form():
 
 
 def test_correlated_residuals_are_less_evidence():
-    """A thousand samples of which each keeps two thirds of the last say what two hundred would."""
+    """1000 samples with a lag-one correlation of 2/3 count as 200 independent samples."""
     rng = np.random.default_rng(3)
     small, large = (
         scale * lfilter([1.0], [1.0, -2.0 / 3.0], rng.standard_normal(1000)) for scale in (1.0, 1.1)
@@ -159,7 +159,7 @@ def test_a_bent_structure_is_found_where_it_is():
     assert found.straight
     assert found.share > 0.99
     assert found.bent > 0.99
-    rms = 0.1 * np.sqrt(4 / 45) * 0.5  # of x² - 1/3 along a quarter of the samples
+    rms = 0.1 * np.sqrt(4 / 45) * 0.5  # RMS of 0.1 (x² - 1/3) on a quarter of the samples
     assert found.size == pytest.approx(rms, rel=0.05)
 
 
@@ -167,7 +167,7 @@ def test_a_bent_structure_is_found_where_it_is():
 
 
 def impact(springs, heights, site=0.0, velocity=2.0, noise=0.005, seed=0, samples=101):
-    """A synthetic impact without stated noise."""
+    """Simulate an impact whose noise level is not stated."""
     chain = ff.Chain(springs, heights, AREA, site_damping=site)
     drive = ff.Impact(7e-3, velocity)
     long = ff.simulate(chain, drive, np.linspace(0, 20 * HEIGHT / velocity, 4001))
@@ -211,7 +211,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_a_clear_structure_is_found(name, monkeypatch):
     springs, heights, site = CASES[name]
-    if name == "linear+bistable with damping":  # for time; the others have the whole ladder
+    if name == "linear+bistable with damping":  # saves time; the other cases use the full ladder
         monkeypatch.setattr(auto, "LADDER", groups("bistable", "linear+bistable"))
     test = impact(springs, heights, site, velocity=2.6)
     result = ff.fit(test, model="auto", starts=2, intervals="local")
@@ -223,7 +223,7 @@ def test_a_clear_structure_is_found(name, monkeypatch):
 
 
 def test_two_bistable_springs_are_told_from_fewer(monkeypatch):
-    """For time, without the model of a linear spring and without exchanges between springs."""
+    """To save time, omit the model of a linear spring and exchanges between springs."""
     monkeypatch.setattr(auto, "LADDER", groups("bistable", "bistable+bistable"))
     monkeypatch.setattr(one_model, "exchange_springs", lambda *_: [])
     test = impact([SOFT, STIFF], HALVES, velocity=4.5, samples=201)
@@ -235,7 +235,7 @@ def test_two_bistable_springs_are_told_from_fewer(monkeypatch):
 
 
 def test_a_linear_spring_in_series_adds_combinations_and_no_evidence():
-    """Along a given motion it only bends the branches of one bistable spring."""
+    """Under a prescribed motion, it only bends the branches of one bistable spring."""
     loop = short_loop()
     one = ff.fit(loop, starts=4, intervals="local")
     chain = ff.fit(loop, model="linear+bistable", starts=4, intervals="local")
@@ -257,14 +257,14 @@ def test_a_linear_spring_in_series_adds_combinations_and_no_evidence():
 
 
 def choose_of(table, by_prediction, criteria=None):
-    """Decision on a table of (parameters, fitted misfit, predicted misfit)."""
+    """Return the choice from a table of (parameters, fitted misfit, predicted misfit)."""
     scores = [evidence.Score(*row) for row in table]
     criteria = criteria or [evidence.Criteria(n, 0.0, 0.0) for n, *_ in table]
     return evidence.decide(scores, criteria, by_prediction)
 
 
 def test_the_model_that_predicts_best_for_its_parameters_is_chosen():
-    """A shoe foam: misfits in percent of the range."""
+    """The table is that of a shoe foam, with misfits in percent of the range."""
     foam = [
         (7, 2.35, 3.07),  # bistable
         (7, 1.20, 1.39),  # microscale
@@ -272,19 +272,19 @@ def test_the_model_that_predicts_best_for_its_parameters_is_chosen():
         (9, 1.42, 2.06),  # bistable with relaxation
         (9, 0.63, 0.88),  # microscale with relaxation
         (15, 1.05, 1.08),  # bistable+bistable
-        (17, 0.61, 0.80),  # richer: 9 % for eight parameters
+        (17, 0.61, 0.80),  # predicts 9 % better with eight more parameters
     ]
     decision = choose_of(foam, by_prediction=True)
     assert decision.best == 4
     assert decision.before == (None, 0, 1, 1, 1, 4, 4)
     assert decision.ruled_out_by == (None, None, 0, 1, None, 4, None)
-    assert choose_of([*foam, (11, 0.5, 0.82)], by_prediction=True).best == 7  # 6.8 % for two
-    assert choose_of([*foam, (11, 0.5, 0.84)], by_prediction=True).best == 4  # 4.5 %
-    assert choose_of([*foam, (9, 0.9, 0.87)], by_prediction=True).best == 7  # as many: the lowest
+    assert choose_of([*foam, (11, 0.5, 0.82)], by_prediction=True).best == 7  # 6.8 % better
+    assert choose_of([*foam, (11, 0.5, 0.84)], by_prediction=True).best == 4  # only 4.5 % better
+    assert choose_of([*foam, (9, 0.9, 0.87)], by_prediction=True).best == 7  # equal count
 
 
 def test_no_model_twice_as_bad_with_no_fewer_parameters_is_chosen():
-    """Whatever the criteria and predictions say, on random tables of numbers."""
+    """This is true for any criteria and predictions, here random numbers."""
     rng = np.random.default_rng(5)
     for _ in range(500):
         table = [
@@ -299,9 +299,9 @@ def test_no_model_twice_as_bad_with_no_fewer_parameters_is_chosen():
 
 
 def slow_loop(*, noise=0.003, wave=0.0, seed=0, samples=150):
-    """A loop in 2 s on a microscale spring that relaxes, known in time; a wave that none follows.
+    """Simulate a 2 s loop with time on a relaxing microscale spring, plus a wave no model follows.
 
-    Noise and wave are shares of the range of stress.
+    Noise and wave amplitude are fractions of the stress range.
     """
     spring = ff.MicroscaleSpring(
         k0=5.5e5, kc=2.5e5, eps_star=0.08, sigma_plus=1.3e5, spread_plus=0.4, sigma_minus=5.5e4,
@@ -326,8 +326,8 @@ def slow_loop(*, noise=0.003, wave=0.0, seed=0, samples=150):
 
 
 def test_held_back_samples_are_predicted_by_a_fit_to_the_others():
-    """From a point beside the best one: the true model predicts curves without noise exactly."""
-    test = slow_loop(noise=0.0, samples=301)  # one at the turn: without noise it is followed there
+    """Starting near the best point, the true model predicts noise-free curves exactly."""
+    test = slow_loop(noise=0.0, samples=301)  # odd: one sample is exactly at the reversal
     found = one_model.identify(
         test, "microscale", None, one_model.Options(starts=4, relaxation=1), lambda *_: None
     )
@@ -375,7 +375,7 @@ def test_where_no_model_reaches_the_noise_prediction_decides(monkeypatch):
 
 @pytest.mark.parametrize("given", [None, 0.004])
 def test_without_the_time_for_a_prediction_the_fitted_misfit_stands_in(given):
-    """Of all models, if it is missing of one."""
+    """If one model has no prediction, the fitted misfit is used for all models."""
     models = [
         SimpleNamespace(varied=7, misfit=0.02, predicted=0.05),
         SimpleNamespace(varied=9, misfit=0.003, predicted=given),
@@ -390,14 +390,14 @@ def test_a_running_shoe_foam_ends_below_one_percent(thin_foams, tmp_path, monkey
     toml.write_text('[specimen]\nheight = "10.53 mm"\ndiameter = "7.63 mm"\n')
     test = ff.read_test(thin_foams / "shoe-foam" / "turbo-comp-1_cycle1.csv", toml)
     few = (*groups("bistable", "microscale"), *groups("microscale", relaxation=1))
-    monkeypatch.setattr(auto, "LADDER", few)  # for time
+    monkeypatch.setattr(auto, "LADDER", few)  # saves time
     result = ff.fit(test, model="auto", starts=2, intervals="local")
     assert result.misfit["stress_strain"] <= 0.009
     assert result.ladder.chosen.name == "microscale with relaxation"
 
 
 def test_a_simpler_model_is_carried_into_its_relaxation():
-    """With a share of zero the curves are those of the simpler one."""
+    """With a relaxing fraction of zero, the curves are those of the simpler model."""
     test = slow_loop()
     simple = ff.fit(test, model="microscale", starts=2, intervals="local")
     problem = make_problem(test, "microscale", None, None, None, False, relaxation=1)
@@ -427,7 +427,7 @@ def test_only_models_that_the_test_allows_are_tried(monkeypatch):
         raise ff.SimulationError("not now")
 
     def models(test):
-        """Models that are tried, each once, and which are left out and why."""
+        """Return the models to try, without repetition, and the omitted models with reasons."""
         tried.clear()
         with pytest.raises(ff.SimulationError) as caught:
             ff.fit(test, model="auto")
@@ -456,7 +456,7 @@ def test_only_models_that_the_test_allows_are_tried(monkeypatch):
 
 @pytest.mark.parametrize(("microscale", "tried"), [(0.021, True), (0.023, False)])
 def test_chains_of_microscale_springs_need_one_that_follows_the_curves(microscale, tried):
-    """As closely as a bistable spring does, or nearly."""
+    """One microscale spring must follow the curves nearly as well as one bistable spring."""
     misfits = {("bistable", 0): 0.02, ("microscale", 0): microscale, ("microscale", 1): 0.001}
     before = [
         SimpleNamespace(result=SimpleNamespace(model=model, relaxation=terms), misfit=misfit)
@@ -472,14 +472,14 @@ def test_chains_of_microscale_springs_need_one_that_follows_the_curves(microscal
     for model in (Model.parse("linear+bistable"), Model.parse("microscale", 1)):
         assert auto._hopeless(model, before) == ""
     remembers = Model.parse("microscale, stiffening, mullins", 1)
-    assert auto._hopeless(remembers, before) == ""  # with relaxation microscale misses least
+    assert auto._hopeless(remembers, before) == ""  # relaxing microscale misses by 0.1 %
     assert bool(auto._hopeless(remembers, before[:2]))
     assert auto._hopeless(Model.parse("linear+microscale"), before[1:]) == ""
 
 
 def test_springs_in_series_are_not_searched_on_from_a_poor_first_search(monkeypatch, wavy):
-    """Nor is a richer chain: one spring with all that it needs is closer."""
-    monkeypatch.setattr(auto, "UNPROMISING", 0.0)  # so that any is poor
+    """Richer chains are then skipped too."""
+    monkeypatch.setattr(auto, "UNPROMISING", 0.0)  # every first search counts as poor
     monkeypatch.setattr(
         auto, "LADDER", groups("bistable", "bistable+bistable", "linear+bistable+bistable")
     )
@@ -498,7 +498,7 @@ def test_a_drive_without_dampers_has_one_rung_for_each_model():
 
 
 def test_only_the_chosen_rung_gets_the_intervals_that_were_asked_for(monkeypatch):
-    """Models are compared with local ones; options reach every model."""
+    """Models are compared with local intervals, and options apply to every model."""
     given = []
     original = one_model.judge
 
@@ -516,7 +516,7 @@ def test_only_the_chosen_rung_gets_the_intervals_that_were_asked_for(monkeypatch
 
 
 def test_outliers_leave_the_ladder_standing():
-    """Places of structure go by the samples that count."""
+    """The location of systematic residuals is found from the samples that are not outliers."""
     _, test = synthetic_impact(samples=201)
     stress = test.stress * 1.0
     left_out = np.zeros(201, bool)
@@ -537,7 +537,7 @@ def test_outliers_leave_the_ladder_standing():
 
 @pytest.fixture(scope="module")
 def wavy():
-    """A loop that no model follows: a wave of 5 % lies on it."""
+    """Return a loop that no model follows because of a superposed wave of 5 %."""
     loop = short_loop()
     wave = 0.05 * np.ptp(loop.stress) * np.sin(np.linspace(0, 60, loop.stress.size))
     return replace(loop, stress=loop.stress + wave, name="synthetic loop with a wave")
@@ -566,7 +566,7 @@ def test_an_interrupted_ladder_keeps_what_is_done(wavy, monkeypatch):
 
 
 def test_the_time_limit_is_shared_over_the_rungs(wavy, monkeypatch):
-    """A timer that gains a second with each look: what is left for a model shrinks."""
+    """With a clock that advances 1 s per reading, each model gets less time than the one before."""
     now = itertools.count(0.0, 1.0)
     monkeypatch.setattr(auto.time, "monotonic", lambda: next(now))
     given = []
@@ -577,7 +577,7 @@ def test_the_time_limit_is_shared_over_the_rungs(wavy, monkeypatch):
         return original(measurement, model, params, replace(options, max_time=None), *rest)
 
     monkeypatch.setattr(auto.one_model, "identify", watched)
-    monkeypatch.setattr(auto, "predicted_misfit", lambda *_: 0.1)  # it looks at the timer too
+    monkeypatch.setattr(auto, "predicted_misfit", lambda *_: 0.1)  # must not read the clock
     result = ff.fit(wavy, model="auto", starts=2, max_time=2.5)
     assert given == [1.5, 0.5]
     assert len(result.ladder.rungs) == 2
@@ -609,18 +609,18 @@ def test_a_rung_that_cannot_be_simulated_is_left_out(wavy, monkeypatch):
         ff.fit(wavy, model="auto", starts=2)
 
 
-# ---------------------------------------------------------------- what is written
+# ---------------------------------------------------------------- output
 
 
 @pytest.fixture(scope="module")
 def models_with_ranges():
-    """Models of which `climbed` has made ranges."""
+    """Names of the models for which `climbed` computes ranges."""
     return []
 
 
 @pytest.fixture(scope="module")
 def climbed(wavy, models_with_ranges):
-    """Two models, neither of which reaches the noise."""
+    """Fit two models, neither of which reaches the noise level."""
     original = one_model.left_open
 
     def watched(best, *rest):
@@ -634,7 +634,7 @@ def climbed(wavy, models_with_ranges):
 
 
 def test_ranges_are_made_of_the_chosen_model_alone(climbed, models_with_ranges):
-    """Both models miss a wave; its table goes by the 95 % intervals of the other one."""
+    """Both models miss the wave; the other model is judged by its 95 % intervals."""
     result = climbed
     assert set(models_with_ranges) == {result.model}
     known = [p for p in result.parameters.values() if p.vary and p.ci95 is not None]
@@ -650,12 +650,12 @@ def test_what_remains_is_said(climbed):
     )
     assert "those of stress_strain are" in warning
     size = float(warning.split("stress_strain are ")[1].split(" %")[0])
-    assert size == pytest.approx(5 / np.sqrt(2), rel=0.25)  # what the springs follow of it is less
+    assert size == pytest.approx(5 / np.sqrt(2), rel=0.25)  # springs follow part of the wave
     assert climbed.ladder.ended == "there are no richer ones left to try"
 
 
 def test_undetermined_parameters_of_the_chosen_model_are_named():
-    """A loop that never closes leaves branches c and e out of every model."""
+    """This impact is too slow to reach branches c and e."""
     _, test = synthetic_impact(velocity=1.75, samples=201)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(auto, "LADDER", groups("bistable"))
@@ -664,7 +664,7 @@ def test_undetermined_parameters_of_the_chosen_model_are_named():
     assert "s1_kc" in sentence
     assert "no model of the ladder has all parameters determined" in sentence
     assert sentence in result.warnings
-    # k0, eps_a and kh_plus of the spring, contact time and zero of the motion
+    # determined: k0, eps_a and kh_plus of the spring, contact time and zero of the motion
     assert result.ladder.chosen.rank <= 5 < result.ladder.chosen.n_vary
     assert any("combinations" in text for text in result.ladder.sentences)
     for name in result.ladder.chosen.not_determined:

@@ -1,4 +1,4 @@
-"""A material card: its curves, its unloading, its text as others read it, and what it loses."""
+"""A material card: its curves, unloading, text as read by the solver, and loss of accuracy."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ LAW: dict[str, float] = {
     "sigma_minus": 7.9e4, "spread_minus": 0.7, "eta": 20.0, "g1": 0.3, "tau1": 0.25,
 }  # fmt: skip
 TOP, NOISE = 0.6, 300.0
-# Pa, 1/s and kg/m³ of one unit of stress, strain rate and density.
+# One unit of stress, strain rate and density in Pa, 1/s and kg/m³.
 SI = {"kg-mm-ms": (1e9, 1e3, 1e9), "t-mm-s": (1e6, 1.0, 1e12), "SI": (1.0, 1.0, 1.0)}
 
 
 def write_fit(
     folder: Path, rate: float, b: float = 0.0, top: float = TOP, **changed: Any
 ) -> ff.FitResult:
-    """Write the folder of a fit to a triangular test: the law itself, and noise.
+    """Write the folder of a fit to a triangular test simulated by the law, with added noise.
 
-    The snap stresses go with the rate to the power b.
+    The snap stresses are proportional to the strain rate to the power b.
     """
     values = LAW | {name: LAW[name] * rate**b for name in ("sigma_plus", "sigma_minus")}
     *own, g, tau = values.values()
@@ -75,7 +75,7 @@ def fit(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def joint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three tests whose snap stresses follow a rate law."""
+    """Write a joint fit of three tests whose snap stresses follow a rate law."""
     folder, b = tmp_path_factory.mktemp("joint") / "study", 0.08
     rates = {"slow": 0.01, "middle": 1.0, "fast": 100.0}
     tests = {name: write_fit(folder / name, rate, b) for name, rate in rates.items()}
@@ -108,12 +108,12 @@ def test_loading_curves_are_those_of_the_law_and_fit_for_a_solver(joint: Path) -
     assert curves.strain[0] == 0.0
     assert np.all(np.diff(curves.strain) > 0.0)
     assert np.all(np.diff(curves.stress) > 0.0)
-    assert np.all(np.diff(curves.stress, axis=0) >= 0.0)  # none crosses
+    assert np.all(np.diff(curves.stress, axis=0) >= 0.0)  # curves do not cross
     assert curves.strain[-1] > 0.85
     np.testing.assert_array_equal(curves.stress[0], curves.stress[1])  # clamped
     np.testing.assert_array_equal(curves.stress[-1], curves.stress[-2])
     assert sum("outside the fitted rates" in one for one in card.warnings) == 2
-    # At a rate between the fitted ones: simulated here, and read between the points of the card.
+    # Between the fitted rates, the interpolated card must agree with a simulation.
     sigma = [LAW[name] * 10.0**0.08 for name in ("sigma_plus", "sigma_minus")]
     values = LAW | dict(zip(("sigma_plus", "sigma_minus"), sigma, strict=True))
     *own, g, tau = values.values()
@@ -121,7 +121,7 @@ def test_loading_curves_are_those_of_the_law_and_fit_for_a_solver(joint: Path) -
     strain = np.linspace(0.0, 0.85, 3001)
     law = ff.simulate(chain, ff.DisplacementDrive(strain), strain / 10.0).base_stress
     read = np.interp(strain, curves.strain, curves.stress[3])
-    beyond = strain > 0.01  # where the jump of the dashpot is spread
+    beyond = strain > 0.01  # below, the card smooths the initial jump of the dashpot
     assert np.abs(read - law)[beyond].max() < 2e-3 * curves.stress[3].max()
 
 
@@ -138,7 +138,7 @@ def test_a_curve_ends_where_the_foam_is_solid(tmp_path: Path) -> None:
 
 
 def replayed(style: str, strain: np.ndarray, unloading: card_curves.Unloading) -> np.ndarray:
-    """A card of one curve, σ = ε² MPa, along a strain in steps of a second."""
+    """Return the stress of a card with one curve, σ = ε² MPa, for strain samples 1 s apart."""
     x = np.linspace(0.0, 1.0, 4001)
     curves = card_curves.Curves(np.array([1e-3]), x, 1e6 * x[None] ** 2, 1.0)
     first = strain >= np.maximum.accumulate(strain)
@@ -150,15 +150,15 @@ def test_unloading_follows_the_formula_of_the_solvers() -> None:
     hu, shape, expon = unloading = card_curves.Unloading(0.1, 1.7, 0.6)
     down, up = np.linspace(0.8, 0.2, 61), np.linspace(0.2, 0.9, 71)[1:]
     strain = np.concatenate([np.linspace(0.0, 0.8, 81), down[1:], up])
-    # W goes with ε³.
+    # W is proportional to ε³.
     share = 1.0 - (1.0 - hu) * (1.0 - (down / 0.8) ** (3.0 * shape)) ** expon
     dyna = replayed("mat083", strain, unloading)
     np.testing.assert_allclose(dyna[80:141], 1e6 * share * down**2, rtol=1e-4)
-    np.testing.assert_allclose(dyna[141:200], dyna[139:80:-1], rtol=1e-6)  # and back
+    np.testing.assert_allclose(dyna[141:200], dyna[139:80:-1], rtol=1e-6)  # the same on reloading
     np.testing.assert_allclose(dyna[201:], 1e6 * strain[201:] ** 2, rtol=1e-4)
     radioss = replayed("law90", strain, unloading)
     np.testing.assert_allclose(radioss[81:140], dyna[81:140], rtol=2e-3)
-    np.testing.assert_allclose(radioss[142:], 1e6 * strain[142:] ** 2, rtol=1e-4)  # jumps
+    np.testing.assert_allclose(radioss[142:], 1e6 * strain[142:] ** 2, rtol=1e-4)  # jumps back
 
 
 @pytest.mark.parametrize("style", FORMATS)
@@ -173,7 +173,7 @@ def test_the_unloading_of_a_card_is_found_again(style: str) -> None:
 
 
 def test_what_the_card_loses_is_said(fit: Path, joint: Path) -> None:
-    """On the law's own record the fit leaves the noise, three parameters more, two more again."""
+    """The fit reaches the noise; the card loses less with three unloading parameters than two."""
     losses = {}
     for style in FORMATS:
         card = ff.card(fit, format=style)
@@ -202,7 +202,7 @@ def test_on_real_foam_three_parameters_lose_little_and_two_more(tmp_path: Path) 
     assert fit.misfit["stress_strain"] < 0.007
     assert three.misfit["card"] < 0.012
     assert 1.2 * three.misfit["card"] < two.misfit["card"] < 0.02
-    # The loss is at the turn, where the foam relaxes and a card does not.
+    # The loss is largest at the strain reversal, where the foam relaxes but a card does not.
     one = three.records[0]
     off = (one.card - one.stress)[one.strain < one.strain.max() - 0.01]
     assert np.sqrt(np.mean(off**2)) / np.ptp(one.stress) < 0.009
@@ -216,7 +216,7 @@ def fixed(line: str, width: int = 10) -> list[str]:
 
 
 def dyna_blocks(text: str) -> Iterator[tuple[str, list[str]]]:
-    """Keywords of an LS-DYNA deck with their data lines."""
+    """Yield the keywords of an LS-DYNA deck with their data lines."""
     lines = [line for line in text.splitlines() if not line.startswith("$")]
     starts = [i for i, line in enumerate(lines) if line.startswith("*")]
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
@@ -283,7 +283,7 @@ def test_the_other_solvers_read_their_cards(joint: Path) -> None:
     _, shape, hu, alpha = (float(cell) for cell in fixed(head[20:], 20))
     np.testing.assert_allclose([hu, shape, alpha], card.unloading, rtol=1e-6)
     rows = [(int(row[:10]), float(row[10:30])) for row in lines[at + 5 : at + 9]]
-    assert [row[0] for row in rows] == [1001, 1002, 1003, 1003]  # clamped beyond the last
+    assert [row[0] for row in rows] == [1001, 1002, 1003, 1003]  # constant above the highest rate
     assert rows[3][1] > 1e3 * rows[2][1]
     functions = [i for i, line in enumerate(lines) if line.startswith("/FUNCT/")]
     stress = points(lines[functions[1] + 2 : functions[2]])[1]
@@ -294,12 +294,12 @@ def test_the_other_solvers_read_their_cards(joint: Path) -> None:
     data = np.array([[float(x) for x in row.split(",")] for row in body if row[:2] != "**"])
     stress, _, rate = data.T
     assert np.all(np.diff(rate) >= 0.0)
-    assert list(np.unique(rate)) == [-0.02, 0.02, 3.0, 100.0]  # the clamped curve is left out
+    assert list(np.unique(rate)) == [-0.02, 0.02, 3.0, 100.0]  # 1e4 is beyond the fitted rates
     parts = [data[rate == one] for one in np.unique(rate)]
     for part in parts:
         assert np.all(np.diff(part[:, :2], axis=0) > 0.0)
     for below, above in pairwise(parts):
-        assert np.all(below[1:, 0] < above[1:, 0])  # none meets another
+        assert np.all(below[1:, 0] < above[1:, 0])  # curves do not touch
     np.testing.assert_allclose(parts[1][:, 0], card.curves.stress[0], rtol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""The command line as a user calls it: what it prints, what it writes, how it refuses."""
+"""The command line as a user calls it: printed output, written files and error messages."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def accepted(*args: object) -> Result:
 
 
 def refused(folder: Path, *args: object, words: tuple[str, ...]) -> None:
-    """One sentence on stderr that holds the words, exit code 1, nothing else anywhere."""
+    """Check for one error sentence with these words, exit code 1 and no new files."""
     before, folders = files(folder), {p for p in folder.rglob("*") if p.is_dir()}
     result = run(*args)
     assert isinstance(result.exception, SystemExit), result.exception
@@ -68,16 +68,16 @@ def refused(folder: Path, *args: object, words: tuple[str, ...]) -> None:
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty working directory."""
+    """Change to an empty working directory."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
-    """A reconstruction fitted once, without --out: where, and what was printed.
+    """Fit a reconstruction once without --out; return the directory and the printed output.
 
-    Its pictures are a few bytes; true ones of this command are in report/test_result_figures.py.
+    The pictures are placeholders; report/test_result_figures.py tests the real ones.
     """
     folder = tmp_path_factory.mktemp("fitted")
     with pytest.MonkeyPatch.context() as patch:
@@ -98,7 +98,7 @@ def write(
     return path
 
 
-# What it does.
+# Normal operation.
 
 
 @pytest.mark.parametrize("args", [[], *([command] for command in COMMANDS)])
@@ -160,7 +160,7 @@ def test_fit_writes_beneath_the_current_directory(fitted: tuple[Path, Result]) -
     assert (content["seed"], content["status"]) == (1, "ok")
     assert set(content["visited"]["s1"]) == set("adce")
     page = next(folder.rglob("report.html")).read_text(encoding="utf-8")
-    for name in content["statistics"]:  # all have labels
+    for name in content["statistics"]:  # every statistic has a label
         assert f"<td>{name.replace('_', ' ')}</td>" not in page
 
 
@@ -184,7 +184,7 @@ def test_an_older_result_is_replaced_and_quiet_is_quiet(
     result = accepted("fit", RECONSTRUCTION, "--out", "old", "--quiet", *args)
     assert result.stdout == ""
     content = json.loads((here / "old" / "fit.json").read_text())
-    # Of parameters whose cost is no parabola, and of zeros that the record leaves open.
+    # Written only if the cost is not parabolic in a parameter, or if a zero is uncertain.
     more = {"old/profiles.csv", "old/budget.csv"}
     assert set(files(here)) - more == {f"old/{name}" for name in FILES}
     assert (content["drive"], content["statistics"]["n_starts"]) == ("displacement", 3)
@@ -193,7 +193,7 @@ def test_an_older_result_is_replaced_and_quiet_is_quiet(
     assert freed["vary"]
 
 
-@pytest.mark.usefixtures("fitted")  # it has the solver compiled
+@pytest.mark.usefixtures("fitted")  # so that the solver is already compiled
 def test_the_time_limit_gives_the_best_so_far(here: Path) -> None:
     args = ("--model", " bistable ", "--starts", 9000, "--max-time", 0.5, "--json", "--no-report")
     result = run("fit", RECONSTRUCTION, *args)
@@ -243,7 +243,7 @@ def test_compare(here: Path, fitted: tuple[Path, Result]) -> None:
     assert set(files(here)) == {"comparison.png"}
 
 
-# Scenes.
+# Simulated scenes.
 
 SPRING = """\
 [[chain.springs]]
@@ -384,7 +384,7 @@ def test_simulate_a_drive_from_a_file(
         assert 0.14 < strain.max() < 0.36
 
 
-# What is wrong is refused in one sentence.
+# Invalid input is rejected with one sentence.
 
 
 @pytest.mark.parametrize("command", ["check", "fit"])
@@ -468,7 +468,7 @@ def test_refuses_values(here: Path, factors: tuple[float, float], words: tuple[s
             ("--model", "linear+bistable", "--vary", "s1_height"),
             ("'s1_height' is given by the specimen", "leave [specimen] heights out"),
         ),
-        (SPECIMEN + 'heights = ["4 mm", "6 mm"]\n', (), ()),  # one spring needs no heights
+        (SPECIMEN + 'heights = ["4 mm", "6 mm"]\n', (), ()),  # heights do not matter for one spring
     ],
 )
 def test_refuses_tomls(
@@ -504,7 +504,7 @@ def test_without_a_toml_all_that_is_missing_is_shown(
         *keys, "mass", "velocity",
     ]  # fmt: skip
     assert len(shown) == lines
-    tomllib.loads("\n".join(shown))  # it can be copied
+    tomllib.loads("\n".join(shown))  # the printed TOML can be pasted
 
 
 @pytest.mark.parametrize(
@@ -523,7 +523,7 @@ def test_init_asks_what_the_file_does_not_say(
     toml = path.with_suffix(".toml")
     text = toml.read_text(encoding="utf-8")
     assert set(tomllib.loads(text)["columns"]) | answers.keys() >= {"time", "displacement"}
-    assert run("check", path).exit_code == 1  # as the questions are open
+    assert run("check", path).exit_code == 1  # because required values are missing
     for key in ("height", "diameter", *answers):
         assert f"    {key} = " in told
         at = text.index(f"\n# {key} = ")
@@ -711,7 +711,7 @@ def test_a_defect_is_one_line_too(here: Path, monkeypatch: pytest.MonkeyPatch) -
     assert isinstance(run("check", "x.csv").exception, KeyError)
 
 
-# As a process of its own.
+# Run as a separate process.
 
 
 def process(*args: object) -> subprocess.CompletedProcess[str]:
@@ -720,7 +720,7 @@ def process(*args: object) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_process_keeps_stdout_and_stderr_apart(here: Path) -> None:
-    good = process("published")  # of a fit see report/test_result_figures.py
+    good = process("published")  # for a fit see report/test_result_figures.py
     assert (good.returncode, good.stderr) == (0, "")
     assert good.stdout.startswith("Published")
     bad = process("fit", write(here, rows=["x"]), "--out", "no")

@@ -1,4 +1,4 @@
-"""Several cycles as one history, and springs that remember, from the file to the prediction."""
+"""Several cycles as one history, and springs with memory, from the file to the prediction."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ AREA, HEIGHT = 5e-5, 0.01
 
 @pytest.fixture(scope="module")
 def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four synthetic cycles of one spring, written as a rig does: arbitrary zeros, noise."""
+    """Write four synthetic cycles of one spring with arbitrary zeros and noise, as a rig would."""
     folder, rng = tmp_path_factory.mktemp("cycles"), np.random.default_rng(5)
     corners = np.array([0.0, 0.0, 0.55, 0.0, 0.0, 0.55, 0.0, 0.0, 0.55, 0.0, 0.0, 0.55, 0.0, 0.0])
     times = np.array([0.0, 0.4, 2.0, 3.6, 3.9, 5.5, 7.1, 7.4, 9.0, 10.6, 10.9, 12.5, 14.1, 14.4])
@@ -87,7 +87,7 @@ def test_cycles_of_a_record_without_any_are_refused(tmp_path: Path) -> None:
 
 
 def test_one_set_of_parameters_for_all_cycles_and_the_next(record: Path, tmp_path: Path) -> None:
-    """Identified from cycles 1 to 3 through the file, and a fourth is predicted."""
+    """Parameters identified from cycles 1 to 3 of the file predict the fourth cycle."""
     call = ["fit", str(record), "--model", "microscale", "--stiffening", "--mullins"]
     call += ["--cycles", "1-3", "--starts", "3", "--out", str(tmp_path / "fit"), "--quiet"]
     told = CliRunner().invoke(main, [*call, "--no-report"])
@@ -147,7 +147,7 @@ def test_a_batch_and_a_toml_take_several_cycles(record: Path, tmp_path: Path) ->
 
 
 def test_a_branch_of_the_first_sample_was_reached(record: Path) -> None:
-    """A spring that snaps at the first sample already has reached that branch."""
+    """A spring that already snaps at the first sample has reached that branch."""
     test = ff.read_test(record, cycles=(1, 3))
     found = ff.fit(
         test, model="microscale", mullins=True, starts=2, intervals="local", max_time=30.0
@@ -158,14 +158,14 @@ def test_a_branch_of_the_first_sample_was_reached(record: Path) -> None:
 
 @pytest.fixture(scope="module")
 def lifted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Chain]:
-    """Two cycles of a spring that recovers more slowly than its platen; pressed a little before."""
+    """Write two cycles, after a preload, of a spring that recovers more slowly than the platen."""
     folder, rng = tmp_path_factory.mktemp("lifted"), np.random.default_rng(3)
     spring = replace(TRUTH, relaxation=((0.8, 0.5),))
     chain = ff.Chain([spring], [HEIGHT], AREA)
     t = np.arange(0.0, 8.0, 0.01)
     strain = np.interp(t, [0.4, 2.0, 3.6, 3.9, 5.5, 7.1], [0.0, 0.55, 0.0, 0.0, 0.55, 0.0])
     stress = ff.simulate(chain, ff.DisplacementDrive(HEIGHT * strain), t).base_stress
-    assert stress.min() < -2e3  # it would have to pull
+    assert stress.min() < -2e3  # without separation, the stress would be tensile
     stress = np.maximum(stress, 0.0) + np.where(t < 0.4, 2e3, 0.0)
     force = AREA * (stress + rng.normal(0.0, 100.0, t.size)) + 0.05
     table = np.column_stack([t, force, 1e3 * HEIGHT * strain + 3.0])
@@ -185,7 +185,7 @@ def test_the_stress_between_cycles_is_the_zero_of_a_specimen_that_was_pressed(
     assert history.origins["stress_zero"] == pytest.approx(offset, abs=50.0)
     assert 5.0 < history.zeros["stress"] < 100.0
     assert any("between the first two cycles" in note for note in history.notes)
-    one = ff.read_test(lifted[0])  # which shows no stress after it
+    one = ff.read_test(lifted[0])  # one cycle has no unloaded gap after it
     assert one.origins["stress_zero"] == pytest.approx(offset + 2e3, abs=50.0)
 
 
@@ -212,7 +212,7 @@ def test_a_specimen_that_has_lost_contact_bears_no_tension(lifted: tuple[Path, C
     assert np.std(made.residual(point)[: made.n_data]) == pytest.approx(1.0, abs=0.2)
     pulling, there = of(replace(test, last_cycle=None))
     assert pulling.simulate(there).curves["stress_strain"].min() < -2e3
-    # What bears nothing does not change; derivatives elsewhere are those of differences.
+    # Derivatives are zero where contact is lost; elsewhere they equal central differences.
     places = np.arange(len(own))
     slopes = made.jacobian(point, places)
     assert not slopes[: lost.size][lost].any()

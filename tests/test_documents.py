@@ -1,4 +1,4 @@
-"""What the documents promise about each other: links, names and versions."""
+"""Consistency of the documents: links, names and versions."""
 
 import re
 import tomllib
@@ -13,7 +13,7 @@ LINK = re.compile(r"\]\(([^)\s]+)\)|src=\"([^\"]+)\"")
 
 
 def links(page):
-    """Targets of the links of a page, without those on the web and within the page."""
+    """Return the link targets of a page, except web addresses and anchors in the page."""
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     targets = (a or b for a, b in LINK.findall(text))
     return [t.partition("#")[0] for t in targets if not t.startswith(("http", "#"))]

@@ -1,4 +1,4 @@
-"""What is written is whole, replaces nothing of others, and leaves nothing behind."""
+"""Files are written completely, never replace foreign files, and leave no remnants."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions o
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty working directory, and results of one file that need no time."""
+    """Change to an empty directory and replace the pictures, so that saving is fast."""
     without_pictures(monkeypatch)
     monkeypatch.setattr(foamfit.report.figures, "image", lambda *_: b"\x89PNG" + bytes(20))
     monkeypatch.chdir(tmp_path)
@@ -48,14 +48,14 @@ def names(folder: Path | str) -> list[str]:
 
 
 def gone() -> int:
-    """The number of a process that has ended."""
+    """Return the id of a process that has ended."""
     with subprocess.Popen([sys.executable, "-c", ""]) as process:
         pass
     return process.pid
 
 
 def left_behind(path: Path, ending: str, process: int) -> Path:
-    """What a process with this number has left beside a path, named as this one names it."""
+    """Return the path of a remnant that the process with this id would leave next to `path`."""
     with suppress(InterruptedError), replacing(path.parent / "apart" / path.name) as fresh:
         raise InterruptedError
     named, found = re.subn(rf"\.{os.getpid()}\.\w{{8}}", f".{process}.{8 * '0'}", fresh.name)
@@ -64,7 +64,7 @@ def left_behind(path: Path, ending: str, process: int) -> Path:
     return path.with_name(named.removesuffix("new") + ending)
 
 
-# ---------------------------------------------------------------- whose folder it is
+# ---------------------------------------------------------------- ownership of the folder
 
 
 def test_a_result_with_a_file_of_others_is_refused_and_kept(here: Path) -> None:
@@ -167,7 +167,7 @@ def test_a_long_name_leaves_room_for_what_is_beside_it(here: Path) -> None:
     assert len(names(here)) == 2
 
 
-# ---------------------------------------------------------------- nothing half written
+# ---------------------------------------------------------------- no incomplete files
 
 
 @pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device")])
@@ -194,7 +194,7 @@ def test_a_full_disk_leaves_the_older_file(
 
 
 def test_no_text_of_a_table_is_a_formula(here: Path) -> None:
-    """A spreadsheet would compute the name of a test, as =1+1, and could start programs."""
+    """A spreadsheet would evaluate a test name such as =1+1 and could even start programs."""
     texts = ("=1+1", "@SUM(1)", "+1+1", "-1+1", "\t=1", "a=1", "-2.5e-3", "-", "-inf")
     told = csv_bytes([texts, (-1.5, None, "")]).decode().splitlines()
     assert told == ["'=1+1,'@SUM(1),'+1+1,'-1+1,'\t=1,a=1,-2.5e-3,'-,-inf", "-1.5,,"]
@@ -205,7 +205,7 @@ def test_no_text_of_a_table_is_a_formula(here: Path) -> None:
 
 
 def test_a_full_disk_loses_no_numbers(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The folder cannot be written: the numbers are printed all the same, the exit code is true."""
+    """If the folder cannot be written, the numbers are still printed and the exit code is 1."""
 
     def full(*_: object, **__: object) -> None:
         raise InputError("the result cannot be written to r: No space left on device")
@@ -226,7 +226,7 @@ CALL = ("fit", str(RECONSTRUCTION), "--starts", "1", "--max-time", "0.1", "--out
 def test_what_cannot_be_written_is_tried_before_the_fit(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As a file system that says that it may be written, and may not."""
+    """Some file systems report a folder as writable although writing fails."""
 
     def denied(path: Path, *_: object, **__: object) -> None:
         raise PermissionError(errno.EPERM, "Operation not permitted")
@@ -303,7 +303,7 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(here: Path) -> Non
     target = here / "r"
     dead = left_behind(target, "new", gone())
     others = [
-        left_behind(target, "new", os.getppid()),  # it lives
+        left_behind(target, "new", os.getppid()),  # still running
         left_behind(here / "another", "new", gone()),
         here / ".r.notes.new",
         here / ".r.abcdef123456.new",
@@ -312,7 +312,7 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(here: Path) -> Non
     for folder in (dead, *others):
         folder.mkdir()
         (folder / "fit.json").write_text("{")
-    recycled = left_behind(target, "new", os.getpid())  # of an earlier process of the same number
+    recycled = left_behind(target, "new", os.getpid())  # from an earlier process with our id
     recycled.mkdir()
     fabricated.result().save("r")
     assert names(here) == sorted([*(path.name for path in others), "r"])
@@ -384,7 +384,7 @@ main(["write"])
 @posix
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
 def test_a_signal_while_writing(here: Path, number: signal.Signals) -> None:
-    """SIGTERM and Ctrl-C clean up and say so in a sentence; after SIGKILL the next one does."""
+    """SIGTERM and Ctrl-C clean up and print a message; after SIGKILL the next write cleans up."""
     with subprocess.Popen(
         [sys.executable, "-c", KILLED], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -406,9 +406,9 @@ def test_a_signal_while_writing(here: Path, number: signal.Signals) -> None:
 
 @posix
 def test_the_process_that_compiles_is_ended_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is in a group of its own, where Ctrl-C does not reach it, and is stopped by what ends us.
+    """Ctrl-C does not reach the separate process group, so a signal that ends us must stop it.
 
-    Also while its end is waited for.
+    This must also work while we wait for that process to end.
     """
     from foamfit.solve import precompile
 

@@ -1,4 +1,4 @@
-"""A user-defined law, in a file that --law names: known to every command and its processes."""
+"""A user-defined law from the file given by --law is available to all commands and processes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.springs import laws
 
-# An elastic law: what is tested is who knows it.
+# An elastic law suffices, because only its availability is tested.
 LAW = """\
 import foamfit as ff
 
@@ -64,7 +64,7 @@ TRUE = {"s1_k": 2e5, "s1_q": 1e6}
 
 @pytest.fixture(scope="module")
 def cubic(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The law file: in one place, it is compiled once."""
+    """Write the law file once per module, so that it is compiled only once."""
     path = tmp_path_factory.mktemp("law") / "cubic.py"
     path.write_text(LAW)
     return path
@@ -72,7 +72,7 @@ def cubic(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with two tests of the law; what is registered goes with the test."""
+    """Change to a folder with two tests of the law; registered laws are removed after each test."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(laws, "_LAWS", dict(laws._LAWS))
     monkeypatch.setattr(laws, "_TEXTS", dict(laws._TEXTS))
@@ -94,7 +94,7 @@ def run(*words: object) -> Result:
 
 
 def refused(*words: object) -> str:
-    """The one sentence with which a command refuses."""
+    """Return the single error message with which a command fails."""
     told = run(*words)
     assert (told.exit_code, told.stdout) == (1, ""), told.output
     assert re.fullmatch(r"foamfit: [^\n]+\n", told.stderr)
@@ -138,7 +138,7 @@ def test_a_law_of_a_file_is_fitted_and_predicts(
 
 
 def test_processes_of_a_batch_know_the_law_as_it_is_now(here: Path) -> None:
-    """With another text of the law what is done is fitted again."""
+    """After a change of the law file, the batch repeats finished fits."""
     (here / "cubic.py").write_text(LAW)
     asked = ("t1.csv", "--model", "cubic", "--law", "cubic.py", "--starts", 1, "--jobs", 1)
     told = run("batch", *asked, "--json", "--no-report", "--out", "b")
@@ -159,7 +159,7 @@ def test_the_process_of_the_page_knows_the_law(here: Path, cubic: Path) -> None:
     laws.load_file(cubic)
     desk = Desk(here / "window")
     desk.take(here / "t1.csv")
-    assert desk.check(*desk.dropped_toml())  # an error is raised
+    assert desk.check(*desk.dropped_toml())  # raises an error if the test is invalid
     worker = desk.fit(["--model", "cubic", "--starts", "1", "--no-report"])
     end = time.monotonic() + 60.0
     while worker.ended is None:
@@ -170,7 +170,7 @@ def test_the_process_of_the_page_knows_the_law(here: Path, cubic: Path) -> None:
 
 
 def test_no_toml_no_result_and_no_browser_names_a_law_file(here: Path) -> None:
-    """A law file is code."""
+    """A law file is code, so only the command line may name one."""
     from foamfit.page.worker import parsed
 
     (here / "law.py").write_text("import pathlib\npathlib.Path('run').touch()\n")

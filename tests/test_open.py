@@ -1,4 +1,4 @@
-"""--open shows what was found in the browser, or says that there is none."""
+"""--open shows the report in the browser, or reports that no browser was found."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 
 @pytest.fixture
 def opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What was opened; a browser is there."""
+    """Simulate a browser and return the list of opened addresses."""
     found: list[str] = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(webbrowser, "open", lambda address: bool(found.append(address)) or True)

@@ -1,4 +1,4 @@
-"""The laws of experiments/other_laws against closed forms, SciPy and direct evaluation."""
+"""Compare the laws of experiments/other_laws with closed forms, SciPy and direct evaluation."""
 
 import importlib
 import sys
@@ -21,21 +21,21 @@ UP_DOWN = np.concatenate([np.linspace(0.0, 0.6, 61), np.linspace(0.59, 0.0, 60)]
 
 @cache
 def law(name):
-    """Register the law of a file."""
+    """Register the law in a file and return it."""
     if str(FOLDER) not in sys.path:
         sys.path.insert(0, str(FOLDER))
     return ff.register(importlib.import_module(name).LAW)
 
 
 def stress(strain, mu, alpha, nu, beta):
-    """Nominal stress of the hyperfoam by its published sum."""
+    """Return the nominal stress of the hyperfoam from its published sum."""
     stretch = 1.0 - strain
     terms = ((mu, alpha), (nu, -beta))
     return sum(2.0 * m / a * (1.0 / stretch - stretch ** (a - 1.0)) for m, a in terms)
 
 
 def pressed(spring, time, strain):
-    """Base stress of one spring under a prescribed motion."""
+    """Return the base stress of one spring under a prescribed motion."""
     chain = ff.Chain([spring], [0.01], area=1e-4)
     drive = ff.DisplacementDrive(0.01 * strain)
     return ff.simulate(chain, drive, time, rtol=1e-6).base_stress

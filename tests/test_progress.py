@@ -1,4 +1,4 @@
-"""What a fit shows on a terminal while it runs, and where nothing is shown."""
+"""The progress line of a fit on a terminal, and cases in which no line is shown."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ def terminal() -> Iterator[Terminal]:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Reports without pictures, an empty working directory, a line that does not depend on load.
+    """Use an empty directory, no pictures, and a progress line that is independent of the load.
 
-    The line shows all that it is told; by its clock each step takes 0.1 s.
+    The line draws every update; by its clock each update takes 0.1 s.
     """
     now = [0.0]
 
@@ -103,7 +103,7 @@ def test_a_terminal_shows_what_is_done_a_bar_the_best_misfit_and_the_time_left(
     assert re.search(r", about \d+ s left", told)
     found = [float(one) for one in re.findall(r"best misfit ([\d.]+) %", told)]
     assert found == sorted(found, reverse=True)
-    assert told.endswith("\r")  # nothing is left of it
+    assert told.endswith("\r")  # the line is erased
     curves = r"stress-time ([\d.]+) %, displacement-time ([\d.]+) %"
     said = re.search(curves, capsys.readouterr().out)
     assert said is not None
@@ -138,7 +138,7 @@ def test_nothing_is_shown_and_nothing_watched_without_a_terminal(
 def test_a_sentence_in_between_does_not_run_into_the_line(
     terminal: Terminal, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.WARNING, logger="foamfit")  # a quiet command may have silenced it
+    caplog.set_level(logging.WARNING, logger="foamfit")  # an earlier test may have raised it
     monkeypatch.setattr(sys, "stderr", terminal.stream)
     with progress_line(False, "fit") as line:
         line.progress(0.5, "loop")
@@ -157,7 +157,7 @@ def standing(
     stream: Any = None,
     **more: Any,
 ):
-    """A line that was told shares of the work at these seconds; and its clock."""
+    """Return a progress line after updates at the given (second, fraction), and its clock."""
     now = [0.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     monkeypatch.setattr(module, "REDRAWN", 60.0)
@@ -174,7 +174,7 @@ def test_the_time_left_follows_the_pace_and_counts_down(monkeypatch: pytest.Monk
     assert line.left() == "about 5 s left"
     now[0] += 2.0
     assert line.left() == "about 3 s left"
-    now[0] += 60.0  # nobody knows
+    now[0] += 60.0  # past the estimated end
     assert line.left() == "about 2 s left"
     line.close()
     slower = [*steady, *((5.0 + 1.0 * i, 0.5 + 0.01 * i) for i in range(1, 21))]
@@ -227,7 +227,7 @@ def test_the_best_misfit_is_that_of_all_fitted_curves_and_costs_no_evaluation() 
     assert problem.objective.evaluations == counts
     best = BestPoint(problem, values)
     assert line.misfit == pytest.approx(misfit_of(best.problem.objective, best.residual), rel=1e-6)
-    line.progress(0.5, "cycle 2: loop")  # of another test
+    line.progress(0.5, "cycle 2: loop")  # another test begins
     assert line.misfit is None
     line.close()
 
@@ -250,7 +250,7 @@ def test_simulations_for_the_line_take_a_small_share_of_the_time(
         now[0] += 0.001
         line.watch(problem, np.zeros(8))
         line.progress(0.1, "loop")
-    # What the first one took does not count: it loads the solver.
+    # The first interval is excluded, because the first simulation loads the solver.
     assert np.diff(looks)[1:11] == pytest.approx([took + apart] * 10, abs=0.002)
     line.close()
 

@@ -1,4 +1,4 @@
-"""What a fit bears: outliers, a clock that is off, and being stopped."""
+"""Robustness of a fit to outliers, a time shift and interruption."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 
 
 def worst_deviation(result: ff.FitResult, spring: ff.BistableSpring) -> float:
-    """Largest deviation of the seven parameters from the truth, in standard errors."""
+    """Return the largest deviation of the seven parameters from the true values, in stderr."""
     items = [result.parameters[f"s1_{name}"] for name in NAMES]
     return max(
         abs(item.value - true) / item.stderr for item, true in zip(items, spring.seven, strict=True)
@@ -44,7 +44,7 @@ def worst_deviation(result: ff.FitResult, spring: ff.BistableSpring) -> float:
 
 
 def spoilt_impact() -> tuple[ff.BistableSpring, Measurement, np.ndarray]:
-    """An impact whose stress was wild at some samples, as the loader hands it on."""
+    """Return an impact with stress outliers at some samples, in the form the loader returns."""
     spring, test = synthetic_impact()
     at = np.array([57, 148, 149, 301])
     left_out = np.isin(np.arange(test.time.size), at)
@@ -119,7 +119,7 @@ def test_a_file_with_spikes_and_gaps_gives_the_parameters_of_the_spring(tmp_path
 
 
 def shifted_impact(late: float, **changed: object) -> tuple[ff.BistableSpring, Measurement]:
-    """The impact of conftest, its motion written down `late` seconds too late."""
+    """Return the impact of conftest with its motion recorded `late` seconds too late."""
     spring, test = synthetic_impact(samples=201)
     chain = ff.Chain([spring], [HEIGHT], AREA)
     dense = np.linspace(0.0, 0.9e-3, 20_001)
@@ -161,7 +161,7 @@ def test_no_shift_is_warned_of_where_there_is_none():
 
 @pytest.mark.parametrize("contact", ["file", "stress", "motion"])
 def test_the_curves_of_a_shifted_test_are_those_that_it_shows(contact):
-    """Time zero is the file's, where the stress starts (the motion is zero), or the motion's."""
+    """Time zero comes from the file, the onset of stress (zero displacement), or the motion."""
     late = 12e-6
     spring, test = synthetic_impact(noise=0.0)
     chain = ff.Chain([spring], [HEIGHT], AREA)
@@ -231,7 +231,7 @@ def test_the_command_fits_a_shift_and_refuses_it_without_time(tmp_path, monkeypa
     assert len(out.stderr.splitlines()) == 1
 
 
-# ---------------------------------------------------------------------------------------- stopped
+# ----------------------------------------------------------------------------------- interruption
 
 
 def test_a_stopped_fit_is_marked_everywhere(tmp_path, monkeypatch):
@@ -256,7 +256,7 @@ def test_sigterm_keeps_the_best_so_far(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small_pictures(monkeypatch)
     end = partial(signal.raise_signal, signal.SIGTERM)
-    monkeypatch.setattr(one_model, "settle_ends", lambda *_: end())  # when the search is over
+    monkeypatch.setattr(one_model, "settle_ends", lambda *_: end())  # stop after the search
     call = ["fit", str(fabricated_csv(tmp_path)), "--starts", "2", "--out", "stopped"]
     out = CliRunner().invoke(main, call)
     assert (out.exit_code, out.stderr) == (0, "")
@@ -281,7 +281,7 @@ def test_a_stopped_fit_is_never_ok(monkeypatch):
     def stop(*_: object, **__: object) -> None:
         raise SearchStoppedError
 
-    monkeypatch.setattr(lmfit, "minimize", stop)  # the refinement
+    monkeypatch.setattr(lmfit, "minimize", stop)  # interrupts the refinement
     result = ff.fit(synthetic_impact(samples=201)[1], starts=2)
     assert result.stopped == "the time limit"
     assert result.status == "warnings"

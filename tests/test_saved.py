@@ -1,4 +1,4 @@
-"""Results read back, and what Python shows of them."""
+"""Results read back from files, and their display in Python."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from foamfit.trust.intervals import Intervals
 
 
 def odd() -> ff.FitResult:
-    """A fit with much that a fit may have: outliers, profiles, open ends, a strange name."""
+    """Return a fit with outliers, profiles, open interval ends and an unusual name."""
     base = fabricated.result()
     n = base.curves.time.size
     gone = np.arange(n) % 50 == 3
@@ -149,7 +149,7 @@ def test_what_python_and_notebooks_show(fitted: ff.FitResult) -> None:
 
 
 def test_tables_compile(tmp_path: Path) -> None:
-    """With booktabs, whatever the names hold; without a TeX their structure is checked."""
+    """Tables with booktabs and unusual names compile; without TeX, only check the structure."""
     strange = "a_1 & 100 % #µ~^\\ {x} [*] <σ> ü 漢 $"
     cycles = ff.CycleFits(strange, "bistable", (1, 2), {1: odd(), 2: fabricated.result()}, {})
     cycles.save(tmp_path / "cycles", report=False)

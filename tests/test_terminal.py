@@ -1,4 +1,4 @@
-"""What reaches the terminal: every encoding, no control characters, true exit codes."""
+"""Terminal output: all encodings, no control characters, correct exit codes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ODD = "foam \x1b[31mred\x1b[0m\x07\x9b2J\u202eback χ"
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty working directory, and figures that need no time."""
+    """Change to an empty directory and replace the figures by small files."""
     monkeypatch.chdir(tmp_path)
     small_pictures(monkeypatch)
     return tmp_path
@@ -41,7 +41,7 @@ def run(*args: object, encoding: str = "utf-8") -> Result:
 
 
 def quick(monkeypatch: pytest.MonkeyPatch, *, light: bool = True, **changed: object) -> None:
-    """Let the fit be there at once, and its folder hold no pictures if `light`."""
+    """Replace the fit by a fabricated result, and write no pictures if `light`."""
     made = fabricated.result(**changed)
     monkeypatch.setattr(api, "fit", lambda *_, **__: made)
     if light:
@@ -147,7 +147,7 @@ def test_no_control_character_of_a_name_reaches_the_terminal(
 def test_a_name_that_is_no_unicode_is_written_and_printed(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As a file name of another encoding is read by Python."""
+    """Python decodes a file name in another encoding to such a name."""
     name = os.fsdecode(b"foam \xe9")
     measurement = fabricated.result().measurement
     named = type(measurement)(**{**vars(measurement), "name": name})
@@ -159,7 +159,7 @@ def test_a_name_that_is_no_unicode_is_written_and_printed(
     assert told.exit_code == 0
 
 
-# ---------------------------------------------------------------- whose fault it is
+# ---------------------------------------------------------------- origin of errors
 
 
 def broken(error: BaseException):
@@ -207,7 +207,7 @@ def test_what_springs_and_chains_refuse_is_an_input_error() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_in_code_that_cannot_raise_is_not_lost(number: signal.Signals) -> None:
-    """As in the callbacks by which numba loads what it has compiled."""
+    """A signal may arrive in such code, as in the callbacks with which numba loads functions."""
     callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))
     hook = sys.unraisablehook
 

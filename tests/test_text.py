@@ -1,4 +1,4 @@
-"""Numbers, lists and lines as people read them."""
+"""Formatting of numbers, lists and lines for readers."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_lines_keep_their_width_and_their_words() -> None:
 def test_text_and_tables_fit_the_terminal(
     columns: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Columns for which a line has no room follow below, beside the first one."""
+    """Columns that do not fit follow below, again next to the first column."""
     monkeypatch.setenv("COLUMNS", columns)
     rows = [["parameter", *"abcdefghij"], *([name, *["1234567 MPa"] * 10] for name in ("k0", "kc"))]
     lines = aligned(rows)

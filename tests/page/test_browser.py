@@ -1,4 +1,4 @@
-"""The page in a real browser: everything that is pressed, dropped and turned there."""
+"""The page in a real browser: clicking, dropping files and moving sliders."""
 
 import json
 import os
@@ -28,7 +28,7 @@ TEST = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
 HEAD = "time (ms),force (N),displacement (mm)"
 SOON, LATER = 20_000, 90_000  # ms
 
-# Milliseconds from a move of a slider to the next frame after the curve has come, many moves.
+# Time in ms from each slider move to the first frame after the new curve has arrived.
 REDRAWS = """async () => {
   const source = [...Bokeh.documents[0]._all_models.values()].find((m) => m.data?.stress_time_y);
   const inputs = (at) => [...at.querySelectorAll('*')].flatMap((e) => [
@@ -51,7 +51,7 @@ REDRAWS = """async () => {
   }
   return took;
 }"""
-# What lies beneath the pointer gets the events of a drag from outside, with the files.
+# Send the events of dropping external files to the element under the pointer.
 DROP = """([files, x, y]) => {
   const carried = new DataTransfer();
   for (const [name, text] of files)
@@ -76,11 +76,11 @@ CURVE = """() => Array.from([...Bokeh.documents[0]._all_models.values()]
 
 
 def rows(change=lambda i, row: row):
-    """A table that can be read but for what is changed in it."""
+    """Return a valid table except for the changes that `change` makes."""
     return "\n".join([HEAD, *(change(i, f"{i},{0.1 * i},{0.01 * i}") for i in range(40))])
 
 
-# Of each: its text, and what the sentence says.
+# Text of each invalid file, and words of the error message.
 BAD = {
     "word.csv": (rows(lambda i, r: "9,oops,1" if i == 9 else r), "row 11"),
     "no-unit.csv": (rows().replace("force (N)", "force"), "'force'"),
@@ -97,22 +97,22 @@ def playwright():
 
 
 def launch(driver, names, **options):
-    """Start a browser that is installed under one of these names, or that Playwright brings."""
+    """Start a browser installed under one of these names, or else the one of Playwright."""
     found = next((path for path in map(shutil.which, names) if path), None)
     if found is None and not Path(driver.executable_path).exists():
         pytest.skip(f"no {driver.name} is here: neither {', '.join(names)} nor playwright's own")
     if found is None:
-        options.pop("channel", None)  # its own needs none
+        options.pop("channel", None)  # Playwright's browser has no channel
     return driver.launch(executable_path=found, **options)
 
 
 @contextmanager
 def opened(browser, served):
-    """An open window; that no error is on its console is tested at its end."""
+    """Open a window and check at the end that its console shows no errors."""
     context = browser.new_context(viewport={"width": 1280, "height": 900}, accept_downloads=True)
     page, wrong, hosts = context.new_page(), [], set()
     page.set_default_timeout(SOON)
-    api.expect.set_options(timeout=SOON)  # whose own default is 5 s
+    api.expect.set_options(timeout=SOON)  # the default of 5 s is too short
     page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.on(
@@ -122,7 +122,7 @@ def opened(browser, served):
     page.goto(served.address)
     page.get_by_label("Drop a CSV").wait_for()
     yield page
-    assert [text for text in wrong if "status of 400" not in text] == []  # of a bad file
+    assert [text for text in wrong if "status of 400" not in text] == []  # 400: invalid file
     assert hosts == {f"127.0.0.1:{served.port}"}
     context.close()
 
@@ -137,15 +137,15 @@ def window(playwright, served):
 
 
 def drop(page, *files):
-    """Drop files onto the page, beside the zone that is drawn for them, as a file manager does."""
+    """Drop files onto the page outside the marked zone, as a file manager would."""
     at = page.get_by_role("heading", name="Curves").bounding_box()
     given = [[name, text.encode("latin-1").decode("latin-1")] for name, text in files]
     taken = page.evaluate(DROP, [given, at["x"] + 5, at["y"] + 5])
-    assert taken == [True, True, True]  # else the browser would leave the page for the file
+    assert taken == [True, True, True]  # otherwise the browser would open the file
 
 
 def choose(page, *files):
-    """Choose files in the dialog of the browser."""
+    """Select files as with the browser's file dialog."""
     given = [
         {"name": name, "mimeType": "text/csv", "buffer": text.encode("latin-1")}
         for name, text in files
@@ -154,7 +154,7 @@ def choose(page, *files):
 
 
 def press(button):
-    """Click after scrolling: in the same frame the click goes to the report that stood there."""
+    """Scroll, wait and click; an immediate click would hit the report that was there before."""
     button.scroll_into_view_if_needed()
     button.page.wait_for_timeout(300)
     button.click()
@@ -168,13 +168,13 @@ def load(page):
 
 def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     page = window
-    # What is wrong is said at once, and shown.
+    # Errors in a file are shown immediately.
     for name, (text, told) in BAD.items():
         drop(page, (name, text), ("t.toml", TEST.with_suffix(".toml").read_text()))
         api.expect(page.get_by_text(told, exact=False).first).to_be_visible()
         api.expect(page.get_by_role("button", name="Fit", exact=True)).to_be_disabled()
         api.expect(page.get_by_text("Save the result folder")).to_be_hidden()
-    # A name with markup is text.
+    # Markup in a name is shown as plain text.
     name = "<img src=x onerror=document.title='hit'>"
     toml = TEST.with_suffix(".toml").read_text()
     toml = re.sub(r'name = ".*"', f"name = {json.dumps(name)}", toml)
@@ -182,8 +182,8 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     page.get_by_text("What is understood").click()
     api.expect(page.get_by_text(name).first).to_be_visible()
     assert page.title() == "foamfit"
-    page.get_by_text("What is understood").click()  # folds it again
-    # The good test; a wrong quantity is marked.
+    page.get_by_text("What is understood").click()  # folds the section again
+    # With a valid test, a quantity of the wrong dimension is marked.
     load(page)
     height = page.get_by_label("Specimen height")
     api.expect(height).to_have_value("1.19 mm")
@@ -194,7 +194,7 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     height.fill("1.19 mm")
     height.press("Tab")
     page.get_by_label("s1_k0", exact=True).wait_for()
-    # A slider is turned by keys alone, and the curve follows.
+    # A slider works with the keyboard alone, and the curve follows.
     slider, before = page.get_by_label("s1_k0", exact=True), page.evaluate(CURVE)
     slider.focus()
     for _ in range(5):
@@ -203,7 +203,7 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     page.get_by_label("s1_eps_c as a number").fill("0.01")
     page.get_by_label("s1_eps_c as a number").press("Enter")
     api.expect(page.get_by_text("is not admissible").first).to_be_visible()
-    # A fit that is stopped keeps the best.
+    # A stopped fit keeps the best point.
     page.get_by_text("More options").click()
     page.get_by_label("Starts:").fill("100000")
     page.get_by_role("button", name="Fit", exact=True).click()
@@ -212,14 +212,14 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     page.get_by_role("button", name="Stop").click()
     report = page.frame_locator("iframe")
     api.expect(report.get_by_text("stopped by Ctrl-C").first).to_be_visible(timeout=LATER)
-    # One to its end with a parameter that is held.
+    # A complete fit with a fixed parameter.
     page.get_by_label("s1_eta as a number").fill("3")
     page.get_by_label("s1_eta fixed in the fit").check()
     page.get_by_label("Starts:").fill("2")
     page.get_by_role("button", name="Fit", exact=True).click()
     api.expect(page.get_by_text("A fit is running.")).to_be_visible()
     api.expect(report.get_by_text("s1_kc").first).to_be_visible(timeout=LATER)
-    # Saved is what the command writes.
+    # The saved archive contains the files that the command writes.
     with page.expect_download() as saved:
         press(page.get_by_text("Save the result folder"))
     archive = zipfile.ZipFile(saved.value.path())
@@ -249,7 +249,7 @@ def test_several_cycles_and_their_chain_are_turned(window, tmp_path):
     for name in ("stiffening", "softening", "weakening"):
         page.get_by_label(f"s1_{name}", exact=True).wait_for()
     api.expect(page.get_by_text("cycles 1 to 3: misfit")).to_be_visible()
-    # Played from rest, and stopped.
+    # The animation plays from rest and can be paused.
     along = page.get_by_label("instant along the loop")
     most = int(along.input_value())
     api.expect(page.get_by_text(re.compile("strain 3[78].*snapped [1-9]"))).to_be_visible()
@@ -290,7 +290,7 @@ def test_firefox_drops_fits_turns_and_saves(playwright, served, tmp_path):
         api.expect(report.get_by_text("s1_kc").first).to_be_visible(timeout=LATER)
         press(page.get_by_text("Save the report"))
         saved, end = tmp_path / "report.html", time.monotonic() + 20.0
-        while not saved.is_file() or "</html>" not in saved.read_text():  # no event tells it
+        while not saved.is_file() or "</html>" not in saved.read_text():  # no event marks the end
             assert time.monotonic() < end
             page.wait_for_timeout(100)
         assert "s1_kc" in saved.read_text()
@@ -298,7 +298,7 @@ def test_firefox_drops_fits_turns_and_saves(playwright, served, tmp_path):
 
 
 def test_another_file_keeps_nothing_of_the_one_before(window):
-    """Its specimen is that of its own TOML, or is filled in."""
+    """The specimen comes from the new file's TOML or must be entered by the user."""
     page = window
     height, rest = page.get_by_label("Specimen height"), page.get_by_label("Further TOML")
     load(page)
@@ -316,25 +316,25 @@ def test_two_windows_do_not_mix(window, served):
     load(window)
     other.get_by_label("Drop a CSV").wait_for()
     for page in (window, other):
-        page.get_by_text("What is understood").click()  # opens it
+        page.get_by_text("What is understood").click()  # unfolds the section
     api.expect(other.get_by_text("There is no test yet.")).to_be_visible()
     api.expect(other.get_by_label("Specimen height")).to_have_value("")
     other.get_by_label("reconstruction").select_option("foam-1: model-1-2.0mps-reconstruction")
     api.expect(other.get_by_text("VACNT foam-1/model-1").first).to_be_visible()
     api.expect(window.get_by_text("VACNT foam-1/model-2").first).to_be_visible()
     api.expect(window.get_by_text("VACNT foam-1/model-1")).to_have_count(0)
-    # One that is closed while its curves are on the way leaves no traceback: see `served`.
+    # Closing a window while it waits for curves causes no traceback; `served` checks this.
     other.get_by_label("s1_k0", exact=True).focus()
     for _ in range(8):
         other.keyboard.press("ArrowRight")
-    other.close()  # a window behind another one is drawn once a second only
+    other.close()  # windows in the background are drawn only once per second
 
 
 def test_everyone_can_use_it_at_once(window):
-    """A checker finds nothing serious, nothing is cut off, keys reach all, a move is drawn soon."""
+    """Check for accessibility, no cut-off content, keyboard access and fast redrawing."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is missing")
     load(window)
-    for width, colours in product((390, 1280), ("dark", "light")):  # of a phone and a laptop
+    for width, colours in product((390, 1280), ("dark", "light")):  # widths of a phone and a laptop
         window.emulate_media(color_scheme=colours)
         window.set_viewport_size({"width": width, "height": 900})
         window.wait_for_function(f"document.documentElement.scrollWidth <= {width}")

@@ -1,4 +1,4 @@
-"""What a window of the page works on, without a browser: files, sentences, fits, curves."""
+"""The state behind a window of the page, without a browser: files, messages, fits, curves."""
 
 import io
 import json
@@ -48,14 +48,14 @@ def desk(tmp_path):
 
 @pytest.fixture
 def ready(desk):
-    """A desk with a test that can be fitted."""
+    """Prepare a desk with a test that is ready to be fitted."""
     desk.take(TEST)
     desk.check(*desk.dropped_toml())
     return desk
 
 
 class Here(Worker):
-    """A worker without a process: to start one, and to draw its report, takes seconds."""
+    """A worker without a process, because starting one and drawing its report takes seconds."""
 
     def __init__(self, job):
         self.job, self.news, self.told, self.stopping = job, News(), "", False
@@ -72,7 +72,7 @@ class Here(Worker):
 
 @pytest.fixture
 def without_process(monkeypatch):
-    """What a window fits is fitted at once, in this process, and its pictures are a few bytes."""
+    """Run fits of a window in this process, with pictures of a few bytes."""
     monkeypatch.setattr(desk_module, "Worker", Here)
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
@@ -194,7 +194,7 @@ def test_a_fit_is_that_of_the_command(ready):
     there = ff.fit(measurement, model="bistable", starts=2, seed=3)
     saved = load_result(ready.result)["parameters"]["s1_k0"]["value"]
     assert saved == there.params["s1_k0"].value
-    # What was told last is what was found.
+    # The last progress message must agree with the result.
     assert worker.news.misfit["stress_time"] == pytest.approx(there.misfit["stress_time"], rel=0.02)
 
 
@@ -264,7 +264,7 @@ def test_a_fit_that_is_stopped_keeps_the_best(ready):
     assert set(worker.news.values) >= {"s1_k0", "s1_eta"}
     with pytest.raises(InputError, match="A fit is running"):
         ready.fit([])
-    # What it is fitted to cannot change beneath it.
+    # The data cannot be changed during a fit.
     with pytest.raises(InputError, match="A fit is running"):
         ready.receive("other.csv", b"1,2\n")
     with pytest.raises(InputError, match="A fit is running"):
@@ -338,7 +338,7 @@ def test_a_closed_window_ends_its_fit(ready):
 @pytest.mark.parametrize("drive", ["impact", "displacement"])
 def test_turned_curves_are_those_of_a_simulation(drive):
     measurement = ff.read_test(TEST)
-    if drive == "displacement":  # as it was sampled
+    if drive == "displacement":  # prescribe the motion as measured, without smoothing
         noise = replace(measurement.noise, displacement=0.0)
         measurement = replace(measurement, noise=noise)
     turning = Turning(measurement, "bistable", drive=drive)
@@ -368,11 +368,11 @@ def test_a_history_is_drawn_as_a_whole_with_what_springs_remember(tmp_path):
         strain, stress = curves["stress_strain"]
         np.testing.assert_array_equal(strain, record.displacement / record.specimen.height)
         assert len(stress) == len(record.stress)
-    # The second cycle is softer than the first, where the first loads.
+    # During loading, the second cycle is softer than the first.
     loading = [part.start + (part.stop - part.start) // 4 for part in cycles_of(record).values()]
     stresses = np.interp(loading, np.arange(len(stress)), drawn.curves["stress_strain"][1])
     assert stresses[1] < 0.95 * stresses[0]
-    # The chain goes through all cycles, and is snapped most where it is compressed most.
+    # The chain follows all cycles, and most micro-springs are snapped at maximum compression.
     turns = find_turns(drawn.chain["strain"], 0.1)
     assert len(turns) >= 5
     snapped = drawn.chain["snapped"][0]
@@ -389,7 +389,7 @@ def test_a_chain_is_drawn_with_the_fraction_snapped_of_each_spring(model):
     tall = chain["heights"].sum(axis=0)
     pressed = chain["top"] < 1.0
     np.testing.assert_allclose(tall[pressed], chain["top"][pressed], atol=0.01)
-    np.testing.assert_allclose(tall[0], 1.0)  # the striker is above it
+    np.testing.assert_allclose(tall[0], 1.0)  # the striker does not compress it yet
     for shares in chain["snapped"][np.isfinite(chain["snapped"][:, 0])]:
         assert shares[0] == 0.0
         assert 0.0 <= shares.min() < shares.max() <= 1.0
@@ -432,7 +432,7 @@ def test_the_heights_of_a_chain_keep_their_sum():
 def test_sliders_begin_near_the_loop_but_at_no_fit(make):
     _, measurement = make()
     off = Turning(measurement, "bistable").turn({}).misfit["stress_strain"]
-    assert 0.01 < off < 0.30  # the noise leaves 0.005
+    assert 0.01 < off < 0.30  # a fit reaches the noise, 0.005
 
 
 def test_points_lie_on_the_branches_they_join():
@@ -460,7 +460,7 @@ def test_a_test_without_stress_and_motion_is_refused():
         Turning(bare, "bistable")
 
 
-# ------------------------------------------------------------------- what is fixed and varied
+# ------------------------------------------------------------- fixed and varied parameters
 
 
 def test_the_notebook_shows_a_history_and_its_chain(tmp_path):
@@ -486,16 +486,16 @@ def test_ticks_say_what_a_fit_holds_and_varies():
     assert curves.chosen() == ({}, [])
     moves = {"s1_k0": 5.0, "site_eta": 7.0}  # MPa, Pa s
     curves._moved(SimpleNamespace(data={"moves": moves}))
-    assert curves.chosen() == ({"site_eta": 7.0}, [])  # held by itself, not at this value
+    assert curves.chosen() == ({"site_eta": 7.0}, [])  # fixed by default, here at another value
     curves._moved(SimpleNamespace(data={"held": {"s1_k0": True, "s1_eta": True, "no_one": True}}))
     held, varied = curves.chosen()
     assert (held["s1_k0"], set(held), varied) == (5e6, {"s1_k0", "s1_eta", "site_eta"}, [])
     curves._moved(SimpleNamespace(data={"held": {"s1_k0": False, "site_eta": False}}))
     assert (set(curves.chosen()[0]), curves.chosen()[1]) == ({"s1_eta"}, ["site_eta"])
-    # A chain holds its dashpots and varies the striker's by itself: the ticks say nothing else.
+    # Ticks agree with the defaults of a chain: dashpots fixed, onsite damper varied.
     curves.found = {"s2_kc": {"ci95": [80e6, 85e6], "range": None}}
     curves.show(Turning(ff.read_test(TEST), "linear+bistable"))
     bars = {r["name"]: r["interval"] for r in curves.sliders.rows if "interval" in r}
-    assert bars == {"s2_kc": [80.0, 85.0]}  # MPa, as its slider
+    assert bars == {"s2_kc": [80.0, 85.0]}  # in MPa, the unit of the slider
     assert not any("range" in row for row in curves.sliders.rows)
     assert curves.chosen() == ({}, [])

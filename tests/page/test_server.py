@@ -1,4 +1,4 @@
-"""Who may see the page: this machine, by its address, with its token."""
+"""Access to the page: only from this machine, by its address, with its token."""
 
 import http.client
 import socket
@@ -15,7 +15,7 @@ __all__ = ["served"]
 
 
 def ask(served, path, method="GET", body=None, **headers):
-    """Send a request as it is written, and return status and answer."""
+    """Send a request without any changes; return status and response."""
     connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=10)
     names = {"Host": f"127.0.0.1:{served.port}"}
     names |= {name.replace("_", "-"): value for name, value in headers.items()}
@@ -34,7 +34,7 @@ def ask(served, path, method="GET", body=None, **headers):
 
 @pytest.fixture(scope="module")
 def receive(served):
-    """The path at which a window takes files."""
+    """Return the path at which a window receives files."""
     assert ask(served, f"/{served.token}/")[0] == 200
     windows = sorted(served.files.glob("foamfit-page-*/window-*"))
     assert windows
@@ -69,7 +69,7 @@ def test_a_request_without_the_token_is_refused(served, path):
 
 @pytest.mark.parametrize("host", ["localhost:{port}", "evil.example:{port}", "127.0.0.1", "", None])
 def test_another_host_is_refused(served, host):
-    """A name that leads here (DNS rebinding) is not the page's own."""
+    """Another host name that resolves to this machine (DNS rebinding) is rejected."""
     host = host and host.format(port=served.port)
     assert ask(served, f"/{served.token}/", Host=host)[0] in (400, 403)
 
@@ -105,7 +105,7 @@ def test_a_file_is_taken_under_a_safe_name(served, receive):
 
 
 def test_a_file_that_is_too_large_is_refused_unseen(served, receive):
-    size = str(65 << 20)  # the page itself says so before it sends such a file
+    size = str(65 << 20)  # the page rejects such a file before sending it
     assert ask(served, f"{receive}?name=a.csv", "POST", b"x", Content_Length=size)[0] == 400
 
 

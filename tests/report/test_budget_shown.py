@@ -1,4 +1,4 @@
-"""The uncertainty budget and the nuisance parameters, as they are shown."""
+"""Display of the uncertainty budget and of the nuisance parameters."""
 
 from __future__ import annotations
 
@@ -84,18 +84,18 @@ def test_the_report_has_the_budget_as_table_and_picture() -> None:
     text = render_report(result, fabricated.no_figures())
     page = text[text.index("Uncertainty budget") :]
     head, row = (part.split("</tr>")[0] for part in page.split("<tr>")[1:3])
-    assert head.count("<th") == 6  # the corner, three sources, combined, the bars
+    assert head.count("<th") == 6  # corner, three sources, combined, bars
     assert "mass" not in head
     for share in ("1 %", "2 %", "2.4 %"):  # √(1 + 1 + 4)
         assert f">{share}<" in row
     widths = [float(bar.split("%")[0]) for bar in row.split("width: ")[1:]]
-    assert widths == pytest.approx([100 / 6, 100 / 6, 400 / 6], abs=0.1)  # 1, 1, 4 of 6
-    assert "± 0.11" in text  # of k0 = 5.5 MPa
+    assert widths == pytest.approx([100 / 6, 100 / 6, 400 / 6], abs=0.1)  # shares of variance
+    assert "± 0.11" in text  # 2 % of k0 = 5.5 MPa
     assert "Systematic is one standard deviation" in text
 
 
 def test_noise_alone_needs_no_budget() -> None:
-    """All of it stands in the table of parameters."""
+    """The table of parameters already shows uncertainty due to noise."""
     result = fabricated.result(budget=fabricated.budget(law=0.03))
     text = render_report(result, fabricated.no_figures())
     assert "Uncertainty budget" not in text
@@ -122,7 +122,7 @@ def test_check_says_which_deviation_would_matter() -> None:
 
 
 def impact_file(folder: Path, velocity: str, more: str = "") -> Path:
-    """An impact with 80 rows of flight before the contact, in a file."""
+    """Write an impact with 80 rows of free flight before contact."""
     spring, _ = synthetic_impact()
     contact = np.linspace(0.0, 0.75e-3, 401)
     chain = ff.Chain([spring], [HEIGHT], AREA)
@@ -160,4 +160,4 @@ def test_a_velocity_that_the_flight_contradicts_is_a_warning(tmp_path: Path) -> 
     assert wrong.status == "warnings"
     assert summary_text(wrong, verbose=True).count("given as 1.9 m/s") == 1
     page = render_report(wrong, fabricated.no_figures())
-    assert page.index("given as 1.9 m/s") < page.index('class="fold"')  # it is not folded
+    assert page.index("given as 1.9 m/s") < page.index('class="fold"')  # visible without unfolding

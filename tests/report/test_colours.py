@@ -1,8 +1,8 @@
-"""Colours that stand for something are told apart by all eyes, and in grey.
+"""Colours with a meaning are distinguishable with any colour vision, and in greyscale.
 
-Colour vision without one kind of cone is simulated by the matrices of Machado, Oliveira and
-Fernandes (2009, IEEE Trans. Vis. Comput. Graph. 15, 1291), in linear RGB; differences are those of
-CIE76 in L*a*b* (D65).
+Colour vision without one type of cone is simulated with the matrices of Machado, Oliveira and
+Fernandes (2009, IEEE Trans. Vis. Comput. Graph. 15, 1291) in linear RGB. Colour differences are
+CIE76 distances in L*a*b* (D65).
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ EYES = {
     ],
     "grey": [[0.2126, 0.7152, 0.0722]] * 3,
 }  # fmt: skip
-# Difference from which on colours of lines are told apart at a glance, and in grey, where it is one
-# of lightness alone.
+# Smallest colour difference at which lines are distinguishable at a glance, in colour and in grey
+# (where only lightness differs).
 APART, APART_IN_GREY = 20.0, 12.0
 XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
 
@@ -58,7 +58,7 @@ def apart(one: Any, other: Any, eye: str) -> float:
 
 
 def is_told(one: Any, other: Any) -> dict[str, float]:
-    """By which eyes two colours are not told apart, and how far they are from each other."""
+    """Return the kinds of vision that do not distinguish two colours, with their difference."""
     found = {eye: apart(one, other, eye) for eye in EYES}
     return {
         eye: round(far, 1) for eye, far in found.items()
@@ -67,7 +67,7 @@ def is_told(one: Any, other: Any) -> dict[str, float]:
 
 
 def test_the_simulation_is_that_of_the_textbooks() -> None:
-    """Pure red and green are far apart, and close in hue to eyes without the long cones."""
+    """Red and green are far apart, but much closer without the long or the medium cones."""
     assert lab("white", "normal") == pytest.approx([100.0, 0.0, 0.0], abs=0.05)
     assert apart("#ff0000", "#00ff00", "normal") == pytest.approx(170.6, abs=0.5)
     assert lab("#ff0000", "grey")[1:] == pytest.approx([0.0, 0.0], abs=0.05)
@@ -77,7 +77,7 @@ def test_the_simulation_is_that_of_the_textbooks() -> None:
 
 
 def cue(line: Any) -> tuple[Any, ...]:
-    """What tells a line from another one beside its colour: its mark, dashes, width."""
+    """Return the features of a line other than colour: marker, dashes and width."""
     width = line.get_linewidth()
     dashes = str(line._unscaled_dash_pattern) if line.get_linestyle() != "None" else ""
     marked = line.get_marker() not in ("None", None, "")
@@ -135,7 +135,7 @@ TEMPLATES = Path(foamfit.report.__file__).parent / "templates"
 
 
 def backgrounds(template: str) -> dict[str, tuple[str, str]]:
-    """Background and letters of each state on a page."""
+    """Return the background and text colour of each state on a page."""
     style = (TEMPLATES / template).read_text(encoding="utf-8")
     rule = r"([^{}\n]*)\{[^{}]*background: (#\w+); color: (#\w+);[^{}]*\}"
     return {

@@ -1,4 +1,4 @@
-"""Fitted beside published, and beside each other: numbers, errors, and where nothing is said."""
+"""Comparison of fits with published values and with each other: values, errors, omissions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 def published_fit(
     name: str = "foam-1/model-1", *, off: float = 0.0, test: str = "", **changed: Any
 ) -> FitResult:
-    """Return a result with the published values, each `off` standard errors (1 %) from them."""
+    """Return a result with all values `off` standard errors (1 %) from the published ones."""
     item = ff.published[name]
     made = {}
     for i, spring in enumerate(item.chain.springs, start=1):
@@ -108,7 +108,7 @@ def test_independent_errors_of_a_ratio_add_in_squares_and_the_text_says_so() -> 
     result = published_fit()
     section = only(compare([result]))
     assert row(section, "k_c/k0").stderr == pytest.approx(15 * math.hypot(0.01, 0.01))
-    # Δσ (1 - ε_a)/(k0 ε_a): the last enters as 1/(1 - ε_a)
+    # Δσ (1 - ε_a)/(k0 ε_a): the relative error of ε_a is multiplied by 1/(1 - ε_a)
     drop = 0.2 * math.sqrt(0.01**2 + 0.01**2 + (0.01 / 0.86) ** 2)
     assert row(section, "Δσ/σ_a").stderr == pytest.approx(drop)
     assert "fit.json contains no correlations" in comparison_text(compare([result]))
@@ -158,7 +158,7 @@ def test_the_published_damping_is_answered_in_words() -> None:
     section = only(compare([published_fit("foam-1/model-2")]))
     eta, zeta = row(section, "η"), row(section, "ζ")
     assert (eta.value, eta.reference, eta.percent) == (12.0, 1e4, None)
-    # 12 Pa s by the formula by which the published 1e4 Pa s gives 0.845
+    # damping ratio of 12 Pa s by the formula that gives 0.845 for the published 1e4 Pa s
     ratio = ff.published["foam-1/model-2"].damping_ratio_by_formula()
     assert zeta.value == pytest.approx(ratio * 12.0 / 1e4)
     assert zeta.stderr == pytest.approx(zeta.value * math.hypot(0.25, 0.005))
@@ -177,7 +177,7 @@ def test_the_published_damping_is_answered_in_words() -> None:
     ],
 )
 def test_the_damping_ratio_is_known_as_the_damping_is(eta: str, kc: str, zeta: str) -> None:
-    """ζ is η/√k_c: only a stiffness that is not known at all makes it worse than η."""
+    """ζ ∝ η/√k_c has the state of η unless the stiffness k_c is not determined."""
     result = with_parameter(published_fit("foam-1/model-2"), "s1_kc", state=kc, why="kc's reason")
     result = with_parameter(result, "s1_eta", state=eta, why="its reason", vary=eta != "fixed")
     section = only(compare([result]))
@@ -228,7 +228,7 @@ def test_unknown_tests_are_compared_with_the_first() -> None:
     section = only(compare([one, two]))
     assert section.other.label.startswith("monday")
     found = row(section, "k0")
-    expected = 0.03 / math.hypot(0.01, 0.01)  # both have 1 %
+    expected = 0.03 / math.hypot(0.01, 0.01)  # both errors are 1 %
     assert found.standard_errors == pytest.approx(expected)
     assert row(section, "η").percent == pytest.approx(0.0)
     assert "same data" not in comparison_text(compare([one, two]))
@@ -291,7 +291,7 @@ def test_the_text_is_aligned_and_narrow() -> None:
     starts = [line.index("state") for line in lines if line.startswith("parameter")]
     assert len(starts) == 3
     table = [line for line in lines[: lines.index("", 4)] if line.startswith("s")]
-    assert len(table) == 12  # three of the linear spring, eight of the other, the onsite damper
+    assert len(table) == 12  # linear spring 3, bistable spring 8, onsite damper 1
     for line in table:
         assert line[starts[0] :] in ("determined", "weak", "fixed")
 
@@ -410,7 +410,7 @@ def test_no_published_set_has_microscale_springs() -> None:
     one = fabricated.microscale_result()
     named = replace(one.measurement, name="VACNT foam-1/model-1")
     one = replace(one, measurement=named)
-    assert compare([one, one]).reference == "reference"  # though the name is that of a set
+    assert compare([one, one]).reference == "reference"  # although a published set has this name
     told = comparison_text(compare([one], "foam-1/model-1"))
     assert "The published sets have no microscale springs, so there are no" in told
     with pytest.raises(InputError, match="no published set has microscale springs; give a second"):

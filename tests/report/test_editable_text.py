@@ -1,4 +1,4 @@
-"""Text in the figures stays text: letters of embedded TrueType fonts, with what they stand for."""
+"""Text in figures stays editable: embedded TrueType fonts that map glyphs to characters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from foamfit.report.plots import plot_fit
 
 
 def objects(pdf: bytes) -> dict[int, bytes]:
-    """The objects of a PDF, streams inflated."""
+    """Return the objects of a PDF with decompressed streams."""
     found = {}
     for number, body in re.findall(rb"(\d+) 0 obj\s(.*?)\sendobj", pdf, re.DOTALL):
         head, mark, rest = body.partition(b"stream\n")
@@ -29,7 +29,7 @@ def objects(pdf: bytes) -> dict[int, bytes]:
 
 
 def fonts(pdf: bytes) -> list[tuple[str, bool]]:
-    """Kind of each font, and whether a TrueType file is embedded."""
+    """Return the type of each font and whether a TrueType file is embedded."""
     there = objects(pdf).values()
     kinds = [
         kind.decode()
@@ -37,19 +37,19 @@ def fonts(pdf: bytes) -> list[tuple[str, bool]]:
         for kind in re.findall(rb"/Subtype /(\w+)", body)[:1]
     ]  # fmt: skip
     embedded = b"".join(there).count(b"/FontFile2")
-    whole = [kind for kind in kinds if kind != "CIDFontType2"]  # which is a part of a Type0
+    whole = [kind for kind in kinds if kind != "CIDFontType2"]  # part of a Type0 font
     return [(kind, embedded >= len(whole)) for kind in whole]
 
 
 def letters(pdf: bytes) -> set[str]:
-    """The characters that the glyphs of a PDF say they stand for."""
+    """Return the characters to which the glyphs of a PDF are mapped."""
     found = set[str]()
     for body in objects(pdf).values():
         if b"beginbfrange" in body or b"beginbfchar" in body:
             for line in re.findall(rb"<\w+> (?:<\w+> )?\[?(<[\w<> ]+>)", body):
                 for code in re.findall(rb"<(\w+)>", line):
                     found.add(bytes.fromhex(code.decode()).decode("utf-16-be"))
-            ranges = re.sub(rb"\[[^]]*\]", b"", body)  # those whose codes are not listed
+            ranges = re.sub(rb"\[[^]]*\]", b"", body)  # ranges without a list of codes
             for first, last, code in re.findall(rb"<(\w+)> <(\w+)> <(\w+)>", ranges):
                 span = int(last, 16) - int(first, 16)
                 found |= {chr(int(code, 16) + i) for i in range(span + 1)}
@@ -58,7 +58,7 @@ def letters(pdf: bytes) -> set[str]:
 
 @functools.cache
 def pictures(form: str) -> dict[str, bytes]:
-    """Two of the figures, with all kinds of letters, as files."""
+    """Return two figures as files; together they contain all kinds of characters."""
     given = dict(figures())
     return {name: image(given[name], form) for name in ("microscale, relaxing", "comparison")}
 

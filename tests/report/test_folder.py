@@ -39,7 +39,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Save without the time that figures take, where the test is about the folder."""
+    """Skip the slow figures, because these tests only check the folder."""
     small_pictures(monkeypatch)
 
 

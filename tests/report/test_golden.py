@@ -1,9 +1,9 @@
-"""What the commands print, word for word: one file for each in tests/golden.
+"""Exact output of the commands: one file for each case in tests/golden.
 
     FOAMFIT_RENEW_GOLDEN=1 pytest tests/test_golden.py
 
-writes the files anew; look at what changed with `git diff tests/golden` before it is committed.
-The results are made up, so that no number depends on a search or on the machine.
+rewrites the files; check the changes with `git diff tests/golden` before committing them.
+The results are fabricated, so that no number depends on a search or on the machine.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def one_spring() -> Fit:
 
 
 def two_bistable() -> Fit:
-    """Sixteen parameters that vary, of which fourteen are determined, and two of the record."""
+    """Return a fit with 16 varied law parameters, 14 of them determined, and 2 of the record."""
     one = fabricated.result()
     made = {
         f"s{i}_{name}": fabricated.estimate(f"s{i}_{name}", getattr(fabricated.SPRING, name) or 9.0)
@@ -167,5 +167,5 @@ def test_what_is_printed_is_narrow_and_a_fit_is_one_screen(name: str) -> None:
     lines = (GOLDEN / f"{name}.txt").read_text(encoding="utf-8").splitlines()
     screen = name.startswith("fit_") and not name.endswith("_verbose")
     assert max(map(len, lines)) <= (80 if screen else 100)
-    assert len(lines) <= 22 or not screen  # two more say where the result is
+    assert len(lines) <= 22 or not screen  # the real command adds two lines on the result folder
     assert not re.search(r"\de\+\d", "".join(lines))

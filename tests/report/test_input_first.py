@@ -1,4 +1,4 @@
-"""What is wrong with the input of a fit stands first, and is never hidden."""
+"""Warnings about the input of a fit come first and are never hidden."""
 
 import json
 
@@ -13,7 +13,7 @@ HEAD = "time (s),force (MN),strain (%),displacement (mm)\n"
 
 def test_what_check_finds_wrong_stands_before_all_other_warnings(tmp_path, monkeypatch):
     without_pictures(monkeypatch)
-    # Fabricated: a force of meganewtons, a strain of another height, a loop of two straight lines.
+    # Faulty input: force in meganewtons, strain for another height, a loop of simple power laws.
     rows = [(t, min(t, 2.4 - t) ** (1 if t < 1.2 else 2), min(t, 2.4 - t)) for t in TIMES]
     body = "".join(f"{t:.3f},{1e2 * f:.6f},{12 * w:.6f},{w:.6f}\n" for t, f, w in rows)
     (tmp_path / "test.csv").write_text(HEAD + body)

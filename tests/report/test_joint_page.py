@@ -1,4 +1,4 @@
-"""The picture and the page of a joint fit."""
+"""The figure and the page of a joint fit."""
 
 import re
 from dataclasses import replace
@@ -29,7 +29,7 @@ KINDS = {
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory) -> JointResult:
-    """A joint fit of three loops, started at the truth; one name would be HTML."""
+    """Fit three loops jointly, starting at the true values; one test name contains HTML."""
     up = np.linspace(0.0, 0.5, 50)
     strain, names = np.concatenate([up, up[::-1][1:]]), ("first", "second", "<i>third</i>")
     problems, vectors, x = [], [], np.log(np.array(RATES) / 0.1)
@@ -86,12 +86,12 @@ def test_the_page_has_every_parameter_and_test(found):
         assert (f"<code>{name}</code>" in page) == (one.kind != "fixed")
     body = page.split('<table class="sortable">')[1]
     assert body.count("<tr>") == 1 + 3
-    # what a test has of its own, in the unit of the heading
+    # values of individual tests have the unit in the heading
     value = found.parameters["s1_kc"].tests["first"].value
     assert f'data-v="{value:.8g}">{value / 1e3:.1f}<' in body
     assert "scatters by" in page
     assert re.search(r"b = 0\.0\d+ \(0\.0\d+ to 0\.0\d+\)", page)
-    assert page.count("<td>log rate</td>") == 2  # of the parameter, and of the evidence
+    assert page.count("<td>log rate</td>") == 2  # in the parameter and evidence tables
 
 
 def test_the_page_tells_the_noise_of_each_test_beside_its_share_of_chi2(found):
@@ -102,7 +102,7 @@ def test_the_page_tells_the_noise_of_each_test_beside_its_share_of_chi2(found):
     assert heads[at - 1] == "share of χ² (%)"
     row = re.findall(r"<td[^>]*>(.*?)</td>", body.split("<tr>")[2])
     assert row[at] == '400.0<i class="ends">stated</i>'
-    # what is estimated counts for more than it is
+    # an estimated noise level is increased to account for correlation
     level = {"sigma": 250.0, "given": False, "time": 2.5, "scale": 1e3, "range": 1e5}
     one, *others = found.noise
     vars(found)["noise"] = ({"stress_strain": level}, *others)

@@ -1,4 +1,4 @@
-"""The notebooks are stored with the outputs of their code, and run."""
+"""The notebooks are stored with their outputs and run without errors."""
 
 import json
 import re
@@ -45,12 +45,12 @@ def test_a_notebook_is_stored_as_notebooks_run_py_leaves_it(name):
 
 
 def without_pictures(output):
-    """What an output holds as text."""
+    """Return the text of an output without its pictures."""
     return {kind: one for kind, one in output.get("data", {}).items() if "image" not in kind}
 
 
 def test_a_notebook_has_an_animation():
-    """An animated PNG begins with the chunk acTL, before its first picture."""
+    """An animated PNG has an acTL chunk before its first image."""
     from base64 import b64decode
 
     notebook = nbformat.read(NOTEBOOKS / LISTED[0], as_version=4)
@@ -61,13 +61,13 @@ def test_a_notebook_has_an_animation():
 
 @pytest.mark.parametrize("name", [LISTED[-1]])
 def test_notebook_runs_quietly_from_the_root(name, tmp_path, monkeypatch):
-    """Where they lie, the other notebooks are run by nbmake: see addopts in pyproject.toml.
+    """nbmake runs the other notebooks in their own folder: see addopts in pyproject.toml.
 
-    The root is one of links to what is in it, where no other test leaves files meanwhile.
+    The notebook runs in a copy of the root made of links, so that it sees no files of other tests.
     """
     from nbclient import NotebookClient
 
-    monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))  # whatever start-up files do
+    monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))  # ignore the user's start-up files
     folder = tmp_path / "root"
     folder.mkdir()
     for path in ROOT.iterdir():

@@ -15,7 +15,7 @@ from foamfit.report.summary import conclusions, render_report, summary_text
 
 
 class Page(HTMLParser):
-    """The references, tags and text of a page."""
+    """Parser that collects the references, tags and text of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class Page(HTMLParser):
     def handle_data(self, data: str) -> None:
         if "style" not in self.open:
             self.text += " " + data
-            # Of what is folded only the outermost summary is seen.
+            # In a folded section only the outermost summary is visible.
             titles = self.folded == 1 and "summary" in self.open
             self.shown += " " + data if not self.folded or titles else ""
 
@@ -57,7 +57,7 @@ def test_the_page_needs_nothing_else() -> None:
     text = render_report(fabricated.result())
     whole = Page(text)
     assert whole.open == []  # every tag is closed, in order
-    assert len(whole.references) == 2  # the fit, for a screen and for a phone
+    assert len(whole.references) == 2  # the fit figure for large screens and for phones
     assert all(ref.startswith("data:image/png;base64,iVBOR") for ref in whole.references)
     assert not re.search(r"@import|url\(|<link|<script", text)
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
@@ -95,7 +95,7 @@ def test_misfit_figure_parameters_and_warnings_come_first_and_the_rest_is_folded
 
 @pytest.mark.parametrize("make", [fabricated.chain_result, fabricated.microscale_result])
 def test_at_most_350_words_are_open(make: Any) -> None:
-    """Words have a letter; many and long warnings are cut, and the rest of them is folded."""
+    """Words contain a letter; long warnings are shortened, and surplus warnings are folded."""
     parameters = make().parameters
     weak = {n: replace(p, state="not determined", why="so " * 50) for n, p in parameters.items()}
     long = tuple(f"Warning {i}: {'the law misses the curve, ' * 20}" for i in range(9))
@@ -236,7 +236,7 @@ def test_summary_says_what_matters() -> None:
 
 @pytest.mark.parametrize("long", ["word " * 60, "word " * 6])
 def test_many_parameters_and_warnings_are_still_one_screen(long: str) -> None:
-    """What is not determined, and of the record, is a line; warnings are cut, then counted."""
+    """Undetermined and record parameters take one line each; surplus warnings are only counted."""
     one = fabricated.chain_result().parameters
     zeros = {name: fabricated.estimate(name, 1.0) for name in ("contact_time", "stress_zero")}
     more = {

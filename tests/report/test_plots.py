@@ -26,7 +26,7 @@ def with_curves(result: FitResult, **changed: Any) -> FitResult:
 
 
 def panels(result: FitResult) -> list[Any]:
-    """The panels of a fit without their residuals."""
+    """Return the panels of a fit without the residual panels."""
     return [ax for ax in plot_fit(result).axes if not ax.get_label().endswith("residual")]
 
 
@@ -252,7 +252,7 @@ def test_a_response_has_three_panels(name: str, tmp_path: Path) -> None:
     )
     key = [text.get_text() for text in figure.legends[0].get_texts()]
     assert set(key) == {*labelled, "end of contact"}
-    # Past the end of contact the striker flies: that is no stress-strain curve.
+    # After contact the striker flies freely, so the stress-strain curve ends there.
     assert response.contact_end is not None
     assert len(loop.lines[0].get_xdata()) == int(np.sum(time <= response.contact_end))
 
@@ -310,7 +310,7 @@ def test_a_microscale_loop_has_its_branches_and_medians() -> None:
         way = [0.0, strain] if up else [0.0, 0.6, strain]
         assert float(fabricated.MICRO.stress(way)[-1]) / 1e3 == pytest.approx(stress)
     limits = loop.get_ylim()
-    assert limits[1] < 1.2 * np.max(result.curves.stress) / 1e3  # branch a goes far beyond
+    assert limits[1] < 1.2 * np.max(result.curves.stress) / 1e3  # branch a extends much higher
     equilibrium = line(loop, "equilibrium")
     np.testing.assert_allclose(equilibrium.get_ydata(), result.curves.stress / 1e3)
 
@@ -348,7 +348,7 @@ def test_the_fraction_snapped_is_drawn_over_time_and_in_pictures_of_the_foam() -
     np.testing.assert_allclose(
         line(below, "ever snapped").get_ydata(), 100 * np.maximum.accumulate(fraction)
     )
-    whole, shaded = strip.patches[6:8]  # of the fourth of seven pictures, at the turn
-    assert whole.get_height() == pytest.approx(0.4, abs=0.004)  # of its height, at a strain of 60 %
+    whole, shaded = strip.patches[6:8]  # the fourth of seven stages, at maximum strain
+    assert whole.get_height() == pytest.approx(0.4, abs=0.004)  # height at 60 % strain
     assert shaded.get_height() / whole.get_height() == pytest.approx(fraction.max(), 0.01)
     assert plot_snapping(fabricated.result()) is None

@@ -1,4 +1,4 @@
-"""Figures of a result are the same whoever draws them, and need little."""
+"""Figures of a result are the same in any process and need few imports."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_all_figures_of_the_report_are_pdf_where_that_is_asked_for(
     assert snapping is not None
     assert snapping.pdf is None
     small_pictures(monkeypatch)
-    result.save(folder)  # and may be replaced
+    result.save(folder)  # replaces the folder
     assert {path.name for path in folder.glob("*.pdf")} == {"fit.pdf"}
     with pytest.raises(InputError, match="optionally followed by a comma and untitled or pdf"):
         result.save(folder, figure_width="two, png")
@@ -94,7 +94,7 @@ def test_one_core_draws_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def a_process(code: str, *arguments: str) -> tuple[str, set[str]]:
-    """What a new process prints that runs some code, and the modules that it has imported."""
+    """Run code in a new process; return its output and the modules that it imported."""
     at_the_end = "import atexit, sys\natexit.register(lambda: print('modules', *sys.modules))\n"
     run = subprocess.run(
         [sys.executable, "-c", at_the_end + code, *arguments], capture_output=True, text=True

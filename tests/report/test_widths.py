@@ -1,4 +1,4 @@
-"""Figures for one and two columns of print: nothing is cut off, nothing overlaps."""
+"""In figures for one and two print columns, nothing is cut off and nothing overlaps."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_what_is_no_width_is_refused_before_anything_is_done(
 def test_panels_stand_above_each_other_in_one_column_and_letters_keep_their_size() -> None:
     narrow, wide = (plot_fit(fabricated.result(), width=width) for width in ("one", "two"))
     assert (narrow.get_figwidth(), wide.get_figwidth()) == (3.25, 7.0)
-    assert narrow.get_figheight() < 9.0  # a page
+    assert narrow.get_figheight() < 9.0  # fits on a page
     with laid_out(narrow):
         boxes = [ax.get_position() for ax in narrow.axes[:3]]
     assert [round(box.x0, 3) for box in boxes] == [round(boxes[0].x0, 3)] * 3
