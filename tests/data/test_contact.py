@@ -1,4 +1,4 @@
-"""The start of an impact, and what the rows before it show, on closed-form synthetic pulses."""
+"""The start of an impact and the zeros found before it, for synthetic pulses in closed form."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ import rig
 HEIGHT, AREA, MASS, VELOCITY = 10e-3, 1e-4, 0.5, 2.0
 DURATION = 4e-3
 OMEGA = np.pi / DURATION
-BRAKED = 0.95 * VELOCITY * OMEGA  # m/s², at its peak: 95 % of the momentum is turned round
+BRAKED = 0.95 * VELOCITY * OMEGA  # peak, m/s²; the impulse is 1.9 times the initial momentum
 PEAK = BRAKED * MASS / AREA
 SPECIMEN, STRIKER = Specimen(HEIGHT, AREA), Striker(MASS, VELOCITY)
 
 
 def noise(rng, n, tau):
-    """Noise of unit variance, correlated over `tau` samples."""
+    """Return noise of unit variance with an autocorrelation time of `tau` samples."""
     rho = (tau - 1) / (tau + 1)
     white = rng.standard_normal(n + 400)
     return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white)[400:]
@@ -41,7 +41,10 @@ def record(
     channels="FW", n=500, before=200, phase=0.37, level=0.003, tau=1, gauge="flight", seed=0,
     clock=0.0, zeros=(0.0, 0.0, 0.0), after=0.3, gravity=0.0,
 ):  # fmt: skip
-    """A half-sine pulse in `n` samples, contact at the time `clock`, `zeros` in peaks."""
+    """Return a half-sine pulse of `n` samples with contact at time `clock`.
+
+    `zeros` are offsets of stress, displacement and acceleration as fractions of their peaks.
+    """
     rng = np.random.default_rng(seed)
     step = DURATION / n
     t = (np.arange(-before, int(n * (1 + after))) + phase) * step
@@ -69,7 +72,7 @@ def run(given, striker=STRIKER, **more):
 
 
 def error(done, clock=0.0):
-    """Error of the start, s."""
+    """Return the error of the contact time, s."""
     return done.origins["contact_time"] - clock
 
 
@@ -81,14 +84,14 @@ ZEROS = [(0.0, 0.0, 0.0), (-0.9, 0.7, 0.4), (0.8, -1.0, -0.6)]
 @pytest.mark.parametrize("tau", [1, 8])
 @pytest.mark.parametrize(("n", "before"), [(80, 40), (500, 150), (500, 2000), (8000, 3000)])
 def test_the_start_is_found_within_samples_or_a_few_percent(channels, gauge, tau, n, before):
-    # Each level of noise with each zero; with one zero where rows are many and reading takes long.
+    # All combinations of noise level and zero; for long records one zero per level, to save time.
     pairs = [(i, j) for i in range(3) for j in range(3) if n < 8000 or i == j]
     for i, j in pairs:
         level, zeros, seed = (5e-4, 5e-3, 0.02)[i], ZEROS[j], 3 * i + j
         clock = (0.0, 12.5, -3.0)[seed % 3]
         given = record(channels, n, before, 0.37, level, tau, gauge, seed, clock, zeros)
         done = run(given)
-        share = 0.02 if tau == 1 else 0.03  # slow noise looks like a rise
+        share = 0.02 if tau == 1 else 0.03  # slow noise resembles a rise of the stress
         assert abs(error(done, clock)) <= max(3 * DURATION / n, share * DURATION)
         assert done.contact != "file"
 
@@ -108,7 +111,7 @@ def test_one_impact_written_in_several_ways_starts_at_one_instant(channels):
 @pytest.mark.parametrize("phase", [0.0, 0.5])
 @pytest.mark.parametrize("level", [5e-4, 0.02])
 def test_a_record_that_begins_at_contact_loses_nothing(phase, level, after):
-    """Where it goes on past the contact its end shows the zero of the stress, else nothing does."""
+    """The zero of the stress is found only if the record continues after the end of contact."""
     given = record(before=0, phase=phase, level=level, after=after)
     done = run(given)
     assert error(done) == 0.0
@@ -127,7 +130,7 @@ def test_a_motion_alone_gives_the_start_of_a_gauge_at_rest():
         done = run(replace(given, derived=("stress",)))
         assert abs(error(done)) <= 0.02 * DURATION
         assert (done.contact, done.derived) == ("motion", ("stress",))
-        assert "stress" not in done.zeros  # which is none of its own
+        assert "stress" not in done.zeros  # a derived stress has no zero of its own
 
 
 def test_a_motion_alone_followed_in_flight_gives_a_rough_start():
@@ -139,7 +142,7 @@ def test_a_motion_alone_followed_in_flight_gives_a_rough_start():
 
 
 def test_a_gauge_that_moves_before_contact_is_not_taken_for_it():
-    """A striker released in sight of its gauge: the stress says where contact starts."""
+    """The gauge records the release of the striker, so the stress determines the contact time."""
     given = record(before=900, level=1e-3)
     t = given.time
     fall = np.where(t < -0.6 * DURATION, VELOCITY * -0.6 * DURATION, VELOCITY * t)
@@ -149,7 +152,7 @@ def test_a_gauge_that_moves_before_contact_is_not_taken_for_it():
 
 
 def test_a_stress_that_rises_in_two_steps_is_found_at_the_first():
-    """A long plateau of 5 to 10 % of the peak, then a steep rise; once no start was found."""
+    """The stress rises slowly to 10 % of its peak, then steeply; once, no start was found."""
     rng, t = np.random.default_rng(0), (np.arange(-200, 160) + 0.4) * DURATION / 80
     plateau = np.interp(t, [0.0, 0.1 * DURATION, DURATION], [0.0, 0.05, 0.1])
     peak = np.interp(t, [0.85 * DURATION, 0.95 * DURATION, 1.1 * DURATION], [0.0, 1.0, 0.0])
@@ -157,10 +160,10 @@ def test_a_stress_that_rises_in_two_steps_is_found_at_the_first():
     stress += 0.01 * PEAK * rng.standard_normal(t.size)
     done = run(Record(t, stress, 1e-3 + 0.5 * np.minimum(t, 2 * DURATION - t)))
     assert done.contact == "stress"
-    assert abs(error(done)) < 0.25 * DURATION  # no start at all was found once, 2.5 off
+    assert abs(error(done)) < 0.25 * DURATION  # 2.5 durations when no start was found
 
 
-# What the rows before contact show.
+# Rows before contact.
 
 
 def test_zeros_have_the_error_of_their_mean():
@@ -185,7 +188,7 @@ def test_zeros_have_the_error_of_their_mean():
 @pytest.mark.parametrize("after", [0.0, 0.3])
 @pytest.mark.parametrize(("before", "rest"), [(5, 0), (6, 3), (20, 10), (300, 250)])
 def test_few_rows_are_shared_between_zeros_and_contact(before, rest, after):
-    """The zero of the stress is shown by the end of a record where that is of more rows."""
+    """The zero of the stress is taken from the end of the record if that has more rows at rest."""
     done = run(record(before=before, phase=0.5, level=1e-4, gauge="rest", after=after))
     lead = int(np.count_nonzero(done.time < -1e-9))
     assert lead == pytest.approx(before - rest, abs=2)
@@ -205,7 +208,7 @@ def test_a_rest_that_drifts_owns_up_to_it():
     assert any("The stress drifts by" in note for note in drifting.notes)
     assert drifting.zeros["stress"] > 0.05 * PEAK > 50 * still.zeros["stress"]
     assert drifting.origins["stress_zero"] == 0.0
-    # A zero that lies farther off than it drifts is taken off all the same.
+    # An offset larger than the drift is subtracted nevertheless.
     far = run(replace(given, stress=given.stress + drift + 3 * PEAK))
     assert far.stress.max() == pytest.approx(PEAK, rel=0.1)
 
@@ -219,7 +222,7 @@ def test_a_motion_counts_before_contact_only_in_flight():
     assert not marked[rest.time < 0].any()
     assert not marked[(rest.time > 0) & (rest.time < 1.9 * DURATION / 500)].any()
     assert marked[(rest.time > 3 * DURATION / 500) & (rest.time < 0.97 * DURATION)].all()
-    assert not marked[-3:].any()  # it rests again
+    assert not marked[-3:].any()  # the gauge is at rest again
     assert rest.rows.used == len(rest.time)
     assert not any("the displacement starts at" in note for note in rest.notes)
 
@@ -277,7 +280,7 @@ def test_a_file_of_the_motion_alone_gives_a_derived_stress(tmp_path, gauge):
     assert done.derived == ("stress",)
     assert done.motion == "measured"
     assert any("deceleration of its motion" in note for note in done.notes)
-    clock = done.time + done.origins["contact_time"]  # the contact itself is found but roughly
+    clock = done.time + done.origins["contact_time"]  # since the contact time is only approximate
     truth = np.where(clock > 0, PEAK * np.sin(OMEGA * np.clip(clock, 0, DURATION)), 0.0)
     assert np.sqrt(np.mean((done.stress - truth) ** 2)) < 0.05 * PEAK
     assert ("displacement" in done.zeros) == (gauge != "flight")
@@ -308,7 +311,7 @@ def test_a_file_of_the_acceleration_alone_counts_its_stress(tmp_path):
 def test_a_start_from_which_the_motion_passes_the_height_is_moved():
     given = record("FW", level=1e-4)
     top = float(given.displacement.max())
-    thin = replace(SPECIMEN, height=top / 1.1)  # as if contact had been found too early
+    thin = replace(SPECIMEN, height=top / 1.1)  # as if contact were too early
     done = condition(given, thin, striker=STRIKER)
     assert done.displacement.max() == pytest.approx(0.97 * thin.height, rel=1e-3)
     assert error(done) == pytest.approx((top - 0.97 * thin.height) / VELOCITY, rel=0.02)
@@ -358,7 +361,7 @@ def test_where_gravity_matters_and_the_record_does_not_show_it_the_toml_is_asked
 
 @pytest.mark.parametrize("channels", ["FW", "AW"])
 def test_a_gauge_that_rests_again_does_not_stop_the_striker(channels):
-    """The rebound is read while the gauge still follows it, and the momentum agrees."""
+    """The rebound velocity is evaluated while the gauge moves; the momentum balance closes."""
     given = record(channels, gauge="rest")
     end = int(np.searchsorted(given.time, DURATION))
     still = np.where(given.time < DURATION, given.displacement, given.displacement[end])
@@ -371,7 +374,7 @@ def test_a_gauge_that_rests_again_does_not_stop_the_striker(channels):
 
 @pytest.mark.parametrize("seed", [6062, 6088])
 def test_a_rest_in_correlated_noise_is_found(seed, tmp_path):
-    """Its slope is hardly known; begun at the first sample, a fit does not get to the contact."""
+    """The slope at contact is uncertain; a fit started at the first sample misses the contact."""
     made = rig.impact(rig.Impact(tau=8.0), seed)
     found = read_test(rig.write(made, tmp_path)).origins["contact_time"]
     assert found == pytest.approx(made.truth["contact_time"], abs=2e-4)
@@ -387,7 +390,7 @@ def test_a_rest_in_correlated_noise_is_found(seed, tmp_path):
     ],
 )
 def test_a_fit_can_reach_the_contact_of_a_record_whose_rest_is_hard_to_see(given, seed, tmp_path):
-    """Correlated noise, few samples, a soft start before a steep peak."""
+    """Cases with correlated noise, few samples, or a soft start before a steep peak."""
     made = rig.impact(given, seed)
     contact = make_params(read_test(rig.write(made, tmp_path)))["contact_time"]
     assert contact.min < made.truth["contact_time"] < contact.max

@@ -1,4 +1,4 @@
-"""What a test file may look like, and how one that cannot be used is refused."""
+"""Formats of test files that are read, and messages for files that cannot be used."""
 
 import collections
 import re
@@ -17,11 +17,11 @@ needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are
 
 SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
 STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
-LOOP = np.sin(np.linspace(0, np.pi, 41))  # loading and unloading, from 0 over 1 to 0
+LOOP = np.sin(np.linspace(0, np.pi, 41))  # loading from 0 to 1 and unloading to 0
 
 
 def numbers(separator=",", decimal="."):
-    """Rows of time (ms), stress (2 MPa at most) and displacement (4 mm at most)."""
+    """Return rows of time (ms), stress (up to 2 MPa) and displacement (up to 4 mm)."""
     time_ms = np.arange(41.0)
     table = zip(time_ms, 2 * LOOP, 4 * LOOP, strict=True)
     rows = [separator.join(f"{v:.9g}" for v in row) for row in table]
@@ -38,7 +38,7 @@ def write(folder, header="time (ms),stress (MPa),displacement (mm)", rows=None, 
 
 
 def expect(test):
-    """Check that it is the loop of `numbers`."""
+    """Check that the test contains the loop of `numbers`."""
     assert test.time[-1] == pytest.approx(0.04)
     assert test.stress.max() == pytest.approx(2e6)
     assert test.displacement.max() == pytest.approx(4e-3)
@@ -204,7 +204,7 @@ def test_the_toml_is_read_in_si(tmp_path):
 
 
 def test_no_function_is_called_for_each_row(tmp_path):
-    """So a million rows take a second; counted, because a clock depends on the machine."""
+    """This keeps reading fast; calls are counted because times depend on the machine."""
     n = 20_000
     t = np.linspace(0, 1, n)
     y = np.sin(np.pi * t)
@@ -212,7 +212,7 @@ def test_no_function_is_called_for_each_row(tmp_path):
     rows = zip(t.tolist(), y.tolist(), strict=True)
     block = "\n".join(f"{a:.7f},{2 * b:.7f},{4 * b:.7f}" for a, b in rows)
     path.write_text("time (ms),stress (MPa),displacement (mm)\n" + block)
-    read_test(path)  # imports are not counted
+    read_test(path)  # the first call also imports modules, which must not be counted
     calls = collections.Counter()
     before = sys.getprofile()
     sys.setprofile(lambda frame, event, _: calls.update([(event, frame.f_code)]))
@@ -225,14 +225,14 @@ def test_no_function_is_called_for_each_row(tmp_path):
     assert test.stress.max() == pytest.approx(2e6, rel=1e-3)
 
 
-# Masses inside that a camera followed.
+# Masses inside that a camera tracked.
 
 INSIDE = "time (ms),stress (MPa),displacement (mm),"
 PLAIN = INSIDE + "displacement_1 (mm)"
 
 
 def inside(*factors, offset=0.0):
-    """Rows of `numbers` and, for each factor, a mass inside that goes so many mm."""
+    """Return rows of `numbers` with a mass inside for each factor, its peak displacement in mm."""
     return [
         ",".join([row, *(f"{factor * y + offset:.9g}" for factor in factors)])
         for row, y in zip(numbers(), LOOP, strict=True)
@@ -251,7 +251,7 @@ def inside(*factors, offset=0.0):
 )
 def test_a_mass_inside_is_read(tmp_path, header, scale):
     test = read_test(write(tmp_path, INSIDE + header, inside(1.5 * scale)))
-    expect(test)  # it is not taken for the top
+    expect(test)  # the new column is not taken for the top
     assert list(test.interior) == [1]
     np.testing.assert_allclose(test.interior[1], 1.5e-3 * LOOP, atol=1e-11)
     assert f"displacement_1 from {header!r}" in test.notes[0]
@@ -287,7 +287,7 @@ def test_without_a_mass_inside_there_is_none(tmp_path):
     assert read_test(write(tmp_path, header, inside(1.0))).interior == {}
 
 
-# What is refused: one sentence that names what is wrong.
+# Files that are rejected, with one sentence that names the error.
 
 
 HEADER = "time (ms),stress (MPa),displacement (mm)"
@@ -384,7 +384,7 @@ def test_refuses_rows_by_their_number(tmp_path, row, words):
     ],
 )
 def test_a_last_row_that_is_cut_is_left_out_and_named(tmp_path, form, last, cut):
-    """Writing was interrupted: 6. stands for 6.428."""
+    """If writing was interrupted, the last number may be cut, for example 6. instead of 6.428."""
     table = zip(np.arange(41.0), 2 * LOOP, 4 * LOOP, strict=True)
     rows = [",".join(f"{value:{form}}" for value in row) for row in table]
     path = write(tmp_path, rows=[*rows, last])
@@ -436,7 +436,7 @@ def test_refuses_masses_inside(tmp_path, header, factors, words):
     path = write(tmp_path, header, inside(*factors))
     if words:
         refused(path, "test.csv", *words)
-    else:  # the better name of two wins
+    else:  # of two columns, the one with the better name is used
         assert read_test(path).interior[1].max() == pytest.approx(1e-3)
 
 
@@ -521,13 +521,13 @@ def shoe_toml(folder, shoe, more=""):
 def test_shoe_foam(tmp_path, shoe):
     path = DATA / "shoe-foam" / f"{shoe}_cycle1.csv"
     test = read_test(path, shoe_toml(tmp_path, shoe))
-    assert test.time[0] == 0.0  # the file starts in contact
+    assert test.time[0] == 0.0  # the file starts at contact
     assert len(test.time) > 1260
     assert test.displacement.max() / test.specimen.height == pytest.approx(0.615, abs=0.015)
     assert any("held for about 5 samples" in note for note in test.notes)
     checks = [note for note in test.notes if note.startswith("Check:")]
     assert ["play of the gauge" in note for note in checks] == [True]
-    assert (np.diff(test.displacement) == 0).mean() < 0.2  # most are held in the file
+    assert (np.diff(test.displacement) == 0).mean() < 0.2  # held values are interpolated
 
 
 @needs_data
@@ -578,7 +578,7 @@ def test_cartilage_as_labview_wrote_it(tmp_path, more, motion, strain):
     test = read_test(raw, cartilage_toml(tmp_path, VOLTS + more))
     assert test.motion == motion
     assert test.displacement.max() / test.specimen.height == pytest.approx(strain, abs=0.05)
-    assert test.time[-1] == pytest.approx(1.45e-3, abs=0.15e-3)  # not the second bounce
+    assert test.time[-1] == pytest.approx(1.45e-3, abs=0.15e-3)  # the second bounce is cut
     assert any("announces 100000 samples" in note for note in test.notes)
 
 

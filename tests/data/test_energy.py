@@ -1,4 +1,4 @@
-"""The balance of energy and momentum, and what is printed of a test."""
+"""The balance of energy and momentum, and the printed description of a test."""
 
 import os
 from dataclasses import replace
@@ -19,11 +19,11 @@ MASS, VELOCITY, REBOUND, STIFFNESS = 7e-3, 1.75, 1.05, 5e4
 
 
 def bounce():
-    """Return a test on a spring that is stiff in loading and gives back v = REBOUND."""
+    """Return a test on a spring that is stiffer in loading, so that it rebounds with REBOUND."""
     omega = np.sqrt(STIFFNESS / MASS)
     loading = np.linspace(0, np.pi / 2 / omega, 400)
     top = VELOCITY / omega
-    # In unloading a spring that is soft by (REBOUND / VELOCITY)² keeps the same top.
+    # With a stiffness lower by (REBOUND / VELOCITY)², unloading starts at the same displacement.
     slow = omega * REBOUND / VELOCITY
     unloading = np.linspace(0, np.pi / 2 / slow, 400)[1:]
     time = np.concatenate([loading, loading[-1] + unloading])
@@ -166,5 +166,5 @@ def test_cartilage_does_not_close(tmp_path, number, velocity):
         f'[striker]\nmass = "358.39 g"\nvelocity = "{velocity} m/s"\n'
     )
     found = audit(read_test(DATA / "cartilage-impact" / f"test_{number}_impact.csv", toml))
-    assert 0.745 < found.impulse_ratio < 0.795  # which zero the eight rows at rest have is in it
+    assert 0.745 < found.impulse_ratio < 0.795  # depends on the zero of eight rows
     assert any("impulse of the force" in warning for warning in found.warnings())

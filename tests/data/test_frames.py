@@ -1,6 +1,6 @@
-"""A motion in a file of its own, with its own clock: put on that of the force, or refused.
+"""A motion in a separate file with its own clock is resampled to the force or rejected.
 
-The records are synthetic: a force at 100 kHz, frames of a camera at 10 kHz.
+The records are synthetic: a force at 100 kHz and camera frames at 10 kHz.
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ def clock(rate):
 
 
 def press(t):
-    """A displacement of 4 mm at most, m."""
+    """Return a displacement (m) with a peak of 4 mm."""
     return 4e-3 * np.sin(np.pi * t / LAST)
 
 
@@ -39,7 +39,7 @@ def table(path, **columns):
 
 
 def written(folder, toml=MOTION, rate=1e5, frames=None, motion=None, force=None):
-    """The two files: a force over time, and frames (s) of the motion."""
+    """Write two files, the force and the motion at `frames` (s), and return the first path."""
     t, at = clock(rate), clock(1e4) if frames is None else frames
     given = {"time (ms)": 1e3 * t, "force (N)": 200.0 * np.sin(np.pi * t / LAST)}
     table(folder / "test.csv", **given, **(force or {}))
@@ -85,7 +85,7 @@ def test_time_of_the_force_is_that_of_the_motion_and_the_delay(tmp_path, sign):
 
 
 def test_a_frame_counts_at_the_sample_nearest_to_it(tmp_path):
-    at = clock(1e4)[:-1] + 3.4e-5 + 2e-6  # 4e-6 ahead of a sample
+    at = clock(1e4)[:-1] + 3.4e-5 + 2e-6  # 4e-6 s before the next sample
     test = read_test(written(tmp_path, frames=at))
     assert test.count.rows == 401
     [gone] = test.count.dropped
@@ -93,7 +93,7 @@ def test_a_frame_counts_at_the_sample_nearest_to_it(tmp_path):
     assert gone.rows == 401 - test.time.size == 4 + 7
     samples = clock(1e5)[4 : 4 + test.time.size]
     near = samples[taken(test)]
-    assert near[:-1] == pytest.approx(at[: near.size - 1], abs=0.5e-5)  # the last is dropped
+    assert near[:-1] == pytest.approx(at[: near.size - 1], abs=0.5e-5)  # the last frame is dropped
     assert near[0] == pytest.approx(at[0], abs=0.5e-5)
 
 
@@ -181,14 +181,14 @@ def test_the_noise_is_that_of_the_frames(tmp_path):
 
 @pytest.mark.parametrize(("rate", "several"), [(1e4, False), (5e5, True)])
 def test_blocks_of_samples_keep_the_frames(rate, several):
-    """3001 samples in 1001 blocks, with 0.04 or 2 frames each."""
+    """3001 samples are averaged in 1001 blocks, with 0.04 or 2 frames each."""
     t = LAST * np.arange(3001) / 3000
     at = clock(rate)
     noise = 1e-5 * np.random.default_rng(2).standard_normal(at.size)
     record = Record(t, 2e6 * np.sin(np.pi * t / LAST), None)
     joined = join(record, Frames("camera.csv", at, {"displacement": press(at) + noise}))
     test = condition(joined, Specimen(0.01, 1e-4))
-    assert 998 <= test.time.size <= 1001  # of one cycle
+    assert 998 <= test.time.size <= 1001  # some samples lie outside of the cycle
     level = test.noise.of("displacement")
     if several:
         assert test.sampled == {}
@@ -203,7 +203,7 @@ def test_blocks_of_samples_keep_the_frames(rate, several):
         assert "averaged" not in level.how
 
 
-# What a fit does with it.
+# Fits.
 
 
 def impact(folder, **changed):
@@ -385,7 +385,7 @@ def test_nothing_is_written(tmp_path):
 
 
 def test_striker_and_motion_of_two_files_are_one_impact(tmp_path):
-    """The same record in one file, sampled as the force is, and in two."""
+    """The motion is either in the file of the force, at the same rate, or in a file of its own."""
     t, at = np.arange(0, 701) * 1e-6, np.arange(0, 36) * 2e-5
     spring = ff.published["foam-1/model-1"].bistable
     run = ff.simulate(ff.Chain([spring], [1.19e-3], 1.9635e-5), ff.Impact(7e-3, 2.0), t)

@@ -1,4 +1,4 @@
-"""A gauge that stands still and then jumps: found and bridged, and never invented."""
+"""A gauge that sticks and then jumps is detected and bridged, without false detections."""
 
 import csv
 from dataclasses import replace
@@ -21,7 +21,7 @@ TOP = 6.0  # mm
 
 
 def motion(*ramps):
-    """Displacement (mm) at even times: where each ramp leads, in how many samples."""
+    """Return displacement (mm) at equal time steps; a ramp is its end and number of samples."""
     out = [0.0]
     for to, samples in ramps:
         out += list(np.linspace(out[-1], to, samples + 1)[1:])
@@ -29,7 +29,10 @@ def motion(*ramps):
 
 
 def relaxing_stress(w):
-    """Synthetic stress (kPa), by formulas of its own: stiffening spring, friction, Maxwell."""
+    """Return stress (kPa) of a stiffening spring with friction and a Maxwell element.
+
+    The formulas are independent of the package.
+    """
     elastic = 20.0 * w + 3.0 * np.maximum(w - 3.0, 0.0) ** 2
     friction, maxwell = np.zeros_like(w), np.zeros_like(w)
     for i in range(1, w.size):
@@ -40,12 +43,12 @@ def relaxing_stress(w):
 
 
 def held(w, samples):
-    """What a gauge shows that is read at every so many samples only."""
+    """Return the displacement of a gauge that is updated only once every `samples` samples."""
     return w[np.arange(w.size) // samples * samples]
 
 
 def recorded(folder, shown, stress, *, noise=(0.0, 0.0), timed=True, seed=0):
-    """Write and read a test; the noise is a share of each range: displacement, stress."""
+    """Write and read a test; `noise` is a fraction of the range of displacement and stress."""
     rng = np.random.default_rng(seed)
     shown = shown + noise[0] * TOP * rng.standard_normal(shown.size)
     stress = stress + noise[1] * np.ptp(stress) * rng.standard_normal(shown.size)
@@ -62,7 +65,7 @@ def recorded(folder, shown, stress, *, noise=(0.0, 0.0), timed=True, seed=0):
 
 
 def conditioned(shown, stress, noise):
-    """The same without its file, with noise of the stress."""
+    """Return the test without writing a file, with noise on the stress."""
     noisy = stress + noise * np.ptp(stress) * np.random.default_rng(0).standard_normal(stress.size)
     record = Record(STEP * np.arange(shown.size), 1e3 * noisy, 1e-3 * shown)
     return condition(record, Specimen(height=1e-3 * HEIGHT, area=1e-4))
@@ -72,27 +75,27 @@ def notes(test):
     return [note for note in test.notes if "stands still" in note]
 
 
-# The way back is not sampled at the displacements of the way there, which would be a digitiser's.
+# Unloading has another number of samples: equal displacements would suggest a digitised signal.
 CYCLE = ((TOP, 600), (0.0, 613))
-SLOW_TOP = ((TOP, 600), (TOP, 60), (0.0, 613))  # it rests at its top
+SLOW_TOP = ((TOP, 600), (TOP, 60), (0.0, 613))  # a short rest at the top
 
 
 def stuck(w, first, last):
-    """What a gauge shows that stands still from one sample up to another, and then is right."""
+    """Return the displacement of a gauge that sticks from sample `first` to sample `last`."""
     return np.concatenate((w[:first], np.full(last - first, w[first]), w[last:]))
 
 
-# ------------------------------------------------------------------------------------------ found
+# ------------------------------------------------------------------------------- detections
 
 
 @pytest.mark.parametrize("timed", [True, False], ids=["time", "no time"])
 @pytest.mark.parametrize(
     ("ramps", "first", "last", "every"),
     [
-        (SLOW_TOP, 594, 650, 1),  # late at the top: on while the machine rests there
-        (SLOW_TOP, 594, 645, 5),  # the same, read at every fifth sample
-        (CYCLE, 600, 640, 1),  # backlash: it stays at the top while the machine goes back
-        (((TOP, 500), (3.0, 250), (TOP, 250), (0.0, 450)), 750, 790, 1),  # of an inner turn
+        (SLOW_TOP, 594, 650, 1),  # sticks just before the top and while the machine rests there
+        (SLOW_TOP, 594, 645, 5),  # the same, updated every fifth sample
+        (CYCLE, 600, 640, 1),  # backlash: sticks at the top while the machine unloads
+        (((TOP, 500), (3.0, 250), (TOP, 250), (0.0, 450)), 750, 790, 1),  # sticks in an inner loop
     ],
 )
 @pytest.mark.parametrize("noise", [(0.0, 0.0), (0.0, 0.001), (0.0002, 0.002)])
@@ -100,7 +103,7 @@ def test_a_gauge_that_stands_still_and_jumps_is_bridged(
     tmp_path, ramps, first, last, every, timed, noise
 ):
     w = motion(*ramps)
-    # It sticks at what it showed last.
+    # The gauge sticks at its last updated value.
     at = first // every * every
     shown = stuck(held(w, every), at, last)
     test = recorded(tmp_path, shown, relaxing_stress(w), noise=noise, timed=timed)
@@ -109,12 +112,12 @@ def test_a_gauge_that_stands_still_and_jumps_is_bridged(
     told = [float(part.split(" %")[0].split()[-1]) for part in note.split("jumps by")[1:]]
     assert told == pytest.approx([100.0 * jump], rel=0.1, abs=0.05)
     (dropped,) = (item for item in test.rows.dropped if "stands still" in item.why)
-    # Line 1 is the header, and sample 0 the line after it.
+    # Line 1 is the header, sample 0 is line 2.
     assert abs(dropped.first - (at + 3)) <= (2 if noise[0] == 0.0 else 25)
     assert abs(dropped.last - (last + 1)) <= 1
     assert f"rows {dropped.first} to {dropped.last} " in note
     assert test.rows.rows == test.rows.used + sum(item.rows for item in test.rows.dropped)
-    # A straight line leads from before the stretch to after the jump.
+    # A straight line bridges the standstill and the jump.
     ((start, end),) = test.standstills
     instants = np.arange(test.stress.size) if test.time is None else test.time
     bridged = (instants >= start) & (instants <= end)
@@ -138,7 +141,7 @@ def test_only_the_stretches_of_the_cycle_that_is_used_are_named(tmp_path):
     assert f"rows {second + 603} to {second + 641} " in note
 
 
-# ---------------------------------------------------------------------------------- never invented
+# -------------------------------------------------------------------------- no false detections
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.001, 0.003])
@@ -149,10 +152,10 @@ def test_only_the_stretches_of_the_cycle_that_is_used_are_named(tmp_path):
     [
         CYCLE,
         ((TOP, 600), (TOP, 250), (0.0, 613)),  # a hold of 1 s
-        ((TOP, 600), (TOP, 2500), (0.0, 600)),  # of 10 s
-        ((3.0, 300), (3.0, 250), (TOP, 300), (3.0, 300), (3.0, 250), (0.0, 300)),  # on the way
-        ((2.0, 4), (2.0, 300), (4.0, 4), (4.0, 300), (TOP, 4), (TOP, 300), (0.0, 600)),  # by steps
-        ((0.0, 400), (TOP, 600), (0.0, 600), (0.0, 400)),  # it waits before contact and after
+        ((TOP, 600), (TOP, 2500), (0.0, 600)),  # a hold of 10 s
+        ((3.0, 300), (3.0, 250), (TOP, 300), (3.0, 300), (3.0, 250), (0.0, 300)),  # two holds
+        ((2.0, 4), (2.0, 300), (4.0, 4), (4.0, 300), (TOP, 4), (TOP, 300), (0.0, 600)),  # steps
+        ((0.0, 400), (TOP, 600), (0.0, 600), (0.0, 400)),  # rests around contact
         ((TOP, 30), (TOP, 20), (0.0, 30)),  # few samples
     ],
     ids=["turn", "1 s", "10 s", "twice", "steps", "dwell", "few"],
@@ -206,7 +209,7 @@ def test_the_stretch_is_shaded_in_every_panel_and_has_a_key():
 
 @pytest.mark.skipif(not (DATA / "shoe-foam-twins").is_dir(), reason="the records are not here")
 def test_the_gauge_of_every_shoe_foam_stands_still_at_the_top(tmp_path):
-    """Ten specimens by others (arXiv:2602.12694): 34 to 76 samples, then 0.4 to 1 % strain."""
+    """In ten tests (arXiv:2602.12694) 34 to 76 samples stand still before a jump of 0.4 to 1 %."""
     with (DATA / "shoe-foam-twins" / "specimens.csv").open() as table:
         specimens = list(csv.DictReader(table))
     for specimen in specimens:

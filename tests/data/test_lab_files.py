@@ -1,6 +1,6 @@
 """Files as testing machines and oscilloscopes write them.
 
-The layouts are those of the instruments; all values in them are fabricated.
+The layouts are those of the instruments; all values are synthetic.
 """
 
 import gzip
@@ -21,7 +21,7 @@ N = 161
 TIME = np.linspace(0, 30, N)  # s
 LOOP = np.sin(np.linspace(0, np.pi, N))
 TURN = np.arange(N) > N // 2
-FORCE = 200 * LOOP * np.where(TURN, LOOP, 1.0)  # N, 2 MPa at most; unloading lies below
+FORCE = 200 * LOOP * np.where(TURN, LOOP, 1.0)  # N, up to 2 MPa; lower in unloading
 MOTION = 4 * LOOP  # mm
 
 
@@ -38,7 +38,7 @@ def write(folder, lines, toml=SPECIMEN, name="test.csv", encoding="utf-8"):
 
 
 def expect(test, time=TIME[-1]):
-    """Check that it is the fabricated loop."""
+    """Check that the test contains the synthetic loop."""
     assert test.stress.max() == pytest.approx(2e6, rel=1e-5)
     assert test.displacement.max() == pytest.approx(4e-3, rel=1e-5)
     assert (None if test.time is None else test.time[-1]) == pytest.approx(time)
@@ -273,7 +273,7 @@ def test_a_scale_and_a_sensitivity(tmp_path, entry, told):
 
 
 def test_the_sensitivity_of_an_accelerometer(tmp_path):
-    # Fabricated: 1 kg is braked by at most 200 N, 20.394 g of standard gravity at 10 mV/g.
+    # A force of 200 N decelerates 1 kg by 20.394 times standard gravity; 10 mV/g.
     millivolts = 10 * FORCE / 9.80665
     lines = ["Time (ms),Channel A,displacement (mm)", *rows(TIME, millivolts, MOTION)]
     entry = '[columns]\nacceleration = { column = "Channel A", scale = "10 mV/g"'
@@ -283,7 +283,7 @@ def test_the_sensitivity_of_an_accelerometer(tmp_path):
     assert test.stress.max() == pytest.approx(2e6, rel=1e-4)
 
 
-# ------------------------------------------------------------------------ packed and workbooks
+# --------------------------------------------------------------- compressed files and workbooks
 
 PLAIN = ["time (s),force (N),displacement (mm)", *rows(TIME, FORCE, MOTION)]
 
@@ -345,7 +345,7 @@ def test_a_workbook_without_the_extra(tmp_path, monkeypatch):
     assert out.stderr.count("\n") == 1
 
 
-# ---------------------------------------------------------------------------- never silently
+# ------------------------------------------------------------- ambiguous columns and units
 
 STRAIN = MOTION / 10
 
@@ -412,7 +412,7 @@ def test_two_clocks_with_a_striker(tmp_path):
     head = "time (ms),force (N),camera time (ms),displacement (mm)"
     for other, same in ((TIME + 3.0, True), (1.02 * TIME, False), (TIME % 7, True)):
         path = write(tmp_path, [head, *rows(TIME, FORCE, other, MOTION)], SPECIMEN + STRIKER)
-        if same:  # only its origin is another, or it is no clock
+        if same:  # the clocks differ only in their origin, or one is not a time
             assert not any("times that differ" in note for note in read_test(path).notes)
             continue
         refused(path, "'time (ms)' and 'camera time (ms)'", "differ by 600 µs", "[motion]")
@@ -481,7 +481,7 @@ def test_force_and_motion_swapped(tmp_path):
     assert "force and motion are swapped" in " ".join(out.stdout.split())
 
 
-# ---------------------------------------------------------------------- what check finds wrong
+# ---------------------------------------------------------------------- warnings of check
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The motion behind a noisy displacement, against synthetic motions that are known."""
+"""Smooth motions estimated from noisy displacements, compared with known motions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from foamfit.data.motion import SmoothMotion, follow
 from foamfit.data.noise import estimated_noise
 
 DRAWS = 20
-SHAPES = {  # places and heights of straight lines, over a duration and a range of one
+SHAPES = {  # corners of straight lines (time, displacement), both normalised to one
     "triangle": ([0.0, 0.4873, 1.0], [0.0, 1.0, 0.0]),
     "trapezoid": ([0.0, 0.4312, 0.5123, 1.0], [0.0, 1.0, 1.0, 0.0]),
     "inner loop": ([0.0, 0.3011, 0.3312, 0.5531, 1.0], [0.0, 0.6, 0.54, 1.0, 0.0]),
@@ -41,7 +41,7 @@ def measured(shape: str, n: int, sigma: float, seed: int) -> tuple[np.ndarray, .
 
 
 def reversal(motion: SmoothMotion, t: np.ndarray) -> float:
-    """Furthest that the motion goes back from one place to the next between its turns."""
+    """Return the largest step of the motion against its direction between two turns."""
     ends, worst = np.concatenate([t[:1], motion.turns, t[-1:]]), 0.0
     for a, b in pairwise(ends):
         steps = np.diff(motion.at(np.linspace(a, b, 5 * t.size)))
@@ -59,7 +59,7 @@ def test_intervals_hold_the_motion_as_often_as_they_say(shape, sigma):
         off = motion.at(t) - true
         held.append(np.mean(np.abs(off) < 1.96 * np.linalg.norm(motion.modes(t), axis=1)))
         errors.append(np.sqrt(np.mean(off**2)) / sigma)
-    # Errors along one record go together: over 20 records the share scatters by some 3.5 %.
+    # Errors within a record are correlated: over 20 records the coverage scatters by about 3.5 %.
     assert 0.88 < np.mean(held) < 0.995
     assert np.mean(errors) < 0.4
 
@@ -75,7 +75,7 @@ def test_turns_are_found_with_their_instants_and_heights(shape):
         late.append((motion.turns - places[1:-1]) / t[1])
         stderr = np.linalg.norm(motion.modes(motion.turns), axis=1)
         high.append((motion.at(motion.turns) - heights[1:-1]) / stderr)
-    assert np.sqrt(np.mean(np.square(late))) < 0.5  # to a part of a sample
+    assert np.sqrt(np.mean(np.square(late))) < 0.5  # to a fraction of a sample
     off = np.concatenate(high)
     assert 0.7 < np.sqrt(np.mean(off**2)) < 1.3
     assert abs(np.mean(off)) < 0.5

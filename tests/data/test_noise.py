@@ -1,4 +1,4 @@
-"""Noise and outliers of a channel, against known noise and planted outliers."""
+"""Noise and outliers of a channel, compared with known noise and added outliers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SPECIMEN = Specimen(HEIGHT, 1.9635e-5)
 
 @functools.cache
 def signal(channel: str, n: int) -> np.ndarray:
-    """A channel without noise, over its range: kinks where springs switch, loading and rebound."""
+    """Return a normalised noise-free channel with kinks where springs switch branches."""
     if channel == "loop":
         spring = ff.published["foam-1/model-1"].bistable
         strain = 0.38 * (1 - np.abs(np.linspace(-1, 1, n)))
@@ -34,7 +34,7 @@ def signal(channel: str, n: int) -> np.ndarray:
 
 
 def slow_noise(rng: np.random.Generator, n: int, phi: float) -> np.ndarray:
-    """First-order autoregressive noise of unit variance."""
+    """Return first-order autoregressive noise of unit variance."""
     white = np.sqrt(1 - phi**2) * rng.standard_normal(n + 400)
     return lfilter([1.0], [1.0, -phi], white)[400:]
 
@@ -52,13 +52,13 @@ def test_white_noise_is_estimated_to_fifteen_percent(channel, n):
         for _ in range(20)
     ]
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.05)
-    # Of 300 samples the estimate itself scatters by 6 %, of 5000 by 1.5 %.
+    # The estimate itself scatters by 6 % for 300 samples and by 1.5 % for 5000.
     assert np.mean(np.abs(np.array(ratios) - 1.0) < 0.15) >= (0.9 if n == 300 else 0.99)
 
 
 @pytest.mark.parametrize(("n", "phi", "off"), [(300, 0.5, 0.4), (1000, 0.8, 0.4), (5000, 0.9, 0.2)])
 def test_slow_noise_is_not_taken_for_signal(n, phi, off):
-    """Second differences would see 0.61, 0.34 and 0.25 of it."""
+    """Estimates from second differences would be too small by factors of 0.61, 0.34 and 0.25."""
     rng = np.random.default_rng(1)
     found = np.array(
         [
@@ -97,7 +97,7 @@ def test_a_digitiser_makes_noise_of_its_own(step):
     "turns", [(0.0, 1.0, 0.0), (0.0, 1.0, 1.0, 0.0), (0.0, 1.0, 0.2, 0.8, 0.2)]
 )
 def test_a_motion_at_one_speed_has_no_noise(samples, digits, turns):
-    """To and fro it meets the same levels again, as a digitised signal does."""
+    """Loading and unloading pass the same values, which resembles a digitised signal."""
     share = np.linspace(0.0, 1.0, samples)
     at = np.cumsum([0.0, *np.maximum(np.abs(np.diff(turns)), 0.2)])
     motion = np.round(10.0 * np.interp(share, at / at[-1], turns), digits)
@@ -105,7 +105,7 @@ def test_a_motion_at_one_speed_has_no_noise(samples, digits, turns):
 
 
 def test_noise_is_taken_from_the_samples_before_contact():
-    """Slow in time, so that the signal's own samples would show less of it."""
+    """The noise is slow, so that residuals of the signal would underestimate it."""
     _, test = synthetic_impact(noise=0.0, samples=601)
     rng = np.random.default_rng(3)
     step = test.time[1]
@@ -130,8 +130,8 @@ def test_noise_of_a_held_channel_is_that_of_its_fresh_samples():
     done = condition(Record(np.arange(n) * 1e-3, 1e9 * held + 1e3, held), SPECIMEN)
     level = done.noise.estimated["displacement"]
     assert level.sigma == pytest.approx(1e-6, rel=0.2)
-    assert level.time == pytest.approx(1.0, abs=0.01)  # of the samples that count
-    assert done.sampled["displacement"].sum() in (n // hold - 1, n // hold)  # of one cycle
+    assert level.time == pytest.approx(1.0, abs=0.01)  # in units of fresh samples
+    assert done.sampled["displacement"].sum() in (n // hold - 1, n // hold)  # cut to one cycle
     assert "fresh samples" in level.how
 
 
@@ -167,7 +167,7 @@ def test_clean_records_have_next_to_no_outliers():
     flagged = samples = 0
     for channel in CHANNELS:
         for n in (150, 300, 600, 1500):
-            assert not find_outliers(signal(channel, n)).any()  # kinks alone
+            assert not find_outliers(signal(channel, n)).any()  # kinks are not outliers
             for level in (0.0005, 0.003, 0.01, 0.03):
                 for phi in (0.0, 0.5, 0.9):
                     for _ in range(3):
@@ -178,10 +178,10 @@ def test_clean_records_have_next_to_no_outliers():
 
 
 def uneven(rng: np.random.Generator, n: int, kind: str) -> np.ndarray:
-    """A clock whose steps differ, from 0 to 1."""
+    """Return times from 0 to 1 with unequal steps."""
     if kind == "random":
         step = rng.uniform(0.1, 1.0, n)
-    else:  # of a machine that records every 10 ms, or sooner where it turns
+    else:  # a machine that records every 10 ms and occasionally sooner
         step = np.where(rng.random(n) < 0.1, 3.0, 10.0)
     clock = np.cumsum(step)
     return (clock - clock[0]) / (clock[-1] - clock[0])
@@ -203,7 +203,7 @@ def test_uneven_times_make_no_outliers(kind):
                 by_number += int(find_outliers(noisy).sum())
                 samples += n
     assert flagged / samples < 2e-4
-    assert by_number > 3 * flagged  # the test can fail
+    assert by_number > 3 * flagged  # without the times, more samples are flagged
 
 
 @pytest.mark.parametrize(("size", "least"), [(10.0, 0.9), (20.0, 0.98)])
@@ -297,10 +297,10 @@ def test_outliers_are_bridged_named_and_kept_for_the_eye():
 
 
 def test_a_steep_short_peak_is_no_gap() -> None:
-    """Four samples of branch c between a slow rise and a fall as steep as they are."""
+    """The peak rises as steeply as it falls, over four samples of branch c after a slow rise."""
     peak = [250.8, 277.2, 303.9, 292.1, 265.7]
     rise, fall, rest = np.linspace(0.0, 246.4, 149), np.arange(239.6, 10.0, -26.2), np.zeros(140)
     force = np.array([*rise, *peak, *fall, *rest])
     assert not find_outliers(force).any()
-    force[40:44] = 0.0  # a true gap in the same record
+    force[40:44] = 0.0  # a real gap in the same record
     assert np.flatnonzero(find_outliers(force)).tolist() == [40, 41, 42, 43]

@@ -1,4 +1,4 @@
-"""Each step from samples to one loading and unloading, on pulses whose truth is known."""
+"""Each step from raw samples to one loading and unloading, on pulses with known values."""
 
 import contextlib
 import functools
@@ -26,11 +26,11 @@ import rig
 SPECIMEN = Specimen(height=1.19e-3, area=1.9635e-5, mass=5.56e-6)
 STRIKER = Striker(mass=7e-3, velocity=1.75)
 DURATION = 7e-4
-PEAK = 1.9 * 7e-3 * 1.75 * np.pi / 2 / DURATION / 1.9635e-5  # takes 0.95 of the momentum twice
+PEAK = 1.9 * 7e-3 * 1.75 * np.pi / 2 / DURATION / 1.9635e-5  # impulse of 1.9 momenta
 
 
 def pulse(t):
-    """Stress, displacement and velocity of a half-sine pulse on the striker, contact from t = 0."""
+    """Return stress, displacement and velocity of a half-sine pulse; contact starts at t = 0."""
     omega = np.pi / DURATION
     inside = np.clip(t, 0, DURATION)
     stress = np.where((t > 0) & (t < DURATION), PEAK * np.sin(omega * inside), 0.0)
@@ -42,7 +42,7 @@ def pulse(t):
 
 
 def impact(n=600, before=0.0, after=0.0, noise=0.0, offset=0.0, origin=0.0, w="measured"):
-    """Return a record of a pulse; `before` and `after` are shares of contact."""
+    """Return a record of a pulse; `before` and `after` are fractions of the contact duration."""
     step = DURATION / n
     t = np.arange(-round(before * n), round((1 + after) * n) + 1) * step
     if before:
@@ -63,7 +63,7 @@ def run(record, **window):
 
 
 def error_of_motion(conditioned):
-    """RMS error of displacement along the contact, as a share of its peak, where it counts."""
+    """Return the RMS error of measured displacements in contact, relative to the peak."""
     truth = pulse(conditioned.time)[1]
     inside = (conditioned.time <= DURATION) & conditioned.sampled.get("displacement", True)
     return np.sqrt(np.mean((conditioned.displacement - truth)[inside] ** 2)) / truth.max()
@@ -90,11 +90,11 @@ def test_a_file_that_starts_in_contact_keeps_its_time_zero(n, noise, w):
 def test_contact_is_found_after_a_pretrigger(noise, w):
     conditioned = run(impact(before=0.4, after=0.4, noise=noise, offset=0.03, origin=5e-3, w=w))
     assert conditioned.origins["contact_time"] == pytest.approx(5e-3, abs=0.012 * DURATION)
-    # a tenth of contact is kept from before it
+    # a tenth of the contact duration is kept before contact
     assert conditioned.time[0] == pytest.approx(-0.1 * DURATION, rel=0.05)
     assert conditioned.time[-1] == pytest.approx(DURATION, rel=0.05)
     assert error_of_motion(conditioned) < 0.015
-    # the sensor's offset is gone
+    # the offset of the sensor is subtracted
     assert conditioned.stress[-3:].mean() == pytest.approx(0, abs=0.02 * PEAK)
     assert any("offset" in note for note in conditioned.notes)
     assert any("are cut" in note for note in conditioned.notes)
@@ -113,8 +113,9 @@ def test_a_drifting_sensor_is_left_alone_and_noted():
     assert conditioned.stress.max() == pytest.approx(PEAK, rel=1e-3)
 
 
-# Records of the study of recovery: random springs, 1 % noise, contact at the first sample. Where
-# branch a is soft, as with these seeds, its stress is lost in the noise. Correlation time, samples.
+# Records of the recovery study: random springs, 1 % noise, contact at the first sample. With these
+# seeds branch a is so soft that its stress lies below the noise. `CLASSES` contains pairs of
+# correlation time and record length, both in samples.
 SOFT = (12, 27, 32, 8, 57, 6)
 CLASSES = [(1.0, 300), (8.0, 300), (1.0, 5000), (8.0, 5000)]
 
@@ -125,14 +126,17 @@ def in_white_noise(samples, seed):
 
 
 def at_contact(tau, samples, seed):
-    """A record that begins at contact, with all zeros right; in any noise of one course."""
+    """Return a record that starts at contact, without offsets.
+
+    The noise-free curves are the same for every correlation time.
+    """
     record = in_white_noise(samples, seed)
     channels, _ = rig.noisy(record.clean, record.noise, 1.0, tau, seed)
     return replace(record, setup=replace(record.setup, tau=tau), channels=channels)
 
 
 def in_memory(record):
-    """What is read of the files of a record, without writing them."""
+    """Return the test of a record as if read from its files, without writing them."""
     own = record.rig
     given = Record(
         record.time, record.channels["force"] / own.area, record.channels["displacement"]
@@ -147,7 +151,7 @@ def test_nothing_is_cut_or_taken_off_where_contact_is_the_first_sample(tmp_path,
         record = at_contact(tau, samples, seed)
         test = read_test(rig.write(record, tmp_path))
         assert not re.search(r"[1-9]\d* samples before and", " ".join(test.notes))
-        # but the zero of the stress, where the striker has left at the end
+        # only the stress may be corrected, by its zero at the end after the striker has left
         taken = [note for note in test.notes if "taken off" in note]
         assert all(note.startswith("The stress at the end of the record") for note in taken)
         assert len(taken) == ("stress" in test.zeros)
@@ -159,12 +163,12 @@ def test_nothing_is_cut_or_taken_off_where_contact_is_the_first_sample(tmp_path,
             np.testing.assert_allclose(test.displacement, written, rtol=1e-8, atol=1e-14)
         stress = record.channels["force"] / record.rig.area
         done = condition(Record(record.time, stress, None), test.specimen, striker=test.striker)
-        assert done.contact == "file"  # by the stress alone
+        assert done.contact == "file"  # from the stress alone
 
 
 @pytest.mark.parametrize(("tau", "samples"), CLASSES)
 def test_the_zero_at_the_end_of_a_record_is_as_far_off_as_it_says(tau, samples):
-    """Impacts whose contact ends softly, in white and correlated noise; the true zero is 0."""
+    """Contact ends with a low stress, in white or correlated noise; the true zero is 0."""
     off = []
     for seed in range(1, 21):
         test = in_memory(at_contact(tau, samples, seed))
@@ -172,7 +176,7 @@ def test_the_zero_at_the_end_of_a_record_is_as_far_off_as_it_says(tau, samples):
             off.append(test.origins["stress_zero"] / test.zeros["stress"])
     assert len(off) > 12
     off = np.sort(np.abs(off))
-    if (tau, samples) == (8.0, 300):  # of 20 a soft beginning is taken for rest once, 10.8 off
+    if (tau, samples) == (8.0, 300):  # in one of 20 a soft start is taken for rest
         off = off[:-1]
     assert off[-1] < 3.5
     assert np.sqrt(np.mean(np.square(off))) < 1.4
@@ -180,7 +184,7 @@ def test_the_zero_at_the_end_of_a_record_is_as_far_off_as_it_says(tau, samples):
 
 @pytest.mark.parametrize("off", [-6.0, 6.0])
 def test_one_sample_is_no_rest(off):
-    """The first displacement alone is off, or the first few: no zero is read off them."""
+    """One or three wrong displacements at the start do not change the zero."""
     for wrong in (1, 3):
         record = impact(300, noise=0.01)
         w = record.displacement.copy()
@@ -202,7 +206,7 @@ def test_what_is_taken_off_stands_with_its_size_against_the_noise():
     told = re.search(words + r"mean of (\d+) samples at rest before contact\)", str(done.notes))
     assert float(told[1]) == pytest.approx(500, abs=1)
     assert float(told[2]) == pytest.approx(offset / sigma, rel=0.15)
-    assert int(told[3]) == pytest.approx(180, abs=3)  # 60 more are kept
+    assert int(told[3]) == pytest.approx(180, abs=3)  # 60 further samples are kept
     assert done.origins["displacement_zero"] == pytest.approx(offset, abs=5 * sigma / 180**0.5)
     assert done.zeros["displacement"] == pytest.approx(sigma / 180**0.5, rel=0.3)
     told = re.search(
@@ -255,7 +259,7 @@ def test_a_slow_test_from_another_zero_without_a_rest_says_what_is_taken_off():
 
 
 def test_a_low_stress_before_and_after_a_sharp_peak_is_contact():
-    """Branches a and e may bear a few noise levels for most of contact."""
+    """On branches a and e, most of the contact, the stress may be only a few times the noise."""
     n = 1000
     s = np.linspace(0, 1.25, n)
     stress = np.where(s < 0.5, np.exp(-(((s - 0.5) / 0.08) ** 2)), 0.0)
@@ -288,7 +292,7 @@ def test_contact_ends_before_a_second_bounce(noise):
 @pytest.mark.parametrize("noise", [0.1, 0.3])
 def test_heavy_noise_does_not_stall_the_search_for_the_end(noise):
     record = impact(100, before=0.5, after=0.5, noise=noise)
-    with contextlib.suppress(InputError):  # strains may be beyond one
+    with contextlib.suppress(InputError):  # strains may exceed one
         run(record)
 
 
@@ -346,7 +350,7 @@ def test_a_smooth_displacement_is_no_staircase():
 
 
 def followed(record, share=0.4, zero=3e-3, noise=0.0):
-    """Add a mass inside that is at rest at `zero` and from contact goes a share of the top."""
+    """Add a mass inside that rests at `zero`, then moves by a fraction `share` of the top."""
     moved = np.where(record.time < 0, 0.0, pulse(np.maximum(record.time, 0.0))[1])
     random = np.random.default_rng(1)
     inside = zero + share * moved + noise * share * moved.max() * random.normal(size=moved.size)
@@ -362,7 +366,7 @@ def test_a_mass_inside_goes_through_the_same_steps(before, n, noise):
     truth = 0.4 * pulse(np.minimum(conditioned.time, DURATION))[1]
     inside = (conditioned.time >= 0) & (conditioned.time <= DURATION)
     away = np.abs(np.mean(conditioned.interior[1] - truth, where=inside)) / truth.max()
-    assert away < 2e-3  # its own zero, 3 mm by the file, is gone
+    assert away < 2e-3  # its offset of 3 mm in the file is subtracted
     assert any("displacement_1 at contact, 3 mm, is taken off" in n for n in conditioned.notes)
 
 
@@ -404,7 +408,7 @@ def test_a_mass_inside_that_rests_within_the_window_is_refused():
 
 
 def cycles(n=3, hold=50):
-    """Triangles of 1 mm with holds below and above, after a rest; stress follows displacement."""
+    """Return trapezoids of 1 mm with holds at both ends, after a rest; stress ∝ displacement."""
     corners = np.cumsum([60, *(n * [200, hold, 200, hold])])
     heights = [0, *(n * [1e-3, 1e-3, 2e-5, 2e-5])]
     w = np.interp(np.arange(corners[-1]), corners, heights)
@@ -422,7 +426,7 @@ def test_one_cycle_of_a_slow_test_is_kept(cycle):
 
 
 def test_cycles_are_told_from_each_other_however_far_the_machine_came_from():
-    """They go back to a third of their own way, which is most of the machine's."""
+    """Cycles of 1 mm that unload to 0.3 mm are counted after an approach of 8 mm."""
     w = np.interp(np.arange(1000), [0, 400, 500, 600, 700, 800, 900, 999],
                   [-8e-3, 0, 1e-3, 3e-4, 1e-3, 3e-4, 1e-3, 0])  # fmt: skip
     record = Record(np.arange(1000) * 0.01, np.maximum(1e9 * w, 0.0), w)
@@ -430,7 +434,10 @@ def test_cycles_are_told_from_each_other_however_far_the_machine_came_from():
 
 
 def preconditioned(set_strain, offset=0.0, noise=0.0, n=4, held=1.0, lowest=0.0):
-    """Triangles of 1 mm on a foam of 10 mm that bears nothing below its set; MPa over mm."""
+    """Return triangles of 1 mm on a foam of 10 mm with a permanent set, with a slope of 1 MPa/mm.
+
+    `set_strain` is the permanent set of each cycle, below which the stress is zero.
+    """
     corners = [0.0, *(level for _ in range(n) for level in (1e-3, lowest))]
     w = np.interp(np.arange(200 * (len(corners) - 1) + 1) / 200, np.arange(len(corners)), corners)
     number = np.maximum(np.arange(w.size) - 1, 0) // 400
@@ -449,10 +456,8 @@ def test_a_later_cycle_starts_at_its_own_contact(cycle, noise):
     sets = [0.0, 0.01, 0.015, 0.02]
     test = condition(preconditioned(sets, noise=noise), SPECIMEN_10, window=Window(cycle=cycle))
     gone = sets[cycle - 1]
-    assert test.start_strain == pytest.approx(
-        gone, abs=1.5e-3
-    )  # contact is a hundredth of the peak
-    # time, displacement and stress are zero there, and the tail without contact is cut
+    assert test.start_strain == pytest.approx(gone, abs=1.5e-3)  # contact is at 1 % of the peak
+    # time, displacement and stress are zero at contact, and the end without contact is cut
     assert abs(test.time[0]) <= 0.011
     assert abs(test.displacement[0]) < 1.1e-5
     assert test.stress[0] < 0.04 * test.stress.max()
@@ -466,7 +471,7 @@ def test_a_later_cycle_starts_at_its_own_contact(cycle, noise):
 
 
 def condition_count(test):
-    """What was dropped of the rows, all of them accounted for."""
+    """Return the dropped rows after a check that every row is used or dropped."""
     assert test.rows.rows == test.rows.used + sum(item.rows for item in test.rows.dropped)
     return test.rows.dropped
 
@@ -481,7 +486,7 @@ def test_a_stress_below_zero_between_the_cycles_is_the_offset_of_the_sensor():
 
 
 def test_a_specimen_that_stays_under_load_between_the_cycles_is_told():
-    record = preconditioned([0.0] * 4, lowest=1e-4)  # a tenth of the peak
+    record = preconditioned([0.0] * 4, lowest=1e-4)  # a tenth of the peak displacement
     later = condition(record, SPECIMEN_10, window=Window(cycle=2))
     assert any("stays under load between the cycles" in note for note in later.notes)
     assert later.stress.max() == pytest.approx(1e6)

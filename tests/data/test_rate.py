@@ -18,13 +18,13 @@ def moved(time, strain):
 
 
 def test_a_triangle_has_the_rate_of_its_loading():
-    time = np.linspace(0.0, 8.0, 801)  # 2 s up, 6 s down
+    time = np.linspace(0.0, 8.0, 801)  # 2 s of loading, 6 s of unloading
     strain = np.interp(time, [0.0, 2.0, 8.0], [0.0, 0.5, 0.0])
     assert loading_rate(moved(time, strain)) == pytest.approx(0.25, rel=1e-3)
 
 
 def test_noise_about_a_flat_peak_does_not_move_it():
-    """The largest sample lies up to a tenth of the time off."""
+    """The largest sample can be a tenth of the duration away from the true peak."""
     time, rng = np.linspace(0.0, 1e-3, 301), np.random.default_rng(0)
     strain = 0.4 * np.sin(np.pi * time / time[-1])
     rates = [loading_rate(moved(time, strain + 2e-3 * rng.standard_normal(301))) for _ in range(50)]
@@ -39,8 +39,8 @@ def test_the_error_of_a_rate_is_the_scatter_of_rates_under_the_noise(level):
     tests = [moved(time, strain + level * rng.standard_normal(201)) for _ in range(60)]
     scatter = np.std(np.log([loading_rate(test) for test in tests]), ddof=1)
     told = [rate_error(test) for test in tests[:20]]
-    assert 0.8 * scatter < np.mean(told) < 1.5 * scatter  # a copy has the noise twice
-    assert told[0] == rate_error(tests[0])  # the same number each time
+    assert 0.8 * scatter < np.mean(told) < 1.5 * scatter  # its copies have the noise twice
+    assert told[0] == rate_error(tests[0])  # repeatable
     assert rate_error(moved(time, strain)) < 0.1 * scatter
 
 

@@ -1,4 +1,4 @@
-"""What a record can be, and what becomes of each row of it."""
+"""Kinds of records that are read, and the fate of each of their rows."""
 
 import itertools
 import time
@@ -38,13 +38,13 @@ def table(*columns, header=HEADER):
 
 
 def loop(n=101, top=4.0):
-    """Time (ms), stress (MPa) and displacement (mm) of one loading and unloading."""
+    """Return time (ms), stress (MPa) and displacement (mm) of one loading and unloading."""
     shape = np.sin(np.linspace(0.0, np.pi, n))
     return np.arange(float(n)), 0.5 * top * shape, top * shape
 
 
 def accounted(test):
-    """Every row of the file is used or counted with its reason."""
+    """Check that every row is used or counted with its reason, and return the counts."""
     count = test.rows
     assert count.rows == count.used + sum(item.rows for item in count.dropped)
     for item in count.dropped:
@@ -61,7 +61,7 @@ def test_all_rows_are_used_where_nothing_is_wrong(tmp_path):
     assert (count.rows, count.used, count.dropped) == (101, 101, ())
 
 
-@pytest.mark.parametrize("at", [60, 800])  # within the lines that are searched for a header or not
+@pytest.mark.parametrize("at", [60, 800])  # inside and outside of the header search
 def test_a_repeated_header_is_refused_with_both_rows(tmp_path, at):
     lines = table(*loop(1284))
     lines.insert(at, HEADER.replace(",", ", "))
@@ -113,14 +113,14 @@ def test_row_numbers_are_lines_of_the_file(tmp_path):
 
 
 def triangles(tops, n=80, low=0.02):
-    """Displacement (mm) of triangles to the given tops, with a rest at both ends."""
+    """Return displacement (mm) of triangles with the given peaks, with rests at both ends."""
     corners = [0.0, *(level for top in tops for level in (top, low * max(tops)))]
     parts = [np.linspace(a, b, n, endpoint=False) for a, b in itertools.pairwise(corners)]
     return np.concatenate([*parts, [corners[-1]]])
 
 
 def record(kind):
-    """Time (ms), stress (MPa) and displacement (mm) of a record with something to leave out."""
+    """Return the lines of a record with rows that must be dropped for a reason given by `kind`."""
     rng = np.random.default_rng(0)
     clock, stress, displacement = loop(601)
     if kind in ("impact", "window"):
@@ -158,7 +158,7 @@ def test_every_row_that_is_not_used_has_its_reason(tmp_path, kind, toml, why):
     count = accounted(test)
     assert count.rows == len(lines) - 1
     assert why <= {item.why for item in count.dropped}
-    if kind != "many":  # these are averaged in blocks
+    if kind != "many":  # long records are averaged in blocks
         left_out = np.any([found.left_out for found in test.outliers.values()], axis=0)
         assert count.used == test.stress.size - np.count_nonzero(left_out)
     told = describe(test, audit(test))
@@ -216,7 +216,7 @@ def test_cycles_of_any_amplitude_are_counted(tmp_path, tops, cycle, count):
 
 def test_a_column_may_number_the_cycles(tmp_path):
     displacement = triangles([4.0, 4.0, 4.0])
-    number = np.repeat([1, 10, 100], 160)  # of which a machine has recorded three
+    number = np.repeat([1, 10, 100], 160)  # a machine recorded only these three cycles
     number = np.append(number, 100)
     clock = np.arange(float(displacement.size))
     header = HEADER + ",Total Cycles"
@@ -234,10 +234,10 @@ def test_a_column_may_number_the_cycles(tmp_path):
 @pytest.mark.parametrize(
     ("corners", "reversals", "count"),
     [
-        ([0, 2.0, 1.2, 4.0, 0], 1, 1),  # unloaded in part on the way up
-        ([0, 4.0, 2.0, 3.0, 0], 1, 1),  # and loaded again on the way down
+        ([0, 2.0, 1.2, 4.0, 0], 1, 1),  # partial unloading during loading
+        ([0, 4.0, 2.0, 3.0, 0], 1, 1),  # partial reloading during unloading
         ([0, 2.0, 1.0, 3.0, 2.0, 4.0, 2.0, 3.0, 0], 3, 1),
-        ([0, 4.0, 0.1, 3.0, 2.0, 4.0, 0], 0, 2),  # in the cycle that is not used
+        ([0, 4.0, 0.1, 3.0, 2.0, 4.0, 0], 0, 2),  # only in the unused cycle
     ],
 )
 @pytest.mark.parametrize("noise", [0.0, 0.01])
@@ -268,7 +268,7 @@ def test_a_movement_without_a_force_is_no_cycle(tmp_path):
 
 
 def clipped_impact(share, n=600, noise=0.0, digits=9):
-    """Half-sine impact of 1 kg at 1 m/s, the force clipped at a share of its peak."""
+    """Return a half-sine impact of 1 kg at 1 m/s with the force clipped at `share` of its peak."""
     clock = np.linspace(0.0, 10.0, n)
     stress = 3.0 * np.sin(np.pi * clock / 10.0)
     stress += noise * np.random.default_rng(0).standard_normal(n)
@@ -323,7 +323,7 @@ def test_a_clipped_force_is_no_shift_of_the_clocks():
     ]
     told = [[w for w in result.warnings if "--time-shift" in w] for result in results]
     assert told[0] == []
-    assert told[1]  # what a clipped force looks like
+    assert told[1]  # without knowledge of clipping, it resembles a shift in time
     (check,) = [c for c in results[0].checklist if c.key == "time_shift"]
     assert check.answer is None
     assert "clipped" in check.sentence

@@ -1,4 +1,4 @@
-"""Standard deviations of what the TOML says: how they are written, kept, shown and refused."""
+"""Standard deviations in the TOML: how they are written, stored, shown and rejected."""
 
 import math
 
@@ -17,7 +17,7 @@ TIME = np.arange(41) * 1e-3
 
 
 def written(folder, toml, **columns):
-    """A test with these columns, by default time, stress and displacement of a loop."""
+    """Write a test with these columns, by default time, stress and displacement of a loop."""
     given = columns or {
         "time (s)": TIME, "stress (MPa)": 2.0 * LOOP, "displacement (mm)": 4.0 * LOOP,
     }  # fmt: skip
@@ -113,7 +113,10 @@ def test_the_area_goes_before_the_diameter(tmp_path, area, sigma):
 
 
 def test_only_what_is_read_has_a_scale(tmp_path):
-    """Of a stress and a force the stress is used; an acceleration stands for a stress."""
+    """A force named in the TOML replaces the stress, unless the TOML names both.
+
+    An acceleration replaces a missing stress, with its scale.
+    """
     motion = {"time (s)": TIME, "displacement (mm)": 4.0 * LOOP}
     columns = motion | {"stress (MPa)": 2.0 * LOOP, "load cell": LOOP}
     force = '[columns]\nforce = { column = "load cell", unit = "N", scale = "200 ± 1" }\n'
@@ -156,7 +159,7 @@ def test_a_wrong_standard_deviation_is_refused(tmp_path, text, words):
     assert told.startswith(f"{path.with_suffix('.toml')}: [specimen] height = ")
     assert text in told
     assert words in told
-    assert told.count(". ") == 0  # one sentence
+    assert told.count(". ") == 0  # a single sentence
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Records that are unloaded in part: microscale springs follow them, bistable springs say not."""
+"""Records with partial unloading: microscale springs follow it, bistable springs do not."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CORNERS = (0.0, 0.35, 0.2, 0.6, 0.3, 0.45, 0.0)
 
 
 def record(corners: tuple[float, ...] = CORNERS, between: int = 60) -> Measurement:
-    """Return a synthetic test along a motion with these corners (strain), noise on its stress."""
+    """Return a synthetic test between the given strains, with noise on its stress."""
     ends = np.arange(len(corners), dtype=float)
     time = np.linspace(0.0, ends[-1], between * (len(corners) - 1) + 1)
     strain = np.interp(time, ends, corners)
@@ -34,8 +34,8 @@ def record(corners: tuple[float, ...] = CORNERS, between: int = 60) -> Measureme
     [
         (CORNERS, [(60, 143), (240, 321)]),
         ((0.0, 0.6, 0.0), []),
-        ((0.0, 0.5, 0.2, 0.4, 0.3, 0.6, 0.0), [(60, 280)]),  # a loop in a loop
-        ((0.0, 0.6, 0.3, 0.5), [(120, 181)]),  # which ends in its loop
+        ((0.0, 0.5, 0.2, 0.4, 0.3, 0.6, 0.0), [(60, 280)]),  # a loop within a loop
+        ((0.0, 0.6, 0.3, 0.5), [(120, 181)]),  # the record ends within its inner loop
     ],
 )
 def test_partial_unloading_lasts_until_the_motion_is_past_it(

@@ -1,4 +1,4 @@
-"""Parameters of several tests that follow a rate law, scatter, or do not vary everywhere."""
+"""Parameters of several tests that follow a rate law, scatter, or are fixed in some tests."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def vectors(tests, changes):
 @pytest.mark.parametrize("kind", [LOG_RATE, POWER_RATE])
 @pytest.mark.parametrize("name", ["kh_plus", "k0", "eps_c"])
 def test_a_law_of_rate_is_recovered_whatever_its_coordinate_is(kind, name):
-    """kh_plus is linear in the box, k0 a logarithm, eps_c relative to another parameter."""
+    """The fit uses kh_plus itself, the logarithm of k0, and eps_c relative to another parameter."""
     v, b = getattr(SPRING, name), -0.05
     changes = [{name: value} for value in law_values(kind, v, b, X)]
     tests = problems(changes)
@@ -56,7 +56,7 @@ def test_a_law_of_rate_is_recovered_whatever_its_coordinate_is(kind, name):
     assert found.n_vary == 8
     for other in found.shared:
         if other != f"s1_{name}":
-            assert found.value(other) == [found.common[other][0]] * 3  # one value, bit for bit
+            assert found.value(other) == [found.common[other][0]] * 3  # exactly equal
 
 
 def test_the_slopes_of_every_kind_are_those_of_the_cost():

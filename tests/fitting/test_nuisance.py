@@ -1,4 +1,4 @@
-"""What a record does not say exactly: priors, rows averaged in blocks, and a motion that drives."""
+"""Nuisance parameters: priors, rows averaged in blocks, and noise of a driving motion."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OF_SPRING = [SPRING.k0, SPRING.kc, SPRING.eps_star, SPRING.sigma_plus, SPRING.sp
 
 
 def test_a_velocity_with_a_deviation_is_an_unknown_with_that_prior():
-    """It counts as a parameter but its prior as no sample; what it leaves open is in the errors."""
+    """It counts as a parameter, and its prior limits its error but does not count as a sample."""
     spring, test = synthetic_impact(samples=201)
     quick = {"starts": 2, "intervals": "local"}
     exact = ff.fit(test, **quick)
@@ -40,7 +40,7 @@ def test_a_velocity_with_a_deviation_is_an_unknown_with_that_prior():
         assert 0.0 < item.stderr <= 1.001 * sigma
     wrong = replace(stated, striker=replace(test.striker, velocity=2.04))
     off = ff.fit(wrong, **quick)
-    assert off.parameters["velocity"].value < 2.04 - 0.01  # the motion knows better
+    assert off.parameters["velocity"].value < 2.04 - 0.01  # corrected by the record
     assert off.parameters["s1_kc"].value == pytest.approx(spring.kc, rel=0.03)
 
 
@@ -65,13 +65,13 @@ def test_what_is_exact_varies_where_that_is_asked_for():
     found = ff.fit(test, params=params, starts=2, intervals="local")
     zero = found.params["displacement_zero"]
     assert (zero.value, zero.vary) == (0.0, False)
-    assert "displacement_zero" not in found.parameters  # a zero that is none says nothing
+    assert "displacement_zero" not in found.parameters  # a zero fixed at 0 is omitted
     item = found.parameters["velocity"]
     assert abs(item.value - 2.0) < 3 * item.stderr < 0.05
 
 
 def in_blocks(test: Measurement, size: int) -> Measurement:
-    """The same test, so many rows averaged in each sample."""
+    """Return the test with `size` rows averaged in each sample."""
 
     def mean(x: np.ndarray) -> np.ndarray:
         return x.reshape(-1, size).mean(axis=1)
@@ -84,7 +84,7 @@ def in_blocks(test: Measurement, size: int) -> Measurement:
 
 
 def test_an_impact_averaged_in_blocks_fits_the_parameters_of_its_rows():
-    """Means of the curves are compared with means of the rows, kinks and jumps included."""
+    """Curves are averaged in the same blocks as the rows, including blocks with kinks and jumps."""
     spring, test = synthetic_impact(eta=20.0, samples=500)
     few = in_blocks(test, 5)
     clean = in_blocks(replace(synthetic_impact(eta=20.0, samples=500, noise=0.0)[1],
@@ -95,7 +95,7 @@ def test_an_impact_averaged_in_blocks_fits_the_parameters_of_its_rows():
         one = Objective(made, Model.parse("bistable"), "impact", weights)
         values = [*spring.seven, 20.0, 0.0, *(one.usual[name] for name in one.nuisance)]
         off.append(np.abs(one.residual(np.array(values))).max())
-    assert off[0] < 2e-3 < 0.05 < off[1]  # one sample in the middle is not the mean
+    assert off[0] < 2e-3 < 0.05 < off[1]  # the curve at mid-block differs from the block mean
     whole, averaged = (ff.fit(one, starts=2, intervals="local") for one in (test, few))
     assert averaged.statistics["n_data"] == 200
     for name in ("k0", "kc", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta"):
@@ -109,7 +109,7 @@ def test_an_impact_averaged_in_blocks_fits_the_parameters_of_its_rows():
 
 @pytest.fixture(scope="module")
 def driven() -> Objective:
-    """The objective of a slow loop of a microscale spring whose driving motion is noisy."""
+    """Objective of a slow loop of a microscale spring with a noisy driving motion."""
     strain = 0.5 * np.sin(np.pi * np.linspace(0.0, 1.0, 400)) ** 2
     rng = np.random.default_rng(2)
     stress, noise = SPRING.stress(strain), 0.002 * 0.5 * HEIGHT
@@ -123,7 +123,7 @@ def driven() -> Objective:
 
 
 def test_a_driving_motion_is_smooth_and_what_is_unsure_of_it_moves_the_residual(driven):
-    """As the law itself, driven by a motion that is off along each of its modes."""
+    """The residual changes as in a simulation with a motion shifted along one of its modes."""
     motion, time = driven.motion, driven.time
     clean = 0.5 * HEIGHT * np.sin(np.pi * time / 4.0) ** 2
     level = driven.measurement.noise.displacement
@@ -147,7 +147,7 @@ def test_a_driving_motion_is_smooth_and_what_is_unsure_of_it_moves_the_residual(
 
 
 def test_springs_that_relax_start_at_the_contact_and_not_at_the_first_sample():
-    """What the strain at the first sample has put into the relaxing stress is there."""
+    """The relaxing stress includes the contribution of the strain before the first sample."""
     spring = replace(SPRING, relaxation=[(0.8, 0.4)])
     time = np.linspace(0.0, 4.0, 401)
     w = HEIGHT * np.interp(time, [0.0, 2.0, 4.0], [0.0, 0.5, 0.0])
@@ -170,7 +170,7 @@ def test_springs_that_relax_start_at_the_contact_and_not_at_the_first_sample():
 
 
 def test_residuals_of_a_driven_loop_are_weighed_by_their_full_covariance(driven):
-    """Of noise and of what the motion leaves open: weighed, it is that of the noise alone."""
+    """The covariance includes noise and motion; after weighting, that of the noise remains."""
     values = np.array([*OF_SPRING, *(driven.usual[name] for name in driven.nuisance)])
     one = replace(driven)
     plain, slopes = one.residual(values), one.jacobian(values, np.arange(7))
@@ -185,7 +185,7 @@ def test_residuals_of_a_driven_loop_are_weighed_by_their_full_covariance(driven)
 
 
 def test_relaxation_terms_come_back_in_the_order_of_their_times():
-    """Unless one of them is held: then it keeps its place."""
+    """A term with a fixed parameter keeps its place instead."""
     time = np.linspace(0.0, 4.0, 120)
     strain = 0.4 * np.sin(np.pi * time / 4.0) ** 2
     chain = ff.Chain([replace(SPRING, relaxation=[(0.2, 0.05), (0.1, 1.0)])], [HEIGHT], AREA)
@@ -217,7 +217,7 @@ def test_relaxation_terms_come_back_in_the_order_of_their_times():
 @pytest.mark.parametrize("terms", [0, 2])
 @pytest.mark.parametrize("mullins", [False, True])
 def test_the_derivative_by_the_zero_of_a_driving_motion_is_that_of_differences(terms, mullins):
-    """Along loops between which contact is lost: the motion stops at no strain."""
+    """Contact is lost between the loops, at an instant when the motion does not rest."""
     time = np.linspace(0.0, 8.0, 401)
     strain = 0.35 * (0.5 - 0.5 * np.cos(np.pi * time)) + 0.05 * np.sin(1.3 * time) + 0.06
     test = Measurement(

@@ -1,4 +1,4 @@
-"""What is known of a parameter before the fit counts as one residual."""
+"""A prior on a parameter counts as one residual."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_prior_draws_the_value_and_narrows_the_interval(impact: ff.Measurement
     result = ff.fit(impact, priors={"s1_k0": (mean, sigma)}, **OPTIONS)
     found = result.parameters["s1_k0"]
     weight = (sigma / alone.stderr) ** -2
-    # as independent normal distributions combine, as far as the residual is linear
+    # the product of two normal distributions, if the residual is nearly linear
     assert found.value == pytest.approx((alone.value + weight * mean) / (1.0 + weight), rel=0.02)
     assert found.stderr == pytest.approx(math.hypot(1 / sigma, 1 / alone.stderr) ** -1, rel=0.05)
     assert result.to_json_dict()["priors"] == {"s1_k0": [mean, sigma]}

@@ -1,4 +1,4 @@
-"""The fit: recovery, repeatability, states, fixed values, and being stopped."""
+"""The fit: recovery, repeatability, states, fixed values and interruption."""
 
 from __future__ import annotations
 
@@ -95,11 +95,11 @@ def test_fixed_values_bounds_and_expressions_are_kept():
     assert result.params["s1_kc"].value == pytest.approx(15 * spring.k0, rel=1e-12)
     assert result.params["s1_eps_c"].value <= 0.305
     assert result.parameters["s1_k0"].state == "fixed"
-    assert result.parameters["s1_eps_c"].state == "weak"  # the true value lies past the bound
+    assert result.parameters["s1_eps_c"].state == "weak"  # the true value lies outside the bound
 
 
 def test_contact_and_zero_are_reported_in_the_numbers_of_the_file():
-    """And a caller's own parameters, which speak of the file too, are as good for a second fit."""
+    """The caller's parameters, also relative to the file, are unchanged and can be used again."""
     test = ff.read_test(EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv")
     params = make_params(test)
     before = params.valuesdict(), {name: (one.min, one.max) for name, one in params.items()}
@@ -218,7 +218,7 @@ STIFF = ff.BistableSpring(
 
 
 def two_springs(*springs, noise=0.005):
-    """A slow loop without time on two springs of equal height, the mass between them followed."""
+    """Return a slow loop without time of two equally high springs, with a tracked mass between."""
     height = 1.19e-3
     strain = np.concatenate([np.linspace(0, 0.4, 75), np.linspace(0.4, 0.02, 75)[1:]])
     chain = ff.Chain(springs, [0.5 * height] * 2, 1.9635e-5)
@@ -242,7 +242,7 @@ def two_springs(*springs, noise=0.005):
 
 
 def test_a_mass_inside_shows_which_spring_is_at_the_base():
-    """Also where that is the stiffer one, which would be put on top without this motion."""
+    """The stiffer spring is at the base; without this motion it would be put on top."""
     measurement = two_springs(STIFF, SOFT)
     result = ff.fit(measurement, model="bistable+bistable", starts=2, intervals="local")
     for spring, true in zip(result.chain.springs, (STIFF, SOFT), strict=True):
@@ -257,7 +257,7 @@ def test_a_mass_inside_shows_which_spring_is_at_the_base():
 
 
 def test_without_a_mass_inside_the_softest_spring_is_put_at_the_base():
-    """With one its motion says which spring is where; see also `test_series` for a whole fit."""
+    """The motion of a mass inside determines the order; `test_series` has a full fit without."""
     followed = two_springs(STIFF, SOFT)
     blind = replace(followed, interior={})
     for measurement, springs in ((blind, (SOFT, STIFF)), (followed, (STIFF, SOFT))):
@@ -272,7 +272,7 @@ def test_without_a_mass_inside_the_softest_spring_is_put_at_the_base():
 
 
 def test_where_no_motion_is_measured_another_contact_time_is_tried(tmp_path):
-    """A later contact with a dashpot follows this record to χ² = 1801, the true springs to 1795."""
+    """A minimum with later contact and a dashpot has χ² = 1801, the true parameters 1795."""
     record = rig.impact(rig.Impact(channels=("force", "acceleration")), 6010)
     result = ff.fit(ff.read_test(rig.write(record, tmp_path)), intervals="local")
     assert result.statistics["chisqr"] < 1790.0
@@ -331,7 +331,7 @@ FOAMS = {
 @needs_data
 @pytest.mark.parametrize("name", FOAMS)
 def test_one_spring_follows_the_first_cycle_of_a_shoe_foam(name, tmp_path):
-    """Measurements of arXiv:2602.12694; a global search by brute force reaches 0.029-0.032."""
+    """Data of arXiv:2602.12694; an exhaustive global search reaches misfits of 0.029 to 0.032."""
     diameter, height = FOAMS[name]
     toml = tmp_path / "foam.toml"
     toml.write_text(f'[specimen]\nheight = "{height} mm"\ndiameter = "{diameter} mm"\n')
@@ -362,7 +362,7 @@ force = { column = "Load", unit = "V", scale = "4444.4 N/V" }
 @pytest.mark.parametrize(
     ("name", "columns", "motion", "ratio"),
     [
-        # its 8 rows at rest are 90 kPa above those of the whole record, 2 % of the impulse
+        # the 8 rows at rest give a zero 90 kPa above that of the raw file, 2 % of the impulse
         ("test_1_impact.csv", "", "measured", 0.755),
         ("test_1_raw.txt", VOLTS, "integrated from acceleration", 0.775),
     ],
@@ -370,7 +370,7 @@ force = { column = "Load", unit = "V", scale = "4444.4 N/V" }
 def test_a_striker_on_cartilage_is_fitted_and_its_impulse_doubted(
     name, columns, motion, ratio, tmp_path
 ):
-    """Measurements of JoVE 64450, also from the instrument's own text in volts."""
+    """Data of JoVE 64450, as published in a CSV file and as raw text in volts."""
     toml = tmp_path / "cartilage.toml"
     toml.write_text(CARTILAGE + columns)
     measurement = ff.read_test(DATA / "cartilage-impact" / name, toml)
@@ -391,7 +391,7 @@ def test_a_striker_on_cartilage_is_fitted_and_its_impulse_doubted(
     ],
 )
 def test_a_wrong_minimum_is_left_where_more_than_noise_is_missed(given, seed, tmp_path):
-    """Long relaxation times of soft springs, and a branch of few samples without stiffness."""
+    """Wrong minima have long relaxation times and soft springs, or a short branch without slope."""
     test = ff.read_test(rig.write(made := rig.slow(given, seed), tmp_path))
     params = ff.make_params(test, made.model, "displacement", relaxation=given.relaxation)
     params["s1_eta"].vary = given.dashpot

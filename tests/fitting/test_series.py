@@ -1,4 +1,4 @@
-"""Two bistable springs in series: starts off their loop, exchanges between them, other minima."""
+"""Two springs in series: starts read off a loop, exchanges between springs, other minima."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ STIFF = ff.BistableSpring(1.2e6, 3e7, -6e4, 0.20, 0.50, 3e5, 2.2e5)
 
 
 def common_loop():
-    """Synthetic loop of both in series: displacement (m), stress (Pa)."""
-    chain = ff.Chain([STIFF, SOFT], [0.005, 0.005], 4.5e-5)  # the search is to order them
+    """Return displacement (m), time (s) and stress (Pa) of a loop of both springs in series."""
+    chain = ff.Chain([STIFF, SOFT], [0.005, 0.005], 4.5e-5)  # the fit must swap them
     motion = 0.0037 * np.concatenate([np.linspace(0, 1, 150), np.linspace(1, 0, 150)[1:]])
     time = np.linspace(0.0, 4.0, motion.size)
     found = ff.simulate(chain, ff.DisplacementDrive(motion), time)
@@ -57,7 +57,7 @@ def test_an_exchange_keeps_the_stresses_at_which_springs_snap(law):
         return sorted(float(vector[first]) for first in places)
 
     made = list(exchanges(model, values))
-    assert len(made) == 63  # 2⁷ subsets of seven properties, each with the one that it leaves
+    assert len(made) == 63  # 2⁷/2 partitions of seven properties, minus the one without exchange
     assert len({tuple(vector) for vector in made}) == 63
     for vector in made:
         assert snaps(vector) == pytest.approx(snaps(values))
@@ -70,7 +70,7 @@ def test_springs_of_different_laws_exchange_nothing():
 
 
 def test_intervals_of_two_springs_hold_the_truth():
-    """With 0.2 % noise; the search finds the best minimum and tells of the others."""
+    """With 0.2 % noise, at least 85 % of the intervals contain the true value."""
     motion, time, stress = common_loop()
     rng = np.random.default_rng(3)
     noisy = stress + 0.002 * np.ptp(stress) * rng.standard_normal(stress.size)

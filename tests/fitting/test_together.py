@@ -1,4 +1,4 @@
-"""One fit of several tests: shared and own parameters."""
+"""Joint fits of several tests, with shared parameters and parameters of each test."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ SPRING, LOOP = synthetic_loop(noise=0.0)
 
 
 def fit_together(problems, own, starts):
-    """Fit tests that share all parameters but some."""
+    """Fit several tests that share all parameters except `own`."""
     names = {name for one in problems for name in one.free()}
     return fit_linked(problems, Links({n: "shared" for n in names if n not in own}), starts)
 
@@ -94,13 +94,13 @@ def test_nothing_shared_is_each_test_alone(tests):
     alone = [fit_together([p], (), [[start]]) for p, start in zip(problems, starts, strict=True)]
     for cost, one in zip(together.costs, alone, strict=True):
         assert cost == pytest.approx(one.cost, rel=1e-4)
-    # and sharing more never costs less
+    # sharing more parameters never lowers the cost
     costs = [fit_together(problems, names[:n], [starts]).cost for n in (0, 3)]
     assert costs[0] > costs[1] >= together.cost * (1.0 - 1e-6)
 
 
 def test_a_shared_parameter_stays_one_value_where_its_limit_is_another_for_each_test():
-    """eps_star must lie above a limit that k0 sets, which is another one for each test."""
+    """The lower limit of eps_star depends on k0, which differs between the tests."""
     strain = LOOP.displacement / HEIGHT
     problems, starts = [], []
     for i, k0 in enumerate((4e5, 2e5)):

@@ -1,4 +1,4 @@
-"""What the ± of the TOML does to the parameters: against exact scalings and against fits anew."""
+"""Effect of the ± of the TOML on the parameters, compared with exact scalings and refits."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def fitted(test: Measurement, **more: Any) -> ff.FitResult:
 
 
 def moved(best: BestPoint, quantity: str, name: str) -> float:
-    """Change of a parameter by one standard deviation of a quantity, over its value."""
+    """Return the relative change of a parameter for one standard deviation of a quantity."""
     return float(responses(best)[quantity][best.index[name]] / best.values[best.index[name]])
 
 
 @pytest.fixture(scope="module")
 def loop() -> BestPoint:
-    """A driven loop without time, at its best point."""
+    """Best point of a displacement-driven loop without time."""
     _, test = synthetic_loop()
     one = test.specimen
     test = replace(
@@ -64,14 +64,14 @@ def test_area_and_scale_of_the_force_scale_all_stresses(loop, quantity, share):
 
 
 def test_height_and_scale_of_the_motion_are_one_and_the_same_strain(loop):
-    """A strain is a motion over a height: of both only the ratio counts."""
+    """A strain is a displacement divided by a height, so only the ratio of the two matters."""
     for name in (*STRESSES, *STRAINS):
         one, other = (moved(loop, q, name) for q in ("height", "displacement_scale"))
         assert one == pytest.approx(-other, rel=1e-3)
 
 
 def test_a_dashpot_scales_with_the_area():
-    """η of a driven motion is a stress over a rate."""
+    """With a given motion, η is a stress divided by a rate and scales like a stress."""
     time = np.linspace(0.0, 2.0, 301)
     motion = 0.4 * HEIGHT * np.sin(0.5 * np.pi * time)
     spring = ff.BistableSpring(*SPRING.seven, eta=2e5)
@@ -93,7 +93,7 @@ def test_a_dashpot_scales_with_the_area():
 
 def written(folder: Path, *, height: str, area: str, velocity: str = "2 m/s", mass: str = "7 g",
             noise: float = 1e-4) -> Path:  # fmt: skip
-    """The same impact in a file: a force and a motion, and a TOML."""
+    """Write the same impact as a CSV file of force and motion, with its TOML."""
     _, test = synthetic_impact(noise=noise)
     path = folder / "impact.csv"
     table = np.column_stack([test.time * 1e3, test.stress * AREA, test.displacement * 1e3])
@@ -112,20 +112,20 @@ SIZE = {"height": f"{HEIGHT * 1e3:.12g} mm", "area": f"{AREA * 1e6:.12g} mm^2"}
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory) -> ff.FitResult:
-    """The impact whose TOML states no ±."""
+    """Fit of the impact whose TOML states no ±."""
     return fitted(ff.read_test(written(tmp_path_factory.mktemp("plain"), **SIZE)))
 
 
 @pytest.fixture(scope="module")
 def stated(tmp_path_factory) -> ff.FitResult:
-    """The same impact whose area is known to 3 %."""
+    """Fit of the same impact with an uncertainty of 3 % in the area."""
     size = SIZE | {"area": SIZE["area"] + " ± 3 %"}
     return fitted(ff.read_test(written(tmp_path_factory.mktemp("stated"), **size)))
 
 
 @pytest.mark.parametrize("quantity", ["height", "area"])
 def test_what_a_fit_of_the_changed_toml_gives(tmp_path, quantity):
-    """Through the files: half a percent more, and what `systematic` says of half a percent."""
+    """`systematic` for ± 0.5 % equals the change when the value in the file is 0.5 % larger."""
     value, unit = SIZE[quantity].split()
     stated = ff.read_test(written(tmp_path, **SIZE | {quantity: f"{value} {unit} ± 0.5 %"}))
     first = fitted(stated)
@@ -134,7 +134,7 @@ def test_what_a_fit_of_the_changed_toml_gives(tmp_path, quantity):
     for name in (*STRESSES, *STRAINS):
         one, other = first.parameters[name], again.parameters[name]
         change = abs(other.value - one.value)
-        # Minima beside each other, which samples at switches make, differ by 0.1 standard errors.
+        # Samples at switches cause neighbouring minima that differ by 0.1 standard errors.
         assert one.systematic == pytest.approx(change, rel=0.05, abs=0.2 * one.stderr), name
         assert first.budget.contributions[name][quantity] == one.systematic
     if quantity == "area":
@@ -163,7 +163,7 @@ def test_the_summary_says_how_far_it_goes(plain, stated):
 
 
 def test_velocity_and_mass_with_a_deviation_are_fitted_within_it(tmp_path):
-    """Both are wrong in the TOML, by less than what it says; the record itself knows better."""
+    """Both TOML values are wrong by less than their ±; the record corrects them."""
     path = written(tmp_path, **SIZE, velocity="1.98 ± 0.03 m/s", mass="7.05 ± 0.1 g", noise=0.003)
     result = fitted(ff.read_test(path))
     velocity, mass = (result.parameters[name] for name in ("velocity", "striker_mass"))
@@ -178,7 +178,7 @@ def test_velocity_and_mass_with_a_deviation_are_fitted_within_it(tmp_path):
 
 
 def test_a_force_only_record_leaves_the_velocity_at_its_prior(tmp_path):
-    """Nothing else tells of it, so its standard deviation is that of the TOML."""
+    """The record does not determine the velocity, so its standard deviation is that of the TOML."""
     path = written(tmp_path, **SIZE, velocity="2 ± 0.02 m/s")
     table = np.loadtxt(path, delimiter=",", skiprows=1)
     np.savetxt(path, table[:, :2], "%.12g", ",", header="time (ms),force (N)", comments="")
@@ -198,7 +198,7 @@ def _held(path: Path) -> Any:
 
 
 def test_a_force_that_is_mass_times_acceleration_does_not_tell_the_mass(tmp_path):
-    """Then every stress is proportional to the mass, whatever the record says."""
+    """Every stress is then exactly proportional to the mass, which is therefore not fitted."""
     path = written(tmp_path, **SIZE, mass="7 g ± 1 %")
     table = np.loadtxt(path, delimiter=",", skiprows=1)
     table[:, 1] /= 7e-3
@@ -225,7 +225,7 @@ def test_the_parts_of_the_noise_add_up_to_the_standard_error():
 
 
 def test_what_the_contact_adds_is_gone_where_it_is_known():
-    """The noise alone is what a fit with the contact and the zero held says."""
+    """The noise contribution equals the standard error of a fit with fixed contact and zero."""
     _, test = synthetic_impact()
     free = fitted(test)
     params = ff.make_params(test, "bistable")
@@ -238,7 +238,7 @@ def test_what_the_contact_adds_is_gone_where_it_is_known():
 
 
 def test_heights_of_a_chain(tmp_path):
-    """A spring's own ± moves its own strains; the ± of the whole moves those that have none."""
+    """The ± of one spring's height affects this spring, the ± of the total height all others."""
     time = np.linspace(0.0, 1.0, 201)
     motion = 4e-3 * np.sin(np.pi * time)
     chain = ff.Chain([ff.LinearSpring(2e6), MICRO], [4e-3, 6e-3], AREA)
@@ -258,7 +258,7 @@ def test_heights_of_a_chain(tmp_path):
     assert found["height_1"][best.index["s2_height"]] == 0.0
     assert found["height"][best.index["s1_height"]] == 0.0
     assert found["height"][best.index["s2_height"]] == pytest.approx(6e-5)
-    # A linear spring of another height gives the same displacement with another stiffness.
+    # A change in height of a linear spring is compensated by its stiffness.
     assert moved(best, "height_1", "s1_k0") == pytest.approx(0.01, rel=2e-3)
     assert moved(best, "height_1", "s2_k0") == pytest.approx(0.0, abs=2e-5)
 

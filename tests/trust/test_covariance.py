@@ -1,4 +1,4 @@
-"""Autocorrelation, covariance and states against cases that are known in closed form."""
+"""Autocorrelation, covariance and states, compared with closed-form results."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from foamfit.trust.residuals.noise_process import NoiseProcess, autocorrelation_
 
 
 def ar1(n: int, rho: float, seed: int) -> np.ndarray:
-    """First-order autoregressive noise of unit variance."""
+    """Return first-order autoregressive noise of unit variance."""
     white = np.random.default_rng(seed).standard_normal(n + 500)
     return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white)[500:]
 
@@ -24,7 +24,7 @@ def about(value: float, half: float) -> tuple[tuple[float, float], str]:
 
 @pytest.mark.parametrize("rho", [0.5, 0.8, 0.9])
 def test_autocorrelation_time_of_an_autoregressive_noise(rho):
-    """τ = (1+ρ)/(1-ρ) in closed form."""
+    """The closed form is τ = (1+ρ)/(1-ρ)."""
     found = np.mean([autocorrelation_time(ar1(4000, rho, seed)) for seed in range(20)])
     assert found == pytest.approx((1 + rho) / (1 - rho), rel=0.15)
 
@@ -37,7 +37,7 @@ def test_white_noise_counts_every_sample():
 
 @pytest.mark.parametrize("rho", [0.0, 0.8])
 def test_the_error_of_a_line_covers_its_scatter(rho):
-    """Offset and slope of a line in white and in correlated noise, whose scatter is known."""
+    """Offset and slope of a line have a known scatter in white and in correlated noise."""
     x = np.linspace(-1, 1, 800)
     jacobian = np.column_stack([np.ones_like(x), x])
     pull = np.linalg.pinv(jacobian)
@@ -52,10 +52,10 @@ def test_the_error_of_a_line_covers_its_scatter(rho):
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 7 / 9])
 def test_the_degrees_of_freedom_are_those_of_the_scatter_of_the_variance(rho):
-    """Variances v of a fit over 200 repetitions: χ² of as many degrees as 2 (mean/deviation)².
+    """A scaled χ² variance has 2 (mean/standard deviation)² degrees of freedom; 200 repetitions.
 
-    An offset sees the noise at low frequencies alone, where it is read off least surely; a fast
-    wave sees it where it is known best.
+    The offset depends on noise at low frequencies, whose estimate is the least accurate; the fast
+    wave depends on noise at high frequencies, whose estimate is the most accurate.
     """
     x = np.linspace(-1, 1, 300)
     jacobian = np.column_stack([np.ones_like(x), np.sin(60 * x)])
@@ -67,7 +67,7 @@ def test_the_degrees_of_freedom_are_those_of_the_scatter_of_the_variance(rho):
         variances.append(spread.stderr**2)
         freedoms.append(spread.freedom)
     seen = 2.0 * (np.mean(variances, axis=0) / np.std(variances, axis=0)) ** 2
-    left = 300 * (1 - rho) / (1 + rho) - 2  # effective samples less parameters
+    left = 300 * (1 - rho) / (1 + rho) - 2  # effective samples minus number of parameters
     assert np.median(freedoms, axis=0) == pytest.approx(np.minimum(seen, left), rel=0.5)
     if rho == 0.0:
         assert np.median(freedoms) == pytest.approx(298.0)
@@ -76,7 +76,7 @@ def test_the_degrees_of_freedom_are_those_of_the_scatter_of_the_variance(rho):
 
 
 def test_two_curves_have_the_freedom_of_both():
-    """Satterthwaite in closed form: a mean of two curves of 200 samples and of equal noise."""
+    """Satterthwaite's closed form for the mean of two curves with 200 samples and equal noise."""
     rng = np.random.default_rng(3)
     spread = covariance(np.ones((400, 1)), rng.standard_normal(400), (200, 200), np.ones(1))
     shares = np.array([process.variance for process in spread.noise])
@@ -139,9 +139,10 @@ def test_parameters_that_no_curve_follows_have_no_covariance():
 
 
 def test_the_growth_to_a_further_cycle_is_that_of_predicted_repetitions():
-    """Three cycles in which the law is off independently, and a fourth like the third; 400 times.
+    """400 fits of three cycles with independent model errors, and predictions of a fourth cycle.
 
-    Some directions are told by one cycle alone, so that fit and prediction differ much.
+    Only the third cycle determines some directions, so that the residuals of its fit are much
+    smaller than those of the prediction.
     """
     rng, rows = np.random.default_rng(0), np.arange(80, 120)
     jacobian = rng.standard_normal((120, 12))

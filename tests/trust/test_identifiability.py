@@ -1,4 +1,4 @@
-"""What a test can tell, against closed forms, energy, an independent integration and refits."""
+"""Identifiability, checked by closed forms, energy, an independent integration and refits."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ AGREED = ((1.0, 5), (4.0, 2))
 def problem_of(
     measurement: Measurement, model: str = "bistable", *, damped: bool = False, **given: Any
 ) -> Problem:
-    """A problem whose dampers are held at zero unless `damped`."""
+    """Return a problem with dampers fixed at zero unless `damped`."""
     drive = given.pop("drive", None)
     params = make_params(measurement, model, drive)
     if not damped:
@@ -58,12 +58,12 @@ def values_of(problem: Problem, *springs: ff.BistableSpring, **given: float) -> 
 
 
 def best_of(problem: Problem, spring: ff.BistableSpring) -> BestPoint:
-    """The point of one spring."""
+    """Return the best point for the parameters of one spring."""
     return BestPoint(problem, values_of(problem, spring))
 
 
 def insight_of(scaled: np.ndarray, values: np.ndarray | None = None) -> Insight:
-    """An insight with given sensitivities of one curve."""
+    """Return an insight for given sensitivities of one curve."""
     n, k = scaled.shape
     values = np.ones(k) if values is None else values
     halves = (scaled[: n // 2], scaled[n // 2 :])
@@ -72,14 +72,11 @@ def insight_of(scaled: np.ndarray, values: np.ndarray | None = None) -> Insight:
     return Insight(tuple("pqrst"[:k]), values, np.abs(values), parts, triangles)
 
 
-# ---------------------------------------------------------------- errors to expect
-
-
 # ---------------------------------------------------------------- expected errors
 
 
 def test_the_errors_to_expect_are_the_scatter_of_refits() -> None:
-    """60 seeded refits of synthetic impacts; the ratio scatters by 1/√120 = 9 % itself."""
+    """60 seeded refits of synthetic impacts; the ratio has a standard deviation of 1/√120 = 9 %."""
     spring, test = synthetic_impact(noise=0.01, samples=201)
     problem = problem_of(test)
     values = values_of(problem, spring)
@@ -111,7 +108,10 @@ def test_the_errors_to_expect_are_the_scatter_of_refits() -> None:
 
 
 def test_two_springs_in_series_show_only_their_compliance() -> None:
-    """C = h/k_1 + (H-h)/k_2 is all that a slow loop sees; its logarithmic slopes are the powers."""
+    """A slow loop only determines the compliance C = h/k_1 + (H-h)/k_2.
+
+    The powers of the combination are the logarithmic derivatives of C.
+    """
     k, h = (8e6, 3e6), 0.3 * HEIGHT
     compliance = h / k[0] + (HEIGHT - h) / k[1]
     strain = np.concatenate([np.linspace(0, 0.3, 150), np.linspace(0.3, 0.0, 150)[1:]])
@@ -163,7 +163,7 @@ def test_a_combination_is_named_with_its_powers(
 
 
 def test_a_zero_has_no_powers() -> None:
-    """It counts from an arbitrary origin."""
+    """The origin of the coordinate is arbitrary, so powers of it have no meaning."""
     plain = insight_of(100 * np.column_stack([X, -X, 1 - X]))
     insight = replace(plain, names=("contact_time", "displacement_zero", "s1_k0"))
     told = insight.combination("contact_time", 1.0)
@@ -195,7 +195,7 @@ def test_the_shares_of_the_information_add_up_and_lie_where_the_branch_is() -> N
         name: {branch: float(shares[i, j]) for j, (_, branch) in enumerate(parts)}
         for i, name in enumerate(result.insight.names)
     }
-    # Along a known motion a slope is told by its own branch alone.
+    # With the motion given, only the samples on a branch depend on the stiffness of this branch.
     assert where["s1_kh_minus"]["e"] > 0.99
     assert where["s1_kh_plus"]["d"] > 0.99
     assert where["s1_kc"]["c"] > 0.99
@@ -216,7 +216,7 @@ def test_the_sections_are_those_of_the_branches_in_time() -> None:
         assert test.time[start - 1] < switch.time <= test.time[start]
     before = [i for i, (_, label) in enumerate(result.insight.parts) if label in ("a", "d")]
     kc = result.insight.triangles[before, :, result.insight.names.index("s1_kc")]
-    assert not kc[: len(before) // 2].any()  # k_c leaves no trace before branch c
+    assert not kc[: len(before) // 2].any()  # no sample before branch c depends on k_c
 
 
 # ---------------------------------------------------------------- the checklist
@@ -228,7 +228,7 @@ def concluded(
     intervals: Intervals | None = None,
     **given: Any,
 ) -> Any:
-    """What is said at the true parameters of a synthetic impact."""
+    """Return the conclusions at the true parameters of a synthetic impact."""
     spring, test = synthetic_impact(samples=201)
     problem = problem_of(test if measurement is None else measurement, **given)
     values = values_of(problem, spring)
@@ -243,7 +243,7 @@ def answers(result: Any) -> dict[str, bool | None]:
 def test_a_good_fit_passes_every_question() -> None:
     result = concluded()
     found = answers(result)
-    assert found.pop("damping") is None  # which an impact does not leave out
+    assert found.pop("damping") is None  # does not apply to an impact
     assert set(found.values()) == {True}
     assert (result.status, result.warnings) == ("ok", ())
     assert summary_text(result, verbose=True).count("\nyes  ") == len(found)
@@ -310,7 +310,7 @@ def test_a_chain_too_short_to_trust_is_warned_of() -> None:
 
 
 def test_the_standard_error_is_local_whatever_made_the_interval() -> None:
-    """So that it is that of the best point, whatever the seed; that it says less is said."""
+    """It does not depend on the seed; a very different interval is mentioned in the reason."""
     local = concluded().parameters["s1_k0"]
     low, high = local.ci95
     half, profiled = (high - low) / 2, {"s1_k0": "profile likelihood"}
@@ -328,7 +328,7 @@ def test_the_standard_error_is_local_whatever_made_the_interval() -> None:
 
 
 def test_a_profile_much_narrower_than_the_local_interval_is_not_taken() -> None:
-    """Refits that stall where the cost is flat make it so."""
+    """A profile is too narrow if its refits stall where the cost is flat."""
     local = concluded().parameters["s1_k0"]
     half = (local.ci95[1] - local.ci95[0]) / 2
     ends = {"s1_k0": (local.value - 0.1 * half, local.value)}
@@ -373,7 +373,7 @@ def test_what_the_test_does_not_say_is_neither_yes_nor_no() -> None:
     result = conclude(best_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
     assert answers(result)["energy"] is None
     assert answers(result)["impulse"] is None
-    assert answers(result)["noise"] is True  # the noise is estimated here
+    assert answers(result)["noise"] is True  # since the noise is estimated from the record
     assert result.status == "ok"
 
 
@@ -394,7 +394,7 @@ def test_a_damper_that_may_be_none_is_not_called_determined() -> None:
     assert item.ci95[0] == 0.0
     assert item.state == "weak"
     assert item.why.startswith("it is consistent with zero; upper bound ")
-    # Its limit is known well, which is nothing to be warned of, but it is said.
+    # A small upper bound is reported, but is not a reason for a warning.
     assert result.status == "ok"
     told = next(check for check in result.checklist if check.key == "determined")
     expected = "7 of 8 are determined; consistent with zero, with a small upper bound: s1_eta."
@@ -428,7 +428,7 @@ def test_the_report_shows_them_too() -> None:
     assert result.insight.sentence() in " ".join(summary_text(result, verbose=True).split())
 
 
-# ---------------------------------------------------------------- what the words leave out
+# ---------------------------------------------------------------- branches not reached
 
 
 def test_what_was_never_reached_is_said_first() -> None:

@@ -1,4 +1,4 @@
-"""Profiles and Markov chains against closed forms, each other and independent refits."""
+"""Profiles and Markov chains compared with closed forms, each other and independent refits."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def profile(best: BestPoint, name: str, minima: Sequence[np.ndarray] = ()) -> Pr
 
 @dataclass(eq=False)
 class Curve:
-    """An objective in closed form: two parameters, `bend` makes it curved."""
+    """An objective in closed form with two parameters; `bend` makes it nonlinear."""
 
     time: np.ndarray
     data: np.ndarray
@@ -90,7 +90,7 @@ class Curve:
 
 @dataclass(eq=False)
 class Bench:
-    """What `BestPoint` needs of a problem, for a `Curve`."""
+    """A minimal problem for a `Curve`, with the attributes that `BestPoint` uses."""
 
     objective: Curve
     low: float = -100.0
@@ -114,7 +114,7 @@ class Bench:
 def curve(
     bend: float = 0.0, rho: float = 0.0, low: float = -100.0, slope: float = 0.3, n: int = 400
 ) -> BestPoint:
-    """A vicinity of the best fit of a curve with noise of 0.1."""
+    """Return the best fit of a curve with noise of standard deviation 0.1."""
     rng = np.random.default_rng(5)
     time = np.linspace(-1, 1, n)
     bench = Bench(Curve(time, np.zeros(n), bend), low)
@@ -126,7 +126,7 @@ def curve(
 
 @pytest.fixture(scope="module")
 def impact() -> BestPoint:
-    """The best fit of a synthetic impact, closed loop, starting at the truth."""
+    """Best fit of a synthetic impact with a closed loop, started at the true values."""
     spring, measurement = synthetic_impact(samples=301)
     problem = make_problem(measurement, "bistable", "impact", None, None, False)
     problem.params["s1_eta"].set(value=0.0, vary=False)
@@ -137,7 +137,7 @@ def impact() -> BestPoint:
 
 
 def _refitted(problem: Problem, values: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """Least squares by scipy, with its own differences, over some parameters."""
+    """Refit some of the parameters with SciPy's least squares and its finite differences."""
     places = [problem.index[name] for name in names]
     sizes = problem.sizes(names, values)
 
@@ -175,9 +175,9 @@ def test_the_product_with_the_covariance_matrix_is_that_of_the_matrix():
 
 
 def test_what_a_fit_takes_from_the_noise_is_given_back():
-    """Residuals of a polynomial of eight terms: τ and variance of the noise, not of the residual.
+    """Fitting eight polynomial terms removes noise; correcting for this recovers variance times τ.
 
-    Means of 150 repetitions; uncorrected both come out a fifth too small or more.
+    Means of 150 repetitions; without the correction the product is at least 25 % too small.
     """
     rng = np.random.default_rng(2)
     n, rho = 300, 7.0 / 9.0
@@ -228,7 +228,7 @@ def test_a_limit_ends_an_interval():
 
 
 def test_the_ends_of_a_profile_satisfy_the_cut_by_an_independent_refit(impact):
-    """With ε_a held at its ends, scipy finds the same least cost."""
+    """With ε_a fixed at either end of its interval, SciPy finds the same minimum cost."""
     name = "s1_eps_a"
     found = profile(impact, name)
     place = impact.problem.index[name]
@@ -244,7 +244,7 @@ def test_the_ends_of_a_profile_satisfy_the_cut_by_an_independent_refit(impact):
 
 
 def test_a_profile_goes_on_beyond_a_minimum_that_is_as_good():
-    """A cost of two minima: x² (x-3)² seen by its residual x (x-3), flat noise elsewhere."""
+    """The cost x² (x-3)² has two minima; its residual is x (x-3), the other samples are noise."""
     rng = np.random.default_rng(0)
     noise = rng.standard_normal(400)
 
@@ -273,7 +273,7 @@ def test_a_profile_goes_on_beyond_a_minimum_that_is_as_good():
 
     class Gap(Two):
         def residual(self, values: np.ndarray) -> np.ndarray:
-            self.failures += 1e-5 < values[1] < 2.99  # nothing can be simulated there
+            self.failures += 1e-5 < values[1] < 2.99  # every simulation fails between the minima
             return super().residual(values)
 
     bench = TwoBench(Gap(np.arange(400.0), noise))
@@ -283,10 +283,11 @@ def test_a_profile_goes_on_beyond_a_minimum_that_is_as_good():
 
 
 def test_what_one_profile_meets_counts_for_the_others():
-    """Two minima a low barrier apart: a = 0, b = 0 and a = 1, b = 3.
+    """Two minima separated by a low barrier: a = 0, b = 0 and a = 1, b = 3.
 
-    With a held b does not move, since a - (3 - 2u) u², u = b/3, has no slope there: the profile of
-    a alone stays in the first minimum. That of b crosses the barrier and meets the second.
+    With a fixed, b does not move, since a - (3 - 2u) u², u = b/3, has zero slope in b at the first
+    minimum: the profile of a alone stays there. The profile of b crosses the barrier and finds the
+    second minimum.
     """
     noise = np.random.default_rng(1).standard_normal(400)
     noise[:2] = 0.0
@@ -317,9 +318,9 @@ def test_what_one_profile_meets_counts_for_the_others():
 
 @pytest.mark.parametrize("far", [True, False])
 def test_a_value_far_outside_that_fits_almost_as_well_is_named(far):
-    """The residual of b is a line to 1.2 half widths; beyond it goes on, or rises no more.
+    """The residual is linear in b up to 1.2 half widths; beyond, it is constant if `far`.
 
-    Beyond, the best a follows b to where a refit with a held does not find b.
+    There the best a changes with b, so that a refit with a fixed does not find these values of b.
     """
     noise = np.random.default_rng(2).standard_normal(400)
     noise[:2] = 0.0
@@ -349,7 +350,7 @@ def test_a_value_far_outside_that_fits_almost_as_well_is_named(far):
 
 
 class _Interrupting(Tracker):
-    """Ctrl-C after so many evaluations."""
+    """A tracker that raises Ctrl-C after a given number of evaluations."""
 
     left = 60
 
@@ -367,7 +368,7 @@ def test_an_interrupted_profile_keeps_what_was_done(impact, monkeypatch):
     assert not found.profiles[-1].complete
     assert len(found.profiles) < len(impact.names)
     assert set(found.ends) == {p.name for p in found.profiles if p.complete}
-    assert found.notes == ()  # fewer than asked for: what was asked for was not done
+    assert found.notes == ()  # the interrupt is a warning, since the profiles are incomplete
     assert "were stopped by Ctrl-C" in found.warnings[0]
     local = found.warnings[0].partition("the intervals of ")[2].removesuffix(" are local.")
     assert local.split(", ") == [name for name in impact.names if name not in found.ends]
@@ -380,7 +381,7 @@ def test_a_time_that_is_up_ends_profiles_too(impact):
 
 
 def test_a_better_point_is_told(impact):
-    """Around a point that is not the best, a profile says where to go on."""
+    """A profile around a point that is not the minimum returns a better starting point."""
     values = impact.values.copy()
     values[impact.problem.index["s1_kc"]] *= 1.01
     off = BestPoint(impact.problem, values, impact.names)
@@ -402,7 +403,7 @@ def test_a_markov_chain_agrees_with_the_local_errors():
         around.values, abs=0.25 * float(around.spread.stderr.max())
     )
     assert "autocorrelation times" in chain.sentence()
-    for seed in (3, 2**70):  # numpy's own old generators take no seed past 2³²
+    for seed in (3, 2**70):  # NumPy's legacy generators accept no seed above 2³²
         twice = [mcmc(around, 100, seed=seed).samples for _ in range(2)]
         assert np.array_equal(*twice)
 
@@ -413,7 +414,7 @@ def test_a_short_chain_says_that_it_is_short():
 
 
 class Levels(Curve):
-    """A curve that fixes b and only the sum of a and c."""
+    """A curve that determines b, but of a and c only the sum."""
 
     def model(self, values: np.ndarray) -> np.ndarray:
         a, b, c = values
@@ -432,7 +433,7 @@ class LevelsBench(Bench):
 
 
 def levels(kind: type[Curve] = Levels, names: tuple[str, ...] = ("a", "b", "c")) -> BestPoint:
-    """The best point of a curve that does not determine a and c."""
+    """Return the best point of a curve that does not determine a and c."""
     time = np.linspace(-1, 1, 400)
     data = 0.4 + 0.3 * time + 0.1 * np.random.default_rng(5).standard_normal(400)
     bench = LevelsBench(kind(time, data), index={"a": 0, "b": 1, "c": 2})
@@ -442,12 +443,12 @@ def levels(kind: type[Curve] = Levels, names: tuple[str, ...] = ("a", "b", "c"))
 
 
 def test_a_chain_runs_over_what_is_not_determined_within_its_limits():
-    """The others are marginal over it, with the errors that they have without it."""
+    """Marginalising over an undetermined parameter leaves the errors of the others unchanged."""
     pytest.importorskip("emcee")
     around = levels()
     assert np.isnan(around.spread.stderr).tolist() == [True, False, True]
     a, b, c = mcmc(around, 1000, seed=1).samples.T
-    assert np.ptp(a) > 1.0  # a + c = 0.4 within -1 and 1 leaves a from -0.6 to 1
+    assert np.ptp(a) > 1.0  # a + c = 0.4 with both in [-1, 1] allows a from -0.6 to 1
     assert max(np.abs(a).max(), np.abs(c).max()) <= 1.0
     error = 0.1 / np.sqrt(400)
     assert np.std(a + c) == pytest.approx(error, rel=0.15)
@@ -499,7 +500,7 @@ def test_a_time_that_is_up_keeps_the_fit():
 
 @pytest.mark.parametrize("after", [5, 900])
 def test_ctrl_c_keeps_what_was_drawn(after, monkeypatch, capsys):
-    """Also within the first draws, and without what emcee prints of it."""
+    """This includes Ctrl-C during the first draws; emcee's own message is suppressed."""
     monkeypatch.setattr(_Interrupting, "left", after)
     monkeypatch.setattr(intervals, "Tracker", _Interrupting)
     found = assess(levels(), Choice("mcmc", 5000))
@@ -596,7 +597,7 @@ AGREED = SearchRecord(0, 8, 0.0, ((1.0, 8),))
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("method", ["profile likelihood", "MCMC", "none"])
 def test_an_interval_is_in_order_and_holds_its_value(impact, method, seed):
-    """Whatever the draws were: to one side of the value, the wrong way round, past the limits."""
+    """The given ends may lie on one side of the value, be swapped, or lie beyond the limits."""
     rng = np.random.default_rng(seed)
     ends, sizes = {}, impact.sizes * 10.0 ** rng.uniform(-6, 1, len(impact.names))
     for name, size in zip(impact.names, sizes, strict=True):
@@ -630,7 +631,7 @@ def test_what_is_within_rounding_of_its_limit_is_at_it(impact, monkeypatch):
     found = Found(problem, Tracker(problem.objective, best_values=values), AGREED)
     result, _ = judge(found, Choice("local"), lambda _: None)
     assert str(result.parameters["s1_dsigma"].value) == "0.0"
-    # What would cost something stays where it is.
+    # A parameter is not moved to its limit if that would increase the cost.
     monkeypatch.setattr(one_model, "AT_LIMIT", 1.0)
     tracker = Tracker(problem.objective, best_values=impact.values, best_cost=impact.cost)
     _, best = judge(Found(problem, tracker, AGREED), Choice("local"), lambda _: None)
@@ -645,7 +646,7 @@ def test_intervals_are_made_with_the_parameters_on_their_limits(impact, monkeypa
     monkeypatch.setattr(
         one_model, "assess", lambda best, *_, **__: seen.append(best) or intervals.Intervals()
     )
-    # The point is no minimum; what would go on from there is left out.
+    # The point is not a minimum: skip the search for ranges, which would leave it.
     monkeypatch.setattr(one_model, "left_open", lambda *_: Open())
     found = Found(problem, Tracker(problem.objective, best_values=values), AGREED)
     _, best = judge(found, Choice("profile"), lambda _: None)
@@ -667,7 +668,7 @@ def test_a_profile_that_its_limit_cuts_is_not_called_narrow(impact):
 
 
 def test_the_ends_of_a_profile_do_not_depend_on_rounding():
-    """Two springs, whose parameters the curves fix in combinations only: the cost is flat."""
+    """The curves of two springs determine only combinations of parameters: the cost is flat."""
     rng, time = np.random.default_rng(4), np.linspace(0.0, 8e-4, 301)
     foam = ff.BistableSpring(2.0510e6, 60.822e6, -0.39005e6, 0.34889, 0.62232, 6.7937e6, 1.1061e6)
     chain = ff.Chain([ff.LinearSpring(60e6), foam], [0.7e-3, 0.49e-3], 2e-5)
@@ -700,12 +701,12 @@ def test_the_ends_of_a_profile_do_not_depend_on_rounding():
 
 
 def test_nine_of_ten_intervals_hold(tmp_path):
-    """16 synthetic impacts in white noise, their best point found from the truth.
+    """16 synthetic impacts in white noise, each fitted starting from the true values.
 
-    Of the intervals of k_c (one of each test, so independent): a method that holds in 95 % of cases
-    holds in 12 of 16 or less with a probability below 1 %, one that holds in 70 % of cases in 13 or
-    more in one of four. Of all parameters together, which are not independent, a method that holds
-    in 70 % of cases is far below the bound.
+    The 16 intervals of k_c are independent. A method with 95 % coverage contains the true value 12
+    times or less with a probability below 1 %; a method with 70 % coverage contains it 13 times or
+    more with a probability below 25 %. The intervals of all parameters are not independent, but
+    a method with 70 % coverage would lie far below the bound on their mean.
     """
     tests, least = 16, 13
     assert binom.cdf(least - 1, tests, 0.95) < 0.01
@@ -724,7 +725,7 @@ def test_nine_of_ten_intervals_hold(tmp_path):
         around = BestPoint(problem, truth, names)
         best = Refit(around, tracker).run(truth)
         around = BestPoint(problem, best.point, names)
-        found = assess(around, Choice(), budget=2000.0)  # evaluations: as a fit has
+        found = assess(around, Choice(), budget=2000.0)  # evaluations allowed in a fit
         for i, name in enumerate(names):
             if name in around.known:
                 half = around.quantiles[i] * around.spread.stderr[i]

@@ -1,4 +1,4 @@
-"""The covariance of a joint fit by blocks."""
+"""The covariance of a joint fit, computed in blocks."""
 
 from dataclasses import replace
 
@@ -84,7 +84,7 @@ def test_the_slope_of_a_law_has_its_error(point):
 
 @pytest.mark.parametrize("kind", ["log rate", "power rate"])
 def test_the_error_of_a_rate_is_in_that_of_the_slope(kind):
-    """As refits with the rate of each test a little off have it."""
+    """The added variance agrees with refits in which the rate of each test is shifted."""
     problems, vectors = loops_of([{"k0": SPRING.k0 * (1.0 + 0.03 * x)} for x in X], 2e4)
     kinds = dict.fromkeys(problems[0].free(), "shared") | {"s1_k0": kind}
     errors, step = np.array([0.0, 0.03, 0.06]), 1e-3
@@ -145,7 +145,7 @@ def test_what_no_test_reaches_has_no_error():
 
 
 def test_beside_an_error_of_the_law_tests_add_up_as_well():
-    """A wave that no law of one spring follows, the same in all tests, counts as in one test."""
+    """One spring cannot follow the wave in these three tests; errors still decrease by √3."""
     problems, vectors = loops_of([{}] * 3, 5e2)
     wave = 3e4 * np.sin(LOOP.displacement / HEIGHT * 40.0)
     bent = [

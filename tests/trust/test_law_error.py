@@ -1,4 +1,4 @@
-"""Noise told from an error of the law, and what such an error leaves open."""
+"""Separation of noise from errors of the law, and the ranges that such errors cause."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def noise(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
 
 
 def wave(n: int) -> np.ndarray:
-    """What a law leaves of a curve with kinks: slow, and nothing of a polynomial of degree 7."""
+    """Return a slow residual with kinks, orthogonal to all polynomials of degree 7, of unit RMS."""
     x = np.linspace(-1, 1, n)
     kinks = np.abs(x + 0.4) - 1.7 * np.abs(x - 0.1) + np.abs(x - 0.6)
     basis = np.polynomial.legendre.legvander(x, 7)
@@ -69,7 +69,7 @@ def of(residual: np.ndarray):
 @pytest.mark.parametrize("rho", [0.0, 0.5, 7 / 9, 0.9])
 @pytest.mark.parametrize("n", [300, 1000])
 def test_noise_of_first_order_is_no_error_of_the_law(n, rho):
-    """Nine records of each; the process is then that of the residual, as it was."""
+    """Nine records per case, all of them noise only."""
     rng = np.random.default_rng(11)
     found = [of(noise(rng, n, rho)) for _ in range(9)]
     assert not any(one.found for one in found)
@@ -93,9 +93,10 @@ def test_an_error_below_that_of_the_simulation_is_none():
 
 
 def test_the_curvature_that_a_residual_leaves_is_in_the_covariance():
-    """Curves b² t and 5 b fitted to others: variance by White's formula in closed form.
+    """The curves b² t and 5 b cannot fit the data; White's formula gives the variance of b.
 
-    J = (2 b t, 5), so that H = JᵀJ + 2 Σ t r with r the residual of the first curve.
+    With J = (2 b t, 5) the Hessian is H = JᵀJ + 2 Σ t r, where r is the residual of the first
+    curve.
     """
     t = np.linspace(0.0, 1.0, 400)
     y = 0.3 * t + 0.5 * np.sin(9.0 * t)
@@ -123,7 +124,7 @@ def test_the_curvature_that_a_residual_leaves_is_in_the_covariance():
     curvature = square + 2.0 * float(t @ left[:400])
     assert abs(curvature / square - 1.0) > 5e-3
     assert found.matrix[0, 0] == pytest.approx(1e-4 * square / curvature**2, rel=1e-4)
-    # A rise of the cost by a χ² of one is one standard error on its parabola.
+    # On a parabola of the cost, an increase by one unit of χ² corresponds to one standard error.
     assert found.inflation[0] == pytest.approx(found.matrix[0, 0] * curvature, rel=1e-4)
     assert one.covariance.matrix[0, 0] == pytest.approx(max(plain.matrix[0, 0], found.matrix[0, 0]))
 
@@ -133,7 +134,7 @@ def test_the_curvature_that_a_residual_leaves_is_in_the_covariance():
 
 @cache
 def micro(draw: int | None, law: str = "microscale and relaxation") -> Measurement:
-    """A test of another law with 0.5 % noise on the stress, every second sample."""
+    """Return half the samples of a test of another law; `draw` adds 0.5 % noise to the stress."""
     curves = law_error.curves(law)
     stress = curves.stress[::2]
     if draw is not None:
@@ -154,7 +155,7 @@ def fitted(draw: int | None):
 
 @cache
 def strikes(kind: str) -> Problem:
-    """An impact of a foam of another law, 251 samples, or of the own law, without noise."""
+    """Return the problem of a noise-free impact on a foam of another law or of the fitted law."""
     curves = law_error.curves(kind)
     test = Measurement(
         name=kind, path=None, data_sha256="", time=curves.time[::2], stress=curves.stress[::2],
@@ -165,7 +166,7 @@ def strikes(kind: str) -> Problem:
 
 
 def truth(problem: Problem) -> np.ndarray:
-    """The study's own spring without dashpots, its contact and zeros known."""
+    """Return the values of the study's spring without dashpots, with known contact and zeros."""
     values = problem.vector()
     values[:9] = *law_error.SPRING.seven, 0.0, 0.0
     return values
@@ -179,10 +180,10 @@ def refitted(problem: Problem, values: np.ndarray, names: tuple[str, ...]) -> Be
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])
 def test_the_noise_that_a_fit_has_taken_is_given_back(rho):
-    """Variances of the own law's parameters, off residuals, over those of the noise itself.
+    """Variances of the parameters estimated from residuals match those from the true noise.
 
-    The fit takes what is slow: off the residuals as they are, noise of 0.9 from sample to sample
-    would give 0.6 of the variances.
+    A fit absorbs slow noise: with an autocorrelation of 0.9 between samples, residuals without
+    the correction would give 0.6 of the true variances.
     """
     clean = strikes("own law")
     around = BestPoint(clean, truth(clean), clean.free()[:7])
@@ -203,10 +204,10 @@ def test_the_noise_that_a_fit_has_taken_is_given_back(rho):
 
 @pytest.mark.parametrize("kind", ["rate effect", "own law"])
 def test_the_interval_holds_the_best_fit_without_noise(kind):
-    """Of 20 independent intervals of k_c 14 or less hold with p < 1e-3, if 95 % do.
+    """At 95 % coverage, 14 or fewer of 20 independent intervals of k_c succeed with p < 1e-3.
 
-    They are no wider than 2.5 times what refits scatter, which the residual of the rate effect,
-    taken for correlated noise, makes them by far.
+    The intervals are at most 2.5 times as wide as the scatter of refits implies. They would be
+    much wider if the systematic residual of the rate effect were treated as correlated noise.
     """
     assert binom.cdf(14, 20, 0.95) < 1e-3
     clean = strikes(kind)
@@ -256,12 +257,11 @@ def test_every_description_in_the_range_follows_the_curves_about_as_well():
         if item.range is not None:
             assert item.range == pytest.approx(opened.ranges[name], rel=0.05, abs=1e-3)
             assert item.range[0] <= item.value <= item.range[1]
-            # What refits with fresh noise scatter is less than what the law leaves open.
             assert item.ci95 is None or np.ptp(item.range) > 0.0
 
 
 def test_local_intervals_look_for_no_further_minima():
-    """Only the other intervals go by them; the ranges are the same."""
+    """Only profiles and chains use further minima; the ranges are the same without them."""
     _, best, found = fitted(0)
     objective, ends = found.problem.objective, found.tracker.ends
     counts = [objective.evaluations]
@@ -330,7 +330,7 @@ def test_there_is_no_range_where_the_law_follows_the_curves():
 
 
 def test_a_loop_has_two_branches_c():
-    """Both pass through C1 and C2 as they were read, the soft one close to its pole."""
+    """Both pass through the points C1 and C2 read off the loop; the soft one is near its pole."""
     spring = ff.BistableSpring(6.8e5, 5.9e4, -1.3e4, 0.088, 0.19, 3.35e5, 2.6e5)
     strain = np.concatenate([np.linspace(0, 0.5, 200), np.linspace(0.5, 0, 200)[1:]])
     loop, scales = Loop(strain, spring.stress(strain)), Scales(2e5, 0.5, 1.0, 0.01)
@@ -345,7 +345,7 @@ def test_a_loop_has_two_branches_c():
 
 
 def test_the_search_finds_the_soft_branch_c():
-    """Without starts on it the best of 16 descents misses 1.9 % of the range, not 1.15 %."""
+    """Without starts on this branch, the best of 16 descents has a misfit of 1.9 %, not 1.15 %."""
     best = fitted(None)[1]
     assert best.problem.objective.misfit(best.simulated)["stress_strain"] < 0.012
 

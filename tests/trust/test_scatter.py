@@ -1,4 +1,4 @@
-"""Common value and spread of estimates with errors."""
+"""Common value of several estimates with errors, and their spread."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def test_equal_errors_leave_what_the_text_books_have():
     assert found.ci95 == pytest.approx((3.5 - half, 3.5 + half))
     ends = [np.sqrt(4 * variance / stats.chi2.ppf(p, 4) - 0.09) for p in (0.975, 0.025)]
     assert found.tau_ci95 == pytest.approx(ends)
-    # of τ² the variance is 2 (τ² + σ²)²/(n-1)
+    # the variance of τ² is 2 (τ² + σ²)²/(n-1)
     assert found.tau_stderr == pytest.approx(variance * np.sqrt(2 / 4) / (2 * found.tau), rel=1e-4)
 
 
@@ -44,7 +44,7 @@ def test_an_error_that_all_have_in_common_is_no_spread_but_one_of_the_mean():
 
 @pytest.mark.parametrize("tau", [0.0, 0.1, 1.0])
 def test_intervals_hold(tau):
-    """95 % of 200 groups of 8, of unequal errors; by chance within 3 %."""
+    """About 95 % (± 3 % by chance) of 200 groups of 8 estimates with unequal errors."""
     rng, hits = np.random.default_rng(1), []
     for _ in range(200):
         errors = 0.1 * np.exp(0.5 * rng.standard_normal(8))
@@ -58,11 +58,14 @@ def test_intervals_hold(tau):
 
 
 def specimens(n, seed, errors=0.0):
-    """Three parameters of n specimens: the first two with a correlation of -0.9; and errors."""
+    """Return three parameters of n specimens and their true correlation matrix.
+
+    The first two parameters have a correlation of -0.9.
+    """
     truth = np.array([[1.0, -0.9, 0.0], [-0.9, 1.0, 0.0], [0.0, 0.0, 1.0]])
     rng = np.random.default_rng(seed)
     drawn = rng.multivariate_normal(np.zeros(3), truth, n)
-    # errors that two parameters have in common, as those of stiffness and onset
+    # the first two parameters share an error, as stiffness and onset do
     return drawn + errors * rng.standard_normal((n, 1)) * np.array([1.0, 1.0, 0.0]), truth
 
 
@@ -87,7 +90,7 @@ def test_few_specimens_show_less_of_it():
     }
     assert size[2] == 0.0
     assert 0.3 < size[4] < size[16] - 0.05 < 0.85
-    # a correlation it stays: of unit diagonal, and positive
+    # it must remain a correlation matrix: unit diagonal, no negative eigenvalue
     for seed in range(20):
         found = correlation(specimens(3, seed)[0], 0.5 * np.eye(3))
         assert np.diag(found) == pytest.approx(1.0)
