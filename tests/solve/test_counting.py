@@ -126,7 +126,7 @@ def test_inertia_or_damping_takes_steps(counts: dict[str, dict[str, Any]]) -> No
 def test_a_held_parameter_costs_no_sensitivity(
     counted: dict[str, dict[str, dict[str, Any]]], way: str
 ) -> None:
-    """The work for five varying parameters and for the other three adds up to that for all eight."""
+    """The work for five varying parameters plus that for the other three is that for all eight."""
     found = [counted["sensitivities"][f"{way}, {held} held"] for held in (0, 3, 5)]
     assert [one["columns"] for one in found] == [8, 5, 3]
     assert [set(one["carried"].values()) for one in found] == [{8}, {5}, {3}]

@@ -162,7 +162,7 @@ def test_a_derivative_that_does_not_exist_is_said_to_be_one_sided(name) -> None:
 
 @pytest.mark.parametrize("like", [0.0, 1e-9, 1e-6, -1e-6])
 def test_springs_alike_are_answered_while_the_motion_holds(like) -> None:
-    """Rounding once reversed the springs in turn, so that only some values of rtol were answered."""
+    """Rounding once reversed the springs in turn, and some values of rtol led to a refusal."""
     spring, time = replace(SHOE, relaxation=[(0.5, 0.1)]), np.linspace(0.0, 1.0, 41)
     given = ff.Chain([replace(spring, k0=spring.k0 * (1.0 + like)), spring], [H, H], AREA)
     drive = ff.DisplacementDrive(2 * H * np.interp(time, [0, 0.4, 0.7, 1], [0, 0.35, 0.35, 0.05]))
