@@ -165,7 +165,7 @@ def with_value(given: ff.Chain, name: str, value: float) -> ff.Chain:
 
 # Rounding makes springs reverse repeatedly here; SciPy from event to event replaces the judge.
 TURNING = ("impact, gap between masses", "stress, viscous top")
-# The judge lacks softening and weakening after snapping; SciPy from event to event replaces it.
+# Springs that soften and weaken after snapping are compared with SciPy from event to event.
 REMEMBERING = tuple(name for name in SCENES if "remembering" in name)
 
 
