@@ -1,11 +1,12 @@
-"""Benchmarks of the simulation, beside the tests and not among them: nothing is asserted of times.
+"""Benchmarks of the simulation; they are not tests and assert nothing about times.
 
     pip install ".[benchmark]"
     pytest tests/benchmarks/bench_forward.py --benchmark-group-by=group
     pytest tests/benchmarks/bench_forward.py -k impact --benchmark-json=before.json
 
-The default `pytest` does not collect this file (its name does not start with `test_`). Scenes and
-SciPy's side are those of experiments/error_vs_runtime; its `forward.py` sets errors against times.
+By default `pytest` does not collect this file (its name does not start with `test_`). The scenes
+and the SciPy solvers are those of experiments/error_vs_runtime, whose `forward.py` plots errors
+against times.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ SAMPLES = (100, 1000, 10_000, 100_000)
 
 
 def kernel(chain: ff.Chain, drive: Any, time: np.ndarray) -> Any:
-    """The bare run that the fit calls, as a function of nothing."""
+    """Return the bare simulation that the fit calls, as a function without arguments."""
     made = plan(chain, drive, time)
     rows = np.array([spring.row for spring in chain.springs])
     heights = np.array(chain.heights)

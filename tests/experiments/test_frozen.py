@@ -1,4 +1,4 @@
-"""Does the study of frozen results see a change, and only a change?"""
+"""The study of frozen results reports every change and nothing else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The study of discrete micro-springs: its numbers, and that its page holds them."""
+"""The study of discrete micro-springs: its numbers, and its page, which must contain them."""
 
 from __future__ import annotations
 

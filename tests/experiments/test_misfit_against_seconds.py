@@ -40,7 +40,7 @@ def problem() -> Problem:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A clock on which every look takes a millisecond."""
+    """Replace the clock by one that advances a millisecond at each reading."""
     ticks = itertools.count()
     monkeypatch.setattr("time.process_time", lambda: 1e-3 * next(ticks))
 
@@ -69,7 +69,7 @@ def test_a_run_ends_where_nothing_is_left_to_gain(problem: Problem, clock: None)
     with identification.recorded(recorder):
         identification.run_own(case, problem, seed=0)
     assert recorder.cost <= identification.ENOUGH * 1e9
-    assert recorder.rows[-1][2] == recorder.cost  # when it was solved is recorded
+    assert recorder.rows[-1][2] == recorder.cost  # the last row records the solution
 
 
 @pytest.mark.parametrize("coordinates", list(identification.COORDINATES))

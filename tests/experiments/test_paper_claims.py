@@ -1,4 +1,4 @@
-"""The headline numbers of experiments/paper_claims, each by the functions that make its page."""
+"""The main numbers of experiments/paper_claims, from the functions that write its page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _spec = importlib.util.spec_from_file_location("paper_claims", FOLDER / "paper_c
 assert _spec is not None
 assert _spec.loader is not None
 claims = importlib.util.module_from_spec(_spec)
-sys.modules["paper_claims"] = claims  # a dataclass looks its module up
+sys.modules["paper_claims"] = claims  # @dataclass looks up its module here
 _spec.loader.exec_module(claims)
 
 MODEL_1, MODEL_2, MODEL_3, FOAM_2 = claims.MODEL_1, claims.MODEL_2, claims.MODEL_3, claims.FOAM_2
@@ -30,7 +30,7 @@ def drive() -> claims.Drive:
 
 @pytest.fixture(scope="module")
 def coarse() -> claims.Drive:
-    """The same in fewer samples, for what takes many steps between them."""
+    """The same drive with fewer samples, for cases that need many steps between samples."""
     return claims.drive_of_impact(samples=101)
 
 
@@ -64,7 +64,7 @@ def test_small_damper_removes_the_oscillation(drive: claims.Drive, coarse: claim
     weaker = claims.oscillation(drive, claims.OWN_MASS, 0.9 * needed)
     assert weaker["turns"] + weaker["turns_w"] > 0
     given = [(drive, 1.5), (drive, 5.0), (drive, 50.0), (coarse, claims.ETA / needed)]
-    for of, factor in given:  # and no stronger one brings it back
+    for of, factor in given:  # a stronger damper must not bring the oscillation back
         stronger = claims.oscillation(of, claims.OWN_MASS, factor * needed)
         assert stronger["turns"] == stronger["turns_w"] == 0
 
@@ -130,7 +130,7 @@ def test_two_of_three_damping_ratios_follow_from_the_tables() -> None:
     assert f"{formula[MODEL_3]:.4f}" == "0.0297"
     assert f"{formula[FOAM_2]:.3f}" == "0.525"
     assert f"{formula[MODEL_2]:.3f}" == "0.845"
-    for name, value in formula.items():  # the package says the same
+    for name, value in formula.items():  # the package agrees
         assert claims.ff.published[name].damping_ratio_by_formula() == pytest.approx(value)
 
 
@@ -195,7 +195,7 @@ def test_foam_2_just_closes_its_loop() -> None:
 
 
 def test_massless_chain_loses_the_loop_area() -> None:
-    """Just past C1 the striker loses what the smallest closed loop encloses."""
+    """Just past C1 the striker loses the area of the smallest closed loop."""
     chain, velocity = claims.impact_scene(MODEL_2), 1.9108
     brought = 0.5 * claims.STRIKER * velocity**2 / chain.area
     lost = claims.lost_share(chain, velocity) / 100 * brought
@@ -214,7 +214,7 @@ def test_published_damping_is_no_viscosity() -> None:
 
 
 def test_page_is_the_filled_template() -> None:
-    """README.md is what the script writes of the template, apart from its numbers and tables."""
+    """README.md is the filled template; its numbers and tables are not compared."""
     template = claims.subscripts((FOLDER / "page.template.md").read_text(encoding="utf-8"))
     page = (FOLDER / "README.md").read_text(encoding="utf-8")
     for text in re.split(r"{[^}]+}", template):

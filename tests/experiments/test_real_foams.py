@@ -1,4 +1,4 @@
-"""The tables and the picture of the study of real foams, from made-up fits."""
+"""The tables and the figure of the study of real foams, from fabricated fits."""
 
 from __future__ import annotations
 

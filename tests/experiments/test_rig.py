@@ -1,4 +1,4 @@
-"""Synthetic records as a rig writes them: their truth is foamfit's, and files hold the records."""
+"""Synthetic records of the rig: their true curves agree with foamfit, files with the records."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ def test_slow_tests_are_those_of_foamfit(setup: rig.Slow, seed: int) -> None:
     course = rig.slow(setup, seed).course
     assert course.rig.motion is not None
     turns = [t for t in course.rig.motion.times if course.start < t < course.end]
-    # Between samples the motion is simulated as straight, which a sine and a ramp are not.
+    # foamfit interpolates the motion linearly, so a sine and a ramp need many samples.
     samples = 20_001 if setup.motion in ("sine", "ramp") else 1_001
     time = np.union1d(np.linspace(course.start, course.end, samples), turns)
     drive = ff.DisplacementDrive(course.top(time, gauge=False))
     found = ff.simulate(rigs.chain_of(course.rig), drive, time - course.start, rtol=1e-9)
-    smooth = ~np.isin(time, [*turns, course.start])  # at a turn a dashpot's stress has two values
+    smooth = ~np.isin(time, [*turns, course.start])  # a dashpot's stress jumps at a turn
     assert share(found.base_stress[smooth], course.stress(time)[smooth]) < 1e-6
 
 
@@ -72,7 +72,7 @@ def test_gravity_and_a_gauge_on_the_specimen() -> None:
     rests = course.top(time, gauge=True)
     assert np.all(rests[time <= 0.0] == 0.0)
     after = time > course.end
-    assert np.all(np.diff(rests[after]) <= 0.0)  # the specimen recovers, the striker is gone
+    assert np.all(np.diff(rests[after]) <= 0.0)  # the specimen recovers after the striker has left
     assert rests[after][0] == pytest.approx(course.state[0], rel=1e-3)
     assert course.top(time, False)[-1] < rests[-1]
 
@@ -118,7 +118,7 @@ def test_relaxation_and_dashpot_come_under_their_names() -> None:
 
 
 class Found:
-    """A fit with these values and intervals."""
+    """A stand-in for a fit: the true values shifted by the relative error `off`."""
 
     status = "ok"
 
@@ -139,7 +139,7 @@ class Estimate:
 
 
 def test_the_rig_numbers_springs_and_terms_as_the_fit_does() -> None:
-    """By the stress at A1, and by the relaxation time: an estimate is judged by its own name."""
+    """By the stress at A1 and by the relaxation time, because estimates are compared by name."""
     for seed in range(1, 6):
         truth = rigs.make("slow", "two springs, 300 rows, 0.3 %", seed).truth
         onsets = [

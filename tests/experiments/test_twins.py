@@ -1,4 +1,4 @@
-"""What the study of ten twins computes besides the fits."""
+"""Statistics that the study of ten twins computes from the fits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is remade on another machine changes nothing that is tracked, unless a figure changed."""
+"""Files made again on another machine change tracked files only where a figure has changed."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
-"""What a scene does not need is not computed: shown by counting, without compilation.
+"""A scene costs no work that it does not need, shown by counting without compilation.
 
-`counted.py` runs the scenes in a process of its own, where the compiled loops are plain Python, and
-counts from outside: what is read of each spring and mass, what is reckoned with each dashpot, which
-functions are called. `steps`, `control` and `rates` are left out where they only decide how to
-step.
+`counted.py` runs the scenes in a separate process, where the compiled loops are plain Python. It
+counts reads of each spring and mass, arithmetic with each dashpot, and function calls. It leaves
+out `steps`, `control` and `rates` where they only choose the step.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from foamfit.one_model import Options, identify, judge
 from foamfit.solve.plan import CLOSED_FORM, SECOND_ORDER, Plan
 from foamfit.trust.intervals import Choice
 
-HERE = Path(__file__).parents[1]  # counted.py lies beside the folders
+HERE = Path(__file__).parents[1]  # the folder of counted.py
 DRIVES = ("impact", "stress", "displacement")
 CLOSED = [
     f"{chain}, {drive}"
@@ -35,7 +34,7 @@ CLOSED = [
 
 @pytest.fixture(scope="module")
 def counted() -> dict[str, dict[str, dict[str, Any]]]:
-    """All that counted.py counts."""
+    """Return all counts of counted.py."""
     done = subprocess.run(
         [sys.executable, str(HERE / "counted.py")],
         env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
@@ -49,14 +48,14 @@ def counted() -> dict[str, dict[str, dict[str, Any]]]:
 
 @pytest.fixture(scope="module")
 def counts(counted: dict[str, dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
-    """Counts of every scene."""
+    """Return the counts of each scene."""
     return counted["scenes"]
 
 
 def total(
     scene: dict[str, Any], start: str, without: tuple[str, ...] = ("steps", "control", "rates")
 ) -> int:
-    """Sum of the counts whose names start so."""
+    """Return the sum of the counts whose names start with `start`."""
     return sum(
         value
         for name, value in scene.items()
@@ -72,8 +71,8 @@ def test_a_linear_spring_costs_no_evaluation_of_the_law(
     scene = counts[f"{chain}, {drive}"]
     assert total(scene, "linear: law columns read") == 0
     assert total(scene, "linear: law evaluated") == 0
-    assert total(scene, "linear: other columns read") > 0  # it was there and was counted
-    # the choice of the method looks at every spring once per run, whatever its kind
+    assert total(scene, "linear: other columns read") > 0  # the counter sees the linear spring
+    # choosing the method reads every spring once per run, whatever its kind
     assert scene.get("linear: law columns read in rates", 0) <= 4 * scene["ends"][-1]
     law = total(scene, "bistable: law columns read")
     assert law > 0 if chain == "mixed" else law == 0
@@ -127,7 +126,7 @@ def test_inertia_or_damping_takes_steps(counts: dict[str, dict[str, Any]]) -> No
 def test_a_held_parameter_costs_no_sensitivity(
     counted: dict[str, dict[str, dict[str, Any]]], way: str
 ) -> None:
-    """Eight parameters vary, or five of them, or the other three: the work adds up."""
+    """The work for five varying parameters plus that for the other three is that for all eight."""
     found = [counted["sensitivities"][f"{way}, {held} held"] for held in (0, 3, 5)]
     assert [one["columns"] for one in found] == [8, 5, 3]
     assert [set(one["carried"].values()) for one in found] == [{8}, {5}, {3}]
@@ -140,7 +139,7 @@ def test_a_held_parameter_costs_no_sensitivity(
 def test_contact_and_zero_cost_no_sensitivity(
     counted: dict[str, dict[str, dict[str, Any]]], way: str
 ) -> None:
-    """They are two runs of the curves alone, and none."""
+    """The contact time costs two runs without sensitivities, the zero costs no run."""
     known, unknown = (
         counted["sensitivities"][f"{way}, {what}"] for what in ("0 held", "contact unknown")
     )
@@ -161,7 +160,7 @@ def test_a_residual_alone_costs_no_sensitivity(
 def test_the_best_point_is_simulated_once(monkeypatch: pytest.MonkeyPatch, known: bool) -> None:
     """One run with all curves (and the stress along the motion), one with sensitivities.
 
-    Two more of the curves tell what the contact time does, where it is unknown.
+    Where the contact time is unknown, its derivative takes two more runs of the curves.
     """
     _, measurement = synthetic_impact(samples=101)
     params = make_params(measurement)

@@ -1,4 +1,4 @@
-"""Gravity on a striker: against an independent integration, by all solvers, with derivatives."""
+"""Gravity on a striker by all solvers, with derivatives, against an independent integration."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ sys.path.insert(0, str(EXPERIMENTS / "recovery"))
 import rig
 import rigs
 
-WEIGHT = 300.0  # m/s²: thirty times the usual one, so that it matters on every bench
+WEIGHT = 300.0  # m/s²: thirty times standard gravity, so that every test would show its absence
 
 
 def share(found: np.ndarray, truth: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""The judge by brute force of experiments/stability, held against what is not the solver."""
+"""The brute-force judge of experiments/stability against closed forms and other programs."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_a_loop_keeps_its_energy() -> None:
     down = quad(
         lambda e: SPRING.kc * (e - row[x.STAR]) / (1 - (e - row[x.STAR])), 0.7, row[x.HAT_C]
     )[0]
-    zero = 0.7 - row[x.SIG_C] / row[x.DOWN]  # where branch e meets no stress
+    zero = 0.7 - row[x.SIG_C] / row[x.DOWN]  # where the stress on branch e is zero
     down += quad(lambda e: row[x.SIG_C] + row[x.DOWN] * (e - 0.7), zero, 0.7)[0]
     lost = 0.5 * m * (v**2 - rebound**2)
     assert lost == pytest.approx(AREA * H * (up - down), rel=1e-11)
@@ -155,7 +155,7 @@ DAMPED = Bistable(5.75e6, 230e6, -3.07e6, 0.40, 0.70, 34.5e6, 1.15e6, 40.0)
 def test_impacts_of_the_reference(springs: tuple, masses: tuple | None, site: float) -> None:
     time = np.linspace(0.0, 1.2e-3, 60)
     made, drive = chain(*springs, masses=masses, site=site), Impact(7e-3, 4.44)
-    steps = 300 if site else 200  # the onsite damper needs more for an error far below 1e-9
+    steps = 300 if site else 200  # with the onsite damper, an error far below 1e-9 needs more steps
     want = reference.reference_impact(made, drive, time, steps=steps)
     got = follow(made, drive, time)
     assert got.contact_end == pytest.approx(want.contact_end, rel=1e-9)
@@ -177,7 +177,7 @@ def test_displacements_of_the_reference(springs: tuple, masses: tuple | None, si
     made = chain(*springs, masses=masses, site=site)
     want = reference.reference_displacement(made, motion, time)
     got = follow(made, Displacement(motion), time)
-    kinks = slice(1, -1)  # the reference takes the plain mean of both sides at a sample
+    kinks = slice(1, -1)  # the reference averages both sides at a sample
     base = want.base_stress.copy()
     if not masses and all(s.eta > 0.0 for s in springs):
         before, after = np.diff(time)[:-1], np.diff(time)[1:]
@@ -208,7 +208,7 @@ def test_no_judgement_past_the_bound_on_steps() -> None:
 
 
 def test_it_has_no_say_where_the_law_leaves_open_which_spring_moves() -> None:
-    """Two gaps under one stress, two flat branches: the sum is known, its shares are not."""
+    """Two gaps or two flat branches under one stress: only the sum of the strains is determined."""
     time = np.linspace(0.0, 1.0, 11)
     pull = SimpleNamespace(displacement=1e-5 * time)
     gap, flat = Linear(6e7, unilateral=True), Bistable(2e6, 6e7, -1e5, 0.2, 0.5, 0.0, 1e6)

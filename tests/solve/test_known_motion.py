@@ -1,4 +1,4 @@
-"""Chains with memory under a known motion: narrow snaps, like springs, origins of time."""
+"""Chains with memory under a prescribed motion: narrow snaps, equal springs, origins of time."""
 
 from __future__ import annotations
 
@@ -39,21 +39,21 @@ def off(got: np.ndarray, want: np.ndarray) -> float:
 @pytest.mark.parametrize("spread", [1e-6, 1e-5, 5e-4, 1e-2, 0.3, 5.0])
 @pytest.mark.parametrize("other", [SHOE, SOFT, ff.LinearSpring(2e6)], ids=["micro", "two", "line"])
 def test_the_stress_whose_strains_make_the_motion_is_found(spread, other) -> None:
-    """The motion is made from a stress: what every spring's strain is under it, the law says."""
+    """The laws give the strain of every spring under a stress, and so the motion to prescribe."""
     given = chain(narrow(spread), other, narrow(3.0 * spread, sigma_plus=1.7e5))
     strains = np.array([spring.strain(STRESSES) for spring in given.springs])
     above = np.cumsum(np.array(given.heights)[:, None] * strains, axis=0)
     time = np.cumsum(10.0 ** np.linspace(-8.0, 0.0, STRESSES.size))
     for rtol in (1e-4, 1e-8):
         got = ff.simulate(given, ff.DisplacementDrive(above[-1]), time, rtol)
-        # An ulp of the stress is so many of the rank.
+        # A narrow spread amplifies rounding of the stress in the rank.
         assert off(got.base_stress, STRESSES) <= 1e-12 + 1e-15 / min(spread, 1.0)
         assert off(got.displacement, above) <= 1e-12 + 1e-15 / min(spread, 1.0)
 
 
 @pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
 def test_like_springs_share_the_motion(rtol) -> None:
-    """Two of them are one of twice the height, with derivatives and without."""
+    """Two equal springs act as one of twice the height, with derivatives and without."""
     top = np.interp(np.linspace(0.0, 6.0, 61), np.arange(7.0), 2 * H * np.array(TURNS))
     time, drive = np.linspace(0.0, 1.0, 61), ff.DisplacementDrive(top)
     for spring in (narrow(1e-5), SHOE, replace(SHOE, relaxation=[(0.5, 0.1)])):
@@ -67,7 +67,7 @@ def test_like_springs_share_the_motion(rtol) -> None:
 
 @pytest.mark.parametrize("eta", [0.0, 2e3])
 def test_no_origin_of_time_takes_digits(eta) -> None:
-    """Steps of about 1 µs at 1.7e9 s, which are whole multiples of its last digit."""
+    """Steps of about 1 µs at 1.7e9 s, chosen as whole multiples of one ulp of that time."""
     step, origin = 2.0**-20, 1.7e9
     given = chain(replace(SHOE, eta=eta, relaxation=[(0.5, 2e-5)]), replace(SHOE, k0=8e5))
     top = np.interp(np.linspace(0.0, 6.0, 61), np.arange(7.0), 2 * H * np.array(TURNS))
@@ -81,7 +81,7 @@ def test_no_origin_of_time_takes_digits(eta) -> None:
 
 
 def test_derivatives_under_a_known_motion_are_those_of_differences() -> None:
-    """What is held moves with the stress at which it turned, which other springs move as well."""
+    """A rank that stays constant depends on the stress at the turn, and so on the other springs."""
     springs = [SHOE, replace(SHOE, k0=8e5, sigma_plus=2e5, spread_minus=0.3), SOFT]
     heights, time = [H, 2 * H, H], np.linspace(0.0, 1.0, 97)
     top = np.interp(time, np.linspace(0.0, 1.0, 7), 4 * H * np.array(TURNS))
@@ -136,7 +136,7 @@ ALIKE = {
 
 @pytest.mark.parametrize("name", ALIKE)
 def test_a_derivative_that_does_not_exist_is_said_to_be_one_sided(name) -> None:
-    """Two springs alike, while the motion holds or they share a plateau: who goes on?"""
+    """For equal springs in a hold or on a common plateau, either spring may move first."""
     spring, one_sided, both = ALIKE[name]
     time = np.linspace(0.0, 1.0, 41)
     drive = ff.DisplacementDrive(2 * H * np.interp(time, [0, 0.4, 0.7, 1], [0, 0.35, 0.35, 0.05]))
@@ -162,7 +162,7 @@ def test_a_derivative_that_does_not_exist_is_said_to_be_one_sided(name) -> None:
 
 @pytest.mark.parametrize("like", [0.0, 1e-9, 1e-6, -1e-6])
 def test_springs_alike_are_answered_while_the_motion_holds(like) -> None:
-    """Rounding turned one, then the other: refused at one rtol and answered at the next."""
+    """Rounding once reversed the springs in turn, and some values of rtol led to a refusal."""
     spring, time = replace(SHOE, relaxation=[(0.5, 0.1)]), np.linspace(0.0, 1.0, 41)
     given = ff.Chain([replace(spring, k0=spring.k0 * (1.0 + like)), spring], [H, H], AREA)
     drive = ff.DisplacementDrive(2 * H * np.interp(time, [0, 0.4, 0.7, 1], [0, 0.35, 0.35, 0.05]))

@@ -1,4 +1,4 @@
-"""Many springs under one stress as one: the answers of following each, at linear cost."""
+"""Many springs under one stress solved together: the same curves at linear cost."""
 
 import dataclasses
 import itertools
@@ -19,12 +19,13 @@ from reference import Bistable, Chain, Impact, Linear, energy_balance
 TIME = np.linspace(-0.05e-3, 0.9e-3, 301)
 HEIGHT = 1.19e-3
 STRIKER = 7e-3
-# The first turns back on branch d, the second with some of the springs on c, the others beyond.
+# Unloading starts on branch d at the first speed, with some springs on c at the second, and beyond
+# c at the others.
 SPEEDS = (1.2, 1.8, 2.1, 3.0)
 
 
 def unlike(spring: Bistable, factor: float) -> Bistable:
-    """A spring whose stresses are all `factor` times as high."""
+    """Return the spring with all stresses multiplied by `factor`."""
     scaled = {
         name: factor * getattr(spring, name)
         for name in ("k0", "kc", "dsigma", "kh_plus", "kh_minus")
@@ -33,9 +34,9 @@ def unlike(spring: Bistable, factor: float) -> Bistable:
 
 
 def chain_of(count: int, spread: float = 0.1, linear: bool = False, drag: float = 0.0) -> Chain:
-    """`count` springs like foam-1's, distinct within ± spread; every fifth linear where wanted.
+    """Return `count` springs like foam-1's with stresses varied by ± spread; a fifth may be linear.
 
-    Branch e of every other one meets branch a under pressure; the others keep to it to the end.
+    In every other one, branch e meets branch a in compression; the others stay on e to the end.
     """
     factors = 1.0 + spread * np.random.default_rng(count).uniform(-1.0, 1.0, count)
     springs: list[Bistable | Linear] = [unlike(MODEL_1, factor) for factor in factors]
@@ -47,7 +48,7 @@ def chain_of(count: int, spread: float = 0.1, linear: bool = False, drag: float 
 
 
 def one_by_one(chain: ff.Chain, speed: float, time: np.ndarray = TIME) -> Response:
-    """The same impact with every spring followed through every step, to eleven digits."""
+    """Simulate the impact with every spring followed through every step, at rtol = 1e-11."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(planned, "LEAST_AGGREGATE", 10**9)
         response = ff.simulate(chain, ff.Impact(STRIKER, speed), time, rtol=1e-11)
@@ -56,7 +57,7 @@ def one_by_one(chain: ff.Chain, speed: float, time: np.ndarray = TIME) -> Respon
 
 
 def assert_same(got: Response, want: Response, most: float = 1e-9) -> None:
-    """Curves to `most` of their range; the same switches at the same times; the same end."""
+    """Assert equal curves (to `most` of their range), switches and end of contact."""
     assert got.method == AGGREGATE
     for a, b in ((got.displacement, want.displacement), (got.base_stress, want.base_stress)):
         assert np.abs(a - b).max() <= most * np.ptp(b)
@@ -108,7 +109,7 @@ def test_what_the_striker_loses_stays_in_the_loops(speed: float) -> None:
 
 
 def effort(count: int, rtol: float = 1e-6) -> tuple[int, int, int, int]:
-    """Steps, switches, sums over all springs and orders of all steps of one closed impact."""
+    """Count steps, switches, sums over all springs and orders summed over steps, for one impact."""
     chain = built(chain_of(count))
     scene = plan(chain, ff.Impact(STRIKER, 2.1), TIME)
     spent = np.zeros(2, np.int64)
@@ -195,7 +196,7 @@ def test_only_what_one_stress_tells_of_is_taken_as_one() -> None:
 
 # ---------------------------------------------------------------- a prescribed elongation
 
-# To and fro so that springs turn back on every branch, into tension, and past all switches.
+# Reversals on every branch, tension, and strains past all switches.
 TURNS = [0.0, 0.22, 0.05, 0.3, 0.18, 0.45, 0.38, 0.41, 0.12, 0.24, -0.1, 0.5, 0.0]
 TO_AND_FRO = np.concatenate(
     [HEIGHT * np.linspace(a, b, 61)[1:] for a, b in itertools.pairwise(TURNS)]
@@ -205,7 +206,7 @@ TO_AND_FRO = np.concatenate(
 @pytest.mark.parametrize("count", [3, 8, 40, 300])
 @pytest.mark.parametrize("linear", [False, True])
 def test_springs_under_a_known_elongation_carry_one_stress(count: int, linear: bool) -> None:
-    """The strains add up to the elongation, each on the law of its spring, on every branch."""
+    """The strains add up to the elongation and satisfy the spring laws on every branch."""
     chain = built(chain_of(count, linear=linear))
     rows, heights = chain.arrays.rows, chain.arrays.heights
     stress, strain = np.empty(TO_AND_FRO.size), np.empty((count, TO_AND_FRO.size))
@@ -225,7 +226,7 @@ def test_an_elongation_that_no_stress_gives_is_no_number() -> None:
 
 
 def test_tension_beyond_the_least_slope_is_borne_on_a_straight_branch() -> None:
-    """The softest spring is on branch e, which has no pole, when the stress passes its -k0."""
+    """When the stress passes its -k0, the softest spring is on branch e, which has no pole."""
     soft = ff.BistableSpring(1e5, 1e5, 0.0, 0.5, 0.75, 1e5, 4e5)
     stiff = ff.BistableSpring(1e7, 1e7, 0.0, 0.5, 0.75, 1e7, 1.3e7)
     chain = ff.Chain([soft, stiff, stiff], [1e-3] * 3, AREA)

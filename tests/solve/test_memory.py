@@ -1,4 +1,4 @@
-"""Chains in which springs remember, by the explicit integrator, against an independent one."""
+"""Chains of springs with memory: the explicit integrator against an independent one."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def relaxing(spring: Spring, terms: list[tuple[float, float]] = ONE) -> Spring:
 
 
 def cycles(t: Array, size: float) -> Array:
-    """Loading and unloading with inner loops, linear between few corners."""
+    """Return a piecewise linear history with inner loops."""
     corners = np.array([0.0, 0.6, 0.35, 0.8, 0.2, 0.7, 1.0, 0.05, 0.5, 0.0, -0.03])
     return size * np.interp(t, np.linspace(t[0], t[-1], corners.size), corners)
 
@@ -121,12 +121,12 @@ SCENES: dict[str, tuple[ff.Chain, Drive]] = {
 
 
 def difference(one: Array, other: Array) -> float:
-    """Largest difference over the range of the first, rest included."""
+    """Return the largest difference relative to the range of the first curve, zero included."""
     return float(np.abs(one - other).max()) / (max(one.max(), 0.0) - min(one.min(), 0.0))
 
 
 def names_of(given: ff.Chain) -> list[str]:
-    """All parameters of a chain that has these springs."""
+    """Return the names of all parameters of the chain."""
     names = []
     for i, spring in enumerate(given.springs, start=1):
         own = list(spring.law.names)
@@ -163,10 +163,9 @@ def with_value(given: ff.Chain, name: str, value: float) -> ff.Chain:
     return ff.Chain(springs, heights, AREA, given.masses, site)
 
 
-# The others differ in little; all are within the error that is asked for.
-# Where springs turn to and fro by rounding the judge has no say: SciPy, from event to event, has.
+# Rounding makes springs reverse repeatedly here; SciPy from event to event replaces the judge.
 TURNING = ("impact, gap between masses", "stress, viscous top")
-# The judge does not know what springs remember of their snapping; SciPy, from event to event, does.
+# Springs that soften and weaken after snapping are compared with SciPy from event to event.
 REMEMBERING = tuple(name for name in SCENES if "remembering" in name)
 
 
@@ -205,7 +204,7 @@ def test_derivatives_by_all_parameters_are_those_of_differences(name: str) -> No
     given, drive = SCENES[name]
     names = [n for n in names_of(given) if value_of(given, n) != 0.0]
     run = ff.simulate(given, drive, TIME, 1e-10, sensitivities=names)
-    away = np.abs(TIME - (run.contact_end or -1.0)) > 6e-5  # at the end of contact they jump
+    away = np.abs(TIME - (run.contact_end or -1.0)) > 6e-5  # derivatives jump at the end of contact
     for short in names:
         value = value_of(given, short)
         step = 1e-4 * value
@@ -223,7 +222,7 @@ def test_derivatives_by_all_parameters_are_those_of_differences(name: str) -> No
 
 @pytest.mark.parametrize("moved", [True, False])
 def test_a_chain_may_start_loaded(moved: bool) -> None:
-    """It starts in equilibrium, as if brought there quickly and held: nothing has relaxed yet."""
+    """The loaded chain starts in equilibrium, with no overstress."""
     given = chain([relaxing(MICRO), relaxing(BISTABLE), FOAM])
     shape = 0.3 + 0.5 * np.sin(np.linspace(0.0, 6.0, TIME.size))
     drive: Drive = ff.DisplacementDrive(4e-4 * shape) if moved else ff.StressDrive(1.2e6 * shape)
@@ -246,7 +245,7 @@ def test_a_chain_may_start_loaded(moved: bool) -> None:
 
 
 def test_contact_ends_where_the_whole_stress_does() -> None:
-    """Relaxation takes it to zero while the law still presses."""
+    """Relaxation brings the total stress to zero while the equilibrium stress still compresses."""
     given = chain([relaxing(MICRO)])
     run = ff.simulate(given, IMPACT, TIME, 1e-8)
     assert run.contact_end is not None
@@ -257,7 +256,7 @@ def test_contact_ends_where_the_whole_stress_does() -> None:
 
 
 def test_a_gap_opens_and_closes_beside_springs_with_memory() -> None:
-    """Between masses while the base is pressed; at the base it is the end of contact."""
+    """Between masses a gap opens while the base is in compression; at the base it ends contact."""
     between = ff.simulate(*SCENES["impact, gap between masses"], TIME, 1e-8)
     open_now = np.diff(between.displacement, axis=0)[0] < 0.0
     pressed = between.base_stress > 0.0

@@ -1,4 +1,4 @@
-"""Springs with memory: the judge by brute force, and answers held against it and closed forms."""
+"""Springs with memory: the brute-force judge, and simulations against it and closed forms."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ sys.path.insert(0, str(EXPERIMENTS / "stability"))
 import fresh
 from independent import Truth, follow, over_range
 
-# Spreads that meet far away; snap-through wider than snap-back, and the other way round; a snap
-# within a thousandth of a stress; snap-back above snap-through at most ranks.
+# Narrower and wider snap-through than snap-back, snaps with a relative spread of 1e-3, and
+# snap-back above snap-through at most ranks.
 LAWS = [
     (5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77),
     (5.5e5, 5.5e6, 0.60, 1.3e5, 0.9, 4.0e4, 0.20),
@@ -30,7 +30,7 @@ LAWS = [
 H, AREA = 20e-3, 1e-3
 TURNS = [0.0, 0.5, 0.1, 0.6, 0.05, 0.7, 0.3, 0.4, 0.0]
 TERMS = [(0.7, 0.05), (0.2, 0.4)]
-# Fresh scenes of all drives.
+# Random scenes of all drives, by number.
 FRESH = {
     "microscale": (0, 1, 2, 4, 11),
     "relaxation": (0, 1, 2, 11),
@@ -50,14 +50,14 @@ def alone(law: tuple[float, ...], **more: Any) -> ff.Chain:
 
 
 def to_and_fro(law: tuple[float, ...], samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Time and strain of a history with inner loops."""
+    """Return time and strain of a history with inner loops."""
     time = np.linspace(0.0, 1.0, samples)
     turns = np.linspace(0.0, 1.0, len(TURNS))
     return time, np.interp(time, turns, (0.6 + law[2]) * np.array(TURNS))
 
 
 def by_roots(spring: ff.MicroscaleSpring, strains: np.ndarray) -> np.ndarray:
-    """The law, one bracketed root at each strain."""
+    """Evaluate the law by one bracketed root at each strain."""
 
     def rank(s: float, sign: str) -> float:
         place, wide = getattr(spring, f"sigma_{sign}"), getattr(spring, f"spread_{sign}")
@@ -110,7 +110,7 @@ def test_an_impact_keeps_what_the_loop_takes(law: tuple[float, ...], soft: float
     truth = follow(chain, drive, time)
     assert truth.contact_end is not None
     want = np.diff(truth.displacement[-1, -2:])[0]
-    assert -want < drive.velocity * time[1]  # the loop keeps something
+    assert -want < drive.velocity * time[1]  # the loop dissipates energy
     for rtol in (1e-4, 1e-6, 1e-8):
         answer = ff.simulate(chain, drive, time, rtol=rtol)
         assert answer.contact_end == pytest.approx(truth.contact_end, rel=rtol)
@@ -120,7 +120,7 @@ def test_an_impact_keeps_what_the_loop_takes(law: tuple[float, ...], soft: float
 
 @pytest.mark.parametrize("law", LAWS)
 def test_the_stress_comes_back_to_where_it_turned(law: tuple[float, ...]) -> None:
-    """Whatever inner loops lie between two visits of one strain."""
+    """Inner loops between two visits of a strain have no effect."""
     time = np.arange(9.0)
     strain = (0.6 + law[2]) * np.array([0.0, 0.7, 0.2, 0.5, 0.3, 0.5, 0.2, 0.7, 0.75])
     bare = alone(law)
@@ -130,7 +130,7 @@ def test_the_stress_comes_back_to_where_it_turned(law: tuple[float, ...]) -> Non
     assert stress[7] == pytest.approx(stress[1], rel=1e-12)
     direct = ff.simulate(bare, ff.DisplacementDrive(H * strain[[0, 8]]), time[:2]).base_stress
     assert stress[8] == pytest.approx(direct[1], rel=1e-12)
-    # the same in a chain that takes steps
+    # the same in a chain that needs an integrator
     chain = ff.Chain([ff.LinearSpring(4e6), *bare.springs], [H / 10, H], AREA)
     stepped = ff.simulate(chain, ff.DisplacementDrive(H * strain), time, rtol=1e-9).base_stress
     assert stepped[[5, 6, 7]] == pytest.approx(stepped[[3, 2, 1]], rel=1e-8)
@@ -138,7 +138,7 @@ def test_the_stress_comes_back_to_where_it_turned(law: tuple[float, ...]) -> Non
 
 @pytest.mark.parametrize("law", LAWS)
 def test_what_relaxes_dies_out(law: tuple[float, ...]) -> None:
-    """Held at a strain, each term fades by its own time, and the law in equilibrium remains."""
+    """At constant strain each term decays with its own time constant to the equilibrium law."""
     time = np.concatenate((np.linspace(0.0, 1.0, 20), 1.0 + np.linspace(0.1, 8.0, 20)))
     strain = (0.5 + law[2]) * np.minimum(time, 1.0)
     drive = ff.DisplacementDrive(H * strain)
@@ -155,9 +155,9 @@ def test_what_relaxes_dies_out(law: tuple[float, ...]) -> None:
 
 
 def hasten_roots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the judge by roots follow a scene once, and to 22 of its 30 digits.
+    """Let the judge by roots follow each scene once, with 22 digits instead of 30.
 
-    It gives one truth at whatever tolerance; what is left out is 1e-10 of the range of a curve.
+    Its result does not depend on rtol, and the change is 1e-10 of the range of a curve.
     """
     import roots
 
@@ -166,7 +166,8 @@ def hasten_roots(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def once(chain: ff.Chain, *rest: Any) -> Truth:
         if id(chain) not in known:
-            known[id(chain)] = chain, whole(chain, *rest)  # kept, so that no other has its number
+            # Keeping the chain prevents its id from being reused.
+            known[id(chain)] = chain, whole(chain, *rest)
         return known[id(chain)][1]
 
     monkeypatch.setattr(roots, "DIGITS", 22)
@@ -175,7 +176,7 @@ def hasten_roots(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("family", FRESH)
 def test_fresh_scenes_with_memory(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A known motion was refused for its origin in time, for narrow and for wide snaps."""
+    """Prescribed motions were once refused for their time origin and for narrow and wide snaps."""
     if family.endswith("motion"):
         pytest.importorskip("mpmath")
         hasten_roots(monkeypatch)
@@ -191,10 +192,10 @@ def test_fresh_scenes_with_memory(family: str, monkeypatch: pytest.MonkeyPatch) 
     assert judged >= 6
 
 
-# What went wrong once: a narrow snap passed over within a step, springs of one stress that turn
-# together, strains of such springs whose stresses parted, a step of what relaxes that took its
-# stress from both ends only where a snap began, a held step of what relaxes whose third Legendre
-# coefficient is next to nothing.
+# Former errors: a narrow snap skipped within a step; springs under one stress that reverse
+# together, or whose stresses drifted apart; a relaxation step that interpolated the stress between
+# its ends where a snap began; a relaxation step at constant rank whose third Legendre coefficient
+# is almost zero.
 HARD = [
     ("microscale:3", 1e-6), ("microscale:165", 1e-6), ("microscale:226", 1e-8),
     ("microscale:365", 1e-8), ("mixed:233", 1e-6), ("mixed:388", 1e-6),
@@ -213,7 +214,7 @@ def test_snaps_and_turns_of_springs_under_one_stress(name: str, rtol: float) -> 
 
 
 def test_derivatives_may_begin_behind_masses() -> None:
-    """They have no size yet in the first step, whose length they must not bring to nothing."""
+    """Derivatives are zero in the first step; error control must not shrink that step to zero."""
     spec = fresh.spec_of("relaxation", 0)
     names, scene = spec["sensitivities"], fresh.scene_from(spec)
     rough, fine = (ff.simulate(*scene, rtol, sensitivities=names) for rtol in (1e-4, 1e-8))
@@ -225,12 +226,12 @@ def test_derivatives_may_begin_behind_masses() -> None:
 
 
 def test_a_refusal_names_what_is_too_fast_only_where_something_is() -> None:
-    """Here springs are thrown against the ends of their branches."""
+    """In this scene springs reach the ends of their branches, and no time scale is too short."""
     with pytest.raises(ff.SimulationError, match=r"end of (its|a) branch"):
         ff.simulate(*fresh.scene_from(fresh.spec_of("mixed", 89)), 1e-4)
 
 
 def test_a_spring_that_turns_at_the_end_of_its_branch_between_samples_is_refused() -> None:
-    """No sample lies near; a digit of its strain there is a third of a percent of its stress."""
+    """No sample is near the turn, where one ulp of the strain changes the stress by 0.3 %."""
     with pytest.raises(ff.SimulationError, match="end of its branch"):
         ff.simulate(*fresh.scene_from(fresh.spec_of("worn", 104)), 1e-6)

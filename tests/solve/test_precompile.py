@@ -1,4 +1,4 @@
-"""First use: what is compiled beside the reading of a test is what a fit then calls."""
+"""First use: a fit calls exactly the loops that are compiled while a test is read."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 
 
 def keep_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the loops of this package say that numba keeps them compiled in a folder."""
+    """Make the loops of this package report `folder` as their numba cache."""
     loop = SimpleNamespace(stats=SimpleNamespace(cache_path=str(folder)))
     for module, name in (
         (kernels, "fault"), (followed, "_begin"), (polynomial, "first_crossing"),
@@ -42,8 +42,8 @@ def keep_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def is_other(kind: Any) -> bool:
-    """Whether an argument is a literal, or of springs with memory, which are compiled apart."""
-    strided = getattr(kind, "layout", "C") == "A"  # a series of all that these remember
+    """Return whether an argument is a literal or belongs to springs with memory, compiled apart."""
+    strided = getattr(kind, "layout", "C") == "A"  # a series of the memory
     return (
         strided
         or isinstance(kind, types.Literal)
@@ -52,7 +52,7 @@ def is_other(kind: Any) -> bool:
 
 
 def test_a_fit_calls_what_was_compiled_and_nothing_else() -> None:
-    """Every loop that a fit calls has one set of argument types, that of the small scenes."""
+    """Every loop that a fit calls has a single signature, that of the small scenes."""
     precompile._rest()
     ff.fit(ff.read_test(RECONSTRUCTION), starts=2)
     assert taylor.integrate.signatures == [precompile._calls()[taylor.integrate]]
@@ -80,9 +80,9 @@ def test_a_fit_of_springs_with_memory_calls_what_was_compiled_and_nothing_else()
 
 
 def test_the_small_scenes_meet_every_loop_of_the_integrator() -> None:
-    """Where the integrator itself was compiled, it left no loop in other types.
+    """Compiling the integrator must not compile a loop with other argument types.
 
-    Other loops may call `first_crossing` too, with an order that is known when they are compiled.
+    Other loops may also call `first_crossing` with an order known at compile time.
     """
     calls = precompile._calls()
     text = Path(taylor.__file__).read_text()
@@ -149,7 +149,7 @@ def test_the_first_use_compiles_what_the_model_needs(
 def test_the_other_process_finds_this_package_and_is_stopped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It is asked for with this package in its path, and stopped where the body fails."""
+    """The process starts with this package in its path and is stopped if the body raises."""
     asked: list[Any] = []
 
     class Other(subprocess.Popen):  # type: ignore[type-arg]
@@ -190,7 +190,7 @@ def test_what_is_compiled_where_it_is_needed_is_announced_once(
         signatures: tuple[object, ...] = ()
 
     keep_in(tmp_path, monkeypatch)
-    caplog.set_level(logging.WARNING, logger="foamfit")  # a quiet command may have silenced it
+    caplog.set_level(logging.WARNING, logger="foamfit")  # an earlier --quiet may have raised it
     new, known, kept, other = Loop(), Loop(), Loop(), Loop()
     known.signatures = ((),)
     cache._first.cache_clear()

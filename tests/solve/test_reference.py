@@ -1,4 +1,4 @@
-"""The reference against closed forms, against itself with other tolerances, and against energy."""
+"""The reference against closed forms, other tolerances of its own and the energy balance."""
 
 import dataclasses
 
@@ -74,7 +74,7 @@ def test_dashpot_creeps_under_a_ramp_of_stress() -> None:
     want = rate / k * (t - eta / k * (1 - np.exp(-k * t / eta)))
     got = reference_stress(Chain((Linear(k, eta),), (h,), AREA), rate * t, t)
     assert relative(got.strain, want) < 1e-11
-    # the same motion with the damper on the ground, but another force at the base
+    # with the damper between top and ground, the motion is the same but the base force differs
     onsite = Chain((Linear(k),), (h,), AREA, site_damping=eta)
     got = reference_stress(onsite, rate * t, t)
     assert relative(got.strain, want) < 1e-11

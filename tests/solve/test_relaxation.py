@@ -1,4 +1,4 @@
-"""Springs that relax, against an integration of high order on laws written anew."""
+"""Springs with relaxation against a high-order integration of independent laws."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Terms = list[tuple[float, float]]
 
 @dataclass
 class Law:
-    """The microscale law of model.md, anew; its state is the rank w."""
+    """Independent implementation of the microscale law of model.md; its state is the rank w."""
 
     k0: float
     kc: float
@@ -61,7 +61,7 @@ class Law:
         )
 
     def flexibility(self, s: float, held: bool, back: bool, w: float) -> float:
-        """dε/dσ."""
+        """Return dε/dσ."""
         snapping = 0.0
         if s <= 0.0:
             w = -math.inf
@@ -75,7 +75,7 @@ class Law:
 
 
 def integrated(law: Law, eps: np.ndarray, t: np.ndarray, terms: Terms) -> np.ndarray:
-    """Stress by integrating dσ/dt and dq/dt, anew from every kink (and from beads between)."""
+    """Integrate dσ/dt and dq/dt for the stress, restarting at every kink and at points between."""
     g, tau = np.array(terms).T
     fixed = []
     if law.spread_minus != law.spread_plus:
@@ -127,7 +127,7 @@ def integrated(law: Law, eps: np.ndarray, t: np.ndarray, terms: Terms) -> np.nda
 
 
 def loops(turns: tuple[float, ...], samples: int) -> np.ndarray:
-    """Samples from turning point to turning point, the turns among them."""
+    """Return samples between the turning points, including the turns."""
     legs = [np.linspace(a, b, samples + 1)[1:] for a, b in itertools.pairwise(turns)]
     return np.concatenate([[turns[0]], *legs])
 
@@ -172,7 +172,7 @@ def test_stress_is_within_rtol(own: tuple[float, ...], terms: Terms, samples: in
 
 
 def test_a_bistable_spring_relaxes_about_its_own_law() -> None:
-    """The term is g (σ - σ(0) exp(-t/τ) - ∫ σ exp(-(t-u)/τ) du/τ), here by quadrature."""
+    """The term g (σ - σ(0) exp(-t/τ) - ∫ σ exp(-(t-u)/τ) du/τ) is evaluated by quadrature."""
     spring = ff.BistableSpring(5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6)
     turns = np.array([0.01, 0.4, 0.2, 0.25, 0.05, 0.2])
     t = np.linspace(0.0, 1.0, turns.size)
@@ -197,14 +197,14 @@ def test_a_bistable_spring_relaxes_about_its_own_law() -> None:
 
 
 def test_a_held_strain_relaxes_exponentially() -> None:
-    """Loaded in no time to speak of: the overstress is g σ exp(-t/τ)."""
+    """After almost instantaneous loading the overstress is g σ exp(-t/τ)."""
     spring = ff.MicroscaleSpring(*SHOE, relaxation=[(0.5, 0.2), (0.0, 1.0)])
     t = np.array([0.0, 1e-9, 0.1, 0.3, 5.0])
     got = stress_of(spring, np.array([0.0, 0.4, 0.4, 0.4, 0.4]), t).base_stress
     rest = spring.stress(0.4)
     np.testing.assert_allclose(got[1:], rest * (1 + 0.5 * np.exp(-t[1:] / 0.2)), rtol=1e-8)
     below = stress_of(spring, np.array([0.4, 0.4]), np.array([0.0, 1.0])).base_stress
-    np.testing.assert_allclose(below, rest, rtol=1e-15)  # at the start nothing has relaxed yet
+    np.testing.assert_allclose(below, rest, rtol=1e-15)  # a chain starts without overstress
 
 
 NAMES = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus", "eta")
@@ -246,7 +246,7 @@ def test_sensitivities_against_differences(kind: str, terms: Terms) -> None:
         if name[:3] == "tau":
             size = 1e-4 * terms[int(name[-1]) - 1][1]
         size = size or 2e-5 * abs(getattr(spring, name))
-        if name == "g2":  # from zero on
+        if name == "g2":  # g2 = 0: one-sided
             want = (-3 * run(name, 0) + 4 * run(name, size) - run(name, 2 * size)) / (2 * size)
         else:
             ends = [run(name, k * size) for k in (-2, -1, 1, 2)]
@@ -257,7 +257,7 @@ def test_sensitivities_against_differences(kind: str, terms: Terms) -> None:
 
 
 def test_a_term_of_no_strength_is_left_out() -> None:
-    """The solver is that of the spring without it, also where it is a chain under an impact."""
+    """A spring with g = 0 uses the same solver as without the term, also in an impact."""
     bistable = ff.BistableSpring(5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6)
     t = np.linspace(0.0, 1e-3, 50)
     runs = [
@@ -272,7 +272,7 @@ def test_a_term_of_no_strength_is_left_out() -> None:
 
 
 def test_moments_of_short_and_long_steps_meet() -> None:
-    """One step of any length over a straight line: q = g τ (1 - exp(-t/τ)) dσ/dt, σ linear."""
+    """For linear σ, one step of any length gives q = g τ (1 - exp(-t/τ)) dσ/dt."""
     flat = ff.BistableSpring(1e9, 2e9, -1.0, 0.5, 0.9, 1e6, 1e6, relaxation=[(1.0, 1.0)])
     row = chain(flat).arrays.rows[0].copy()
     for x in (1e-12, 1e-3, 0.9999, 1.0001, 3.0, 50.0, 1e4):
@@ -337,7 +337,7 @@ def test_what_a_spring_cannot_bear_is_refused() -> None:
 
 @pytest.mark.parametrize("sigma_plus", [1e-100, 1e-300])
 def test_springs_may_snap_at_next_to_no_stress(sigma_plus: float) -> None:
-    """The stress is found however small it is, which halving it does not reach."""
+    """Stresses too small to reach by bisection from k0 are still found."""
     law, star = (5.5e5, 2.5e5, 0.08, sigma_plus, 0.4, 7e4, 0.77), 0.08
     once = stress_of(ff.MicroscaleSpring(*law), np.array([0.0, 0.03]), np.array([0.0, 1.0]))
     want = sigma_plus * math.exp(0.4 * ndtri(0.03 / star))

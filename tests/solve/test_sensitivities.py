@@ -1,4 +1,4 @@
-"""The sensitivities carried along with a simulation, against central differences of it."""
+"""Sensitivities computed with a simulation against central differences."""
 
 from dataclasses import replace
 
@@ -65,7 +65,7 @@ SCENES: dict[str, tuple[ff.Chain, Drive]] = {
     "stress on a mass": (chain(PAIR, [0.0, 1e-5]), STRESS),
 }
 
-# Implicit steps begin anew at each sample of a drive: what is stiff has a quarter of them.
+# Implicit steps restart at each sample of a drive, so stiff scenes use a quarter of the samples.
 SPARSE = TIME[::4]
 FEW = {
     "motion": ff.DisplacementDrive(MOTION.displacement[::4]),
@@ -74,8 +74,8 @@ FEW = {
     "stress": ff.StressDrive(STRESS.stress[::4]),
 }
 
-# Where explicit steps would have to follow what is long over; the tolerance is what is affordable,
-# and differences of second order are as good there.
+# Scenes with transients far shorter than the test, which explicit steps would have to resolve.
+# Tighter tolerances take too long, and at this one second-order differences are accurate enough.
 STIFF: dict[str, tuple[ff.Chain, Drive]] = {
     "stiff: heavy and light dashpot": (chain(damped(PAIR, 1e5, 1e-2)), IMPACT),
     "stiff: light mass, onsite damper": (chain(damped(PAIR, 50.0, 30.0), [1e-8, 0.0], 1e3), IMPACT),
@@ -90,7 +90,7 @@ STIFF: dict[str, tuple[ff.Chain, Drive]] = {
 
 
 def names_of(scene: ff.Chain) -> list[str]:
-    """Parameters of a chain, but for dashpots that are not there."""
+    """Return the parameters of a chain except for dashpots of zero."""
     names = ["site_eta"] if scene.site_damping > 0.0 else []
     for i, spring in enumerate(scene.springs, start=1):
         own = spring.law.names
@@ -174,7 +174,7 @@ def test_a_dashpot_of_zero_has_a_sensitivity() -> None:
             events = [*got.switches[:, 0], *([got.contact_end] if got.contact_end else [])]
             near = np.abs(TIME[:, None] - np.array([events])) < 1e-2 * TIME[-1]
             away = ~near.any(axis=1)
-            away[0] = False  # a light dashpot has a thin layer at first contact
+            away[0] = False  # a light dashpot causes a short transient at first contact
             expected = (other.base_stress - got.base_stress) / 1e-2
             miss = np.abs(got.sensitivities[name].base_stress - expected)[away]
             assert miss.max() <= 2e-3 * max(np.abs(expected).max(), 1e-300), (name, drive)
@@ -199,7 +199,7 @@ def test_a_dashpot_of_zero_beside_what_is_stiff() -> None:
 
 def test_sensitivities_do_not_change_the_response() -> None:
     for scene, drive in STIFF.values():
-        if drive is FEW["moved"]:  # slow, and another motion is among them
+        if drive is FEW["moved"]:  # slow, and another scene has a prescribed motion
             continue
         alone = ff.simulate(scene, drive, SPARSE)
         got = ff.simulate(scene, drive, SPARSE, sensitivities=names_of(scene))
@@ -217,7 +217,7 @@ def test_a_name_that_is_no_parameter_is_refused() -> None:
 @pytest.mark.parametrize("model", ["bistable", "linear+bistable"])
 @pytest.mark.parametrize("drive", ["impact", "displacement", "stress"])
 def test_the_jacobian_of_a_fit_against_differences(model: str, drive: str) -> None:
-    """In SI and in the coordinates of the search, with the last height tied to the others."""
+    """In SI and in search coordinates, where the last height follows from the others."""
     test = ff.read_test("experiments/foam-1/model-3-2.0mps-reconstruction.csv")
     problem = make_problem(test, model, drive, None, None, interior_mass=False)
     problem.objective.rtol = 1e-12

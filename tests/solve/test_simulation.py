@@ -1,4 +1,4 @@
-"""`simulate` against the independent reference, published facts, energy and its own contract."""
+"""`simulate` against the independent reference, published results, energy and its documentation."""
 
 import dataclasses
 import math
@@ -81,7 +81,7 @@ FAST = {  # fast enough to close the loop of foam-1
 
 
 def built(chain: Chain) -> ff.Chain:
-    """The package's chain of a reference chain."""
+    """Return the package's chain for a chain of the reference."""
     springs = [
         (ff.BistableSpring if isinstance(s, Bistable) else ff.LinearSpring)(**dataclasses.asdict(s))
         for s in chain.springs
@@ -105,18 +105,18 @@ def loop_stress(name: str) -> float:
 
 
 TIME = np.linspace(0.0, 1.0e-3, 112)
-LOCAL = 1e-11  # error of a step of the reference, whose curves are then within 5e-10 of a range
+LOCAL = 1e-11  # step error of the reference, for curves within 5e-10 of their range
 
 
 def history() -> np.ndarray:
-    """Rises past 1, is taken back in part, rises again, and goes to zero; starts at rest."""
+    """Return a relative load that rises, falls partly, rises past 1 and returns to zero."""
     s = TIME / TIME[-1]
     return np.interp(s, [0, 0.25, 0.36, 0.55, 0.8, 0.9, 1.0], [0, 0.62, 0.45, 1.13, 0.1, 0.22, 0])
 
 
 @cache
 def case(name: str, drive: str) -> tuple[Motion, ff.Impact | ff.StressDrive | ff.DisplacementDrive]:
-    """The reference motion of a chain and the package's drive for it."""
+    """Return the reference motion of a chain and the package's drive for it."""
     chain = CHAINS[name]
     if drive in ("impact", "fast impact"):
         impact = published_impact(name) if drive == "impact" else Impact(7e-3, FAST[name])
@@ -125,7 +125,7 @@ def case(name: str, drive: str) -> tuple[Motion, ff.Impact | ff.StressDrive | ff
     stress = history() * loop_stress(name)
     if drive == "stress":
         return reference_stress(chain, stress, TIME, LOCAL), ff.StressDrive(stress)
-    # a displacement that takes the chain, undamped, through the same states more smoothly
+    # a smoother displacement through the same states of the undamped chain
     still = dataclasses.replace(
         chain, springs=tuple(damped(s, 0.0) for s in chain.springs), masses=None, site_damping=0.0
     )
@@ -135,7 +135,7 @@ def case(name: str, drive: str) -> tuple[Motion, ff.Impact | ff.StressDrive | ff
     return reference_displacement(chain, top, TIME, LOCAL), ff.DisplacementDrive(top)
 
 
-# under a prescribed displacement the onsite damper of the top acts on nothing: one case will do
+# a prescribed displacement of the top makes the onsite damper irrelevant: one case suffices
 CASES = [(name, drive) for name in CHAINS for drive in ("impact", "stress")]
 CASES += [(name, "displacement") for name in CHAINS if "onsite" not in name]
 CASES += [("model-3, onsite", "displacement")]
@@ -143,7 +143,7 @@ CASES += [(name, "fast impact") for name in FAST]
 
 
 def errors(got: ff.Response, want: Motion) -> tuple[float, float]:
-    """Largest error over range of the displacements (worst node) and of the base stress."""
+    """Return the largest error over the range of displacement (worst node) and of base stress."""
     miss = np.abs(got.displacement - want.displacement).max(axis=1)
     return (
         float((miss / np.ptp(want.displacement, axis=1)).max()),
@@ -157,7 +157,7 @@ def test_against_reference(name: str, drive: str, rtol: float, bar: float) -> No
     want, load = case(name, drive)
     got = ff.simulate(built(CHAINS[name]), load, TIME, rtol=rtol)
     if "mass" not in name and rtol == 1e-6:
-        bar = 1e-8  # few steps: a margin costs little
+        bar = 1e-8  # with few steps the solver keeps a margin
     displacement, stress = errors(got, want)
     assert displacement <= bar
     assert stress <= bar
@@ -189,7 +189,7 @@ DAMPED_BASES = {
 @pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
 @pytest.mark.parametrize("label", DAMPED_BASES)
 def test_a_dashpot_at_the_base_below_a_mass(label: str, rtol: float) -> None:
-    """The sensor reads η dε/dt of a mass that moves a thousand times faster than the striker."""
+    """The base stress includes η dε/dt of a mass that moves 1000 times faster than the striker."""
     chain, impact, end = DAMPED_BASES[label]
     time = np.linspace(0.0, end, 101)
     want = damped_base(label)
@@ -209,7 +209,7 @@ def damped_base(label: str) -> Motion:
 
 @pytest.mark.parametrize("name", CHAINS)
 def test_cases_visit_every_branch(name: str) -> None:
-    """The drives above are worth something: each loop is run through in the sampled drives."""
+    """The sampled drives take the springs through every branch of their loops."""
     quiet = "onsite" in name or "dashpot" in name
     for drive in ("stress", "displacement"):
         if (name, drive) not in CASES:
@@ -287,20 +287,20 @@ def test_foam_1_with_two_springs_rebounds_without_loss() -> None:
     _, strain, rebound = impact("model-3")
     assert strain[1].max() == pytest.approx(0.705, abs=1e-3)
     assert rebound == pytest.approx(1.75, rel=1e-8)
-    # with the interior mass a little energy stays behind in its vibration
+    # a little energy remains in the vibration of the interior mass
     _, strain, rebound = impact("model-3, mass")
     assert f"{strain[1].max():.3f}" == "0.705"
     assert rebound == pytest.approx(1.75, rel=1e-4)
 
 
 def test_foam_2_closes_its_loop() -> None:
-    """The published numbers hold for the interior mass without dampers."""
+    """The published numbers are those of the chain with the interior mass and without dampers."""
     got, strain, rebound = impact("foam-2, mass")
     assert f"{strain[1].max():.3f}" == "0.767"
     assert strain[1].max() > law(TOP_2).eps_hat_c
     assert f"{got.base_stress.max() / 1e6:.1f}" == "17.4"
     assert f"{rebound:.2f}" == "2.17"
-    # without it, nothing vibrates, and a little more comes back
+    # without the interior mass nothing vibrates, and the rebound is slightly faster
     got, strain, rebound = impact("foam-2")
     assert f"{strain[1].max():.3f}" == "0.767"
     assert f"{got.base_stress.max() / 1e6:.1f}" == "17.4"
@@ -340,7 +340,7 @@ def test_energy_of_an_undamped_impact(name: str, speed: float) -> None:
     energy = energy_balance(chain, drive, got.displacement, velocity)
     brought = energy["brought"][0]
     total = (energy["kinetic"] + energy["work"])[3::5]
-    # five samples on one branch of every spring: there the difference formula holds
+    # the difference formula needs five samples on the same branch in every spring
     strain = np.diff(got.displacement, axis=0, prepend=0.0) / np.array(chain.heights)[:, None]
     for spring, eps in zip(chain.springs, strain, strict=True):
         if isinstance(spring, Bistable):
@@ -363,7 +363,7 @@ def test_rebound_is_what_the_loop_leaves(name: str, speed: float) -> None:
     taken = 0.0
     strain = np.diff(got.displacement, axis=0, prepend=0.0) / np.array(chain.heights)[:, None]
     for spring, h, eps in zip(chain.springs, chain.heights, strain, strict=True):
-        # up to the end of contact, where no stress is left
+        # up to the end of contact, where the stress is zero
         during = eps[~free]
         flag = "a"
         if isinstance(spring, Bistable) and law(spring).branches(during)[-1] in "ce":
@@ -373,7 +373,7 @@ def test_rebound_is_what_the_loop_leaves(name: str, speed: float) -> None:
     assert 0.5 * 7e-3 * rebound**2 == pytest.approx(0.5 * 7e-3 * speed**2 - taken, rel=1e-8)
 
 
-# --------------------------------------------------------------------------------------- contract
+# ----------------------------------------------------------------------------- documented behaviour
 
 
 @pytest.mark.parametrize(
@@ -573,7 +573,7 @@ def test_an_extreme_scene_is_finite_or_refused(name: str, load: ff.Impact) -> No
 
 @pytest.mark.parametrize("speed", [0.5, 0.8, 1.1, 1.4, 1.9])
 def test_contact_ends_wherever_in_the_chain_a_gap_opens(speed: float) -> None:
-    """Massless springs in series are one spring, in whatever order: so is the end of contact."""
+    """The order of massless springs in series changes neither the curves nor the end of contact."""
     foam = ff.BistableSpring(5.5e6, 82e6, -0.18e6, 0.14, 0.31, 14e6, 2.4e6)
     loose = ff.LinearSpring(6e7, unilateral=True)
     time = np.linspace(0.0, 3e-3, 301)
@@ -592,7 +592,7 @@ def test_contact_ends_wherever_in_the_chain_a_gap_opens(speed: float) -> None:
 
 @pytest.mark.parametrize("eta", [0.0, 20.0])
 def test_a_stress_that_a_spring_cannot_carry_is_refused(eta: float) -> None:
-    """Also at the first sample, where another spring's dashpot holds that one."""
+    """Also at the first sample, where the dashpot of the other spring could bear the stress."""
     springs = [
         ff.LinearSpring(6e7, unilateral=True),
         ff.BistableSpring(5.5e6, 82e6, -0.18e6, 0.14, 0.31, 14e6, 2.4e6, eta),

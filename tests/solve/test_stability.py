@@ -1,4 +1,4 @@
-"""A seeded part of experiments/stability: stiff and extreme scenes, and the judges themselves."""
+"""A seeded subset of experiments/stability: stiff and extreme scenes, and the judges."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RTOL = 1e-6
 # Dashpot of S1 (Pa·s), mass above it (kg) and window (s) of the published foam-2 chain.
 FOAM_2 = [(4.4e5, 1.05e-4, 1.16e-5), (8.1e5, 4.7e-4, 1.34e-5), (2.3e5, 5.4e-4, 1.96e-4),
           (8.2e4, 6.9e-4, 9.2e-4), (3e3, 5e-6, 6e-4)]  # fmt: skip
-# Fresh scenes that were wrong, and some that were not.
+# Random scenes, by number: some with former errors and some without.
 FRESH = {
     "study": (4, 5, 11, 14, 16, 17, 18, 19),
     "base": (7, 20, 27, 31, 43, 44, 73, 55, 115),
@@ -36,7 +36,7 @@ FRESH = {
 
 
 def ended(point: Point) -> tuple[ff.Response | None, str]:
-    """Answer of a scene, or why there is none; an answer holds only what is finite."""
+    """Return the response of a scene, which must be finite, or the message of the refusal."""
     try:
         answer = ff.simulate(*scene_of(point), rtol=RTOL)
     except ff.SimulationError as refusal:
@@ -47,14 +47,14 @@ def ended(point: Point) -> tuple[ff.Response | None, str]:
 
 
 def bare(point: Point, rtol: float, implicit: bool | None) -> Motion:
-    """Run a scene once, without the check by shorter steps that `simulate` makes."""
+    """Run a scene once, without the check of `simulate` with shorter steps."""
     chain, drive, time = scene_of(point)
     made = plan(chain, drive, time)._replace(implicit=implicit)
     return made.run(chain.arrays.rows, chain.arrays.heights, rtol)
 
 
 def difference(one: ff.Response | Motion, other: ff.Response | Motion) -> float:
-    """Largest difference of displacement, or of base stress, over the range of each."""
+    """Return the largest difference of displacement or base stress, relative to its range."""
     return max(
         independent.over_range(one.displacement, other.displacement),
         independent.over_range(one.base_stress, other.base_stress),
@@ -62,9 +62,9 @@ def difference(one: ff.Response | Motion, other: ff.Response | Motion) -> float:
 
 
 def judge(point: Point, answer: ff.Response) -> None:
-    """Hold an answer to shorter steps, and to brute force where that is affordable."""
+    """Compare a response with shorter steps and, where affordable, with brute force."""
     if answer.steps:
-        finer = (  # the second only if the first does not tell
+        finer = (  # the finer one only if the first is not resolved
             bare(point, fine * RTOL, implicit=answer.method == "Radau IIA") for fine in (1e-2, 1e-4)
         )
         resolved = (motion for motion in finer if motion.unresolved <= RTOL)
@@ -75,7 +75,7 @@ def judge(point: Point, answer: ff.Response) -> None:
 
 
 def cheap(point: Point) -> bool:
-    """Leave to the study what takes a second or more."""
+    """Return whether a scene takes less than a second; the study covers the others."""
     vibration = (point.mass > 0.0 and point.springs > 1) or point.top_mass > 0.0
     rings = vibration and point.drive == "stress" and not (point.eta or point.site_eta)
     return point.springs <= (1 if vibration else 8) and point.samples <= 300 and not rings
@@ -108,7 +108,7 @@ SWEEPS: dict[str, list[float]] = {
 
 
 def swept() -> Iterator[tuple[str, Point]]:
-    """Scenes that leave a usual one along one axis, to its extreme; with the axis."""
+    """Yield each axis and the scenes that vary an ordinary scene along it, up to extremes."""
     for name, base in BASES.items():
         for axis, values in SWEEPS.items():
             if axis == "velocity" and base.drive != "impact":
@@ -182,19 +182,19 @@ def test_vibrations_that_cannot_be_followed_are_refused_by_size(
     motion = plan(chain, drive, time).run(rows, np.array(chain.heights), 1e-9)
     assert motion.method == "Radau IIA"
     assert 1e-9 < motion.unresolved < 1e-2
-    few = plan(chain, drive, time, max_steps=20_000)  # explicit: not enough
+    few = plan(chain, drive, time, max_steps=20_000)  # too few for explicit steps
     with monkeypatch.context() as patch:
         patch.setattr(simulation, "plan", lambda *_, **__: few)
         with pytest.raises(ff.SimulationError, match="use an rtol no smaller") as refusal:
             ff.simulate(chain, drive, time, rtol=1e-9)
     assert f"{motion.unresolved:.1g}" in str(refusal.value)
-    massless = ff.Chain(chain.springs, chain.heights, chain.area)  # without any vibration
+    massless = ff.Chain(chain.springs, chain.heights, chain.area)  # no vibration
     want = ff.simulate(massless, drive, time, rtol=1e-9)
     assert difference(motion, want) <= motion.unresolved
 
 
 def test_damped_out_vibrations_are_accounted_for() -> None:
-    """What implicit steps lose is inside what they say they lose."""
+    """The error of implicit steps is within the error that they report."""
     point = Point(drive="displacement", springs=3, eta=10.0, mass=STRIKER, samples=101,
                   duration=25.0)  # fmt: skip
     right = bare(point, 1e-10, implicit=False)
@@ -204,7 +204,7 @@ def test_damped_out_vibrations_are_accounted_for() -> None:
 
 
 def test_a_light_onsite_damper_beside_heavy_dashpots() -> None:
-    """Explicit steps lose the velocity of the top to cancellation: implicit ones are chosen."""
+    """Cancellation spoils the velocity of the top in explicit steps: implicit ones are chosen."""
     point = Point(drive="stress", eta=1e6, site_eta=1e-5, height=0.25, samples=21)
     answer, _ = ended(point)
     assert answer is not None
@@ -214,12 +214,13 @@ def test_a_light_onsite_damper_beside_heavy_dashpots() -> None:
 
 
 def test_the_layer_after_a_jump_of_the_velocity_is_passed() -> None:
-    """Heavy dashpots stop light masses in 1e-20 s at each sample: shorter than a clock can tell."""
+    """Heavy dashpots stop light masses within 1e-20 s after each sample, below an ulp of time."""
     point = Point(drive="displacement", springs=4, eta=1e7, mass=2e-12, height=5e-6, samples=5)
     answer, why = ended(point)
     assert answer is not None, why
     free = ff.simulate(*scene_of(dataclasses.replace(point, mass=0.0)), rtol=RTOL)
-    # at a sample the massless base stress is the mean of both sides, that of a mass the one before
+    # Base stress jumps at samples: without masses it is the mean of both sides, with masses the
+    # value before the jump.
     np.testing.assert_allclose(
         answer.displacement, free.displacement, rtol=0, atol=RTOL * free.displacement.max()
     )
@@ -238,7 +239,7 @@ def test_a_single_sample_of_a_stress(implicit: bool) -> None:
 
 
 def test_the_judge_sees_a_wrong_answer() -> None:
-    """A base stress that is 1e-5 off."""
+    """The judge detects an error of 1e-5 in the base stress."""
     scene = scene_of(Point(springs=2, kinds="linear+bistable", eta=100.0, velocity=3.0))
     answer = ff.simulate(*scene, rtol=RTOL)
     coarse = dataclasses.replace(answer, base_stress=answer.base_stress * (1.0 + 1e-5))
@@ -248,7 +249,7 @@ def test_the_judge_sees_a_wrong_answer() -> None:
 
 
 def test_contact_lasts_until_the_blow_has_come_through() -> None:
-    """Before it reaches the base of a long chain, only rounding presses there."""
+    """Before the wave reaches the base of a long chain, the stress there is only rounding."""
     point = next(p for _, p in swept() if p.springs == 100 and p.kinds == "unilateral+bistable"
                  and p.drive == "impact" and p.mass > 0.0)  # fmt: skip
     chain, drive, time = scene_of(point)
@@ -261,13 +262,13 @@ def test_contact_lasts_until_the_blow_has_come_through() -> None:
     assert miss <= 1e-4 * explicit.base_stress.max()
 
 
-# --------------------------------------------------------------------------------- fresh scenes
+# --------------------------------------------------------------------------------- random scenes
 
 
 def against_brute_force(
     chain: ff.Chain, drive: ff.Impact | ff.DisplacementDrive, time: np.ndarray, rtol: float
 ) -> tuple[ff.Response, independent.Truth]:
-    """Hold an answer against the judge that shares nothing with the solver."""
+    """Compare a simulation with the judge, which shares no code with the solver."""
     truth = independent.judge(chain, drive, time)
     assert not truth.why
     assert truth.unsure <= 0.1 * rtol
@@ -309,7 +310,7 @@ def test_the_base_dashpot_of_foam_2(eta: float, mass: float, stop: float, rtol: 
 
 
 def test_nothing_presses_behind_an_open_gap() -> None:
-    """Nor does a parameter move the base stress there."""
+    """Behind an open gap, base stress and its sensitivities are zero."""
     item = ff.published["foam-2"]
     chain = ff.Chain(item.chain.springs, item.chain.heights, item.chain.area)
     time = np.linspace(0.0, 1e-3, 101)

@@ -1,4 +1,4 @@
-"""The implicit integrator: its order, and its answers where others have them, and where not."""
+"""The implicit integrator: its order, and its results against other solvers and limits."""
 
 from itertools import pairwise
 
@@ -39,14 +39,14 @@ def run(
     implicit: bool | None = True,
     time: np.ndarray = TIME,
 ) -> Motion:
-    """Run a scene with the integrator that is asked for (None: that the scene asks for)."""
+    """Run a scene with implicit or explicit steps (None: chosen by the package)."""
     scene = plan(built(chain), load, time)._replace(implicit=implicit)
     rows = np.array([spring.row for spring in built(chain).springs])
     return scene.run(rows, np.array(chain.heights), rtol)
 
 
 def errors(got: Motion, want: object) -> tuple[float, float]:
-    """Largest error over range of the displacements (worst node) and of the base stress."""
+    """Return the largest error over the range of displacement (worst node) and of base stress."""
     miss = np.abs(got.displacement - want.displacement).max(axis=1)
     return (
         float((miss / np.ptp(want.displacement, axis=1)).max()),
@@ -64,7 +64,7 @@ def struck(name: str, eta: float = 0.0, mass: float = 0.0) -> tuple[Chain, ff.Im
 
 
 def test_order_conditions() -> None:
-    """B(2s - 1), C(s) and D(s - 1) make the order 2s - 1; the last stage is the step's end."""
+    """B(2s - 1), C(s) and D(s - 1) imply order 2s - 1; the last stage is the end of the step."""
     c, a = collocation.radau(collocation.STAGES)
     s, b = collocation.STAGES, a[-1]
     assert c[-1] == 1.0
@@ -83,11 +83,11 @@ def test_two_stages_are_the_known_ones() -> None:
     np.testing.assert_allclose(a, [[5 / 12, -1 / 12], [3 / 4, 1 / 4]])
 
 
-# -------------------------------------------------------------------- scenes that others can do too
+# -------------------------------------------------------------------- against other solvers
 
 
 def integrated(name: str, drive: str) -> bool:
-    """Whether a case needs an integrator at all: an undamped chain in equilibrium does not."""
+    """Return whether a case needs an integrator; an undamped chain in equilibrium does not."""
     chain = CHAINS[name]
     masses = (chain.masses or ()) if drive == "stress" else (chain.masses or ())[:-1]
     dashpots = any(spring.eta for spring in chain.springs)
@@ -97,7 +97,7 @@ def integrated(name: str, drive: str) -> bool:
 
 
 def rings(name: str) -> bool:
-    """Whether a mass goes on vibrating: implicit steps, which are slow, then follow it for long."""
+    """Return whether a mass vibrates undamped, which takes many slow implicit steps."""
     return (", mass" in name and "dashpot" not in name) or "own mass" in name
 
 
@@ -128,7 +128,7 @@ def test_dashpots_like_explicit_steps(name: str, eta: float, rtol: float, bar: f
     want = run(*scene, 1e-11, implicit=False)
     got = run(*scene, rtol)
     assert max(errors(got, want)) <= bar
-    # from heavy dashpots the striker parts while it creeps: explicit steps know no better when
+    # with heavy dashpots the striker separates so slowly that explicit steps are no more accurate
     assert got.contact_end == pytest.approx(want.contact_end, rel=bar if eta < 1e6 else 1e-4)
     assert got.steps < 500
 
@@ -196,14 +196,14 @@ def test_light_masses_tend_to_none(name: str, mass: float) -> None:
 
 @pytest.mark.parametrize("mass", [1e-14, 1e-12, 1e-10])
 def test_the_vibration_that_steps_pass_over_is_owned_up_to(mass: float) -> None:
-    """Steps of 100 radians: against the closed form of a mass between two springs on branch a."""
+    """Steps of 100 radians report the amplitude in closed form of a mass between two springs."""
     chain, blow = struck("foam-2", mass=mass)
     below, above = (s.k0 / h for s, h in zip(chain.springs, chain.heights, strict=True))
     rate = np.sqrt((below + above) / (mass / AREA))
     time = np.linspace(0.0, 5000.0 / rate, 41)
     got = run(chain, blow, 1e-1, time=time)
     assert got.steps <= 10
-    speed = blow.velocity * above / (below + above)  # from rest to what the springs share
+    speed = blow.velocity * above / (below + above)  # mean velocity of the mass, initially 0
     ripple = below * speed / rate
     assert got.unresolved * got.base_stress.max() == pytest.approx(ripple, rel=0.01)
     want = run(chain, blow, 1e-8, implicit=False, time=time)
@@ -219,7 +219,7 @@ def test_vibration_that_is_lost_is_refused_or_followed(eta: float) -> None:
     got = run(chain, blow, 1e-6, time=time)
     miss = errors(got, want)[1]
     assert miss <= got.unresolved + 1e-6
-    if eta > 0.0:  # it dies out soon: a few hundred steps follow it
+    if eta > 0.0:  # it decays within a few hundred steps
         assert miss <= 1e-6
     else:
         assert got.unresolved > 1e-6
@@ -236,7 +236,7 @@ def test_contact_with_heavy_dashpots_ends_as_in_closed_form(eta: float) -> None:
     a = k / (m * b)
     end = 2.0 * np.log(b / a) / (b - a)
     chain = Chain((spring,), (height,), AREA)
-    for choice in (True, None):  # None: also where a short history would do for explicit steps
+    for choice in (True, None):  # None: also where explicit steps could manage a short history
         got = run(chain, blow, 1e-6, implicit=choice, time=np.linspace(0.0, 3.0 * end, 31))
         assert got.contact_end == pytest.approx(end, rel=1e-7)
         assert got.steps < 200
@@ -255,7 +255,7 @@ def test_heavy_dashpots(name: str) -> None:
     assert got.method == RADAU
     assert got.steps < 500
     assert max(errors(got, want)) <= 1e-8
-    # the striker is stopped by the dashpots before the springs feel anything
+    # the dashpots stop the striker before the spring forces matter
     stopping = blow.mass / AREA * sum(chain.heights) / 1e8
     assert got.displacement[-1].max() == pytest.approx(blow.velocity * stopping, rel=1e-4)
 
@@ -298,7 +298,7 @@ def test_the_choice() -> None:
     assert set(methods.values()) == {TAYLOR}
     still = ff.simulate(built(CHAINS["model-3"]), ff.StressDrive(0.0 * TIME), TIME)
     assert still.method == "closed form"
-    light = struck("foam-2", mass=1e-12)  # it rings by 1e-5 of the base stress
+    light = struck("foam-2", mass=1e-12)  # its vibration is 1e-5 of the base stress
     for scene, rtol in (
         (struck("foam-2", 1e-2), 1e-6),
         (light, 1e-4),
@@ -338,7 +338,8 @@ def test_energy_of_an_undamped_impact(name: str, speed: float) -> None:
     free = time > got.contact_end
     rebound = np.polyfit(time[free], got.displacement[-1, free], 1)[0]
     assert rebound < 0.0
-    time = np.append(time[~free], got.contact_end * (1 - 1e-13))  # at the last, what is left
+    # The last sample gives the remaining energy.
+    time = np.append(time[~free], got.contact_end * (1 - 1e-13))
     got = run(chain, ff.Impact(7e-3, speed), 1e-9, time=time)
     velocity = np.zeros_like(got.displacement)
     velocity[-1] = rebound
@@ -380,7 +381,7 @@ def long_chain(n: int, kind: str) -> Chain:
 
 @pytest.mark.parametrize("kind", ["massless", "damped", "masses"])
 def test_a_long_chain_behaves_as_a_short_one(kind: str) -> None:
-    """Alternating springs in equal parts are the same foam, however finely divided."""
+    """Alternating springs of equal heights represent the same foam for any number of springs."""
     found = []
     for n in (20, 100):
         scene = plan(built(long_chain(n, kind)), ff.Impact(7e-3, 2.0), TIME)

@@ -33,7 +33,7 @@ def there_and_back(peak, n):
 
 @pytest.mark.parametrize("springs", [(FOAM, SOFT), (SOFT, FOAM, FOAM), (FOAM,) * 5])
 def test_coarse_samples_end_where_fine_ones_do(springs):
-    """Several springs switch within one coarse sample; the fine history visits every switch."""
+    """Several springs switch between two coarse samples; fine samples resolve every switch."""
     peak = 0.40e-3 * len(springs)
     fine = drive(chain(*springs), there_and_back(peak, 4001))
     coarse = drive(chain(*springs), there_and_back(peak, 9))
@@ -50,7 +50,7 @@ def test_coarse_samples_end_where_fine_ones_do(springs):
     turns=st.lists(st.floats(0.05, 0.6), min_size=2, max_size=5),
 )
 def test_all_springs_carry_one_stress_and_fill_the_elongation(springs, turns):
-    """Whatever the history: each spring's own law, along its own strain, gives the base stress."""
+    """For any history, the law of each spring along its own strain gives the base stress."""
     structure = chain(*springs)
     top = np.concatenate([[0.0], np.array(turns) * structure.height])
     top = np.interp(np.linspace(0, len(turns), 60 * len(turns) + 1), np.arange(top.size), top)
@@ -60,7 +60,7 @@ def test_all_springs_carry_one_stress_and_fill_the_elongation(springs, turns):
     largest = np.max(np.abs(response.base_stress))
     for spring, strain in zip(springs, strains, strict=True):
         along = spring.stress(strain)
-        stiff = spring.tangent(strain)  # strains are known to rounding only
+        stiff = spring.tangent(strain)  # strains are exact only to rounding
         slack = 1e-9 * largest + 1e-12 * stiff
         switched = spring.branches(strain) != np.roll(spring.branches(strain), 1)
         assert np.all((np.abs(along - response.base_stress) <= slack) | switched)
@@ -80,7 +80,7 @@ def test_against_the_independent_reference():
 
 
 def test_flat_branches_are_shared_from_the_base_up():
-    """With k_h+ = 0 the split on the plateau is open; the rule is: the base spring snaps first."""
+    """With k_h+ = 0 the split on the plateau is open; by convention the base spring snaps first."""
     flat = replace(FOAM, kh_plus=0.0)
     structure = chain(flat, flat, flat)
     at_a1 = 3 * flat.eps_a * 1e-3
@@ -91,7 +91,7 @@ def test_flat_branches_are_shared_from_the_base_up():
     np.testing.assert_allclose(on_plateau, flat.sigma_a, rtol=1e-12)
     strains = np.diff(response.displacement, axis=0, prepend=0.0) / 1e-3
     np.testing.assert_allclose(strains[0, 29:], flat.eps_hat_c, rtol=1e-9)  # first third: base
-    np.testing.assert_allclose(strains[2, 20:40], flat.eps_a, rtol=1e-9)  # top waits its turn
+    np.testing.assert_allclose(strains[2, 20:40], flat.eps_a, rtol=1e-9)  # the top snaps last
     np.testing.assert_allclose(response.displacement[-1], top, atol=1e-15)
 
 

@@ -1,4 +1,4 @@
-"""The microscale law against root finding on the law anew, and any other laws of snapping."""
+"""The microscale law against root finding on an independent implementation of the law."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TURNS = (0.0, 0.5, 0.3, 0.4, 0.15, 0.45, 0.7, -0.05, 0.25, 0.1, 0.9)
 
 
 def walk(turns: tuple[float, ...] = TURNS, between: int = 5) -> np.ndarray:
-    """Samples from turning point to turning point."""
+    """Return strains with `between` steps from one turning point to the next."""
     return np.concatenate(
         [[turns[0]]] + [np.linspace(a, b, between + 1)[1:] for a, b in itertools.pairwise(turns)]
     )
@@ -98,7 +98,7 @@ def test_branches_of_a_loop_with_an_inner_loop() -> None:
 
 @EACH
 def test_the_stress_comes_back_to_where_it_turned(spring: ff.MicroscaleSpring) -> None:
-    """Return-point memory, of an inner loop and of one inside it, whatever was done within."""
+    """Return-point memory of an inner loop and of a loop inside it."""
     scale = min(1.0, 0.9 * (1.0 + spring.eps_star))
     strain = np.array([0.6, 0.2, 0.5, 0.3, 0.4, 0.3, 0.5, 0.2, 0.6, 0.8]) * scale
     stress = spring.stress(strain)
@@ -126,7 +126,7 @@ def test_strain_past_the_pole_is_refused(beyond: float) -> None:
 
 @EACH
 def test_slope_is_that_of_the_stress(spring: ff.MicroscaleSpring) -> None:
-    """On the way that the strain goes, a third into each leg."""
+    """The slope is that in the direction of loading, a third of the way into each leg."""
     turns = np.array(TURNS) * min(1.0, 0.9 * (1.0 + spring.eps_star))
     for k in range(1, turns.size):
         here = turns[k - 1] + (turns[k] - turns[k - 1]) / 3
@@ -148,7 +148,7 @@ def check_derivative(
     size = 2e-4 * value * min(1.0, spring.spread_plus, spring.spread_minus)
     at = [getattr(replace(spring, **{name: value + k * size}), of)(history) for k in (-2, -1, 1, 2)]
     want = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * size)
-    # A rank is a logarithm of stress over a spread: an ulp of the stress is so many of the rank.
+    # A rank is a log of stress divided by a spread, which amplifies rounding of the stress.
     amplified = 2.0**-52 / min(1.0, spring.spread_plus, spring.spread_minus)
     rounding = (1e-14 + amplified) * np.abs(at[0]).max() / size
     assert np.abs(got - want).max() <= 1e-6 * np.abs(want).max() + rounding, name
@@ -158,7 +158,7 @@ def check_derivative(
     "spring", [SHOE, SPRINGS["reversible at low ranks"], SPRINGS["reversible at high ranks"]]
 )
 def test_derivatives_along_histories(spring: ff.MicroscaleSpring) -> None:
-    """By every own parameter, also where the rank is held that a turning point left behind."""
+    """By every parameter of the spring, including where the rank stays constant after a turn."""
     strain = walk(TURNS, 7)[1:]
     path = microscale_kernels.stress_along(spring.row, strain)
     assert {6, 7, 8} <= set(path[2].tolist())
@@ -179,7 +179,7 @@ def test_derivatives_along_histories(spring: ff.MicroscaleSpring) -> None:
 
 
 def test_the_held_rank_at_the_end_of_its_stresses_is_held() -> None:
-    """Snapped back to rank 0 at sigma_minus, a spring is held up to sigma_plus, and there."""
+    """After snapping back to rank 0, a spring keeps its rank up to and including sigma_plus."""
     spring = SPRINGS["reversible at low ranks"]
     stress = np.array([3e5, 5e4, 1e5])
     _, (ranks, _), branches = microscale_kernels.strain_along(spring.row, stress)
@@ -202,7 +202,7 @@ def test_the_fraction_that_has_snapped_follows_its_two_laws() -> None:
 
 @pytest.mark.parametrize("spread", [1e-6, 1e-5])
 def test_a_narrow_snap_goes_on_at_the_stress_at_which_it_turned(spread: float) -> None:
-    """The last digit of the stress covers many ranks; the strain shows what has snapped."""
+    """One ulp of the stress spans many ranks; only the strain resolves the snapped fraction."""
     spring = ff.MicroscaleSpring(2.5e6, 2.1e8, 1.09, 7.5e4, spread, 7.2e3, 0.46)
     for turn in np.linspace(0.1, 1.0, 50):
         there, _, again = spring.stress(np.array([turn, 0.99 * turn, turn]))

@@ -1,4 +1,4 @@
-"""The flat vector of parameters: microscale springs and relaxation terms in it."""
+"""The flat parameter vector with microscale springs and relaxation terms."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_vector_that_is_not_admissible_has_no_rows(place: int, value: float) -
     values = np.array([*MICROSCALE, 0.5, 0.2, 0.0, 3.0, 0.0])
     assert model.rows(values) is not None
     values[place] = value
-    if place == 12 or (place == 7 and value == np.inf):  # the onsite damper is in no row
+    if place == 12 or (place == 7 and value == np.inf):  # no row contains the onsite damper
         return
     assert model.rows(values) is None
     with pytest.raises(ValueError, match=rf"\b{model.names[place].removeprefix('s1_')}\b"):
@@ -77,7 +77,7 @@ def test_relaxation_that_is_no_sequence_of_pairs_is_refused(given: object) -> No
 
 
 def test_eps_star_is_admissible_from_its_bound_on() -> None:
-    """With the bound branch c touches branch a; any less is refused, with the bound in words."""
+    """At the bound, branch c touches branch a; smaller values are refused with the bound stated."""
     bound = (np.sqrt(2.5e6) - np.sqrt(5e5)) / (np.sqrt(2.5e6) + np.sqrt(5e5))
     parameters = {
         "k0": 5e5,

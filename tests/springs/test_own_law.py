@@ -1,4 +1,4 @@
-"""User-defined laws: registered from a file, refused where wrong, simulated, fitted."""
+"""User-defined laws: registration from a file, refusals, simulation and fits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def bouc_wen() -> Iterator[Law]:
     yield law
     laws._LAWS.clear()
     laws._LAWS.update(before)
-    laws._TEXTS.clear()  # each new process would compile them
+    laws._TEXTS.clear()  # a new process would compile the laws again
 
 
 def chain_of(spring: ff.springs.spring.Spring, **more: float) -> ff.Chain:
@@ -37,7 +37,7 @@ def chain_of(spring: ff.springs.spring.Spring, **more: float) -> ff.Chain:
 
 
 def by_hand(time: np.ndarray, strain_rate: object) -> np.ndarray:
-    """Bouc-Wen stress along a strain rate of time, by scipy."""
+    """Integrate the Bouc-Wen stress under a strain rate, a function of time, with SciPy."""
     k, alpha, limit, n, _ = VALUES
 
     def rhs(t: float, y: np.ndarray) -> list[float]:
@@ -89,9 +89,9 @@ PAPERS = {"bistable": laws.bistable.LAW, "microscale": laws.microscale.LAW}
 
 @functools.cache
 def either() -> Law:
-    """Both laws of the paper as one that is registered, so that the steps of any law follow it.
+    """Register both laws of the paper as one user-defined law, which the generic steps follow.
 
-    One, because the steps are compiled for each law anew: its first parameter says which it is.
+    One law saves compilation, as the steps are compiled per law; its first parameter selects one.
     """
     which = ff.Param("which", coordinate="value", start=(0.0, "one"), admissible="finite")
     of = PAPERS["bistable"]
@@ -105,14 +105,14 @@ def either() -> Law:
 
 
 def copy_of(spring: ff.BistableSpring | ff.MicroscaleSpring) -> ff.springs.spring.Spring:
-    """A spring of the paper that the steps of any law follow."""
+    """Return the same spring as a user-defined law, which the generic steps follow."""
     which = float(isinstance(spring, ff.MicroscaleSpring))
     return either().make((which, *spring.values), spring.relaxation)
 
 
-@pytest.mark.usefixtures("bouc_wen")  # after which what is registered here is forgotten
+@pytest.mark.usefixtures("bouc_wen")  # removes laws registered here afterwards
 def test_steps_of_any_law_agree_with_the_solver_of_the_papers_laws() -> None:
-    """All in one test: each process would compile the steps anew."""
+    """One test for all cases, because each test process would compile the steps again."""
     for kind, relaxation, drive in itertools.product(
         PAPERS, [(), [(0.4, 2e-4)]], ["impact", "stress", "displacement"]
     ):
@@ -120,7 +120,7 @@ def test_steps_of_any_law_agree_with_the_solver_of_the_papers_laws() -> None:
 
 
 def steps_agree(kind: str, relaxation: list[tuple[float, float]], drive: str) -> None:
-    """Steps of a copy of one of the paper's laws give its curves and derivatives."""
+    """Assert that generic steps give the curves and derivatives of one of the paper's laws."""
     spring: ff.BistableSpring | ff.MicroscaleSpring = (
         ff.BistableSpring(5.5e6, 82.5e6, -0.18e6, 0.14, 0.31, 14.3e6, 2.34e6, 50.0,
                           relaxation=relaxation)
@@ -152,7 +152,7 @@ NAMES = ("s1_k0", "s1_eta")
 
 @pytest.mark.usefixtures("bouc_wen")
 def test_a_derivative_at_a_limit_of_a_law_is_one_sided() -> None:
-    """Δσ may not be positive: beside 0 there is one side."""
+    """Δσ must not be positive, so only one side of 0 is admissible."""
     spring = ff.BistableSpring(5.5e6, 82.5e6, 0.0, 0.14, 0.31, 14.3e6, 2.34e6)
     time = np.linspace(0.0, 1.0, 81)
     drive = ff.DisplacementDrive(4e-4 * np.sin(np.pi * time) ** 2)
@@ -176,7 +176,7 @@ def test_a_law_stands_in_a_chain(bouc_wen: Law) -> None:
         np.testing.assert_allclose(spring.stress(strain), got.base_stress, rtol=1e-8, atol=1.0)
 
 
-# ---------------------------------------------------------------------------- what is refused
+# ---------------------------------------------------------------------------- refusals
 
 
 def changed(law: Law, **by: object) -> Law:

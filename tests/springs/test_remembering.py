@@ -1,8 +1,8 @@
-"""Microscale springs that remember (model, section 8) against an implementation of their own.
+"""Microscale springs with memory (model, section 8) against an independent implementation.
 
-`Formula` is section 8 as it stands: the state is updated in small steps, the strain is written out,
-and the stress at a strain is a root found by bracketing. `discrete` follows the micro-springs
-themselves.
+`Formula` implements section 8 literally: the state is updated in small steps, the strain is
+explicit, and the stress at a strain is found by bracketing. `discrete` follows individual
+micro-springs.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SPRINGS = {
 
 
 class Formula:
-    """Section 8; ranks w and W stand for p and P, so that 1 - P keeps its digits."""
+    """Section 8 with ranks w and W in place of p and P, so that 1 - P is accurate."""
 
     def __init__(self, spring: ff.MicroscaleSpring) -> None:
         self.spring, self.w, self.most = spring, -math.inf, -math.inf
@@ -72,7 +72,7 @@ class Formula:
             while self.strain(high) < strain:
                 high *= 2.0
             near = high
-            while near > 1e-280 and self.strain(near) > strain:  # the size of a small root
+            while near > 1e-280 and self.strain(near) > strain:  # bracket small roots closely
                 near *= 1e-3
             low = near if self.strain(near) <= strain else 0.0
         if self.strain(low) == strain:
@@ -94,7 +94,7 @@ def between(rng: Generator, low: float, high: float) -> float:
 
 
 def drawn(rng: Generator, extreme: bool) -> ff.MicroscaleSpring:
-    """Draw any admissible spring; its least ε_* is the largest of many values."""
+    """Draw an admissible spring; the lower bound on ε_* is a maximum over a grid of stresses."""
     k0 = between(rng, 1e4, 1e8)
     kc = k0 * between(rng, 0.02, 100.0)
     n = between(rng, 0.02, 50.0) if extreme else between(rng, 0.3, 4.0)
@@ -116,7 +116,7 @@ def drawn(rng: Generator, extreme: bool) -> ff.MicroscaleSpring:
 
 
 def history(rng: Generator, spring: ff.MicroscaleSpring) -> Array:
-    """Stresses that turn anywhere: partial loops, past the old peak, to zero, back, in tension."""
+    """Draw a stress history with partial loops, new peaks, zeros, revisited levels and tension."""
     top = spring.sigma_plus * between(rng, 0.1, 30.0)
     pull = -0.4 * min(spring.k0 * math.exp(-spring.softening) / spring.stiffening, spring.kc)
     levels = [0.0]
@@ -139,7 +139,7 @@ def history(rng: Generator, spring: ff.MicroscaleSpring) -> Array:
 
 @pytest.mark.parametrize("extreme", [False, True])
 def test_stress_and_strain_are_those_of_the_formula(extreme: bool) -> None:
-    """To 1e-8 of the range; where a digit of the strain moves the stress by more, within that."""
+    """To 1e-8 of the range, or to the effect of rounding the strain where that is larger."""
     for number in range(150):
         rng = np.random.default_rng([8, extreme, number])
         spring = drawn(rng, extreme)
@@ -165,7 +165,7 @@ def test_stress_and_strain_are_those_of_the_formula(extreme: bool) -> None:
             before = s
         got, allowed = spring.stress(wanted), 1e-9 * np.abs(given).max() + 2.0 * np.array(loose)
         assert (np.abs(got - back) <= allowed).all(), number
-        assert (np.abs(got - given) <= allowed).all(), number  # each is the inverse of the other
+        assert (np.abs(got - given) <= allowed).all(), number  # stress inverts strain
 
 
 def test_without_memory_it_is_section_6_bit_for_bit() -> None:
@@ -180,7 +180,7 @@ def test_without_memory_it_is_section_6_bit_for_bit() -> None:
         strain.append(along.strain(s))
         before = s
     assert PLAIN.strain(given) == pytest.approx(strain, rel=1e-13)
-    # neither does it differ before anything has snapped twice
+    # softening and weakening do not affect first loading
     up = np.linspace(0.0, 4e6, 30)
     once = replace(WORN, stiffening=1.0)
     assert once.strain(up) == pytest.approx(PLAIN.strain(up), rel=1e-14)
@@ -188,7 +188,7 @@ def test_without_memory_it_is_section_6_bit_for_bit() -> None:
 
 
 def discrete(spring: ff.MicroscaleSpring, stress: Array, count: int) -> Array:
-    """Follow so many micro-springs, each of which knows whether it has snapped once."""
+    """Follow `count` micro-springs, each of which records whether it has ever snapped."""
     score = ndtri((np.arange(count) + 0.5) / count)
     first = spring.sigma_plus * np.exp(spring.spread_plus * score)
     again = first * math.exp(-spring.weakening)
@@ -214,12 +214,12 @@ def test_discrete_micro_springs_converge_to_it_as_their_number_grows(name: str) 
     exact = spring.strain(stress)
     counts = np.array([125, 500, 2000, 8000])
     error = np.array([np.abs(discrete(spring, stress, c) - exact).max() for c in counts])
-    assert (error * counts < 1.0).all()  # less than the strain of one micro-spring
+    assert (error * counts < 1.0).all()  # error below the strain of one micro-spring
     order = -np.polyfit(np.log(counts), np.log(error), 1)[0]
     assert order == pytest.approx(1.0, abs=0.15)
 
 
-# ---------------------------------------------------------------------------------- what it refuses
+# ---------------------------------------------------------------------------------- refusals
 
 
 @pytest.mark.parametrize(
@@ -259,33 +259,33 @@ def test_a_tension_that_the_softened_branch_cannot_carry_is_refused() -> None:
         WORN.stress(np.array([0.0, 1.0 + WORN.eps_star]))
 
 
-# ----------------------------------------------------------------------------------- loops it makes
+# ----------------------------------------------------------------------------------- loops
 
 
 @pytest.mark.parametrize("name", SPRINGS)
 @pytest.mark.parametrize("by_strain", [False, True])
 def test_inner_loops_return_to_where_they_began(name: str, by_strain: bool) -> None:
-    """Each loop closes, and is wiped out by a larger one; the largest fraction ever is not."""
+    """Each loop closes and a larger loop erases it, but not the largest fraction ever snapped."""
     spring = SPRINGS[name]
     stress = 1e6 * np.array([0, 2.5, 0.6, 1.4, 0.9, 1.2, 0.9, 1.4, 0.6, 1.4, 0.6, 2.5, 3.0])
     follow = spring.strain
     if by_strain:
         given = spring.strain(stress)
 
-        def follow(levels: Array) -> Array:  # the same, by what is inverse to it
+        def follow(levels: Array) -> Array:  # the inverse
             return spring.stress(levels)
 
         stress = given
     out = follow(stress)
-    # levels 3 and 7, 2, 8 and 10, 4 and 6: visited again, whatever lay between
+    # each pair of samples has the same level on the same path, with inner loops in between
     for one, other in [(3, 7), (7, 9), (2, 8), (8, 10), (4, 6), (1, 11)]:
         assert out[other] == pytest.approx(out[one], rel=1e-12), (one, other)
-    # past the old peak first loading goes on as if nothing had been
+    # past the old peak, first loading continues as if the loops had not happened
     assert out[12] == pytest.approx(follow(stress[[0, 12]])[1], rel=1e-12)
 
 
 def test_zero_stress_does_not_wipe_out_what_has_snapped_once() -> None:
-    """The second loop of a test differs from the first; the third is the second."""
+    """The second loop of a test differs from the first; the third equals the second."""
     up = np.linspace(0.0, 2.5e6, 40)
     loop = np.concatenate([up, up[::-1]])
     strain = WORN.strain(np.tile(loop, 3)).reshape(3, -1)
@@ -295,7 +295,7 @@ def test_zero_stress_does_not_wipe_out_what_has_snapped_once() -> None:
     assert (strain[1, 1:39] > strain[0, 1:39] + 1e-4).all()
     assert strain[2] == pytest.approx(strain[1], rel=1e-14)
     assert strain[:, 39] == pytest.approx([strain[0, 39]] * 3, rel=1e-14)  # the peak
-    # unloading is that of the first loop
+    # unloading is the same as in the first loop
     assert strain[1, 40:] == pytest.approx(strain[0, 40:], rel=1e-14)
 
 
@@ -308,7 +308,7 @@ def test_zero_stress_does_not_wipe_out_what_has_snapped_once() -> None:
 def test_derivatives_in_closed_form_are_those_of_differences(
     name: str, moved: bool, count: int
 ) -> None:
-    """Along histories of stress and of displacement; the second spring is another one in series."""
+    """For prescribed stress and displacement, for one spring and with another one in series."""
     spring, heights = SPRINGS[name], [1e-3, 0.7e-3][:count]
     corners = np.array([0.0, 1.4, 0.31, 1.1, 0.23, 1.9, 0.05, 1.2, 0.52, 2.6, 0.41, 2.7, 0.0])
     time = np.arange(12.0 * 8 + 1)
@@ -336,7 +336,7 @@ def test_derivatives_in_closed_form_are_those_of_differences(
 
 
 def test_derivatives_behind_a_narrow_snap_that_all_have_passed() -> None:
-    """What is softer is then all of branch a; the derivative by softening was none."""
+    """All of branch a is then softened; the derivative by softening was once wrongly zero."""
     narrow = replace(WORN, spread_plus=0.02, relaxation=[(0.3, 1.0)])
     time = np.linspace(0.0, 4.0, 81)
     drive = ff.DisplacementDrive(0.9e-3 * (1.0 - np.cos(1.5 * np.pi * time)) / 2.0)

@@ -1,4 +1,4 @@
-"""The spring law against the published table, against the reference and against its own meaning."""
+"""The spring law against the published table, the reference and its defining properties."""
 
 import dataclasses
 import math
@@ -73,10 +73,10 @@ def test_derived_points_of_random_springs(spring: ff.BistableSpring) -> None:
         if name != "eps_hat_a":
             assert value == pytest.approx(want, rel=1e-12, abs=1e-15)
         elif want is None or value is None:
-            # only where branches a and e nearly touch may rounding decide whether they meet
+            # rounding may decide whether branches a and e meet only where they nearly touch
             assert value is want or points.nearly_parallel
         else:
-            # the root is as sharp as the angle at which a and e meet
+            # the accuracy of the root depends on the angle at which a and e meet
             angle = points.slope("a", want) - points.slope("e", want)
             allowed = 1e-12 + 1e-14 * spring.k0 / angle
             assert value == pytest.approx(want, rel=0, abs=allowed)
@@ -178,11 +178,11 @@ def test_branches_are_monotone_and_the_loop_takes_energy(spring: ff.BistableSpri
     if spring.eps_hat_a is not None:
         exact = law(spring).loop
         assert exact >= -1e-12 * spring.sigma_hat_c
-        # work below A2, on branch a down to the last strain, is given back
+        # the work on branch a between A2 and the last strain is recovered
         last = law(spring).work([down[-1]])[0]
         curvature = np.ptp(up) * np.ptp(stress) / 300
         assert area - last == pytest.approx(exact, abs=3 * curvature)
-    # at equal strain, loading is nowhere below unloading
+    # at equal strain, the loading stress is never below the unloading stress
     both = np.linspace(max(down[-1], 0.0), up[-1], 200)
     upper = spring.stress(both)
     lower = spring.stress(np.concatenate([[up[-1]], both[::-1]]))[1:][::-1]

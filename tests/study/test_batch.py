@@ -1,4 +1,4 @@
-"""Many tests: each whole or not at all, none twice, whatever ends; and their summary."""
+"""Batches: each result is complete or absent and made once, whatever fails; and the summary."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from foamfit.terminal import TerminatedError
 from inline import Inline
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-QUICK = {"starts": 2, "intervals": "local"}  # after a single start a search looks around longer
+QUICK = {"starts": 2, "intervals": "local"}  # a search from one start explores longer
 TOML = (
     f'[specimen]\nheight = "{1e3 * HEIGHT} mm"\narea = "19.635 mm^2"\n'
     '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
@@ -63,7 +63,7 @@ def write(folder: Path, name: str, seed: int) -> None:
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """Three tests, one file that is none, and the TOML of all."""
+    """Three tests, a CSV file that is not a test, and one TOML for all."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tests").mkdir()
     for seed, name in enumerate("abc"):
@@ -75,7 +75,7 @@ def here(tmp_path, monkeypatch):
 
 @pytest.fixture
 def tried(monkeypatch):
-    """The names of the tests that are fitted; a fit takes no time."""
+    """Replace the fit by a fast one that records the names of the fitted tests."""
     found = []
 
     def fit(test, **options):
@@ -100,17 +100,17 @@ def names(folder):
 
 
 def numbers(out):
-    """What was fitted, as it is written."""
+    """Return the fitted numbers as written to the files."""
     found = Path(out).glob("*/parameters.csv")
     return {path.parent.name: path.read_text() for path in sorted(found)}
 
 
 def stamps(out):
-    """When each result was written."""
+    """Return the time at which each result was written."""
     return {p.parent.name: p.stat().st_mtime_ns for p in Path(out).glob("*/batch.json")}
 
 
-# ------------------------------------------------------------------------- what there is at the end
+# ------------------------------------------------------------------------- output
 
 
 def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
@@ -141,7 +141,7 @@ def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """Pictures of the tests and of their comparison are a few bytes."""
+    """Replace the figures of the tests and of their comparison by a few bytes."""
     without_pictures(monkeypatch)
     monkeypatch.setattr(batch_report, "plot_parameters", lambda *_, **__: None)
     monkeypatch.setattr(batch_report, "image", lambda *_: b"\x89PNG")
@@ -202,7 +202,7 @@ def test_only_what_is_missing_or_has_changed_is_fitted(here, tried):
     before = stamps("out")
     pd.testing.assert_frame_equal(again(), first)
     assert tried == ["a", "b", "c"]
-    assert stamps("out") == before  # the one that was refused is not tried again, too
+    assert stamps("out") == before  # the refused test is not retried either
     changes = (
         (lambda: write(here / "tests", "b", 7), {}, ["b"]),
         (lambda: write(here / "tests", "d", 8), {}, ["d"]),
@@ -238,7 +238,7 @@ def test_a_test_that_became_unreadable_loses_its_old_result(here, tried):
     assert again().set_index("test").loc["a", "status"] != "refused"
 
 
-# ------------------------------------------------------------------------- what goes wrong
+# ------------------------------------------------------------------------- failures
 
 
 @posix
@@ -263,13 +263,13 @@ def test_a_defect_is_a_row_and_ends_nothing(here, tried, monkeypatch):
 
 
 def unfitted(task):
-    """Work, in another process, with a fit that takes no time; a module's function, as must be."""
+    """Work in another process with a fast fit; at module level so that it can be pickled."""
     batch_work.fit = lambda test, **_: fabricated.result(measurement=test)
     return work(task)
 
 
 def failing(task):
-    """Work, but for the test b, whose process is killed."""
+    """Work like `unfitted`, but kill the process that fits test b."""
     if task.name == "b":
         os.kill(os.getpid(), signal.SIGKILL)
     return unfitted(task)
@@ -292,7 +292,7 @@ def test_a_test_that_kills_its_process_is_a_row_and_is_tried_again_when_called(
     assert {name: after[name] for name in before} == before
 
 
-# Kills its process at the first call; a process imports nothing for it.
+# Kills its process at the first call; built without any import in that process.
 SEEN_ONCE = """
 import os, pathlib, signal
 seen = pathlib.Path({path!r})
@@ -304,7 +304,7 @@ if not seen.exists():
 
 @posix
 def test_what_another_thread_imports_while_a_process_starts_stays_imported(monkeypatch):
-    """`unittest.mock.patch.dict` would put all of `sys.modules` back, without it."""
+    """`unittest.mock.patch.dict` would restore `sys.modules` and so drop the new module."""
     name = "foamfit_imported_in_the_meantime"
     monkeypatch.delitem(sys.modules, name, raising=False)
     script = sys.modules["__main__"]
@@ -339,7 +339,7 @@ def test_one_process_that_ends_takes_nothing_else_with_it(tmp_path, monkeypatch)
 
 
 def shown(out):
-    """Tests and their states, as the page of a batch has them."""
+    """Return the tests and their states from the page of a batch."""
     page = (Path(out) / "summary.html").read_text(encoding="utf-8")
     return re.findall(r'<tr><td><span[^>]*>(\w+)<.*?<span class="badge [^"]*">([^<]*)<', page)
 
@@ -357,7 +357,7 @@ def test_ctrl_c_and_sigterm_leave_what_is_done_and_a_summary(here, tried, end):
 
 
 def test_what_is_killed_leaves_a_page_as_current_as_the_table(here, tried, monkeypatch):
-    """Nothing is written after the last test: what kills a process lets it do nothing more."""
+    """A killed process cannot write anything afterwards, so the page must already be current."""
     monkeypatch.setattr(module, "PAUSE", 0.0)
     monkeypatch.setattr(module, "SHARE", 0.0)
     seen = list[tuple[list[tuple[str, str]], list[str]]]()
@@ -375,7 +375,7 @@ def test_what_is_killed_leaves_a_page_as_current_as_the_table(here, tried, monke
 
 
 def test_the_pages_of_a_long_batch_take_a_fiftieth_of_its_time(here, tried, monkeypatch):
-    """A page takes longer with every test: the next one waits the longer."""
+    """Each page takes longer than the one before, so the interval between pages grows."""
     clock, saved = [0.0], list[float]()
 
     def save(made, *, whole=False):
@@ -391,7 +391,7 @@ def test_the_pages_of_a_long_batch_take_a_fiftieth_of_its_time(here, tried, monk
     for number in range(20):
         shutil.copy(here / "tests/c.csv", here / f"tests/t{number:02d}.csv")
     again(progress=second)
-    assert saved == [5.0, 25.0]  # after the pause, and at the end
+    assert saved == [5.0, 25.0]  # s: after the interval, and at the end
 
 
 def test_ctrl_c_leaves_what_is_done_and_a_summary(here, monkeypatch):
@@ -453,7 +453,7 @@ def test_memory_errors_and_other_versions_are_not_the_fault_of_a_test(here, monk
         "summary.csv",
         "summary.html",
         "summary.tex",
-    ]  # so that it is tried again
+    ]  # no result of the test, so the next call retries it
 
 
 @pytest.mark.parametrize(
@@ -472,7 +472,7 @@ def test_memory_errors_and_other_versions_are_not_the_fault_of_a_test(here, monk
     ],
 )
 def test_a_wrong_call_is_one_sentence_and_nothing_is_written(here, monkeypatch, words, told):
-    # Else what is not in the cache yet is announced before the refusal.
+    # Otherwise the announcement of a compilation could come before the refusal.
     monkeypatch.setattr(module.cache, "compiled", lambda *_: True)
     before = sorted(here.rglob("*"))
     result = run("batch", *words)
@@ -496,7 +496,7 @@ def test_a_folder_with_files_of_others_is_refused(here, tried, place):
 
 
 def alive(process):
-    """Whether a process runs; one that has ended may be a zombie, if nobody waits for it."""
+    """Return whether a process runs; an ended process that nobody waits for is a zombie."""
     import psutil
 
     try:
@@ -507,7 +507,7 @@ def alive(process):
 
 @posix
 def test_killed_and_called_again_nothing_is_lost_or_done_twice(here, tried, monkeypatch):
-    """The process of the command is killed: the others end, and the next call goes on."""
+    """Kill the process of the command: its workers end, and the next call resumes."""
     import psutil
 
     words = ["batch", "tests", "--specimen", "foam.toml", "--starts", "2", "--jobs", "2"]
@@ -521,7 +521,7 @@ def test_killed_and_called_again_nothing_is_lost_or_done_twice(here, tried, monk
     done = stamps("out")
     assert len(done) < 4
     assert len(others) >= 3
-    # What a process left stays until the system forgets the process, which takes a moment.
+    # The traces of a process remain until the system has removed it, which takes a moment.
     psutil.wait_procs(others, timeout=20)
     assert not any(map(alive, others))
     done = stamps("out")
@@ -554,10 +554,10 @@ def test_the_command_prints_counts_parameters_and_refusals(here, tried, monkeypa
 
 
 class Local(Inline):
-    """In place of the processes."""
+    """Executor that works in this process."""
 
     def stop(self):
-        """Nothing to end."""
+        """Do nothing: there is no process to stop."""
 
 
 def test_progress_says_done_wrong_left_and_how_long(here, monkeypatch):
@@ -573,7 +573,7 @@ def test_progress_says_done_wrong_left_and_how_long(here, monkeypatch):
 
     monkeypatch.setattr(module, "run", fitted)
     run("batch", "tests", "--json")
-    # What an earlier call has done does not count for the time left.
+    # Tests finished by an earlier call do not enter the estimate of the time left.
     assert shown == [
         (0.25, "4 done, 1 without a fit, 6 left"),
         (1.0, "10 done, 1 without a fit, 0 left"),
@@ -601,7 +601,7 @@ def test_a_scheduler_that_does_not_answer_is_one_sentence(here, monkeypatch):
 
 @posix
 def test_a_dask_cluster_loses_a_worker_and_no_test(here):
-    """Two workers, which read nothing of this file system; one is killed in the middle."""
+    """Two workers without access to this file system; one is killed during the batch."""
     distributed = pytest.importorskip("distributed")
     (here / "tests/bad.csv").unlink()
     (here / "elsewhere").mkdir()
@@ -644,7 +644,7 @@ def test_one_fit_compiles_what_all_need_before_the_others_start(here, monkeypatc
             return super().submit(fn, task)
 
         def stop(self):
-            """Nothing to end."""
+            """Do nothing: there is no process to stop."""
 
     def fit(test, **options):
         second.wait(60.0 if module.cache.compiled("integrate_with_memory") else 0.02)
@@ -739,7 +739,7 @@ def test_models_with_other_parameters_leave_cells_empty():
 
 
 def test_the_page_of_a_batch_shows_the_range_that_a_state_goes_by(tmp_path: Path) -> None:
-    """A parameter is not determined by its range, however narrow its interval is."""
+    """A wide range makes a parameter undetermined, however narrow its interval is."""
     cell = fabricated.estimate(
         "s1_kc", 2e5, stderr=1e3, ci95=(1.98e5, 2.02e5), state="not determined", range=(4e4, 7.1e5)
     )

@@ -1,4 +1,4 @@
-"""The cycles of a record, each on its own, and their folder."""
+"""Separate fits of the cycles of a record, and the folder of their results."""
 
 import csv
 import json
@@ -63,7 +63,7 @@ def test_ctrl_c_keeps_what_was_found(record, monkeypatch, at):
 
     def fit(*words, **options):
         tried.append(1)
-        if at == "fit" and len(tried) == 2:  # as a fit says it that has been interrupted
+        if at == "fit" and len(tried) == 2:  # like an interrupted fit
             return replace(real(*words, **options), stopped="Ctrl-C")
         if at == "reading" and len(tried) == 2:
             raise KeyboardInterrupt
@@ -84,7 +84,7 @@ def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path,
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
     monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
     folder = tmp_path / "out"
-    found.results[1].save(folder)  # of a fit of one cycle
+    found.results[1].save(folder)  # folder of a fit of one cycle
     found.save(folder)
     names = {path.name for path in folder.iterdir()}
     assert names == {
@@ -123,7 +123,7 @@ def test_the_picture_has_a_panel_for_each_parameter_and_a_row_for_each_cycle(fou
     key = [text.get_text() for text in loops.get_legend().get_texts()]
     assert key == ["cycle 1", "cycle 2", "cycle 3"]
     ends = [line.get_xdata()[-1] for line in loops.lines if line.get_label().startswith("cycle")]
-    assert ends == sorted(ends)  # each starts where the one before left it
+    assert ends == sorted(ends)  # each cycle starts where the previous one ended
     titles = [ax.get_title().replace("\n", " ") for ax in panels]
     assert titles[:3] == ["start strain (%)", "dissipated (kJ/m³)", "misfit of the loop (%)"]
     assert [text.get_text() for text in panels[0].get_yticklabels()] == key

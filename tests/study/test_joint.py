@@ -1,4 +1,4 @@
-"""Several tests in one fit, from files and STUDY.toml as a user has them."""
+"""Joint fits of several tests, from files and a STUDY.toml as a user writes them."""
 
 import importlib
 import json
@@ -26,7 +26,7 @@ from foamfit.study.identified import read_source
 from foamfit.study.joint_fit import open_slope
 from foamfit.study.joint_result import parameter_of
 
-joint_module = importlib.import_module("foamfit.study.joint")  # `foamfit.study` has its function
+joint_module = importlib.import_module("foamfit.study.joint")  # the attribute is the function
 HEIGHT, AREA, TOP = 10e-3, 1e-4, 0.5
 SPRING = {
     "k0": 5.5e5, "kc": 4e5, "eps_star": 0.3, "sigma_plus": 1.1e5, "spread_plus": 0.4,
@@ -36,7 +36,7 @@ NOISE = 400.0
 
 
 def write_test(folder: Path, name: str, *, rate=0.1, seed=0, noise=NOISE, samples=101, **changes):
-    """The CSV of a slow loop on a microscale spring, at a strain rate."""
+    """Write the CSV of a slow loop of a microscale spring at a constant strain rate."""
     spring = ff.MicroscaleSpring(**{**SPRING, **changes})
     up = np.linspace(0.0, TOP, samples // 2 + 1)
     strain = np.concatenate([up, up[::-1][1:]])
@@ -63,7 +63,7 @@ RATES = (0.01, 0.1, 1.0)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Three tests over two decades of rate; a file that is none; kc differs between them."""
+    """Three tests over two decades of rate with different kc, and a file that is not a test."""
     here = tmp_path_factory.mktemp("family")
     for i, (rate, kc) in enumerate(zip(RATES, (3.6e5, 4e5, 4.5e5), strict=True)):
         slow = 1.0 + 0.04 * np.log(rate / 0.1)
@@ -88,7 +88,7 @@ def test_kinds_are_what_the_study_says(found):
         "s1_sigma_plus": "log rate", "s1_spread_plus": "shared", "s1_sigma_minus": "own",
         "s1_spread_minus": "shared", "s1_eta": "fixed", "site_eta": "fixed",
     }  # fmt: skip
-    assert found.status == "warnings"  # of the file that is none
+    assert found.status == "warnings"  # about the file that is not a test
     assert list(found.refused) == [str(f) for f in found.refused if f.endswith("t9.csv")]
     assert found.rates == pytest.approx(RATES)
     assert found.rate0 == pytest.approx(0.1)
@@ -108,7 +108,7 @@ def test_values_are_found_with_their_intervals(found):
 
 
 def coarse(figure, place, *_):
-    """What a page shows of a picture, at a fifth of the resolution."""
+    """Render a figure of the page at a fifth of the resolution, to save time."""
     return joint_report.figures.image(figure, "png", 36)
 
 
@@ -184,7 +184,7 @@ def test_joint_json_tells_the_noise_by_which_each_test_is_weighted(found, tmp_pa
         single = json.loads((tmp_path / "out" / name / "fit.json").read_text())
         assert level.keys() == single["noise"][curve].keys()
         assert level["range"] == single["noise"][curve]["range"]
-    # so that a prediction takes off the noise of each fitted test what its law missed
+    # a prediction subtracts this noise from the misfit of each fitted test
     wanted = [NOISE / one["noise"]["stress_strain"]["range"] for one in content["tests"].values()]
     source = read_source(tmp_path / "out")
     assert [one.noise for one in source.misses["stress"]] == pytest.approx(wanted)
@@ -206,7 +206,7 @@ def test_what_noise_alone_is_left_of_has_no_range(found):
 
 @pytest.fixture(scope="module")
 def unlike(tmp_path_factory):
-    """Five specimens that differ in k0 by 5 %, and a study that says they do not."""
+    """Five specimens whose k0 scatters by 5 %, and a study that takes k0 as shared."""
     here, deviates = tmp_path_factory.mktemp("unlike"), np.array([-1.2, -0.6, 0.1, 0.4, 1.3])
     for i, z in enumerate(deviates):
         write_test(here, f"t{i}", seed=i, noise=0.1 * NOISE, k0=5.5e5 * (1.0 + 0.05 * z))
@@ -221,7 +221,7 @@ def test_the_range_of_a_shared_value_holds_that_of_a_mean_over_other_specimens(u
     assert 0.5 * (high - low) == pytest.approx(stats.t.ppf(0.975, 4) * error, rel=0.3)
     assert low < 5.5e5 < high
     assert k0.range[0] <= low < high <= k0.range[1]
-    assert high - low > 5.0 * (k0.ci95[1] - k0.ci95[0])  # noise says nothing of specimens
+    assert high - low > 5.0 * (k0.ci95[1] - k0.ci95[0])  # the interval covers noise only
     assert "its range is ±" in k0.why
     content = json.loads(json.dumps(joint.to_json_dict()))
     assert content["parameters"]["s1_k0"]["range"] == list(k0.range)
@@ -264,7 +264,7 @@ def test_evidence_chooses_a_kind(folder):
 
 
 def test_a_law_of_rate_is_no_kind_where_the_rates_span_too_little(tmp_path):
-    """Repeats at one rate, as a machine makes them: 2 to 3 % about it, and specimens scatter."""
+    """Repeats at a nominal rate, which a machine meets within 2 to 3 %; the specimens scatter."""
     rates = (0.0985, 0.0992, 0.1, 0.101, 0.1016)
     for i, (rate, k0) in enumerate(zip(rates, (5.1e5, 5.6e5, 5.4e5, 5.8e5, 5.9e5), strict=True)):
         write_test(tmp_path, f"t{i}", rate=rate, seed=i, k0=k0)
@@ -287,7 +287,7 @@ def test_a_law_of_rate_is_no_kind_where_the_rates_span_too_little(tmp_path):
         (np.log([0.1, 0.3, 1.0, 3.0]), (0.0, 0.05)),  # a span of rates
         (np.log([0.1, 0.101, 0.102, 0.103]), (1.0, 10.0)),  # repeats
         (np.zeros(4), (np.inf, np.inf)),
-        (np.array([0.0, 1.0]), (np.inf, np.inf)),  # no scatter about a line through two
+        (np.array([0.0, 1.0]), (np.inf, np.inf)),  # two points lie on a line: no scatter
     ],
 )
 def test_how_open_a_slope_is_says_the_scatter_of_the_tests_about_it(x, half):
@@ -302,7 +302,7 @@ def test_how_open_a_slope_is_says_the_scatter_of_the_tests_about_it(x, half):
 
 
 def test_a_kind_that_no_test_can_be_simulated_with_is_not_chosen(folder, monkeypatch):
-    """The values in common of a law may be no admissible spring, as they are relative to others."""
+    """Common values of a law may form an inadmissible spring: limits depend on other parameters."""
     real = joint_fit.fit_linked
 
     def fit_linked(problems, links, starts, **options):
@@ -317,7 +317,7 @@ def test_a_kind_that_no_test_can_be_simulated_with_is_not_chosen(folder, monkeyp
 
 
 def test_what_goes_to_other_processes_gives_the_same_numbers(folder, found, monkeypatch):
-    """What is sent to a process and back is what `pickle` makes of it."""
+    """Arguments and results pass through `pickle` on their way to and from a process."""
     sent = []
 
     @contextmanager
@@ -392,7 +392,7 @@ def test_drives_and_noise_mix(tmp_path):
     ]  # fmt: skip
     assert result.parameters["s1_eta"].value == pytest.approx(300.0, rel=0.2)
     assert result.fit.found.value("s1_eta")[1] == 0.0  # it does not vary in the slow loop
-    # Beside the springs': contact and zero of the impact, and the zero of the slow motion.
+    # Besides the spring's: contact time and zero of the impact, and the zero of the slow motion.
     assert result.fit.found.n_vary == 8 + 3
     assert result.parameters["s1_k0"].value == pytest.approx(5.5e6, rel=0.03)
 
@@ -471,7 +471,7 @@ def test_a_study_is_read_once(folder, tmp_path, monkeypatch):
 
 
 def test_what_the_folders_need_is_imported_beside_the_fit(folder, tmp_path, monkeypatch):
-    """Where other processes draw them: not for one job, and not without reports."""
+    """Preload only where other processes draw reports: not for one job or without reports."""
     begun = list[tuple[str, ...]]()
     monkeypatch.setattr("foamfit.study.processes.prepare", begun.append)
     monkeypatch.setattr(joint_module, "_read", lambda *_: (_ for _ in ()).throw(ff.InputError("x")))
@@ -531,7 +531,7 @@ def test_a_common_value_that_is_open_by_any_orders_of_magnitude_is_not_determine
 
 
 def test_a_test_that_says_nothing_of_a_parameter_has_no_part_in_its_scatter(tmp_path, monkeypatch):
-    """It does not bend to where kc shows; its logarithm would count with errors of thousands."""
+    """Log kc of a test too weak to determine kc would have a standard error in the thousands."""
     for i, kc in enumerate((3.6e5, 4e5, 4.5e5)):
         write_test(tmp_path, f"t{i}", seed=i, kc=kc)
     study = write_study(tmp_path, 's1_k0 = "shared"\ns1_kc = "scatter"' + SHARED)
@@ -571,4 +571,4 @@ def test_a_report_that_fails_leaves_the_numbers(found, tmp_path, monkeypatch):
     monkeypatch.undo()
     without_pictures(monkeypatch)
     monkeypatch.setattr(joint_report.figures, "write_both", few_bytes)
-    found.save(tmp_path / "out", jobs=1)  # and may be replaced
+    found.save(tmp_path / "out", jobs=1)  # and may be overwritten

@@ -1,7 +1,7 @@
-"""What a record does not say exactly, beyond one fit: several tests, predictions, intervals.
+"""Parameters of the record (contact, zeros, velocity) in joint fits, predictions and intervals.
 
-The impacts are synthetic, as rigs write them: `experiments/recovery/rig.py`, which shares nothing
-with foamfit. Each has its own clock, zeros and striker.
+The impacts are synthetic records of a rig (`experiments/recovery/rig.py`, which shares no code
+with foamfit). Each has its own clock, zeros and striker.
 """
 
 import json
@@ -27,7 +27,7 @@ import rig
 SPRING = tuple(f"s1_{name}" for name in (
     "k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta",
 ))  # fmt: skip
-# From before the contact; from the contact on; with a velocity ± 1 %; the force alone.
+# Recorded from before contact; from contact on; with a velocity ± 1 %; force only.
 SETUPS = (
     rig.Impact(before=0.4, samples=250),
     rig.Impact(trimmed=True, samples=250),
@@ -38,7 +38,7 @@ FASTER = (1.0, 0.9, 1.1, 1.05)
 
 
 def write_impacts(folder: Path, seed: int, setups=SETUPS) -> list[rig.Record]:
-    """Write impacts t0, t1, … of one spring, by strikers of different velocities."""
+    """Write impacts t0, t1, … on one spring by strikers of different velocities."""
     drawn = rig.drawn_impact(setups[0], np.random.default_rng([seed, 1])).rig
     records = []
     with pytest.MonkeyPatch.context() as patch:
@@ -74,18 +74,18 @@ def test_each_test_has_its_own_contact_zero_and_striker(together):
     content = json.loads(json.dumps(found.to_json_dict(), allow_nan=False))["parameters"]
     assert list(content)[-len(set(content) & set(NUISANCE)) :] == [
         name for name in NUISANCE if name in content
-    ]  # behind those of the springs
+    ]  # after the parameters of the springs
     assert content.keys() & NUISANCE.keys() == {
         "contact_time", "displacement_zero", "stress_zero", "velocity",
     }  # fmt: skip
     tests = {name: set(content[name]["tests"]) for name in content if name in NUISANCE}
     assert tests["contact_time"] == {"t0", "t1", "t2", "t3"}
-    assert tests["displacement_zero"] == {"t0", "t1", "t2"}  # t3 has a force alone
+    assert tests["displacement_zero"] == {"t0", "t1", "t2"}  # t3 records force only
     assert tests["velocity"] == {"t2"}
     for name in ("contact_time", "displacement_zero", "velocity"):
         assert content[name]["kind"] == "own"
         for test, one in content[name]["tests"].items():
-            truth = records[int(test[1:])].truth[name]  # as the file counts it
+            truth = records[int(test[1:])].truth[name]  # in the clock and zeros of the file
             assert abs(one["value"] - truth) < 4.0 * one["stderr"]
             assert one["ci95"][0] < one["value"] < one["ci95"][1]
 
@@ -105,7 +105,7 @@ def test_the_folder_of_each_test_has_its_own_numbers(together, tmp_path, monkeyp
 
 
 def test_intervals_of_shared_values_hold_the_truth(together, tmp_path):
-    """Over 20 draws 93 % do (147 of 158). Of the 16 of two draws one may fail to."""
+    """Over 20 draws, 93 % do (147 of 158). Of the 16 intervals here, one may miss."""
     inside, off = [], []
     for records, found in (together[1:], fit_together(tmp_path, 1)):
         for name in SPRING:
@@ -125,7 +125,8 @@ def test_a_value_that_the_study_holds_is_that_of_each_file(together):
     found = ff.joint(study, jobs=1)
     held = found.parameters["stress_zero"]
     assert (held.kind, held.value) == ("fixed", 0.0)
-    assert found.estimates(0)["stress_zero"].value == 0.0  # though rows before contact show another
+    # Rows before contact show another value.
+    assert found.estimates(0)["stress_zero"].value == 0.0
     assert found.problems[0].measurement.origins["stress_zero"] != 0.0
 
 
@@ -156,7 +157,7 @@ def test_nothing_of_a_record_is_carried_to_another(together, fitted):
     source = read_source(fitted)
     assert not {*source.parameters, *source.names} & NUISANCE.keys()
     assert set(source.names) == set(fitted.correlation.names) - NUISANCE.keys()
-    # one impact written in two ways is predicted alike
+    # the same impact written in two ways gets the same prediction
     folder, records, _ = together
     other = folder / "other"
     other.mkdir()
@@ -168,7 +169,7 @@ def test_nothing_of_a_record_is_carried_to_another(together, fitted):
 
 
 def write_slow(folder: Path, seeds, law="microscale", rows=400):
-    """Slow tests of one spring whose displacement has noise of 0.3 % of its range."""
+    """Write slow tests of one spring; the displacement has noise of 0.3 % of its range."""
     setup = rig.Slow(law=law, rows=rows)
     course = rig.drawn_slow(setup, np.random.default_rng([seeds[0], 1]))
     with pytest.MonkeyPatch.context() as patch:
@@ -177,7 +178,7 @@ def write_slow(folder: Path, seeds, law="microscale", rows=400):
 
 
 def test_the_band_holds_what_a_noisy_motion_leaves_uncertain(tmp_path):
-    """Over 20 springs, each predicted from one fit, 94 to 96 % of the samples lie inside."""
+    """Over 20 springs, each predicted from one fit, the band contains 94 to 96 % of the samples."""
     first, *others = write_slow(tmp_path, range(10, 15))
     result = ff.fit(ff.read_test(first), model="microscale", starts=2, intervals="local")
     made = [ff.predict(result, path, draws=60) for path in others]
@@ -201,7 +202,7 @@ def test_a_joint_fit_weighs_each_driving_motion(tmp_path, monkeypatch):
     found = ff.joint(tmp_path / "study.toml", jobs=1)
     whole = [problem.objective.weighing for problem in found.problems]
     assert all(one is not None for one in whole)
-    # What is shared costs no more than noise: both are counted with the same weights.
+    # Sharing values raises chi-square by no more than noise does, as both use the same weights.
     statistics = found.statistics
     assert 0.0 < statistics["chisqr"] - statistics["chisqr_alone"] < 40.0
     held = found.problems[0].holding("s1_k0", 1.0)
@@ -239,7 +240,7 @@ def test_a_batch_fixes_and_varies_what_a_record_does_not_say(together, tmp_path)
     assert frame.loc["t2", ["stress_zero", "stress_zero_state"]].tolist() == [0.0, "fixed"]
     assert np.all(frame["contact_time_stderr"] > 0.0)
     places = [frame.columns.get_loc(name) for name in ("s1_eta", "displacement_zero", "velocity")]
-    assert places == sorted(places)  # behind the springs', in one order
+    assert places == sorted(places)  # after those of the springs, in a fixed order
     with pytest.raises(ff.InputError, match=r"its parameters are s1_k0, .*, contact_time, "):
         ff.batch(folder, out=tmp_path / "no", fix={"contact": 0.0}, **quick)
     with pytest.raises(ff.InputError, match="'stress_zero' is not one of the model"):
@@ -261,7 +262,7 @@ def test_a_fit_of_a_record_from_before_contact_is_drawn_on_the_page(fitted):
 
     told = {name: one.value for name, one in fitted.parameters.items()}
     turning = Turning(fitted.measurement, "bistable", told)
-    assert not {row.name for row in turning.rows} & NUISANCE.keys()  # they are not turned by hand
+    assert not {row.name for row in turning.rows} & NUISANCE.keys()  # without controls on the page
     drawn = turning.turn({})
     _, stress = drawn.curves["stress_time"]
     np.testing.assert_allclose(stress, fitted.curves.stress, atol=1e-6 * np.ptp(stress))
@@ -284,7 +285,7 @@ def test_richer_models_start_from_the_contact_that_simpler_ones_found(fitted):
 
 
 def write_two_clocks(folder: Path, seed: int, late: float) -> dict[str, float]:
-    """A force at 1 MHz and a camera at 50 kHz, whose clock is `late` by so many seconds."""
+    """Write a force at 1 MHz and a camera at 50 kHz whose clock lags by `late` seconds."""
     setup = rig.Impact(samples=250)
     made = rig.drawn_impact(setup, np.random.default_rng([3, 1])).rig
     course = made.run(0.0, 100.0 * made.heights[0] / made.velocity)
@@ -316,9 +317,9 @@ def test_a_delay_with_a_spread_is_fitted_as_a_time_shift(tmp_path):
     assert "time_shift" in ff.make_params(test)
     result = ff.fit(test, starts=2, intervals="local")
     shift = result.parameters["time_shift"]
-    # time of the force = time of the motion + 30 µs, so that the motion is that much early
+    # time of the force = time of the motion + 30 µs, so the motion is 30 µs early
     assert abs(shift.value + 30e-6) < 2.0 * shift.stderr
-    assert shift.stderr < 10e-6  # far less than what was known of it
+    assert shift.stderr < 10e-6  # far below the standard deviation of the prior
     for name, value in truth.items():
         one = result.parameters[name]
         assert abs(one.value - value) < 3.0 * one.stderr

@@ -1,4 +1,4 @@
-"""The prediction of a test that was not fitted: its curve, its band, and what is refused."""
+"""Prediction of an unseen test: its curve, its band, and the refusals."""
 
 import copy
 import csv
@@ -32,7 +32,7 @@ DRAWS = 60
 
 
 def loop(rate=0.25, seed=None, height=HEIGHT, noise=SIGMA, most=0.5, **changes) -> Measurement:
-    """A triangle to a strain of `most` on a microscale spring, with the noise of a seed."""
+    """Return a triangular loop to a strain of `most` on a microscale spring, with seeded noise."""
     time = np.linspace(0.0, 1.0 / rate, 301)
     strain = 2.0 * most * (0.5 - np.abs(0.5 - rate * time))
     values = LAW | {f"s1_{name}": value for name, value in changes.items()}
@@ -47,7 +47,7 @@ def loop(rate=0.25, seed=None, height=HEIGHT, noise=SIGMA, most=0.5, **changes) 
 
 
 def fit_content(**changes) -> dict:
-    """What fit.json holds of a test at 0.25 1/s that nothing is uncertain of but sigma_plus."""
+    """Return fit.json of a test at 0.25 1/s in which only sigma_plus is uncertain."""
     parameters = {
         name: {"value": value, "stderr": None, "ci95": None, "vary": False, "state": "fixed"}
         for name, value in LAW.items()
@@ -62,7 +62,7 @@ def fit_content(**changes) -> dict:
 
 
 def joint_content(parameters: dict, rates=(0.2, 0.3), misfit=None) -> dict:
-    """What joint.json holds of tests in which all but `parameters` are held."""
+    """Return joint.json of tests in which all but `parameters` are fixed."""
     held = {name: {"kind": "fixed", "value": value} for name, value in LAW.items()}
     tests = {f"t{i}": {"rate": rate, "misfit": misfit or {}} for i, rate in enumerate(rates)}
     return {
@@ -114,7 +114,7 @@ def test_the_band_of_the_parameters_is_that_of_linearised_errors(fitted):
 
 
 def test_what_is_not_determined_leaves_the_band_as_wide_as_the_noise_does():
-    """Of the fitted samples the variance is σ²k/n, whatever directions of k parameters are open."""
+    """The mean variance at the fitted samples is σ²k/n, even if some directions are open."""
     short = loop(seed=99, most=0.1)
     result = ff.fit(short, model="microscale", starts=3, intervals="local")
     assert result.parameters["s1_kc"].state == "not determined"
@@ -125,7 +125,10 @@ def test_what_is_not_determined_leaves_the_band_as_wide_as_the_noise_does():
 
 
 def shares_of_new_specimens(make, spread=0.25, groups=20, tests=8):
-    """Share inside of a new specimen of each of some groups, sigma_plus log-normal."""
+    """Return the mean share of samples in the band, for a new specimen of each of several groups.
+
+    sigma_plus is log-normal.
+    """
     rng, shares = np.random.default_rng(5), []
     for group in range(groups):
         logs = np.log(1.1e5) + spread * rng.standard_normal(tests + 1)
@@ -221,7 +224,7 @@ def test_what_own_parameters_share_from_test_to_test_widens_the_band_together():
 
 
 def scattering(n=5, **more):
-    """joint.json of n specimens in which k0 and sigma_plus scatter by 20 % each."""
+    """Return joint.json of n specimens in which k0 and sigma_plus scatter by 20 % each."""
     logs = 0.2 * np.array([-1.0, -0.5, 0.0, 0.5, 1.0][:n])
     made = {
         name: {
@@ -332,18 +335,18 @@ def test_draws_that_are_not_admissible_are_drawn_again_and_counted():
     content["parameters"]["s1_kc"]["value"] = 1.036 * LAW["s1_k0"]
     found = ff.predict(InMemory(content), loop(seed=0, eps_star=0.01), draws=DRAWS)
     assert found.draws == DRAWS
-    assert 0.4 * DRAWS < found.redrawn < 1.6 * DRAWS  # about every second one
-    assert found.parameters["s1_eps_star"].lo >= 0.008  # else branch c would lie before branch a
+    assert 0.4 * DRAWS < found.redrawn < 1.6 * DRAWS  # about one draw in two
+    assert found.parameters["s1_eps_star"].lo >= 0.008  # below, branch c would precede branch a
     assert found.to_json_dict()["redrawn"] == found.redrawn
 
 
 def test_draws_lie_within_the_limits_of_a_fit_of_the_test():
-    values = np.array([1e4, 1e5, 1e6])  # of three tests: Student's t reaches from 1e-30 to 1e30
+    values = np.array([1e4, 1e5, 1e6])  # Student's t of three tests reaches from 1e-30 to 1e30
     found = ff.predict(own(values), loop(seed=0), draws=DRAWS)
     limits = ff.make_params(loop(seed=0), "microscale")["s1_sigma_plus"]
     drawn = found.parameters["s1_sigma_plus"]
     assert limits.min <= drawn.lo < drawn.hi <= limits.max
-    assert found.redrawn == 0  # what lies beyond a limit is moved there
+    assert found.redrawn == 0  # draws beyond a limit are moved to it
 
 
 def test_draws_that_are_never_admissible_are_refused():
@@ -532,7 +535,7 @@ def test_file_and_memory_give_the_same_numbers(tmp_path, fitted):
 
 @pytest.fixture(scope="module")
 def joint(tmp_path_factory):
-    """Four tests fitted together: one parameter scatters, one follows a rate law, one is own."""
+    """Four tests fitted jointly: one parameter scatters, one follows a rate law, one is own."""
     here = tmp_path_factory.mktemp("family")
     for i, rate in enumerate((0.01, 0.03, 0.3, 1.0)):
         test = loop(rate=rate, seed=i, sigma_plus=1.1e5 * (rate / 0.1) ** 0.05, kc=4e5 + 2e4 * i)
@@ -570,7 +573,7 @@ def test_a_joint_fit_predicts_a_rate_between_its_own(tmp_path, joint):
 
 @pytest.fixture
 def record(tmp_path) -> Path:
-    """A test in a file, as an instrument would write it, and its TOML."""
+    """Write a test as an instrument would, and its TOML; return the path of the test."""
     test = loop(seed=4)
     path = tmp_path / "other.csv"
     lines = ["time (s),stress (Pa),displacement (m)"]

@@ -1,4 +1,4 @@
-"""What the fits of several tests one by one come to."""
+"""Shared values from separate fits of several tests."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Files, folders and globs become named tests."""
+"""Naming of tests given as files, folders and globs."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from foamfit.study.test_files import find_tests
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """Tests of two days, what lies beside them, and a result."""
+    """Tests of two days, other files in their folders, and a result."""
     monkeypatch.chdir(tmp_path)
     files = (
         "monday/a.csv monday/a.toml monday/b.txt monday/specimens.csv monday/picture.png "
@@ -43,7 +43,7 @@ def test_a_folder_gives_its_tables_but_no_list_of_specimens_and_no_result(here):
 def test_tables_of_figures_are_no_tests(here, mark, table):
     (here / "out").mkdir()
     (here / "out" / table).write_text("x")
-    assert names("out") == [table.removesuffix(".csv")]  # someone's own
+    assert names("out") == [table.removesuffix(".csv")]  # a user's own table of this name
     (here / "out" / mark).write_text("{}")
     with pytest.raises(InputError, match="out: the folder has no test"):
         find_tests("out")
