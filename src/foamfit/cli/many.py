@@ -53,8 +53,9 @@ def batch(
     output: Output,
     **asked: Any,
 ) -> int:
-    """Fit every test on its own: a result folder for each, summary.csv and summary.html.
+    """Fit every test on its own, in parallel.
 
+    Writes a result folder for each test, summary.csv and summary.html.
     A test that cannot be read or fitted is a row of the summary that says why. Called again, the
     command fits only tests that are missing or whose data, TOML, settings, figure width or version
     have changed. Finished tests are kept, however the command ends.
@@ -149,8 +150,9 @@ def _cluster(address: str) -> Iterator[Executor]:
 )
 @options.output("fits/<STUDY>", "joint.json")
 def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> int:
-    """Fit the tests of STUDY.toml together: shared, own, scattering, rate-dependent parameters.
+    """Fit the tests of STUDY.toml together.
 
+    Parameters are shared, own (one per test), scattering or rate-dependent.
     Writes joint.json, joint.html, figures, table.tex and a result folder for each test. Exit codes
     are those of foamfit fit. A test that cannot be read is omitted with a warning.
 

@@ -32,7 +32,9 @@ def compare(
     plot: Path | None,
     figure_width: str,
 ) -> None:
-    """Compare results with published parameters, or with the first of the results.
+    """Compare results with published parameters or each other.
+
+    Without a published set they are compared with the first result.
 
     \b
     Examples:
@@ -95,12 +97,12 @@ def predict(
     output: Output,
     **asked: Any,
 ) -> None:
-    """Predict TEST.csv from RESULT: the folder of a fit or of a joint fit, or its JSON.
+    """Predict an unseen test from the result of a fit.
 
-    TEST.csv was not fitted: its specimen, striker and motion are simulated with the parameters of
-    the result. The folder contains prediction.json, prediction.csv (per sample) and figures: the
-    curve with its 95 % band, and the parts of the band: parameters, scatter between specimens,
-    noise, and the error of the law in the fitted tests.
+    RESULT is the folder of a fit or joint fit, or its JSON. The specimen, striker and motion of
+    TEST.csv are simulated with the parameters of RESULT. The folder contains prediction.json,
+    prediction.csv (per sample) and figures: the curve with its 95 % band, and the parts of the
+    band: parameters, scatter between specimens, noise, and the error of the law in the fitted tests.
 
     \b
     Examples:
@@ -152,8 +154,9 @@ def predict(
     options.FILE,
 )
 def card(result: Path, format: str, units: str, rates: str | None, out: Path | None) -> None:
-    """Write a material card of the law in RESULT: the folder of a fit or of a joint fit.
+    """Write a material card for finite elements.
 
+    RESULT is the folder of a fit or joint fit.
     FILE.json (parameters, curves in SI units, misfit of fit and card), FILE.png and FILE.pdf
     (measured, fitted, card) are written next to FILE. A rate outside the fitted rates gets the
     curve of the nearest fitted rate, with a warning; beyond the measured strain the law

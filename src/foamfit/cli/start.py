@@ -16,7 +16,9 @@ from foamfit.terminal import say
 @options.TEST
 @options.SPECIMEN
 def check(test: Path, specimen: Path | None) -> None:
-    """Print how TEST.csv is understood: columns, units, contact, specimen, energy audit.
+    """Print how TEST.csv is understood, and its energy audit.
+
+    Shows columns, units, contact, specimen and the rows that are not used.
 
     \b
     Example:
@@ -33,8 +35,9 @@ def check(test: Path, specimen: Path | None) -> None:
 @main.command()
 @options.TEST
 def init(test: Path) -> None:
-    """Write TEST.toml next to TEST.csv: what the headers say, and questions for the rest.
+    """Write a TOML for TEST.csv, with questions to answer.
 
+    TEST.toml contains what the headers of TEST.csv say, and questions for the rest.
     Each question is a line after "# " with a unit and an example: enter your value and remove the
     "# ". An existing TOML is not changed.
 
@@ -71,7 +74,7 @@ def init(test: Path) -> None:
 def simulate(
     scene: Path, out: Path | None, plot: Path | None, figure_width: str, rtol: float
 ) -> None:
-    """Simulate a chain under a drive and write the response as CSV.
+    """Simulate a chain and write the response as CSV.
 
     \b
     SCENE.toml, for example:
@@ -122,7 +125,7 @@ def simulate(
 @options.option("--port", "Port of 127.0.0.1. Default: a free one.", click.IntRange(1, 65535))
 @options.option("--no-browser", "Print the address only; open no browser.")
 def page(test: Path | None, port: int | None, no_browser: bool) -> None:
-    """Check and fit TEST.csv, and vary its parameters by hand, in a browser.
+    """Check, fit and explore TEST.csv in a browser.
 
     The page is served on this machine only (127.0.0.1). The first line of stdout is its address,
     which contains a random access token. Ctrl-C ends the server.
