@@ -102,7 +102,7 @@ def predict(
     RESULT is the folder of a fit or joint fit, or its JSON. The specimen, striker and motion of
     TEST.csv are simulated with the parameters of RESULT. The folder contains prediction.json,
     prediction.csv (per sample) and figures: the curve with its 95 % band, and the parts of the
-    band: parameters, scatter between specimens, noise, and the error of the law in the fitted tests.
+    band: parameters, scatter between specimens, noise and the error of the law in fitted tests.
 
     \b
     Examples:
