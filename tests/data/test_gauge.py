@@ -190,6 +190,14 @@ def test_a_smooth_turn_is_no_standstill(samples, digit, every):
 # --------------------------------------------------------------------------------------- in figures
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+def test_a_gauge_that_slips_after_a_hold_at_constant_stress_has_not_stood_still(noise):
+    """A sticking gauge hides a motion that changes the stress; here the motion did rest."""
+    true = motion((4.0, 300), (4.0, 60), (TOP, 150), (0.0, 450))
+    shown = true + np.where(np.arange(true.size) > 360, 0.3, 0.0)
+    assert notes(conditioned(shown, 20.0 * true, noise)) == []
+
+
 def test_the_stretch_is_shaded_in_every_panel_and_has_a_key():
     result = fabricated.result()
     time = result.measurement.time
