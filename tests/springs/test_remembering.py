@@ -1,4 +1,4 @@
-"""Microscale springs with memory (model, section 8) against an independent implementation.
+"""Microscale springs with memory (docs/theory.md) against an independent implementation.
 
 `Formula` implements section 8 literally: the state is updated in small steps, the strain is
 explicit, and the stress at a strain is found by bracketing. `discrete` follows individual

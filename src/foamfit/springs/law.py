@@ -56,7 +56,7 @@ def derived_points(
 def admissible(
     k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
 ) -> bool:
-    """Return whether the seven parameters are admissible (model, section 1).
+    """Return whether the seven parameters are admissible (docs/theory.md).
 
     The other conditions follow from these: branch d lies above C2 and branch e below A1.
     """
@@ -86,7 +86,7 @@ def most_beyond(k: float, kc: float, n: float) -> tuple[float, float]:
     """Return the least ε_* with which branch c never lies before branch a, and its stress.
 
     It is the maximum over σ of the difference
-    f(σ) = a(σ; k) - σ/(kc+σ) with a = 1 - (1 + nσ/k)^(-1/n) (model, section 8). It rises where
+    f(σ) = a(σ; k) - σ/(kc+σ) with a = 1 - (1 + nσ/k)^(-1/n). It rises where
     g(σ) = 2 ln(kc+σ) - ln(k kc) - (1+1/n) ln(1+nσ/k) is positive; g turns once at most, so f has
     one maximum at most.
     """

@@ -1,6 +1,6 @@
 """The compiled microscale law: the response of one spring along a history, and its derivatives.
 
-With p the snapped fraction of micro-springs and P its largest value so far (model, section 8),
+With p the snapped fraction of micro-springs and P its largest value so far (docs/theory.md),
 
     ε = (1-P) a(σ; k0) + (P-p) a(σ; k0 e^-d) + p (eps_star + σ/(kc+σ)),
     a(σ; k) = 1 - (1 + nσ/k)^(-1/n).

@@ -11,7 +11,7 @@ h = u φ(u) every part has a short recurrence,
     w s u' = s',   φ' = -u' h,   P' = u' φ,   (k0 + s) (1 - a) = k0,
 
 in which the last coefficient of s enters linearly, so that one division gives it from that of the
-strain. While the spring is held, P is constant. For a spring that remembers (model, section 8) the
+strain. While the spring is held, P is constant. For a spring that remembers (docs/theory.md) the
 last equation becomes (k + ns) (1-a)' = -s' (1-a), with the softened k of micro-springs that have
 snapped before; those that have never snapped, a share N, add N (a(s; k0) - a(s; k)). The rank of a
 spring is stored as a normal score w = Φ⁻¹(p); like the rest of the state it depends on parameters.
