@@ -22,7 +22,7 @@ Terms = list[tuple[float, float]]
 
 @dataclass
 class Law:
-    """Independent implementation of the microscale law (docs/theory.md); its state is the rank w."""
+    """Independent form of the microscale law (docs/theory.md); its state is the rank w."""
 
     k0: float
     kc: float

@@ -44,8 +44,9 @@ class MicroscaleSpring(Spring):
         p ← min(max(p, P₊(σ)), P₋(σ))          along the history of σ, from p = 0,
         ε = (1-p) σ/(k0+σ) + p (eps_star + σ/(kc+σ))          (docs/theory.md).
 
-    With stiffening, softening or weakening the state also contains P, the largest p so far. Micro-springs that have snapped once are softer on branch a and snap through
-    at a lower stress, and branch a is a(σ; k) = 1 - (1 + nσ/k)^(-1/n):
+    With stiffening, softening or weakening the state also contains P, the largest p so far.
+    Micro-springs that have snapped once are softer on branch a and snap through at a lower stress,
+    and branch a is a(σ; k) = 1 - (1 + nσ/k)^(-1/n):
 
         U(σ) = max(P₊(σ), min(P₊(σ e^s), P)),   p ← min(max(p, U(σ)), max(U(σ), P₋(σ))),
         ε = (1-P) a(σ; k0) + (P-p) a(σ; k0 e^-d) + p (eps_star + σ/(kc+σ)).
