@@ -109,7 +109,7 @@ class Desk:
             self.dropped = toml.read_bytes()
 
     def dropped_toml(self) -> tuple[dict[str, str], str] | None:
-        """Split the TOML dropped last into quantities and the rest; None if there is none.
+        """Return the quantities and the rest of the TOML dropped last; None without a TOML.
 
         It is read once. Raises InputError if it is invalid.
         """

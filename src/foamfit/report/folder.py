@@ -167,7 +167,7 @@ def is_written(path: Path, tests: Collection[str] = ()) -> bool:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """Return the content of a fit.json or the like of any version, or {} if the file is none."""
+    """Return the content of a result file of any version, or {} if it is not a result file."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):  # neither UTF-8 nor JSON
@@ -179,7 +179,7 @@ def _content(path: Path) -> dict[str, Any]:
 def load_result(folder: str | Path) -> dict[str, Any]:
     """Return the content of ``fit.json``, given its path or its folder; values are in SI.
 
-    InputError if there is none that this version of foamfit can read.
+    Raises InputError if this version of foamfit cannot read a result there.
     """
     path = Path(folder)
     if path.is_dir():

@@ -34,7 +34,7 @@ def write_samples(path: Path, draws: Mapping[str, Array]) -> None:
 
 
 def read_samples(path: Path) -> dict[str, Array]:
-    """Read a file of `write_samples`; return an empty dict if there is none."""
+    """Read a file of `write_samples`; return an empty dict if the file does not exist."""
     from scipy.io import netcdf_file
 
     if not path.is_file():

@@ -33,11 +33,11 @@ Row = Array
 Branches = NDArray[np.int64]
 
 # Division by zero gives infinity, as in NumPy; functions in which it can occur handle it.
-_PLAIN: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
-compiled = cast("_JITWrapper", njit(**_PLAIN, cache=True))
+PLAIN: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
+compiled = cast("_JITWrapper", njit(**PLAIN, cache=True))
 # For functions that are only called by compiled ones: without the wrapper for Python, which takes
 # long to compile, and with fused multiply-add, which is faster and at least as exact.
-_BRIDGELESS: dict[str, Any] = {**_PLAIN, "no_cpython_wrapper": True, "fastmath": {"contract"}}
+_BRIDGELESS: dict[str, Any] = {**PLAIN, "no_cpython_wrapper": True, "fastmath": {"contract"}}
 # Without reference counting of arrays, which takes long to run. Such functions copy arrays element
 # by element: `a[:] = b` takes two seconds to compile, because of its error message.
 _COUNTLESS: dict[str, Any] = {**_BRIDGELESS, "_nrt": False}

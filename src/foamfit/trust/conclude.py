@@ -100,9 +100,10 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
 def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[str, Any]]:
     """Return the noise of each fitted curve, its source, and residuals and model error, SI.
 
-    `errors` has one entry per fitted curve, or none if nothing varies. `law_error` is the RMS model
-    error, None if there is none; `law_error_evidence` is the reduction of the Bayesian information
-    criterion by including it. `residual_q95` is the 95th percentile of the absolute residuals.
+    `errors` has one entry per fitted curve, or is empty if nothing varies. `law_error` is the RMS
+    model error, or None without it; `law_error_evidence` is the reduction of the Bayesian
+    information criterion by including it. `residual_q95` is the 95th percentile of the absolute
+    residuals.
     """
     objective, out = best.problem.objective, {}
     error_of = dict(zip(objective.counted, errors, strict=True)) if errors else {}

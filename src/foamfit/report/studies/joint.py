@@ -80,7 +80,7 @@ class JointParameter:
     b: float | None = None
     b_stderr: float | None = None
     b_ci95: tuple[float, float] | None = None
-    # Uncertainty including the error of the law (`joint_fit.ranges_of`); None if there is none.
+    # Uncertainty with the error of the law (`joint_fit.ranges_of`); None without such an error.
     range: tuple[float, float] | None = None
     b_range: tuple[float, float] | None = None
 

@@ -23,10 +23,9 @@ from foamfit.springs.law import MICROSCALE
 from foamfit.springs.laws.record import BRANCH, EPS, SIGMA, Functions, Law
 
 Compiled = Callable[..., Any]
-_PLAIN: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
-_BRIDGELESS: dict[str, Any] = {**_PLAIN, "no_cpython_wrapper": True}
-compiled = njit(**_PLAIN)
-inner = njit(**_BRIDGELESS)  # for functions that only compiled ones call
+compiled = njit(**kernels.PLAIN)
+# For functions that only compiled ones call.
+inner = njit(**kernels.PLAIN | {"no_cpython_wrapper": True})
 MOST_SWITCHES = 10_000  # largest number of switches of a spring in one step
 
 
