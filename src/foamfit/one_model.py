@@ -5,8 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import time
-import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from numbers import Integral, Real
@@ -33,6 +32,14 @@ from foamfit.fitting.search import (
     what_stopped,
 )
 from foamfit.results import Fit, Intervals
+from foamfit.settle import (
+    back_to_plain,
+    descend_again,
+    held_by_record,
+    keep_to_record,
+    refine,
+    weigh_motion,
+)
 from foamfit.springs.model import with_options
 from foamfit.springs.options import OPTIONS
 from foamfit.trust.best_point import BestPoint
@@ -60,7 +67,6 @@ MOVED = 0.999
 # Evaluations that ranges and profiles usually need, as a multiple of those of the search: with an
 # error of the law, and at the noise floor.
 JUDGED, JUDGED_NOISE = 2.0, 0.15
-WEIGHED = 2  # number of times that the covariance of a driving motion is computed
 SEARCHED = 0.5  # fraction of the run time that the search takes
 
 
@@ -252,7 +258,7 @@ def identify(
     tracker = Tracker(problem.objective, deadline, better)
     tracker.looked = None if look is None else partial(look, problem)
     record = SearchRecord(options.seed, starts, began)
-    record = _search(problem, tracker, record, progress)
+    problem, record = _search(problem, tracker, record, options.vary, progress)
     if tracker.best_values is None:
         tried, why = problem.objective.evaluations, "check the drive, the heights and the bounds"
         try:
@@ -320,7 +326,8 @@ def _assess(
             if made.better is None:
                 return best, record, replace(made, ranges=left.ranges)
             tracker.consider(made.better)
-            _refine(problem, tracker)
+            refine(problem, tracker)
+            back_to_plain(problem, tracker)
         except SearchStoppedError:
             return found.best(), record, Intervals()
         best = found.best()
@@ -330,70 +337,36 @@ def _assess(
 
 
 def _search(
-    problem: Problem, tracker: Tracker, record: SearchRecord, progress: Progress
-) -> SearchRecord:
-    """Search, then refine by lmfit; return the record with the costs and the reason of a stop."""
+    problem: Problem,
+    tracker: Tracker,
+    record: SearchRecord,
+    asked: Collection[str],
+    progress: Progress,
+) -> tuple[Problem, SearchRecord]:
+    """Search and refine; return the problem, and the record with costs and reason of a stop.
+
+    Along a given motion, contact and zeros are fitted after the search only: the first rise shows
+    them to a fraction of a sample.
+    """
     rng = np.random.default_rng(record.seed)
     try:
-        costs = search(tracker, problem.space(), starts=record.starts, rng=rng, progress=progress)
+        held = held_by_record(problem, asked) if problem.objective.drive != "impact" else problem
+        costs = search(tracker, held.space(), starts=record.starts, rng=rng, progress=progress)
         record = replace(record, costs=tuple(costs))
         progress(REFINED, "refinement")
-        _refine(problem, tracker)
-        weigh_motion(problem, tracker)
+        if held is problem:
+            refine(problem, tracker)
+        else:
+            descend_again(problem, tracker)
         moved = bool(exchange_springs(tracker, problem.space()))
         if scan_places(tracker, problem.space()) or moved:
-            _refine(problem, tracker)
-            weigh_motion(problem, tracker)
+            refine(problem, tracker)
+        problem, freed = keep_to_record(problem, tracker, asked)
+        record = replace(record, freed=freed)
+        weigh_motion(problem, tracker)
         settle_ends(tracker, problem.space())
     except STOPPING as error:
         ensure_feasible(tracker, problem.space(), np.random.default_rng(record.seed))
-        return replace(record, stopped=what_stopped(error))
+        return problem, replace(record, stopped=what_stopped(error))
     progress(1.0, "done")
-    return record
-
-
-def _refine(problem: Problem, tracker: Tracker) -> None:
-    """Refine the best point by lmfit's least_squares in the physical parameters.
-
-    Parameters of branches that the best point never reaches do not change the curves and are fixed.
-    """
-    if tracker.best_values is None:
-        return
-    best = BestPoint(problem, tracker.best_values)
-    problem.put(best.values)
-    params, names = problem.params.copy(), best.names
-    for name in best.unreached:
-        params[name].vary = False
-    if not names:
-        return
-    for name in names:  # least_squares needs a start inside the bounds
-        parameter = params[name]
-        if math.isfinite(span := parameter.max - parameter.min):
-            low, high = parameter.min + 1e-9 * span, parameter.max - 1e-9 * span
-            parameter.value = min(max(parameter.value, low), high)
-
-    def residual(p: lmfit.Parameters) -> Array:
-        return tracker.residual(problem.vector(p))
-
-    def jacobian(p: lmfit.Parameters) -> Array:
-        return problem.slopes(problem.vector(p), names)
-
-    with warnings.catch_warnings():  # about lmfit's covariance, which is not used
-        warnings.simplefilter("ignore", RuntimeWarning)
-        ends = {"ftol": 1e-10, "xtol": 1e-10, "gtol": 1e-12, "max_nfev": 60}
-        more = {"jac": jacobian, "x_scale": best.sizes} | ends
-        lmfit.minimize(residual, params, method="least_squares", **more)
-
-
-def weigh_motion(problem: Problem, tracker: Tracker) -> None:
-    """Weight the residual by the covariance due to the motion's own uncertainty, and refine.
-
-    The covariance depends on the best point, so this is repeated.
-    """
-    for _ in range(WEIGHED):
-        best = tracker.best_values
-        if best is None or not problem.objective.weigh_motion(best):
-            return
-        tracker.best_values, tracker.best_cost = None, math.inf  # the weights have changed
-        tracker.consider(best)
-        _refine(problem, tracker)
+    return problem, record

@@ -307,6 +307,9 @@ class Measurement(Samples):
         Channels that were computed from others and are not independent measurements.
     braked
         Whether the stress is the striker's mass times its deceleration over the area.
+    rise
+        Contact time by the first rise of the stress alone, s (or sample number) after time zero,
+        and its standard error; None if the record does not show it.
     block
         Number of rows of the file averaged in each sample.
     uncertainties
@@ -337,6 +340,7 @@ class Measurement(Samples):
     last_cycle: int | None = None
     start_strain: float = 0.0
     acceleration: Array | None = None
+    rise: tuple[float, float] | None = None
     block: int = 1
     uncertainties: dict[str, float] = field(default_factory=dict)
     standstills: tuple[tuple[float, float], ...] = ()

@@ -121,7 +121,7 @@ def noise_before_contact(
     """
     levels = dict[str, NoiseLevel]()
     for name, values in ((c, v[:n]) for c, v in whole.items() if n >= MIN_REST):
-        (sigma, time), bent = (_noise_about(values, degree) for degree in (1, 3))
+        (sigma, time), bent = (noise_about(values, degree) for degree in (1, 3))
         # The path of an accelerating machine is curved, not correlated noise; BIC decides.
         if sigma > bent[0] * n ** (2.0 * bent[1] / n):
             sigma, time = bent
@@ -136,7 +136,7 @@ def noise_before_contact(
     return levels
 
 
-def _noise_about(values: Array, degree: int) -> tuple[float, float]:
+def noise_about(values: Array, degree: int) -> tuple[float, float]:
     """Return standard deviation and correlation time (samples) of noise about a polynomial."""
     x = np.linspace(-1.0, 1.0, values.size)
     residual = values - np.polyval(np.polyfit(x, values, degree), x)

@@ -29,6 +29,7 @@ from foamfit.data.measurement import (
     interior_channel,
 )
 from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, noise_level, smooth
+from foamfit.data.rise import Rise, rise_of
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
@@ -88,8 +89,10 @@ def condition(
         end = len(first) if used.place else used.end - used.first
         span = zeros.Span(start.first, end, start.resting, end)
     record = zeros.take_zeros(record, first, start, span, levels, impact=impact)
+    rise = first_rise(record.rows(slice(len(first))), start, levels)
     if used.place:  # a later cycle has its own contact
         record = cycles.cut_to_reload(record, found, used, specimen.height)
+        rise = first_rise(record, contact.Start("", 0.0, 0), levels)
     else:
         record = cycles.zero_between(record, found, used)
         record = cycles.cut_to_cycle(record, found, chosen) if chosen else record
@@ -128,9 +131,27 @@ def condition(
         acceleration=record.acceleration if impact else None,
         derived=whole.derived,
         braked=whole.braked,
+        rise=rise and rise._replace(time=rise.time - whole.origins.get("contact_time", 0.0)),
         block=block,
         standstills=tuple((float(at[0]), float(at[-1])) for at in stood),
     )
+
+
+def first_rise(record: Record, start: contact.Start, levels: contact.Levels) -> Rise | None:
+    """Return the file's time of contact by the first rise of the stress, or of a gauge at rest.
+
+    The zeros of `record` are taken off.
+    """
+    moved = start.by == "motion" and start.gauge == "rest"
+    name = "displacement" if moved else "stress"
+    if name in record.derived and record.acceleration is not None:
+        name = "acceleration"
+    values = record.channel(name)
+    if values is None or name in record.derived:
+        return None
+    zero = record.zeros.get(name)
+    rise = rise_of(record.instants, values, levels[name], start.resting, zero)
+    return rise and rise._replace(time=rise.time + record.origins.get("contact_time", 0.0))
 
 
 def cut_to_contact(record: Record, start: contact.Start, span: zeros.Span) -> Record:

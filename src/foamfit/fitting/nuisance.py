@@ -3,6 +3,8 @@
 They are fitted together with the parameters of the springs: all of them in an impact, the zeros of
 motion and stress under a driving motion. Times and zeros are relative to the values found by the
 loader (`Measurement.origins`), 0 for an exact record; velocity and mass are those of the TOML.
+`shown_by` returns what the record says of them without a law of the springs; their limits follow
+from it.
 """
 
 from __future__ import annotations
@@ -29,11 +31,15 @@ UNDER_DRIVE = {
     "impact": (CONTACT_TIME, *ZEROS, *STRIKER),
     "displacement": ("displacement_zero", "stress_zero"),
 }
-# Limits of a parameter with a prior, in standard deviations.
-REACH = 6.0
-# Largest contact time and time shift, as a fraction of the time under load; largest zero, as a
-# fraction of the range of the channel.
+# Limits of a parameter with a prior, and of one that the first rise shows, in standard deviations.
+REACH, REACH_OF_RISE = 6.0, 5.0
+# Where the record shows nothing: largest contact time and time shift, as a fraction of the time
+# under load; largest zero, as a fraction of the range of the channel.
 LARGEST_CONTACT, LARGEST_SHIFT, LARGEST_ZERO = 0.15, 0.1, 0.5
+# The zero of the file is kept if it is this close to the motion at contact, in standard deviations.
+ALIKE = 1.5
+LARGEST_STRAIN = 0.999  # of the measured motion, with its zero taken off
+_NEAR = 12  # the speed at contact is that over this part of the way to the turn
 _LOW = 0.1  # fraction of the peak stress below which a contact may have been overlooked
 
 
@@ -100,14 +106,56 @@ def open_in(measurement: Measurement, drive: str, counted: Mapping[str, bool]) -
     return frozenset(moved | known)
 
 
+def shown_by(measurement: Measurement, drive: str) -> dict[str, Prior]:
+    """Return contact time and zeros as the record shows them without a law, SI.
+
+    The first rise of the stress shows the contact; the motion at that time is its zero, unless the
+    zero of the file is as likely.
+    """
+    usual, known = values_of(measurement), priors_of(measurement, drive)
+    out = {name: one for name, one in known.items() if name in ZEROS}
+    if measurement.rise is None:
+        return out
+    contact, error = measurement.rise
+    if "displacement_zero" not in out and measurement.displacement is not None:
+        zero, speed, noise = _motion_at(measurement, contact)
+        spread = math.hypot(speed * error, noise)
+        of_file = -measurement.origins.get("displacement_zero", 0.0)
+        if abs(of_file - zero) < ALIKE * spread:
+            contact, zero = contact + (of_file - zero) / speed if speed else contact, of_file
+        out["displacement_zero"] = Prior("displacement_zero", zero, spread)
+    if drive == "impact":
+        out[CONTACT_TIME] = Prior(CONTACT_TIME, contact, error)
+    return {name: one for name, one in out.items() if math.isfinite(usual[name])}
+
+
+def _motion_at(measurement: Measurement, contact: float) -> tuple[float, float, float]:
+    """Return the motion (m) and its speed at contact, by a line near it, and its noise."""
+    values, level = measurement.displacement, measurement.noise.of("displacement")
+    assert values is not None
+    time = np.arange(values.size, dtype=float) if measurement.time is None else measurement.time
+    at, top = int(np.searchsorted(time, contact)), int(np.argmax(values))
+    reach = max(3, (top - at) // _NEAR)
+    near = slice(max(0, at - reach), max(at, 0) + reach + 1)
+    speed, zero = np.polyfit(time[near] - contact, values[near], 1)
+    return float(zero), float(speed), 0.0 if level is None else level.sigma
+
+
 def limits_of(
     name: str, measurement: Measurement, drive: str, duration: float
 ) -> tuple[float, float]:
-    """Return the limits of a nuisance parameter, SI."""
+    """Return the limits of a nuisance parameter, SI.
+
+    They follow from what the record shows (`shown_by`); a measured strain stays below one.
+    """
     prior, middle = priors_of(measurement, drive).get(name), values_of(measurement)[name]
+    rise = None if prior is not None else shown_by(measurement, drive).get(name)
     if prior is not None:
         reach = REACH * prior.sigma
         reach = min(reach, 0.9 * middle) if name in STRIKER else reach
+    elif rise is not None:
+        ends = rise.mean - REACH_OF_RISE * rise.sigma, rise.mean + REACH_OF_RISE * rise.sigma
+        return _within_height(name, measurement, min(*ends, middle), max(*ends, middle))
     elif name in STRIKER:
         return 0.1 * middle, 10.0 * middle
     elif name in ZEROS:
@@ -116,7 +164,17 @@ def limits_of(
     else:
         reach = (LARGEST_CONTACT if name == CONTACT_TIME else LARGEST_SHIFT) * duration
     latest = _latest_contact(measurement) if name == CONTACT_TIME else 0.0
-    return middle - reach, middle + max(reach, latest)
+    return _within_height(name, measurement, middle - reach, middle + max(reach, latest))
+
+
+def _within_height(
+    name: str, measurement: Measurement, low: float, high: float
+) -> tuple[float, float]:
+    """Return the limits of a zero at which the measured strain stays below one."""
+    if name != "displacement_zero" or measurement.displacement is None:
+        return low, high
+    least = float(measurement.displacement.max()) - LARGEST_STRAIN * measurement.specimen.height
+    return min(max(low, least), 0.0), high
 
 
 def _latest_contact(measurement: Measurement) -> float:

@@ -102,6 +102,8 @@ class Objective:
     weighing: Weighing | None = None  # Effect of an uncertain driving motion; see `weigh_motion`
     given: tuple[nuisances.Prior, ...] = ()  # Priors of spring parameters
     followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is already known
+    # Largest amplitude, in standard deviations, of the motion that would explain the residual
+    unexplained: float | None = field(default=None, init=False)
     evaluations: int = field(default=0, init=False)  # Number of simulated sets of parameters
     failures: int = field(default=0, init=False)  # Number of failed simulations
 
@@ -173,18 +175,28 @@ class Objective:
     def weigh_motion(self, values: Array) -> bool:
         """Weight the residuals by the uncertainty of the driving motion; False if it has none.
 
-        The residual of each curve at this point, noise or error of the law, sets its level.
+        `values` are the optimum of plain least squares; its residual, noise or error of the law,
+        sets the level of each curve. If the motion cannot explain that residual, the law errs and
+        the residuals stay unweighted.
         """
         uncertain = self.by_motion(values)
         if uncertain is None:
             return False
-        plain = np.abs(self._moved_by(0.0).residual(values))
+        plain = self.plain(values)
         levels = [
             max(NORMAL * float(np.median(part)), self.noise(name).sigma * self.factor(name), 1e-9)
-            for name, part in self.by_curve(plain).items()
+            for name, part in self.by_curve(np.abs(plain)).items()
         ]
-        self.weighing = Weighing.of(uncertain, np.repeat(levels, self.sizes))
+        weighing = Weighing.of(uncertain, np.repeat(levels, self.sizes))
+        if not weighing.explains(plain):
+            self.unexplained = float(np.abs(weighing.amplitudes(plain)).max())
+            return False
+        self.weighing = weighing
         return True
+
+    def plain(self, values: Array) -> Array:
+        """Return the residuals of the curves without priors and weighing, (n_data,)."""
+        return self._moved_by(0.0).residual(values)[: self.n_data]
 
     def by_motion(self, values: Array) -> Array | None:
         """Return the change of the residual by each mode of the motion, (n_data, m), or None."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import lmfit
@@ -194,6 +194,8 @@ class Problem:
     params: lmfit.Parameters
     scales: Scales
     notes: tuple[str, ...] = ()
+    # Nuisance parameters that are held where the record shows them; see `keeping`
+    kept: Mapping[str, nuisance.Prior] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -222,7 +224,7 @@ class Problem:
     def is_exact(self, name: str) -> bool:
         """Return whether a nuisance parameter is fixed by the record, not by the user."""
         one, usual = self.params[name], nuisance.values_of(self.measurement)
-        return not one.vary and one.value == usual.get(name)
+        return not one.vary and one.value == usual.get(name) and name not in self.kept
 
     def with_springs(self, vector: Array, own: Array | None = None) -> Array:
         """Return `own` (by default the start) with varied spring parameters of another test."""
@@ -249,6 +251,14 @@ class Problem:
         params = self.params.copy()
         params[name].set(value=value, vary=False)
         return replace(self, params=params)
+
+    def keeping(self, shown: Mapping[str, nuisance.Prior]) -> Problem:
+        """Return the problem with free nuisance parameters held where the record shows them."""
+        params = self.params.copy()
+        free = {name: shown[name] for name in self.free() if name in shown}
+        for name, one in free.items():
+            params[name].set(value=one.mean, vary=False)
+        return replace(self, params=params, kept=free)
 
     def tied(self) -> Callable[[Array], Array] | None:
         """Return a function that evaluates the expressions in a vector; None without any."""

@@ -65,6 +65,20 @@ def what_stopped(error: BaseException) -> str:
 
 
 @dataclass(frozen=True)
+class Freed:
+    """What free contact time and zeros would gain where the law errs.
+
+    Misfits (RMS over range) with these `held` where the record shows them and `free`, and the
+    value, SI, of each spring parameter with both, (held, free).
+    """
+
+    names: tuple[str, ...]
+    held: float
+    free: float
+    moved: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
 class SearchRecord:
     """Record of a search."""
 
@@ -75,6 +89,7 @@ class SearchRecord:
     # that led to each.
     costs: tuple[tuple[float, int], ...] = ()
     stopped: str | None = None  # Why it ended early: "the time limit", "Ctrl-C", "SIGTERM"
+    freed: Freed | None = None  # What free contact time and zeros would gain where the law errs
 
     @property
     def agreeing(self) -> int:
@@ -99,6 +114,7 @@ class Tracker:
     pulse: Callable[[], None] | None = None
     looked: Callable[[Array], None] | None = None
     ends: list[Array] = field(default_factory=list)
+    plain: tuple[Array, float] | None = None  # point and cost of plain least squares, if weighed
 
     def residual(self, values: Array) -> Array:
         """Return the residual of the objective; SearchStoppedError after the time limit."""

@@ -5,8 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtri
 
 from foamfit.arrays import Array
+
+# Probability at which amplitudes of the motion's modes are no longer credible; one single
+# amplitude may be larger in ten times as many tests (3.5 standard deviations among 20).
+RARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,12 +27,29 @@ class Weighing:
     levels: Array
     axes: Array
     less: Array
+    sizes: Array  # d (m,)
 
     @classmethod
     def of(cls, uncertain: Array, levels: Array) -> Weighing:
         """Make the transform from S (n, m) and √v (n,)."""
         axes, size, _ = np.linalg.svd(uncertain / levels[:, None], full_matrices=False)
-        return cls(levels, axes, 1.0 - 1.0 / np.sqrt(1.0 + size**2))
+        return cls(levels, axes, 1.0 - 1.0 / np.sqrt(1.0 + size**2), size)
+
+    def amplitudes(self, residual: Array) -> Array:
+        """Return the residual along the modes over its standard deviation, of modes with d > 1.
+
+        They are standard normal if the motion's uncertainty and noise explain the residual.
+        """
+        along = (residual / self.levels) @ self.axes / np.sqrt(1.0 + self.sizes**2)
+        return np.asarray(along[self.sizes > 1.0])
+
+    def explains(self, residual: Array) -> bool:
+        """Return whether noise and the uncertainty of the motion can explain a residual (n,)."""
+        sizes = self.amplitudes(residual) ** 2
+        if not sizes.size:
+            return True
+        most = chdtri(sizes.size, RARE), chdtri(1, 10.0 * RARE / sizes.size)
+        return bool(sizes.sum() <= most[0] and sizes.max() <= most[1])
 
     def __call__(self, rows: Array) -> Array:
         """Transform residuals (n,), or columns of their derivatives (n, k)."""

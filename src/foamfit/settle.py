@@ -1,0 +1,154 @@
+"""After the search: refinement, nuisance parameters that keep to the record, and weighing.
+
+An error of the law could be hidden by a wrong contact time or zero. Where it is larger than the
+noise, these stay where the record shows them (`keep_to_record`). Where the motion that drives is
+uncertain, the residual is weighed by its covariance once, at the optimum of plain least squares; a
+fit that then follows the record worse returns to that optimum (`weigh_motion`).
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Collection
+
+import lmfit
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.fitting.nuisance import shown_by
+from foamfit.fitting.problem import Problem
+from foamfit.fitting.search import STOPPING, Freed, Tracker, descend, distinct, rank
+from foamfit.springs.parameters import NUISANCE
+from foamfit.trust.best_point import BestPoint
+
+# The law errs if its RMS error exceeds this multiple of the noise, and this share of the scale of
+# the curve, which is at least half a percent of its range.
+OVER_NOISE, OVER_SCALE = 1.0, 0.2
+MINIMA = 12  # ends of the search from which a descent begins once parameters are held
+ITERATIONS = 60  # of such a descent
+# Largest RMS deviation from the record over that of plain least squares.
+WORSE = 1.05
+
+
+def refine(problem: Problem, tracker: Tracker) -> None:
+    """Refine the best point by lmfit's least_squares in the physical parameters.
+
+    Parameters of branches that the best point never reaches do not change the curves and are fixed.
+    """
+    if tracker.best_values is None:
+        return
+    best = BestPoint(problem, tracker.best_values)
+    problem.put(best.values)
+    params, names = problem.params.copy(), best.names
+    for name in best.unreached:
+        params[name].vary = False
+    if not names:
+        return
+    for name in names:  # least_squares needs a start inside the bounds
+        parameter = params[name]
+        if math.isfinite(span := parameter.max - parameter.min):
+            low, high = parameter.min + 1e-9 * span, parameter.max - 1e-9 * span
+            parameter.value = min(max(parameter.value, low), high)
+
+    def residual(p: lmfit.Parameters) -> Array:
+        return tracker.residual(problem.vector(p))
+
+    def jacobian(p: lmfit.Parameters) -> Array:
+        return problem.slopes(problem.vector(p), names)
+
+    with warnings.catch_warnings():  # about lmfit's covariance, which is not used
+        warnings.simplefilter("ignore", RuntimeWarning)
+        ends = {"ftol": 1e-10, "xtol": 1e-10, "gtol": 1e-12, "max_nfev": 60}
+        more = {"jac": jacobian, "x_scale": best.sizes} | ends
+        lmfit.minimize(residual, params, method="least_squares", **more)
+
+
+def held_by_record(problem: Problem, asked: Collection[str]) -> Problem:
+    """Return the problem with contact and zeros held where the record shows them.
+
+    Those that the user has `asked` to vary stay free.
+    """
+    shown = shown_by(problem.measurement, problem.objective.drive)
+    return problem.keeping({name: one for name, one in shown.items() if name not in asked})
+
+
+def errs(best: BestPoint) -> bool:
+    """Return whether the error of the law is larger than the noise in some curve."""
+    return any(
+        error.law > max(OVER_NOISE * math.sqrt(error.noise.variance), OVER_SCALE)
+        for error in best.errors
+    )
+
+
+def descend_again(problem: Problem, tracker: Tracker) -> None:
+    """Descend from the ends of the search after other parameters have become free or held."""
+    space, starts = problem.space(), [*tracker.ends]
+    starts += [] if tracker.best_values is None else [tracker.best_values]
+    tracker.best_values, tracker.best_cost, tracker.ends = None, math.inf, []
+    ranked = rank(tracker, space, [space.encode(values) for values in starts])
+    for _, point in distinct(ranked)[:MINIMA]:
+        tracker.ends.append(space.decode(descend(tracker, space, point, ITERATIONS)[1]))
+    refine(problem, tracker)
+
+
+def keep_to_record(
+    problem: Problem, tracker: Tracker, asked: Collection[str]
+) -> tuple[Problem, Freed | None]:
+    """Hold contact and zeros where the record shows them, if the law errs more than the noise."""
+    values, cost, ends = tracker.best_values, tracker.best_cost, tracker.ends
+    held = held_by_record(problem, asked)
+    if values is None or not held.kept or not errs(BestPoint(problem, values)):
+        return problem, None
+    try:
+        descend_again(held, tracker)
+    except STOPPING:
+        tracker.best_values, tracker.best_cost, tracker.ends = values, cost, ends
+        raise
+    if tracker.best_values is None:
+        tracker.best_values, tracker.best_cost, tracker.ends = values, cost, ends
+        return problem, None
+    pairs = zip(problem.names, tracker.best_values.tolist(), values.tolist(), strict=True)
+    springs = {name for name in problem.free() if name not in NUISANCE}
+    return held, Freed(
+        tuple(held.kept),
+        _misfit(problem, tracker.best_values),
+        _misfit(problem, values),
+        {name: (with_record, without) for name, with_record, without in pairs if name in springs},
+    )
+
+
+def _misfit(problem: Problem, values: Array) -> float:
+    """Return the largest misfit of the counted curves, RMS over range."""
+    objective = problem.objective
+    rms = objective.rms(objective.plain(values))
+    return max(value / float(np.ptp(objective.measured[name])) for name, value in rms.items())
+
+
+def weigh_motion(problem: Problem, tracker: Tracker) -> None:
+    """Weight the residual by the covariance due to the motion's own uncertainty, and refine.
+
+    The covariance is that at the optimum of plain least squares, to which the fit returns if it
+    then follows the record worse.
+    """
+    plain, cost = tracker.best_values, tracker.best_cost
+    if plain is None or not problem.objective.weigh_motion(plain):
+        return
+    tracker.plain = plain, cost
+    tracker.best_values, tracker.best_cost = None, math.inf  # the weights have changed
+    tracker.consider(plain)
+    refine(problem, tracker)
+    back_to_plain(problem, tracker)
+
+
+def back_to_plain(problem: Problem, tracker: Tracker) -> bool:
+    """Return to plain least squares if the best point follows the record more than 5 % worse."""
+    objective = problem.objective
+    if tracker.plain is None or objective.weighing is None or tracker.best_values is None:
+        return False
+    values, cost = tracker.plain
+    residual = objective.plain(tracker.best_values)
+    if float(residual @ residual) <= WORSE**2 * cost:
+        return False
+    objective.weighing, tracker.best_values, tracker.best_cost = None, values, cost
+    return True
