@@ -451,6 +451,12 @@ class Fit:
         moved = c.displacement if c.displacement is not None else c.measured_displacement
         return None if moved is None else moved / self.measurement.specimen.height
 
+    def zero_of(self, channel: str) -> float:
+        """Return the fitted zero of a channel in the measured curves, Pa or m; 0 if exact."""
+        name = f"{channel}_zero"
+        fitted = self.parameters.get(name)
+        return fitted.value - self.measurement.origins.get(name, 0.0) if fitted else 0.0
+
     @property
     def loop(self) -> Loop | None:
         """The measured and fitted loop, against time where no strain was measured."""
@@ -464,6 +470,8 @@ class Fit:
         all springs are in equilibrium and there is no striker.
         """
         springs, strain, out = self.springs, self.strain, dict[str, Snapping]()
+        if strain is not None and (zero := self.zero_of("displacement")):
+            strain = np.maximum(strain - zero / self.measurement.specimen.height, 0.0)
         viscous = any(one.eta or one.relaxation or one.law.is_viscous for one in springs.values())
         stress = self.curves.measured_stress if self.drive == "stress" else self.curves.stress
         stress = None if viscous or self.drive == "impact" else stress

@@ -74,19 +74,13 @@ class Record:
     def of(cls, result: Fit) -> Record:
         """Return the record of a fit, with the fitted zeros of the channels subtracted."""
         test, c, impact = result.measurement, result.curves, result.drive == "impact"
-
-        def zero(channel: str) -> float:
-            name = f"{channel}_zero"
-            fitted = result.parameters.get(name)
-            return fitted.value - test.origins.get(name, 0.0) if fitted else 0.0
-
         measured, specimen = c.measured_displacement, test.specimen
         moved = c.displacement if measured is None else measured
         if c.measured_stress is None or moved is None:
             raise InputError(f"{test.name} has no measured loop; a card needs force and motion")
         fitted = c.stress if impact else c.stress_along
         strain, motion = (
-            (one - zero("displacement")) / specimen.height
+            (one - result.zero_of("displacement")) / specimen.height
             for one in (moved, c.displacement if impact and c.displacement is not None else moved)
         )
         # The law of a record without time does not depend on time.
@@ -96,9 +90,9 @@ class Record:
             rate=loading_rate(test),
             time=np.cumsum(steps) if c.time is None else c.time,
             strain=strain,
-            stress=c.measured_stress - zero("stress"),
+            stress=c.measured_stress - result.zero_of("stress"),
             motion=motion,
-            fitted=(c.measured_stress if fitted is None else fitted) - zero("stress"),
+            fitted=(c.measured_stress if fitted is None else fitted) - result.zero_of("stress"),
             misfit=result.misfit["stress_time" if impact else "stress_strain"],
             density=None if mass is None else mass / volume,
         )

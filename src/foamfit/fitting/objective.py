@@ -420,7 +420,7 @@ class Objective:
             shown = run(plan._replace(time=plan.time - late), everywhere)
         along = motion if self._driven else None
         if along is None and (everything or "stress_strain" in self.counted) and self._along:
-            along = run(self._followed(self._along[damped], at), False)
+            along = without_tension(run(self._followed(self._along[damped], at), False))
         by_site = np.flatnonzero(places == values.size - 1) if places.size else places
         runs = {"stress_time": (motion, None), "displacement_time": (shown, -1)}
         runs |= {name: (shown, node - 1) for name, node in self.interior.items()}
@@ -449,9 +449,9 @@ class Objective:
 
     def _placed(self, plan: AnyPlan, at: dict[str, float]) -> AnyPlan:
         """Return the plan with contact time, striker and zero of the driving motion applied."""
-        if self._driven and at.get("displacement_zero", 0.0) != 0.0:
-            moved = plan.values - at["displacement_zero"]
-            return plan._replace(values=np.maximum(moved, 0.0))  # no contact below zero
+        zero = at.get("displacement_zero", 0.0)
+        if self._driven and (zero != 0.0 or self.measurement.contact != "file"):
+            return plan._replace(values=np.maximum(plan.values - zero, 0.0))  # no contact below
         if self.drive != "impact":
             return plan
         mass = plan.mass.copy()
@@ -462,10 +462,10 @@ class Objective:
         )
 
     def _followed(self, plan: AnyPlan, at: dict[str, float]) -> AnyPlan:
-        """Return the plan along the measured motion of an impact, zero before the contact."""
+        """Return the plan along the measured motion of an impact, zero where there is no contact."""
         if self.drive != "impact":
             return plan
-        values = plan.values - at["displacement_zero"]
+        values = np.maximum(plan.values - at["displacement_zero"], 0.0)
         before = self._clock < at[nuisances.CONTACT_TIME]
         return plan._replace(values=np.where(before, 0.0, values))
 

@@ -460,15 +460,20 @@ def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
 
 
 def _points(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
-    """Yield spring, name, x and y of changes of branch and of half-snapped micro-springs."""
+    """Yield spring, name, x and y of changes of branch and of half-snapped micro-springs.
+
+    They are in the coordinates of the measured curves, whose zeros may have been fitted.
+    """
     for switch in result.switches:
         ends, x = (switch.source, switch.target), switch.time
         name = POINTS.get("".join(ends))
+        moved = switch.displacement + result.zero_of("displacement")
         if panel.is_loop:
-            x = switch.displacement / result.measurement.specimen.height
+            x = moved / result.measurement.specimen.height
         remembers = result.chain.springs[switch.spring - 1].law.remembers
         if x is not None and not (name is None and remembers):
-            y = switch.displacement if panel.key == "displacement_time" else switch.stress
+            stress = switch.stress + result.zero_of("stress")
+            y = moved if panel.key == "displacement_time" else stress
             yield f"s{switch.spring}", name or "→".join(ends), x, y
     for spring, snapped in result.snapping.items():
         for symbol, sample in zip(("σ₊", "σ₋"), snapped.halves, strict=True):
@@ -483,9 +488,12 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
         return
     (left, right), (low, top) = ax.get_xlim(), ax.get_ylim()
     ax.set(xlim=(left, right), ylim=(low, top))  # the branches extend beyond the panel
-    stress = np.linspace(0.0, top * labels.fy, 200)
+    zero = result.zero_of("stress")
+    moved = result.zero_of("displacement") / result.measurement.specimen.height
+    stress = np.linspace(0.0, top * labels.fy - zero, 200)
     for name, strain in spring.elastic_branches(stress).items():
-        line = np.column_stack((strain, stress / labels.fy))[strain < right]
+        line = np.column_stack((strain + moved, (stress + zero) / labels.fy))
+        line = line[strain + moved < right]
         if len(line):  # branch c may lie beyond the strains of the test
             ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5, label=f"_branch {name}")
             along, wanted = LIGHT[name[0]]
@@ -493,7 +501,7 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
             labels.write(name, [at], wanted, color=GREY, fontsize=7)
     if spring.relaxation and "s1" in result.snapping and result.strain is not None:
         style: Any = {"color": "0.35", "lw": 0.7, "ls": (0, (4, 2)), "zorder": 3.5}
-        equilibrium = result.snapping["s1"].stress / labels.fy
+        equilibrium = (result.snapping["s1"].stress + zero) / labels.fy
         ax.plot(result.strain, equilibrium, label="equilibrium", **style)
 
 
@@ -534,8 +542,10 @@ def _switch_samples(result: Fit, loop: _Line) -> list[int]:
         if time is not None and switch.time is not None:
             samples.append(min(int(np.searchsorted(time, switch.time)), loop.x.size - 1))
         else:  # the nearest sample after the previous switch
-            strain = switch.displacement / result.measurement.specimen.height
-            x, y = loop.x[samples[-1] :] - strain, loop.y[samples[-1] :] - switch.stress
+            moved = switch.displacement + result.zero_of("displacement")
+            strain = moved / result.measurement.specimen.height
+            stress = switch.stress + result.zero_of("stress")
+            x, y = loop.x[samples[-1] :] - strain, loop.y[samples[-1] :] - stress
             distance = np.hypot(x / (np.ptp(loop.x) or 1.0), y / (np.ptp(loop.y) or 1.0))
             samples.append(samples[-1] + int(np.argmin(distance)))
     return samples[1:]

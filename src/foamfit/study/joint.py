@@ -18,11 +18,13 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate, rate_error
 from foamfit.errors import InputError, SimulationError, naming
 from foamfit.fitting.links import KINDS, RATES, Links
+from foamfit.fitting.nuisance import Prior
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params
 from foamfit.fitting.search import Tracker, descend
 from foamfit.fitting.together import Together
-from foamfit.one_model import Options, Progress, identify, weigh_motion
+from foamfit.one_model import Options, Progress, identify
 from foamfit.report.folder import try_target
+from foamfit.settle import keep_to_record, weigh_motion
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
 from foamfit.study.joint_fit import Map, fit_jointly
@@ -262,7 +264,7 @@ def _own_fits(
     order = sorted(range(len(tests)), key=lambda t: (tests[t].rate or 0.0, t))
     places = np.unique(np.linspace(0, len(order) - 1, min(SEARCHED, len(order))).astype(int))
     first = [order[place] for place in places]
-    found = dict[int, tuple[Array, float]]()
+    found = dict[int, _Own]()
 
     def do(chosen: Sequence[int], near: tuple[Array, ...], done: float) -> None:
         work = [
@@ -278,16 +280,19 @@ def _own_fits(
             tell(done + 0.2 * (i + 1) / len(chosen), "each test")
 
     do(first, (), 0.1)
-    near = tuple(found[t][0] for t in first if t in found)
-    worst = max((found[t][1] for t in first if t in found), default=math.inf)
+    near = tuple(found[t].values for t in first if t in found)
+    worst = max((found[t].cost for t in first if t in found), default=math.inf)
     do([t for t in order if t not in first], near, 0.3)
-    do([t for t in order if t not in first and t in found and found[t][1] > FAR * worst], (), 0.3)
+    do([t for t in order if t not in first and t in found and found[t].cost > FAR * worst], (), 0.3)
     if len(found) < 2:
         _too_few(study, len(found), refused)
     kept, vectors = list[_Test](), list[Array]()
-    for t, (own, _) in sorted(found.items()):
-        test, objective = tests[t], tests[t].problem.objective
-        objective.weigh_motion(own)
+    for t, fitted in sorted(found.items()):
+        test, own = tests[t], fitted.values
+        test = replace(test, problem=test.problem.keeping(fitted.kept))
+        objective = test.problem.objective
+        if fitted.weighed_at is not None:
+            objective.weigh_motion(fitted.weighed_at)
         if objective.drive == "impact" and test.rate is not None:
             # The rate of the fitted motion: the fit's errors already include its error.
             motion = objective.simulate(own, everything=True).curves["displacement_time"]
@@ -298,28 +303,47 @@ def _own_fits(
     return kept, Together.of_own_fits([test.problem for test in kept], vectors)
 
 
+@dataclass(frozen=True, eq=False)
+class _Own:
+    """The fit of one test by itself."""
+
+    values: Array  # Parameters, SI
+    cost: float  # χ² per sample
+    weighed_at: Array | None  # Point at which the uncertainty of the motion was weighed, if it was
+    kept: Mapping[str, Prior]  # Nuisance parameters held where the record shows them
+
+    @classmethod
+    def of(cls, problem: Problem, tracker: Tracker, values: Array) -> _Own:
+        """Return the result of a search or a descent."""
+        objective, plain = problem.objective, tracker.plain
+        weighed_at = plain[0] if plain and objective.weighing is not None else None
+        return cls(values, tracker.best_cost / objective.n_data, weighed_at, problem.kept)
+
+
 def _own_fit(
     measurement: Measurement,
     model: str,
     params: lmfit.Parameters,
     options: Options,
     near: tuple[Array, ...],
-) -> tuple[Array, float] | str:
+) -> _Own | str:
     """Fit one test, starting from the points `near` it or else by a search.
 
-    Returns its parameters and χ² per sample, or the error message.
+    Returns its result, or the error message.
     """
     if not near:
         try:
             found = identify(measurement, model, params, options, lambda *_: None)
         except SimulationError as error:
             return str(error)
-        return found.best().values, found.tracker.best_cost / found.problem.objective.n_data
+        return _Own.of(found.problem, found.tracker, found.best().values)
     problem = options.problem(measurement, model, params)
     space, tracker = problem.space(), Tracker(problem.objective)
     for start in near:
-        descend(tracker, space, space.encode(problem.with_springs(start)), STEPS)
+        end = descend(tracker, space, space.encode(problem.with_springs(start)), STEPS)[1]
+        tracker.ends.append(space.decode(end))
     if tracker.best_values is None:
         return _own_fit(measurement, model, params, options, ())
+    problem, _ = keep_to_record(problem, tracker, options.vary)
     weigh_motion(problem, tracker)
-    return tracker.best_values, tracker.best_cost / problem.objective.n_data
+    return _Own.of(problem, tracker, tracker.best_values)

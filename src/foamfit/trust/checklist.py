@@ -34,6 +34,8 @@ POOR = 0.05
 # Largest ratio of residuals to noise that still counts as noise: a stated noise is seldom accurate
 # to better than 10 %, an estimated one to better than 50 %.
 STATED, ESTIMATED = 1.1, 1.5
+# Relative fall of the misfit by free contact and zeros that is not due to noise.
+BOUGHT = 0.02
 # Residuals are correlated if their autocorrelation time, in samples, exceeds this.
 STRUCTURED = 5.0
 # Largest number of reasons in a warning; more are easier to read in the table of parameters.
@@ -74,11 +76,12 @@ def make_checklist(
     intervals: Intervals,
 ) -> tuple[Check, ...]:
     """Answer all questions, in the order of `sentences.toml`."""
-    with_error = [name for name, item in estimates.items() if item.stderr is not None]
+    with_error = [name for name in best.names if estimates[name].stderr is not None]
     checks = (
         *_of_search(best, record),
         _followed(best, misfit),
         _at_noise(best),
+        _of_record(best, estimates, record),
         _determined(best, estimates),
         _visited(best, estimates),
         *_of_intervals(best, estimates, intervals, with_error),
@@ -155,6 +158,26 @@ def _at_noise(best: BestPoint) -> Check:
     if answer is None and has_noise and (seen or longest >= 1.05):
         answer = True
     return _check("noise", answer, seen=seen, missed=missed, tau=longest, long=long)
+
+
+def _of_record(best: BestPoint, estimates: Estimates, record: SearchRecord) -> Check:
+    """Check whether free contact time and zeros would hide an error of the law."""
+    freed, facts = record.freed, dict[str, Any]()
+    if freed is None:
+        fitted = any(name in NUISANCE for name in best.names)
+        return _check("record", True if fitted else None, names=())
+    moves = dict[str, float]()
+    for name, (held, free) in freed.moved.items():
+        if name in estimates and (ends := estimates[name].ci95) is not None:
+            moves[name] = abs(free - held) / max(ends[1] - ends[0], 1e-300)
+    most = max(moves, key=moves.__getitem__, default="")
+    if moves.get(most, 0.0) > 1.0:
+        held, free = freed.moved[most]
+        size = float(best.problem.sizes((most,), best.values)[0])
+        facts = {"moved": most, "change": abs(free - held) / size}
+    bought = freed.free < (1.0 - BOUGHT) * freed.held or bool(facts)
+    facts = {"names": freed.names, "held": freed.held, "free": freed.free} | facts
+    return _check("record", not bought, **({"moved": "", "change": 0.0} | facts))
 
 
 def _determined(best: BestPoint, estimates: Estimates) -> Check:

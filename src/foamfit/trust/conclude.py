@@ -216,6 +216,10 @@ def _estimates(
             key, branch = "tied" if parameter.expr else key, best.unreached.get(name)
             why = say("why", key, branch=branch, spring=spring, expression=parameter.expr)
             estimate = ParameterEstimate(value, None, None, unit_of(name), vary, state, why)
+            if (shown := problem.kept.get(name)) is not None:
+                half, why = 1.96 * shown.sigma, say("why", "kept")
+                ends = value - half, value + half
+                estimate = replace(estimate, stderr=shown.sigma, ci95=ends, why=why)
         parameter.stderr = estimate.stderr
         out[name] = estimate.counted_from(-problem.measurement.origins.get(name, 0.0))
     return out
