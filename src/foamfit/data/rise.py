@@ -13,9 +13,10 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import NoiseLevel
-from foamfit.data.noise import MIN_REST, noise_about
+from foamfit.data.noise import MIN_REST, noise_about, smooth
 
 _SHARE, _CLEAR, _MOST = 0.05, 8.0, 0.5  # end of the first rise: share of the peak, or of the noise
+_WINDOWS = 64  # moving means up to the peak, which show this level above the noise
 _LOW = 0.25  # share of that level from which the duration of the rise is measured
 _BEFORE, _ROWS_BEFORE = 6, 60  # rows before the rise: multiples of its duration, and more
 _TRIALS, _ROWS = 80, 240  # trial times, and most rows (means of blocks)
@@ -53,8 +54,10 @@ def rise_of(
     if rest >= MIN_REST and (scatter := noise_about(values[:rest], 1))[0] > sigma:
         sigma, tau = scatter
     size = float(up[-1]) - base
-    level = min(max(_SHARE * size, _CLEAR * sigma), _MOST * size)
-    part = _first_rise(up - base, level)
+    width = 1 + up.size // _WINDOWS  # a soft start may be hidden by noise in single samples
+    clear = _CLEAR * sigma * np.sqrt(min(tau / width, 1.0))
+    level = min(max(_SHARE * size, clear), _MOST * size)
+    part = _first_rise(smooth(up, width) - base, level)
     if part.stop - part.start < _FEWEST:
         return None
     rows = part.stop - part.start

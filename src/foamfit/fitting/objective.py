@@ -133,6 +133,8 @@ class Objective:
         driving = {"stress": ["stress_time"], "displacement": ["displacement_time"]}
         self._absent = driving.get(self.drive, []) + ["stress_time"] * (time is None)
         self.usual = nuisances.values_of(self.measurement)
+        motion = self.measurement.displacement
+        self._largest = 0.0 if motion is None else float(motion.max())  # m
         striker = self.measurement.striker
         self._gravity = (striker.gravity if striker else None) or 0.0
         self._plans = self._scenes(self._loading())
@@ -411,6 +413,8 @@ class Objective:
                 rows, heights, self.rtol, drag=drag, everything=everything, directions=wanted
             )
 
+        if self._largest - at.get("displacement_zero", 0.0) >= height:
+            raise SimulationError("the measured strain would reach one with this displacement_zero")
         plan, late = self._placed(self._plans[damped], at), at.get(nuisances.TIME_SHIFT, 0.0)
         motion = run(plan, everywhere)
         if self._driven and self.measurement.last_cycle is not None:

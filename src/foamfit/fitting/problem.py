@@ -330,6 +330,21 @@ def _check_held(params: lmfit.Parameters) -> None:
             raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
 
 
+def _check_strain(params: lmfit.Parameters, measurement: Measurement) -> None:
+    """Raise InputError for a fixed zero of the motion at which the measured strain reaches one."""
+    zero, motion = params.get("displacement_zero"), measurement.displacement
+    if zero is None or zero.vary or motion is None:
+        return
+    strain = (float(motion.max()) - zero.value) / measurement.specimen.height
+    if strain >= 1.0:
+        origin = measurement.origins.get("displacement_zero", 0.0)
+        least = float(motion.max()) - measurement.specimen.height + origin
+        raise InputError(
+            f"displacement_zero = {zero.value + origin:g} m is not admissible: the measured strain "
+            f"would reach {strain:.3g}; it must be larger than {least:g} m"
+        )
+
+
 def _prior(name: str, value: object, model: Model) -> nuisance.Prior:
     """Read a prior of a spring parameter: mean and standard deviation, or a text."""
     where = f"priors: {name}"
@@ -413,6 +428,7 @@ def make_problem(
             wanted[name].set(min=low, max=high)
     _counted_from(wanted, measurement.origins, -1.0)
     _check_held(wanted)
+    _check_strain(wanted, measurement)
     for name in (one.name for one in objective.given):
         if not wanted[name].vary:
             why = f"follows from {wanted[name].expr}" if wanted[name].expr else "is held fixed"
