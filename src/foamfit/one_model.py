@@ -17,6 +17,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
+from foamfit.fitting.box import Space
 from foamfit.fitting.curves import check_time_shift, choose_drive
 from foamfit.fitting.minima import exchange_springs, in_order, scan_places, settle_ends
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
@@ -348,20 +349,31 @@ def _search(
     Along a given motion, contact and zeros are fitted after the search only: the first rise shows
     them to a fraction of a sample.
     """
-    rng = np.random.default_rng(record.seed)
+    rng, early = np.random.default_rng(record.seed), list[Array]()
+
+    def search_in(space: Space) -> list[tuple[float, int]]:
+        return search(tracker, space, starts=record.starts, rng=rng, progress=progress)
+
+    def search_held(space: Space) -> None:
+        """Search with contact and zeros held, unless the first search did that."""
+        if early:
+            tracker.ends += early
+        else:
+            search_in(space)
+
     try:
         held = held_by_record(problem, asked) if problem.objective.drive != "impact" else problem
-        costs = search(tracker, held.space(), starts=record.starts, rng=rng, progress=progress)
-        record = replace(record, costs=tuple(costs))
+        record = replace(record, costs=tuple(search_in(held.space())))
         progress(REFINED, "refinement")
         if held is problem:
             refine(problem, tracker)
         else:
+            early += tracker.ends
             descend_again(problem, tracker)
         moved = bool(exchange_springs(tracker, problem.space()))
         if scan_places(tracker, problem.space()) or moved:
             refine(problem, tracker)
-        problem, freed = keep_to_record(problem, tracker, asked)
+        problem, freed = keep_to_record(problem, tracker, asked, search_held)
         record = replace(record, freed=freed)
         weigh_motion(problem, tracker)
         settle_ends(tracker, problem.space())

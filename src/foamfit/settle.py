@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 import lmfit
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.fitting.box import Space
 from foamfit.fitting.nuisance import shown_by
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import STOPPING, Freed, Tracker, descend, distinct, rank
@@ -93,20 +94,29 @@ def descend_again(problem: Problem, tracker: Tracker) -> None:
 
 
 def keep_to_record(
-    problem: Problem, tracker: Tracker, asked: Collection[str]
+    problem: Problem,
+    tracker: Tracker,
+    asked: Collection[str],
+    search_held: Callable[[Space], object] = lambda _: None,
 ) -> tuple[Problem, Freed | None]:
-    """Hold contact and zeros where the record shows them, if the law errs more than the noise."""
-    values, cost, ends = tracker.best_values, tracker.best_cost, tracker.ends
+    """Hold contact and zeros where the record shows them, if the law errs more than the noise.
+
+    `search_held` searches a box without them; then descents begin from the ends of all searches.
+    """
+    values, cost, found = tracker.best_values, tracker.best_cost, tracker.ends
     held = held_by_record(problem, asked)
     if values is None or not held.kept or not errs(BestPoint(problem, values)):
         return problem, None
+    tracker.best_values, tracker.best_cost, tracker.ends = None, math.inf, []
     try:
+        search_held(held.space())
+        tracker.ends += [*found, values]
         descend_again(held, tracker)
     except STOPPING:
-        tracker.best_values, tracker.best_cost, tracker.ends = values, cost, ends
+        tracker.best_values, tracker.best_cost, tracker.ends = values, cost, found
         raise
     if tracker.best_values is None:
-        tracker.best_values, tracker.best_cost, tracker.ends = values, cost, ends
+        tracker.best_values, tracker.best_cost, tracker.ends = values, cost, found
         return problem, None
     pairs = zip(problem.names, tracker.best_values.tolist(), values.tolist(), strict=True)
     springs = {name for name in problem.free() if name not in NUISANCE}

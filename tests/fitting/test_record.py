@@ -1,0 +1,183 @@
+"""Contact, zeros and weights keep to the record where the law does not describe the foam.
+
+The records are made by the formulas below: a foam that is crushed, recovers little, and is recorded
+from before the contact with arbitrary zeros and noise in each channel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.optimize import least_squares
+
+import foamfit as ff
+
+HEIGHT, AREA = 15e-3, 7.07e-4  # m, m²
+OFFSET, BIAS = 3.1e-3, 0.21e6  # zeros of motion, m, and stress, Pa, in the file
+TOML = f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n'
+
+
+def crushed(folder, *, seed=0, most=0.75, noise=(20e3, 2e-6), rest=40, rows=700):
+    """Write a record of a crushed foam and return its path, travel (m) and peak stress (Pa)."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0.0, 10e-3, rows)
+    start = time[rest] + 0.4 * time[1]
+    phase = np.clip((time - start) / (time[-1] - start), 0.0, 1.0)
+    strain = most * np.sin(0.62 * np.pi * phase) / np.sin(0.5 * np.pi)
+    top = int(np.argmax(strain))
+    plateau = 1.1e6 * np.minimum(strain / 0.012, 1.0)
+    stress = plateau + 9e6 * strain**4 + 1.4e7 * np.maximum(strain - 0.45, 0.0) ** 1.5
+    set_in = 0.9 * most  # strain that is not recovered
+    back = stress[top] * np.maximum((strain - set_in) / (most - set_in), 0.0) ** 1.2
+    stress[top:] = back[top:]
+    table = {
+        "time (s)": time,
+        "stress (Pa)": stress + BIAS + noise[0] * rng.standard_normal(rows),
+        "displacement (m)": strain * HEIGHT + OFFSET + noise[1] * rng.standard_normal(rows),
+    }
+    path = folder / f"crushed-{seed}.csv"
+    pd.DataFrame(table).to_csv(path, index=False)
+    path.with_suffix(".toml").write_text(TOML)
+    return path, most * HEIGHT, float(stress.max())
+
+
+@pytest.mark.parametrize(("model", "terms"), [("bistable", 0), ("microscale", 1)])
+def test_zeros_do_not_hide_an_error_of_the_law(model, terms, tmp_path):
+    """They stay where rest and first rise show them, and the result says what they would gain."""
+    path, travel, peak = crushed(tmp_path)
+    result = ff.fit(ff.read_test(path), model=model, relaxation=terms, starts=8)
+    motion, stress = (result.parameters[f"{c}_zero"] for c in ("displacement", "stress"))
+    assert abs(motion.value - OFFSET) < 0.01 * travel
+    assert abs(stress.value - BIAS) < 0.01 * peak
+    for one in (motion, stress):
+        assert one.state == "fixed"
+        assert one.ci95[0] < one.value < one.ci95[1]
+        assert "record shows" in one.why
+    assert max(result.strain) - (motion.value - OFFSET) / HEIGHT < 1.0
+    assert all(misfit is None or misfit < 0.1 for misfit in result.misfit.values())
+    check = next(one for one in result.checklist if one.key == "record")
+    if check.answer is False:
+        (warning,) = check.warnings
+        assert warning.startswith("The law is at fault: with ")
+        assert " the misfit would fall from " in warning
+
+
+def test_a_zero_that_is_asked_for_is_free(tmp_path):
+    test = ff.read_test(crushed(tmp_path)[0])
+    result = ff.fit(test, starts=4, vary=["displacement_zero"], intervals="local")
+    assert result.parameters["displacement_zero"].vary
+    assert not result.parameters["stress_zero"].vary
+
+
+def test_a_zero_at_which_the_measured_strain_reaches_one_is_refused(tmp_path):
+    test = ff.read_test(crushed(tmp_path)[0])
+    wrong = OFFSET - 0.3 * HEIGHT
+    with pytest.raises(ff.InputError, match="displacement_zero = .* measured strain would reach"):
+        ff.fit(test, fix={"displacement_zero": wrong})
+    low = ff.make_params(test)["displacement_zero"].min
+    assert test.displacement.max() + OFFSET - low < HEIGHT
+
+
+def plain_misfit(test, starts=25):
+    """Return the misfit of a bistable spring by plain least squares from random starts."""
+    strain = np.maximum(test.displacement, 0.0) / test.specimen.height
+    size, most = float(test.stress.max()), float(strain.max())
+    unit = np.array([size / most, size / most, 1.0, most, most, size / most, size / most])
+    box = [(0.03, 30), (0.03, 300), (1e-4, 0.999), (0.02, 0.9), (0.005, 0.8), (0.01, 30)]
+    low, high = np.log(np.array([*box, (1e-4, 30)]).T * unit)
+
+    def residual(point):
+        k0, kc, drop, eps_a, more, plus, minus = np.exp(point)
+        try:
+            spring = ff.BistableSpring(
+                k0=k0, kc=kc, dsigma=-drop * k0 * eps_a / (1.0 - eps_a), eps_a=eps_a,
+                eps_c=eps_a + more, kh_plus=plus, kh_minus=minus,
+            )  # fmt: skip
+            return (spring.stress(strain) - test.stress) / np.ptp(test.stress)
+        except (ValueError, ff.SimulationError):
+            return np.full(strain.size, 10.0)
+
+    rng, best = np.random.default_rng(0), np.inf
+    for _ in range(starts):
+        points = rng.uniform(low, high, (30, 7))
+        start = min(points, key=lambda one: float(np.sum(residual(one) ** 2)))
+        found = least_squares(residual, start, bounds=(low, high), max_nfev=60)
+        best = min(best, float(np.sqrt(np.mean(found.fun**2))))
+    return best
+
+
+@pytest.mark.parametrize("intervals", ["auto", "local"])
+def test_a_noisy_motion_does_not_excuse_an_error_of_the_law(intervals, tmp_path):
+    """The fit follows the record as plain least squares does, and says that it stays plain."""
+    test = ff.read_test(crushed(tmp_path, noise=(20e3, 250e-6))[0])
+    result = ff.fit(test, intervals=intervals)
+    assert result.misfit["stress_strain"] < 1.05 * plain_misfit(test)
+    assert any("The noise of the motion does not explain the residuals" in n for n in result.notes)
+
+
+def test_contact_is_not_sought_before_stress_and_motion_leave_their_rest(tmp_path):
+    """Impact of a striker on the crushed foam: the contact keeps to the first rise."""
+    path, *_ = crushed(tmp_path, rest=120, rows=900)
+    toml = TOML + '[striker]\nmass = "3 kg"\nvelocity = "4.8 m/s"\ngravity = false\n'
+    path.with_suffix(".toml").write_text(toml)
+    table = pd.read_csv(path)
+    step, rise = table["time (s)"][1], table["time (s)"][120]
+    limits = ff.make_params(ff.read_test(path), drive="impact")["contact_time"]
+    assert rise - 10.0 * step < limits.min < rise + step < limits.max < rise + 20.0 * step
+
+
+def test_where_the_law_is_true_contact_and_zeros_stay_free(tmp_path):
+    """The record is that of a bistable spring: its zeros are found and bought nothing."""
+    spring = ff.BistableSpring(
+        k0=4e6, kc=4e7, dsigma=-0.2e6, eps_a=0.2, eps_c=0.35, kh_plus=3e6, kh_minus=1.5e6
+    )
+    rng, rows, rest = np.random.default_rng(5), 800, 60
+    time = np.linspace(0.0, 2.0, rows)
+    phase = np.clip((time - time[rest] - 0.3 * time[1]) / (2.0 - time[rest]), 0.0, 1.0)
+    strain = 0.55 * np.sin(np.pi * phase)
+    stress = np.maximum(np.asarray(spring.stress(strain)), 0.0)
+    table = {
+        "time (s)": time,
+        "stress (Pa)": stress + BIAS + 2e-3 * stress.max() * rng.standard_normal(rows),
+        "displacement (m)": strain * HEIGHT + OFFSET + 1e-6 * rng.standard_normal(rows),
+    }
+    path = tmp_path / "true.csv"
+    pd.DataFrame(table).to_csv(path, index=False)
+    path.with_suffix(".toml").write_text(TOML)
+    result = ff.fit(ff.read_test(path), starts=8)
+    zero = result.parameters["displacement_zero"]
+    assert zero.vary
+    assert abs(zero.value - OFFSET) < 4.0 * zero.stderr
+    check = next(one for one in result.checklist if one.key == "record")
+    assert check.answer is True
+    assert replace(check, warnings=()) == check
+
+
+def test_points_are_drawn_in_the_coordinates_of_the_measured_curve(tmp_path):
+    """A fitted zero moves the points of the springs with the curve that they lie on."""
+    test = ff.read_test(crushed(tmp_path)[0])
+    result = ff.fit(test, starts=4, intervals="local")
+    moved = replace(result.parameters["displacement_zero"], value=OFFSET + 0.1 * HEIGHT)
+    raised = replace(result.parameters["stress_zero"], value=BIAS + 2e6)
+    changed = {"displacement_zero": moved, "stress_zero": raised}
+    other = replace(result, parameters=result.parameters | changed)
+
+    def marks(of):
+        axes = of.plot()
+        lines = [one for one in axes.lines if str(one.get_label()) in ("_A1", "_C1", "_C2")]
+        return np.array([one.get_xydata()[0] for one in lines]), axes
+
+    before, axes = marks(result)
+    unit = float(axes.get_ylabel() and {"MPa": 1e6, "kPa": 1e3}[axes.get_ylabel()[-4:-1]])
+    after, _ = marks(other)
+    assert len(before) >= 2
+    origin = test.origins
+    shift = [
+        (OFFSET + 0.1 * HEIGHT - result.parameters["displacement_zero"].value) / HEIGHT,
+        (BIAS + 2e6 - result.parameters["stress_zero"].value) / unit,
+    ]
+    assert origin["displacement_zero"] == pytest.approx(OFFSET, abs=2e-4)
+    assert after - before == pytest.approx(np.tile(shift, (len(before), 1)), rel=1e-6)
