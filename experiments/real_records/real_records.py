@@ -130,9 +130,7 @@ class Judge:
         peak = float(stress[top]) - rest
         rise = int(np.flatnonzero(stress[:top] - rest < 0.01 * peak)[-1]) + 1
         gap = float(np.median(np.diff(instants)))
-        return cls(
-            float(instants[rise]), gap, float(np.ptp(moved)), float(moved.max()), rest, peak
-        )
+        return cls(float(instants[rise]), gap, float(np.ptp(moved)), float(moved.max()), rest, peak)
 
     def excluded(self, result: ff.FitResult, height: float) -> Iterator[str]:
         """Yield what a fit accepts although the record excludes it."""

@@ -12,7 +12,7 @@ CONTACT, PEAK = 0.37, 1.0  # s, and the largest stress, one second later
 
 
 def rise(kind: str, since: np.ndarray) -> np.ndarray:
-    """Return a made rise: kink, soft start, jump, plateau after a kink, soft start before a kink."""
+    """Return a made rise of the stress, by the time since contact (s)."""
     x = np.maximum(since, 0.0)
     shape = {
         "kink": x,

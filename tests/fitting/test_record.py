@@ -75,7 +75,7 @@ def test_a_zero_that_is_asked_for_is_free(tmp_path):
 def test_a_zero_at_which_the_measured_strain_reaches_one_is_refused(tmp_path):
     test = ff.read_test(crushed(tmp_path)[0])
     wrong = OFFSET - 0.3 * HEIGHT
-    with pytest.raises(ff.InputError, match="displacement_zero = .* measured strain would reach"):
+    with pytest.raises(ff.InputError, match=r"displacement_zero = .* measured strain would reach"):
         ff.fit(test, fix={"displacement_zero": wrong})
     low = ff.make_params(test)["displacement_zero"].min
     assert test.displacement.max() + OFFSET - low < HEIGHT

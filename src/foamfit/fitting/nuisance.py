@@ -112,8 +112,7 @@ def shown_by(measurement: Measurement, drive: str) -> dict[str, Prior]:
     The first rise of the stress shows the contact; the motion at that time is its zero, unless the
     zero of the file is as likely.
     """
-    usual, known = values_of(measurement), priors_of(measurement, drive)
-    out = {name: one for name, one in known.items() if name in ZEROS}
+    out = {name: one for name, one in priors_of(measurement, drive).items() if name in ZEROS}
     if measurement.rise is None:
         return out
     contact, error = measurement.rise
@@ -121,12 +120,12 @@ def shown_by(measurement: Measurement, drive: str) -> dict[str, Prior]:
         zero, speed, noise = _motion_at(measurement, contact)
         spread = math.hypot(speed * error, noise)
         of_file = -measurement.origins.get("displacement_zero", 0.0)
-        if abs(of_file - zero) < ALIKE * spread:
-            contact, zero = contact + (of_file - zero) / speed if speed else contact, of_file
+        if abs(of_file - zero) < ALIKE * spread and speed > 0.0:
+            contact, zero = contact + (of_file - zero) / speed, of_file
         out["displacement_zero"] = Prior("displacement_zero", zero, spread)
     if drive == "impact":
         out[CONTACT_TIME] = Prior(CONTACT_TIME, contact, error)
-    return {name: one for name, one in out.items() if math.isfinite(usual[name])}
+    return out
 
 
 def _motion_at(measurement: Measurement, contact: float) -> tuple[float, float, float]:
@@ -136,7 +135,7 @@ def _motion_at(measurement: Measurement, contact: float) -> tuple[float, float, 
     time = np.arange(values.size, dtype=float) if measurement.time is None else measurement.time
     at, top = int(np.searchsorted(time, contact)), int(np.argmax(values))
     reach = max(3, (top - at) // _NEAR)
-    near = slice(max(0, at - reach), max(at, 0) + reach + 1)
+    near = slice(max(0, at - reach), at + reach + 1)
     speed, zero = np.polyfit(time[near] - contact, values[near], 1)
     return float(zero), float(speed), 0.0 if level is None else level.sigma
 

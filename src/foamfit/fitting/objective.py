@@ -466,7 +466,7 @@ class Objective:
         )
 
     def _followed(self, plan: AnyPlan, at: dict[str, float]) -> AnyPlan:
-        """Return the plan along the measured motion of an impact, zero where there is no contact."""
+        """Return the plan along the measured motion of an impact, zero without contact."""
         if self.drive != "impact":
             return plan
         values = np.maximum(plan.values - at["displacement_zero"], 0.0)

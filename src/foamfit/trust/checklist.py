@@ -162,7 +162,7 @@ def _at_noise(best: BestPoint) -> Check:
 
 def _of_record(best: BestPoint, estimates: Estimates, record: SearchRecord) -> Check:
     """Check whether free contact time and zeros would hide an error of the law."""
-    freed, facts = record.freed, dict[str, Any]()
+    freed = record.freed
     if freed is None:
         fitted = any(name in NUISANCE for name in best.names)
         return _check("record", True if fitted else None, names=())
@@ -170,14 +170,19 @@ def _of_record(best: BestPoint, estimates: Estimates, record: SearchRecord) -> C
     for name, (held, free) in freed.moved.items():
         if name in estimates and (ends := estimates[name].ci95) is not None:
             moves[name] = abs(free - held) / max(ends[1] - ends[0], 1e-300)
-    most = max(moves, key=moves.__getitem__, default="")
+    most, change = max(moves, key=moves.__getitem__, default=""), 0.0
     if moves.get(most, 0.0) > 1.0:
         held, free = freed.moved[most]
-        size = float(best.problem.sizes((most,), best.values)[0])
-        facts = {"moved": most, "change": abs(free - held) / size}
-    bought = freed.free < (1.0 - BOUGHT) * freed.held or bool(facts)
-    facts = {"names": freed.names, "held": freed.held, "free": freed.free} | facts
-    return _check("record", not bought, **({"moved": "", "change": 0.0} | facts))
+        change = abs(free - held) / float(best.problem.sizes((most,), best.values)[0])
+    return _check(
+        "record",
+        not (freed.free < (1.0 - BOUGHT) * freed.held or change),
+        names=freed.names,
+        held=freed.held,
+        free=freed.free,
+        moved=most if change else "",
+        change=change,
+    )
 
 
 def _determined(best: BestPoint, estimates: Estimates) -> Check:
