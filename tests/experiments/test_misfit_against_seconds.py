@@ -89,7 +89,8 @@ def test_the_derivatives_of_the_problem_serve_in_both_coordinates(
         for sign in (1.0, -1.0):
             moved = params.copy()
             scale = 1.0 if coordinates == "box" else problem.sizes((name,), problem.vector())[0]
-            size = abs(params[name].value) or float(scale)
+            value = abs(params[name].value)
+            size = value if value > 1e-9 * scale else float(scale)  # 0 is a rounding error off
             moved[name].value += sign * 1e-5 * size
             sides.append((moved[name].value, variables.residual(moved)))
         (up, high), (down, low) = sides

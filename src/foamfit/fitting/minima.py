@@ -32,6 +32,7 @@ NEAR, MINIMA, SAME = 40.0, 24, 0.02
 # Steps of a scan. STEP and SHORTEST: first and shortest step, as a fraction of the box. STEPS: most
 # steps to each side, halved above the noise floor, where nearby minima are equally good.
 STEP, SHORTEST, STEPS = 0.04, 0.015, 12
+CONTACT_STEP = 0.12  # first step of the contact time: about the error of the first rise
 # Changes of the cost, in residual variances: above TOO_HIGH a step is halved, below FLAT the next
 # one is doubled (until one has been halved), and below NOTHING the scan ends.
 TOO_HIGH, FLAT, NOTHING = 300.0, 4.0, 0.05
@@ -54,7 +55,8 @@ def scan_places(tracker: Tracker, space: Space) -> bool:
         scanned.add(CONTACT_TIME)
     for column, one in enumerate(space.coordinates):
         for sign in (1.0, -1.0) if one.short in scanned else ():
-            values, step, growth, before = best, sign * STEP, 2.0, cost
+            first = CONTACT_STEP if one.short == CONTACT_TIME else STEP
+            values, step, growth, before = best, sign * first, 2.0, cost
             for _ in range(STEPS if at_noise else STEPS // 2):
                 point = _moved(tracker, space, space.encode(values), column, step)
                 if point is None:
