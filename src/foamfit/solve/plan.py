@@ -21,7 +21,7 @@ from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
 from foamfit.springs import equilibrium, kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-from foamfit.springs.law import BISTABLE, LINEAR, UNILATERAL
+from foamfit.springs.law import BISTABLE, LINEAR
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 from foamfit.springs.sensitivities import equilibrium_tangents
 from foamfit.springs.spring import as_samples
@@ -54,19 +54,6 @@ MOST_IMPLICIT = 250_000  # implicit steps, at 0.5 ms each
 LEAST_AGGREGATE = 9  # an impact treats at least this number of springs under one stress as one
 LOGGED = 1024  # switches in the log of a first run; with more it is repeated
 
-_OUTCOMES = {
-    scenes.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
-    "too fast to be followed (a light mass or a heavy dashpot)",
-    scenes.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s, where the scene "
-    "changes faster than numbers can resolve (a strain at the end of its branch, a very light "
-    "mass, or many springs on a flat branch)",
-    scenes.FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
-    "that nothing slows; give the top a mass or the spring a dashpot",
-    scenes.NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
-    "branch (strain 1 on branch a, 1 + eps_star on branch c)",
-}
-
-
 _TOO_FAST = (
     "springs with memory are followed by explicit steps, for which {culprit} is too fast: the "
     "scene lasts {rate:.2g} of its radians or relaxation times, too many for {steps} steps"
@@ -78,8 +65,6 @@ NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 _NOTHING = np.zeros(1)
 # Tops under which springs start from rest, and that start.
 _RESTING, _AT_REST = (scenes.FREE, scenes.VISCOUS), np.zeros((1, 0))
-# Outcomes of a unilateral spring under a prescribed tension.
-_PULLED = (scenes.FLAT_UNDER_STRESS, scenes.NOT_FINITE)
 # Outcomes of explicit steps after which implicit ones are tried.
 _STIFF = (scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW)
 
@@ -270,7 +255,7 @@ class Plan(NamedTuple):
                 elif slopes is not None and what == OWN_HEIGHT:
                     slopes.base_stress[p] -= eta * rate / heights[0]
         if not (fine and math.isfinite(kernels.total(stress))):
-            raise self._error(scenes.NOT_FINITE, rows)
+            raise scenes.failure(scenes.NOT_FINITE, self.top, self.values, rows)
         if not everything:
             if slopes is not None:
                 slopes = slopes._replace(displacement=slopes.displacement[:, -1:])
@@ -298,7 +283,7 @@ class Plan(NamedTuple):
             equilibrium.strains_along(rows, heights, stress, np.empty(1), strain, branches)
             strain[held] = 0.0
         if not np.isfinite(strain).all():
-            raise self._error(scenes.NOT_FINITE, rows)
+            raise scenes.failure(scenes.NOT_FINITE, self.top, self.values, rows)
         start[0, first:] = strain[:, 0]
         own = np.flatnonzero(directions[:, 0] >= first)
         if len(own):
@@ -323,24 +308,11 @@ class Plan(NamedTuple):
         """Return the result of an integrator as a Motion; raise SimulationError if it failed."""
         outcome, time, steps, switches = ending
         if outcome != scenes.DONE:
-            raise self._error(outcome, rows, steps=steps, time=time)
+            raise scenes.failure(outcome, self.top, self.values, rows, steps=steps, time=time)
         slopes = Slopes(out[1:, 1:], out[1:, 0], one_sided) if len(out) > 1 else None
         if log is not NO_SWITCHES:
             log = log[:switches] if switches <= len(log) else np.empty((switches, 5))
         return Motion(out[0, 1:], out[0, 0], time, log, steps, method, slopes, lost)
-
-    def _error(self, outcome: int, rows: Array, **ending: float) -> SimulationError:
-        """Return the error of a run that failed."""
-        pulled = self.top == scenes.STRESS and outcome in _PULLED and self.values.min() < 0.0
-        loose = (rows[:, kernels.KIND] == UNILATERAL) & (rows[:, kernels.ETA] == 0.0)
-        if pulled and loose.any():
-            at = int(np.argmax(self.values < 0.0))
-            return SimulationError(
-                f"the prescribed stress {self.values[at]:g} Pa (sample {at}) is a tension, which "
-                f"spring {int(loose.argmax()) + 1} cannot carry because it is unilateral; give the "
-                "spring a dashpot or the top a mass, or keep the stress at zero or above"
-            )
-        return SimulationError(_OUTCOMES[outcome].format(**ending))
 
     @property
     def _duration(self) -> float:
