@@ -397,6 +397,8 @@ class Fit:
     budget: Budget | None = None
     # Mean and standard deviation of the priors, SI
     priors: dict[str, tuple[float, float]] = field(default_factory=dict)
+    # The model and the options that change the numbers, apart from defaults; None if unknown
+    options: dict[str, Any] | None = None
     # Samples of a Markov chain, (walkers, steps) by parameter, SI; empty without a chain
     draws: dict[str, Array] = field(default_factory=dict)
 
@@ -493,6 +495,7 @@ class Fit:
             "ladder": self.ladder,
             "by_cycle": self.by_cycle,
             "priors": self.priors,
+            "options": self.options,
         }
         content = {
             "schema": SCHEMA,
