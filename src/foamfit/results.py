@@ -489,14 +489,9 @@ class Fit:
         head = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
         found = ("visited", "misfit", "weights", "statistics", "noise", "energy")
         model = Model.parse(self.model)
-        optional = {
-            "correlation": self.correlation,
-            "budget": self.budget and self.budget.contributions,
-            "ladder": self.ladder,
-            "by_cycle": self.by_cycle,
-            "priors": self.priors,
-            "options": self.options,
-        }
+        more = ("correlation", "ladder", "by_cycle", "priors", "options")
+        optional = {"budget": self.budget and self.budget.contributions}
+        optional |= {name: getattr(self, name) for name in more}
         content = {
             "schema": SCHEMA,
             "foamfit": version("foamfit"),
