@@ -173,7 +173,6 @@ def synthetic_impact(
     return spring, measurement
 
 
-@functools.cache
 def refused(path: Path, *words: str, specimen: Path | None = None) -> None:
     """Check that a test is rejected with one sentence that contains these words."""
     with pytest.raises(ff.InputError) as caught:
@@ -184,6 +183,7 @@ def refused(path: Path, *words: str, specimen: Path | None = None) -> None:
         assert word in message
 
 
+@functools.cache
 def synthetic_loop(noise: float = 0.005) -> tuple[ff.BistableSpring, Measurement]:
     """Simulate a quasi-static loop without time and without a striker."""
     spring = ff.published["foam-1/model-1"].bistable

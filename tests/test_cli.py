@@ -148,7 +148,7 @@ def test_check_with_another_specimen(here: Path) -> None:
 
 def test_fit_writes_beneath_the_current_directory(fitted: tuple[Path, Result]) -> None:
     folder, result = fitted
-    at = f"fits/{RECONSTRUCTION.stem}/bistable"
+    at = f"fits/{RECONSTRUCTION.stem}/bistable-seed-1-starts-4"
     profiled = "profile likelihood" in (folder / at / "parameters.csv").read_text()
     names = FILES | {"budget.csv"} | ({"profiles.csv"} if profiled else set())
     assert set(files(folder)) == {f"{at}/{name}" for name in names}
@@ -181,7 +181,7 @@ def test_an_older_result_is_replaced_and_quiet_is_quiet(
     shutil.copytree(next(fitted[0].rglob("fit.json")).parent, "old")
     (here / "old" / "ladder.csv").write_text("x")
     args = ("--drive", "displacement", "--fix", "s1_k0=5.5e6", "--vary", "s1_eta", "--starts", 3)
-    result = accepted("fit", RECONSTRUCTION, "--out", "old", "--quiet", *args)
+    result = accepted("fit", RECONSTRUCTION, "--out", "old", "--force", "--quiet", *args)
     assert result.stdout == ""
     content = json.loads((here / "old" / "fit.json").read_text())
     # Written only if the cost is not parabolic in a parameter, or if a zero is uncertain.
@@ -201,7 +201,8 @@ def test_the_time_limit_gives_the_best_so_far(here: Path) -> None:
     assert result.exit_code == (2 if content["status"] == "failed" else 0)
     assert "stopped by the time limit" in content["warnings"][0]
     assert content["runtime_s"] < 10
-    assert (here / "fits" / RECONSTRUCTION.stem / "bistable" / "fit.json").is_file()
+    name = "bistable-max-time-0.5-starts-9000"
+    assert (here / "fits" / RECONSTRUCTION.stem / name / "fit.json").is_file()
 
 
 def test_what_no_spring_follows_fails_and_is_written(

@@ -58,5 +58,14 @@ def test_phrases_that_are_not_english_stay_out():
     assert [(path.name, line) for path, line in lines if AVOIDED.search(line)] == []
 
 
+def test_the_example_of_the_readme_writes_into_a_folder_that_git_ignores():
+    """The tracked folder fits/ has the results of the published cases."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    folder = re.search(r"foamfit fit experiments/\S+\.csv --out (\S+)\n```", text)[1]
+    assert f"Open `{folder}/report.html`" in text
+    ignored = (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
+    assert f"/{folder.split('/')[0]}/" in ignored
+
+
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
 
 import fabricated
+import foamfit as ff
 from conftest import EXPERIMENTS, without_pictures
 from foamfit import api
 from foamfit.cli import main
@@ -81,7 +81,8 @@ def test_json_for_a_program_and_a_browser_exclude_each_other(
 
 def test_cycles_open_their_picture(opened: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     failed = {1: fabricated.result(status="failed")}
-    found = SimpleNamespace(results=failed, save=lambda *_, **__: None)
+    found = ff.CycleFits("foam", "bistable", (1,), failed, {})
+    monkeypatch.setattr(ff.CycleFits, "save", lambda *_, **__: None)
     monkeypatch.setattr("foamfit.study.cycles.fit_cycles", lambda *_, **__: found)
     monkeypatch.setattr("foamfit.report.studies.cycles.cycles_text", lambda _: "told")
     told = CliRunner().invoke(

@@ -65,14 +65,15 @@ def test_every_command_prints_in_every_encoding(
         ["check", RECONSTRUCTION],
         ["published"],
         ["compare", "r", "--published", "foam-1/model-1"],
-        ["fit", RECONSTRUCTION, "--out", "r"],
+        ["fit", RECONSTRUCTION, "--out", "r", "--force"],
         ["fit", "--help"],
     ):
         told = run(*args, encoding=encoding)
         assert (told.exit_code, told.stderr) == (0, ""), args
         assert told.stdout_bytes.decode(encoding)
     quick(monkeypatch, status="failed")
-    assert run("fit", RECONSTRUCTION, "--json", "--out", "r", encoding=encoding).exit_code == 2
+    again = ("--json", "--force", "--out", "r")
+    assert run("fit", RECONSTRUCTION, *again, encoding=encoding).exit_code == 2
     refused = run("check", "χ.csv", encoding=encoding)
     assert refused.exit_code == 1
     assert "chi.csv" in refused.stderr

@@ -42,14 +42,26 @@ PARTS = (
     "figures, report, result folder",
 )
 PROBE = """
-import gc, sys, time gc.set_threshold(100_000, 20, 10)  # as the command marks =
-[time.perf_counter()] import foamfit.cli marks.append(time.perf_counter()) import foamfit test =
-foamfit.read_test(sys.argv[1]) marks.append(time.perf_counter()) from foamfit import api from
-contextlib import closing from foamfit.cli.options import Drawers with closing(Drawers()) as
-drawers: drawers.begin() marks.append(time.perf_counter()) result = api.fit(test)
-marks.append(time.perf_counter()) result.save(sys.argv[2], mapped=drawers.map)
-marks.append(time.perf_counter()) print(*(after - before for before, after in zip(marks,
-marks[1:]))) gc.freeze()  # as in the command
+import gc, sys, time
+gc.set_threshold(100_000, 20, 10)  # as the command
+marks = [time.perf_counter()]
+import foamfit.cli
+marks.append(time.perf_counter())
+import foamfit
+test = foamfit.read_test(sys.argv[1])
+marks.append(time.perf_counter())
+from foamfit import api
+from contextlib import closing
+from foamfit.cli.options import Drawers
+with closing(Drawers()) as drawers:
+    drawers.begin()
+    marks.append(time.perf_counter())
+    result = api.fit(test)
+    marks.append(time.perf_counter())
+    result.save(sys.argv[2], mapped=drawers.map)
+    marks.append(time.perf_counter())
+print(*(after - before for before, after in zip(marks, marks[1:])))
+gc.freeze()  # as in the command
 """
 
 

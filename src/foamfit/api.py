@@ -190,8 +190,10 @@ def fit(
         if model == "auto":
             from foamfit.auto import compare_models
 
-            return FitResult(**vars(compare_models(measurement, chosen, part(0.0, 1.0), tell)))
-        searched = identify(measurement, model, params, chosen, part(0.0, SEARCHED))
-        found, _ = judge(searched, chosen.choice, tell, part(SEARCHED, 1.0))
-        progress(1.0, "done")
-        return FitResult(**vars(found))
+            found = compare_models(measurement, chosen, part(0.0, 1.0), tell)
+        else:
+            searched = identify(measurement, model, params, chosen, part(0.0, SEARCHED))
+            found, _ = judge(searched, chosen.choice, tell, part(SEARCHED, 1.0))
+            progress(1.0, "done")
+        stored = chosen.stored(measurement, model) if params is None else None
+        return FitResult(**vars(found) | {"options": stored})

@@ -6,7 +6,8 @@ import difflib
 import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from numbers import Integral, Real
 from typing import Any, TypedDict
@@ -32,7 +33,7 @@ from foamfit.fitting.search import (
     search,
     what_stopped,
 )
-from foamfit.results import Fit, Intervals
+from foamfit.results import Fit, Intervals, plain
 from foamfit.settle import (
     back_to_plain,
     descend_again,
@@ -41,7 +42,7 @@ from foamfit.settle import (
     refine,
     weigh_motion,
 )
-from foamfit.springs.model import with_options
+from foamfit.springs.model import Model, with_options
 from foamfit.springs.options import OPTIONS
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
@@ -158,6 +159,37 @@ class Options:
     def of_springs(self) -> dict[str, bool]:
         """The options that free further parameters of some springs."""
         return {name: getattr(self, name) for name in OPTIONS}
+
+    def stored(
+        self, measurement: Measurement, model: str, several: Sequence[int] = ()
+    ) -> dict[str, Any]:
+        """Return the model, the cycle and all options that change the numbers, for fit.json.
+
+        Defaults are left out, among them the default drive of the test and its first cycle.
+        `several` are the cycles of a record that are fitted one by one.
+        """
+        every = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "watch"}
+        defaults = {one.name: one.default for one in fields(self)}
+        if model != "auto":
+            parsed = Model.parse(model)
+            model = parsed.words
+            every |= {name: every[name] or is_set for name, is_set in parsed.options.items()}
+        every["fix"] = dict(sorted((self.fix or {}).items()))
+        every["vary"] = sorted(set(self.vary))
+        every["draws"] = self.choice.draws if self.intervals == "mcmc" else None
+        with suppress(InputError):  # a test without a drive is refused by the fit
+            if self.drive is not None and self.drive == choose_drive(measurement):
+                every["drive"] = None
+        first, last = measurement.cycle, measurement.last_cycle
+        if several:
+            whole = set(several) == set(measurement.cycles)
+            every["cycle"] = "all" if whole else ",".join(map(str, sorted(set(several))))
+        elif last is not None:
+            every["cycles"] = f"{first}-{last}"
+        elif first != min(measurement.cycles, default=first):
+            every["cycle"] = first
+        changed = {n: value for n, value in every.items() if value and value != defaults.get(n)}
+        return dict(plain({"model": model, **changed}))
 
     def check(self, measurement: Measurement, model: str) -> None:
         """Reject options that the test or the model does not allow, before any simulation."""

@@ -397,6 +397,8 @@ class Fit:
     budget: Budget | None = None
     # Mean and standard deviation of the priors, SI
     priors: dict[str, tuple[float, float]] = field(default_factory=dict)
+    # The model and the options that change the numbers, apart from defaults; None if unknown
+    options: dict[str, Any] | None = None
     # Samples of a Markov chain, (walkers, steps) by parameter, SI; empty without a chain
     draws: dict[str, Array] = field(default_factory=dict)
 
@@ -495,13 +497,9 @@ class Fit:
         head = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
         found = ("visited", "misfit", "weights", "statistics", "noise", "energy")
         model = Model.parse(self.model)
-        optional = {
-            "correlation": self.correlation,
-            "budget": self.budget and self.budget.contributions,
-            "ladder": self.ladder,
-            "by_cycle": self.by_cycle,
-            "priors": self.priors,
-        }
+        more = ("correlation", "ladder", "by_cycle", "priors", "options")
+        optional = {"budget": self.budget and self.budget.contributions}
+        optional |= {name: getattr(self, name) for name in more}
         content = {
             "schema": SCHEMA,
             "foamfit": version("foamfit"),

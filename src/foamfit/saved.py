@@ -140,4 +140,5 @@ def _cycles(folder: Path) -> CycleFits:
         names = content["fitted"]
         refused = decode(dict[int, str], content["refused"], {})
         given = content["test"], content["model"], tuple(content["recorded"])
-    return CycleFits(*given, {n: _fit(folder / f"cycle-{n}") for n in names}, refused)
+        made = content.get("data_sha256", ""), content.get("options")
+    return CycleFits(*given, {n: _fit(folder / f"cycle-{n}") for n in names}, refused, *made)

@@ -293,6 +293,14 @@ def test_without_a_mass_inside_there_is_none(tmp_path):
 HEADER = "time (ms),stress (MPa),displacement (mm)"
 
 
+def test_a_repeated_check_of_a_refusal_reads_the_file_again(tmp_path):
+    path = write(tmp_path, toml=None)
+    refused(path, "test.toml", "height")
+    write(tmp_path)
+    with pytest.raises(pytest.fail.Exception, match="DID NOT RAISE"):
+        refused(path, "test.toml", "height")
+
+
 def test_refuses_missing_files_and_directories(tmp_path):
     refused(tmp_path / "none.csv", "none.csv", "no such file")
     refused(tmp_path, "directory")

@@ -592,14 +592,34 @@ def test_contact_ends_wherever_in_the_chain_a_gap_opens(speed: float) -> None:
 
 @pytest.mark.parametrize("eta", [0.0, 20.0])
 def test_a_stress_that_a_spring_cannot_carry_is_refused(eta: float) -> None:
-    """Also at the first sample, where the dashpot of the other spring could bear the stress."""
+    """Also at the first sample, where the dashpot of the other spring could bear the stress.
+
+    The message names the spring and the remedy, and not the end of a branch.
+    """
     springs = [
         ff.LinearSpring(6e7, unilateral=True),
         ff.BistableSpring(5.5e6, 82e6, -0.18e6, 0.14, 0.31, 14e6, 2.4e6, eta),
     ]
     chain = ff.Chain(springs, [7e-4, 5e-4], 2e-5)
-    with pytest.raises(ff.SimulationError, match="no longer finite"):
-        ff.simulate(chain, ff.StressDrive([-1e6, -1e6]), [0.0, 1e-4])
+    for stress, at in (([-1e6, -1e6], 0), ([2e5, -1e6], 1)):
+        with pytest.raises(ff.SimulationError, match="is a tension, which spring 1") as caught:
+            ff.simulate(chain, ff.StressDrive(stress), [0.0, 1e-4])
+        assert f"-1e+06 Pa (sample {at})" in str(caught.value)
+        assert "unilateral" in str(caught.value)
+
+
+def test_all_switches_of_a_long_history_are_kept() -> None:
+    """As many as without the dashpot, which makes the solver step in time."""
+    cycles, seven = 600, dataclasses.astuple(MODEL_1)[:7]
+    time = np.linspace(0.0, 2.0, 20 * cycles + 1)
+    drive = ff.StressDrive(2.5e6 * (1.0 - np.cos(np.pi * cycles * time)))
+    bare, damped = (
+        ff.simulate(ff.Chain([ff.BistableSpring(*seven, eta)], [1.2e-3], AREA), drive, time)
+        for eta in (0.0, 3e3)
+    )
+    assert len(damped.switches) == len(bare.switches) > 2 * cycles
+    assert np.all(np.diff(damped.switches[:, 0]) >= 0.0)
+    assert damped.switches[-1, 0] > 2.0 - 2.0 / cycles
 
 
 def test_a_motion_too_fast_for_a_dashpot_is_refused() -> None:

@@ -176,6 +176,131 @@ def test_a_law_stands_in_a_chain(bouc_wen: Law) -> None:
         np.testing.assert_allclose(spring.stress(strain), got.base_stress, rtol=1e-8, atol=1.0)
 
 
+def test_relaxation_begins_at_zero_at_any_strain(bouc_wen: Law) -> None:
+    """q = ∫ g exp(-(t - s)/τ) dσ/ds ds from the first sample on, whatever its strain or stress."""
+    g, tau, time = 0.5, 0.2, np.linspace(0.0, 1.0, 101)
+    spring, strain = bouc_wen.make(VALUES, [(g, tau)]), 0.1 + 0.2 * time
+    law = bouc_wen.make(VALUES, ())
+    got = ff.simulate(chain_of(spring), ff.DisplacementDrive(HEIGHT * strain), time).base_stress
+    assert got[0] == pytest.approx(law.stress([0.1])[0], rel=1e-9)
+    fine = np.linspace(0.0, 1.0, 20_001)
+    sigma = law.stress(0.1 + 0.2 * fine)
+    held = g * np.trapezoid(np.exp((fine - 1.0) / tau) * np.gradient(sigma, fine), fine)
+    assert got[-1] == pytest.approx(sigma[-1] + held, rel=1e-4)
+    back = ff.simulate(chain_of(spring), ff.StressDrive(got), time)
+    np.testing.assert_allclose(back.strain, strain, rtol=1e-4)
+
+
+def test_the_tangent_follows_the_motion_at_a_cost_that_grows_with_its_length(
+    bouc_wen: Law,
+) -> None:
+    """Bouc-Wen loading and unloading have different slopes; n² steps would take minutes."""
+    k, alpha, limit, n, _ = VALUES
+    spring, ways = bouc_wen.make(VALUES, ()), ((0.0, 0.4), (0.4, 0.05), (0.05, 0.05), (0.05, 0.6))
+    strain = np.concatenate([np.linspace(*way, 10_000)[1:] for way in ways])
+    z = (spring.stress(strain) / k - alpha * strain) / (1.0 - alpha)
+    way = np.repeat([1.0, -1.0, -1.0, 1.0], 9_999)
+    slope = np.where(z * way > 0.0, 1.0 - np.abs(z / limit) ** n, 1.0)
+    want = alpha * k + (1.0 - alpha) * k * slope
+    np.testing.assert_allclose(spring.tangent(strain), want, rtol=1e-5)
+
+
+PLATEAU = ("loading", "plateau")
+
+
+def _bent(row, state, strain):  # type: ignore[no-untyped-def]
+    state[0] = strain
+    stiff = row[0] if strain <= 0.1 else row[1]
+    state[1] = row[0] * min(strain, 0.1) + stiff * max(strain - 0.1, 0.0)
+    state[2] = 0.0 if strain <= 0.1 else 1.0
+
+
+def _beyond(row, state, strain):  # type: ignore[no-untyped-def]
+    return (strain > 0.1) != (state[2] == 1.0)
+
+
+def _across(row, state, up):  # type: ignore[no-untyped-def]
+    state[0], state[1], state[2] = 0.1, 0.1 * row[0], 1.0 if up else 0.0
+
+
+def _copied(values, row):  # type: ignore[no-untyped-def]
+    for i in range(values.size):
+        row[i] = values[i]
+    return True
+
+
+def _at_rest(row, state):  # type: ignore[no-untyped-def]
+    state[:] = 0.0
+
+
+@pytest.mark.usefixtures("bouc_wen")
+def test_the_tangent_at_the_end_of_a_branch_is_that_of_the_branch() -> None:
+    known = ff.register(
+        Law(
+            kind="bent",
+            params=tuple(ff.Param(name, start=(1.0, "slope")) for name in ("k", "kh")),
+            functions=ff.Functions(_copied, _at_rest, _beyond, _across, _bent),
+            branches=dict.fromkeys(PLATEAU, ""),
+        )
+    )
+    spring, strain = known.make((2e6, 1e5, 0.0), ()), [0.0, 0.05, 0.1, 0.2, 0.1 + 1e-12, 0.05]
+    assert spring.branches(strain).tolist() == [PLATEAU[i] for i in (0, 0, 0, 1, 1, 0)]
+    want = [2e6, 2e6, 2e6, 1e5, 1e5, 2e6]
+    np.testing.assert_allclose(spring.tangent(strain), want, rtol=1e-6)
+
+
+def _polynomial(row, state, strain):  # type: ignore[no-untyped-def]
+    state[0], state[1] = strain, 0.0
+    for i in range(row.size):
+        state[1] += row[i] * (2.0 * strain) ** (i + 1)
+
+
+def _never(row, state, strain):  # type: ignore[no-untyped-def]
+    return False
+
+
+@pytest.mark.usefixtures("bouc_wen")
+def test_a_law_may_have_more_than_twenty_parameters() -> None:
+    """σ = Σ p_i (2ε)^i, so that the derivative by each parameter is a power of the strain."""
+    count, g, tau, eta = 26, 0.3, 0.4, 5e3
+    functions = ff.Functions(_copied, _at_rest, _never, _across, _polynomial)
+    params = tuple(ff.Param(f"p{i}", start=(1.0, "slope")) for i in range(1, count + 1))
+    known = ff.register(Law(kind="polynomial", params=params, functions=functions))
+    time, values = np.linspace(0.0, 1.0, 41), np.linspace(1e6, 2e6, count)
+    names = [f"s1_p{i}" for i in range(1, count + 1)]
+    drive = ff.DisplacementDrive(0.5 * HEIGHT * time)
+    quiet = chain_of(known.make((*values, 0.0), ()))
+    got = ff.simulate(quiet, drive, time, sensitivities=names).sensitivities
+    for i, name in enumerate(names, 1):
+        np.testing.assert_allclose(got[name].base_stress, time**i, rtol=0, atol=1e-9)
+    relaxing = chain_of(known.make((*values, eta), [(g, tau)]))
+    more = ff.simulate(relaxing, drive, time, sensitivities=["s1_eta", "s1_g1", "s1_tau1"])
+    own = {name: one.base_stress for name, one in more.sensitivities.items()}
+    np.testing.assert_allclose(own["s1_eta"], 0.5, rtol=1e-6)
+    fine = np.linspace(0.0, 1.0, 20_001)
+    rate = np.gradient(quiet.springs[0].stress(0.5 * fine), fine)
+    late = np.exp((fine - 1.0) / tau)
+    assert own["s1_g1"][-1] == pytest.approx(np.trapezoid(late * rate, fine), rel=1e-4)
+    by_tau = g * np.trapezoid(late * rate * (1.0 - fine) / tau**2, fine)
+    assert own["s1_tau1"][-1] == pytest.approx(by_tau, rel=1e-3)
+
+
+def test_a_chain_keeps_its_law_when_the_name_is_registered_again(bouc_wen: Law) -> None:
+    functions = bouc_wen.functions
+    assert isinstance(functions, ff.Functions)
+    first = ff.register(changed(bouc_wen, kind="again", spring=None))
+    chain, time = chain_of(first.make(VALUES, ())), np.linspace(0.0, 1.0, 21)
+    drive, names = ff.DisplacementDrive(0.2 * HEIGHT * time), ["s1_limit"]
+    before = ff.simulate(chain, drive, time, sensitivities=names)
+    other = ff.Functions(_copied, _at_rest, _never, _across, _polynomial)
+    params = tuple(ff.Param(f"p{i}", start=(1.0, "slope")) for i in (1, 2))
+    ff.register(Law(kind="again", params=params, functions=other))
+    after = ff.simulate(chain, drive, time, sensitivities=names)
+    np.testing.assert_array_equal(after.base_stress, before.base_stress)
+    one, two = (run.sensitivities["s1_limit"].base_stress for run in (before, after))
+    np.testing.assert_array_equal(two, one)
+
+
 # ---------------------------------------------------------------------------- refusals
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, closing
+import re
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +24,7 @@ from foamfit.terminal import say
 
 if TYPE_CHECKING:
     from foamfit.api import FitResult
+    from foamfit.data.measurement import Measurement
     from foamfit.report.studies.cycles import CycleFits
 
 # Options that are not keywords of `foamfit.fit`, and options that select its `intervals`.
@@ -106,17 +110,40 @@ def keywords_of(asked: Mapping[str, Any]) -> dict[str, Any]:
     return search | {"intervals": way, "draws": None if draws is True else draws}
 
 
-def fit_as_asked(
-    test: Path,
-    specimen: Path | None,
-    asked: Mapping[str, Any],
-    begin: Callable[[float | None], AbstractContextManager[Progress]],
-) -> FitResult | CycleFits:
-    """Fit a test, or cycles of a record, with the options of the command.
+@dataclass(frozen=True)
+class Ready:
+    """A fit as the command asks for it: files read, options checked, nothing simulated."""
 
-    `begin` is called after all files are read and before the first simulation, with the time limit
-    (s) of the fit if there is one; the fit reports its progress to the object that it returns.
-    """
+    test: Path
+    specimen: Path | None
+    measurement: Measurement
+    model: str
+    search: dict[str, Any]  # keywords of `foamfit.fit`
+    several: tuple[int, ...] | None  # cycles to be fitted one by one, () for all
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options that the result stores."""
+        from foamfit.one_model import Options
+
+        several = () if self.several is None else self.several or self.measurement.cycles
+        return Options(**self.search).stored(self.measurement, self.model, several)
+
+    def fit(self, news: Progress) -> FitResult | CycleFits:
+        """Fit the test, or the cycles of the record, and report the progress."""
+        from foamfit import api
+
+        search: Any = {"progress": news.progress, "watch": news.watch, "tell": news.tell}
+        search |= self.search | {"model": self.model}
+        if self.several is None:
+            return api.fit(self.measurement, **search)
+        from foamfit.study import cycles as study
+
+        return study.fit_cycles(self.test, self.specimen, cycles=self.several or None, **search)
+
+
+def read_as_asked(test: Path, specimen: Path | None, asked: Mapping[str, Any]) -> Ready:
+    """Read a test with the options of the command; InputError if it cannot be fitted so."""
     from foamfit.data.csv_file import read_test
 
     search = keywords_of(asked)
@@ -128,17 +155,41 @@ def fit_as_asked(
     for number in set(several or ()).difference(measurement.cycles):
         last = f"its cycles are {min(measurement.cycles)} to {max(measurement.cycles)}"
         raise InputError(f"--cycle {asked['cycle']}: {test} has no cycle {number}; {last}")
-    from foamfit import api
     from foamfit.one_model import Options
 
     Options(**search).check(measurement, model)  # fail before anything is compiled
-    with begin(search["max_time"] if several is None else None) as news:  # else a limit per cycle
-        search |= {"progress": news.progress, "watch": news.watch, "tell": news.tell}
-        if several is None:
-            return api.fit(measurement, model=model, **search)
-        from foamfit.study import cycles as study
+    return Ready(test, specimen, measurement, model, search, several)
 
-        return study.fit_cycles(test, specimen, cycles=several or None, model=model, **search)
+
+# Options in the name of a folder: the first ones, in this order, and those of which only the value
+# is named.
+FIRST = (
+    "relaxation", *OPTIONS, "drive", "cycle", "cycles", "specimen", "fix", "vary", "intervals",
+)  # fmt: skip
+BARE, LONGEST = ("drive", "intervals"), 120  # characters of a name
+
+
+def folder_name(options: Mapping[str, Any]) -> str:
+    """Return the name of a result's folder: the model and the options that the result stores."""
+    parts = [options["model"]]
+    for name in sorted(options.keys() - {"model"}, key=lambda one: ((*FIRST, one).index(one), one)):
+        value, shown = options[name], name.replace("_", "-")
+        parts.append(shown if value is True else _words(value))
+        if value is not True and name not in BARE:
+            parts[-1] = f"{shown}-{parts[-1]}"
+    whole = re.sub(r"[^\w.,+=-]+", "-", "-".join(parts))
+    mark = hashlib.sha256(whole.encode()).hexdigest()[:8]
+    return whole if len(whole) <= LONGEST else f"{whole[: LONGEST - 9]}-{mark}"
+
+
+def _words(value: Any) -> str:
+    """Return the value of an option as part of a name."""
+    if isinstance(value, Mapping):
+        return ",".join(f"{key}={_words(one)}" for key, one in sorted(value.items()))
+    if isinstance(value, list):
+        return ",".join(map(_words, value))
+    exact = not isinstance(value, float) or float(f"{value:g}") == value
+    return f"{value:g}" if isinstance(value, float) and exact else str(value)
 
 
 @main.command()
@@ -147,10 +198,16 @@ def fit_as_asked(
 @options.CYCLE
 @options.CYCLES
 @fit_options
-@options.output("fits/<test>/<model>", "fit.json")
+@options.output("fits/<test>/<model and options>", "fit.json")
+@options.option("--force", "Replace a result of other data or options in the same folder.")
 @options.option("--verbose", "Also print the checklist, reasons, notes and all models.")
-def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **asked: Any) -> int:
+def fit(
+    test: Path, specimen: Path | None, output: Output, force: bool, verbose: bool, **asked: Any
+) -> int:
     """Identify the parameters of TEST.csv and write a result folder.
+
+    The name of the default folder has the model and all options that change the numbers, such as
+    microscale-relaxation-1. A result of the same data and options is replaced.
 
     With several cycles the folder holds one result folder for each, cycles.csv, cycles.png and
     cycles.json: the parameters by cycle.
@@ -176,17 +233,31 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
         closing(options.Drawers()) as drawers,
     ):
         from foamfit.data.toml_file import toml_beside
+        from foamfit.report.folder import check_same
 
-        toml = toml_beside(test)
-        folder = output.folder(Path("fits", toml.stem, model), (test, specimen or toml))
+        ready, toml = read_as_asked(test, specimen, asked), toml_beside(test)
+        made = ready.options
+        if specimen not in (None, toml):
+            made["specimen"] = specimen.stem
+        folder = output.folder(Path("fits", toml.stem, folder_name(made)), (test, specimen or toml))
 
-        def begin(limit: float | None) -> AbstractContextManager[Progress]:
-            compile_rest()
-            if not output.no_report:
-                drawers.begin()
-            return progress_line(output.silent, "fit", limit, says=not output.quiet)
+        def check(place: Path) -> None:
+            if not force:
+                check_same(place, ready.measurement.data_sha256, made)
 
-        found = fit_as_asked(test, specimen, asked, begin)
+        check(folder)
+        compile_rest()
+        if not output.no_report:
+            drawers.begin()
+        # Of several cycles, each has the time limit for itself.
+        limit = ready.search["max_time"] if ready.several is None else None
+        with progress_line(output.silent, "fit", limit, says=not output.quiet) as news:
+            found = replace(ready.fit(news), options=made)
+
+        def save(place: Path, **how: Any) -> None:
+            check(place)  # again, for another fit may have written there in the meantime
+            found.save(place, **how)
+
         from foamfit.report.studies.cycles import cycles_text
         from foamfit.report.summary import summary_text
         from foamfit.results import Fit
@@ -198,7 +269,7 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
             page, which = "cycles.png", " of any cycle"
             failed = all(one.status == "failed" for one in found.results.values())
             content, text = partial(_content_of, found), partial(cycles_text, found)
-        output.finish(found.save, folder / page, content, text, mapped=drawers.map)
+        output.finish(save, folder / page, content, text, mapped=drawers.map)
     if failed:
         say(f"foamfit: no acceptable fit{which} was found; see {folder}", err=True)
     return NOT_ACCEPTABLE if failed else 0

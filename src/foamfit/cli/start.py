@@ -34,28 +34,33 @@ def check(test: Path, specimen: Path | None) -> None:
 
 @main.command()
 @options.TEST
-def init(test: Path) -> None:
+@options.option("--force", "Overwrite an existing TOML.")
+def init(test: Path, force: bool) -> None:
     """Write a TOML for TEST.csv, with questions to answer.
 
     TEST.toml contains what the headers of TEST.csv say, and questions for the rest.
     Each question is a line after "# " with a unit and an example: enter your value and remove the
-    "# ". An existing TOML is not changed.
+    "# ". An existing TOML is kept unless --force is given.
 
     Example: foamfit init TEST.csv
     """
     from foamfit.data.tables.csv_table import read_text
     from foamfit.data.tables.draft import draft
     from foamfit.data.toml_file import toml_beside
-    from foamfit.files import reason
+    from foamfit.files import reason, write_file
 
     text, asked = draft(read_text(test, "the CSV file of a test"))
     target = toml_beside(test)
     try:
-        with target.open("x", encoding="utf-8") as file:
-            file.write(text)
+        if force:
+            write_file(target, text.encode())
+        else:
+            with target.open("x", encoding="utf-8") as file:
+                file.write(text)
     except FileExistsError:
         raise InputError(
-            f"{target} exists already and is not changed; foamfit check {test} says what it lacks"
+            f"{target} exists already and is not changed; foamfit check {test} says what it lacks, "
+            "and --force overwrites it"
         ) from None
     except OSError as error:
         raise InputError(f"{target} cannot be written: {reason(error)}") from None

@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from foamfit.cli.progress import APART, Progress, Watcher
+from foamfit.cli.progress import APART, Watcher
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.solve import cache
 from foamfit.springs.model import Model
@@ -231,14 +231,16 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
         context = own.make_context("fit", ["TEST.csv", *arguments])
     except click.ClickException as error:
         raise InputError(error.format_message()) from None
-    others = {"test", "specimen", "verbose", *Output.__dataclass_fields__} - {"figure_width"}
+    others = {"test", "specimen", "force", "verbose", *Output.__dataclass_fields__} - {
+        "figure_width"
+    }
     return {name: value for name, value in context.params.items() if name not in others}
 
 
 def _run(job: Job) -> tuple[str, str]:
     """Fit and write the result; return why the fit failed or "", and the text on cycles."""
     try:
-        from foamfit.cli.fit import fit_as_asked
+        from foamfit.cli.fit import read_as_asked
         from foamfit.report.studies.cycles import cycles_text
         from foamfit.results import Fit
         from foamfit.solve.precompile import at_first_use
@@ -248,13 +250,10 @@ def _run(job: Job) -> tuple[str, str]:
         width = asked.pop("figure_width")
         tell = partial(teller.progress, 0.0, COMPILING, now=True)
         with at_first_use(asked["model"], asked["relaxation"], tell) as compile_rest:
-
-            def begin(_: float | None) -> contextlib.AbstractContextManager[Progress]:
-                compile_rest()
-                return contextlib.nullcontext(teller)
-
+            ready = read_as_asked(Path(job.csv), Path(job.toml), asked)
+            compile_rest()
             with as_signalled():
-                found = fit_as_asked(Path(job.csv), Path(job.toml), asked, begin)
+                found = ready.fit(teller)
         with without_ctrl_c():
             teller.progress(1.0, "writing the report", now=True)
             found.save(job.folder, figure_width=width)

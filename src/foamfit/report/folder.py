@@ -132,6 +132,33 @@ def check_target(folder: str | Path, *, of: str | None = None) -> None:
         ) from error
 
 
+def check_same(folder: str | Path, data_sha256: str, options: Mapping[str, Any]) -> None:
+    """Raise InputError if `folder` has a result of other data, or made with other options.
+
+    `options` are those of the new result; see `foamfit.results.Fit.options`.
+    """
+    place = Path(folder).resolve()
+    contents = ((name, _content(place / name)) for name in FILES)
+    name, content = next(((name, one) for name, one in contents if one), ("", {}))
+    made = content.get("options")
+    if not content or (made == options and content.get("data_sha256") == data_sha256):
+        return
+    if name not in ("fit.json", "cycles.json"):
+        what = f"a {Path(name).stem} result"
+    elif content.get("data_sha256") != data_sha256:
+        what = "a result of other data"
+    elif isinstance(made, dict):
+        every = dict.fromkeys([*options, *made])
+        differing = [one for one in every if options.get(one) != made.get(one)]
+        what = f"a result made with other options ({', '.join(differing)})"
+    else:
+        what = "a result that does not say with which options it was made"
+    raise InputError(
+        f"{folder} holds {what}, so it is not replaced; name another folder with --out, or replace "
+        "it with --force"
+    )
+
+
 def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
     """Raise InputError if the existing folder at `place` must not or cannot be replaced."""
     if place.is_mount():

@@ -21,10 +21,17 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve.scene import MOTION, STRESS, Motion, Slopes, difference
 from foamfit.springs import kernels
-from foamfit.springs import laws as known
 from foamfit.springs.chain import Chain
 from foamfit.springs.laws import followed
-from foamfit.springs.laws.followed import MEMORY, STRENGTH, TIME, Springs, compiled, inner
+from foamfit.springs.laws.followed import (
+    AT_START,
+    MEMORY,
+    STRENGTH,
+    TIME,
+    Springs,
+    compiled,
+    inner,
+)
 from foamfit.springs.laws.record import BRANCH, EPS, Law
 from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
@@ -107,7 +114,7 @@ def driven(laws: tuple[Law, ...], top: int) -> Callable[..., tuple[float, bool]]
                 part = (k + 1.0) / parts if j else 1.0
                 before = values[j - 1] if j else 0.0
                 value = before + part * (values[j] - before)
-                h = (t[j] - t[j - 1]) / parts if j else 0.0
+                h = (t[j] - t[j - 1]) / parts if j else AT_START
                 sigma = follow(springs, sigma, value, h)
             if not math.isfinite(sigma):
                 return math.nan, False
@@ -360,6 +367,5 @@ def plan_of(
             "a prescribed stress on a mass or an onsite damper requires the paper's laws: leave "
             "them out in a chain with a registered law"
         )
-    laws = tuple(known.law(kind) for kind in chain.kinds)
     drag, mass = chain.site_damping / chain.height, np.array([above / chain.area])
-    return AnyLawPlan(laws, chain.height, top, values, time, speed, mass, drag)
+    return AnyLawPlan(chain.laws, chain.height, top, values, time, speed, mass, drag)

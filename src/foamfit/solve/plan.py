@@ -52,20 +52,7 @@ AS_ONE = 1e-4  # divided by the number of springs, whose errors add up
 LEAST_IMPLICIT = 1e-14  # least truncation of implicit steps, about the rounding error
 MOST_IMPLICIT = 250_000  # implicit steps, at 0.5 ms each
 LEAST_AGGREGATE = 9  # an impact treats at least this number of springs under one stress as one
-LOGGED = 1024  # switches that are kept, except of an aggregate
-
-_OUTCOMES = {
-    scenes.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
-    "too fast to be followed (a light mass or a heavy dashpot)",
-    scenes.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s, where the scene "
-    "changes faster than numbers can resolve (a strain at the end of its branch, a very light "
-    "mass, or many springs on a flat branch)",
-    scenes.FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
-    "that nothing slows; give the top a mass or the spring a dashpot",
-    scenes.NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
-    "branch (strain 1 on branch a, 1 + eps_star on branch c)",
-}
-
+LOGGED = 1024  # switches in the log of a first run; with more it is repeated
 
 _TOO_FAST = (
     "springs with memory are followed by explicit steps, for which {culprit} is too fast: the "
@@ -131,10 +118,24 @@ class Plan(NamedTuple):
         """
         if self.solver == CLOSED_FORM:
             return self._closed_form(rows, heights, rtol, everything, directions)
-        p, time, values = len(directions), self.time, self.values
         drag = self.drag if drag is None else drag
+        given = rows, heights, rtol, drag, directions
+        motion = self._integrated(*given, np.empty((LOGGED, 5)) if everything else NO_SWITCHES)
+        if motion.method != AGGREGATE and len(motion.switches) > LOGGED:
+            motion = self._integrated(*given, motion.switches)
+        return motion
+
+    def _integrated(
+        self, rows: Array, heights: Array, rtol: float, drag: float, directions: Directions,
+        log: Array,
+    ) -> Motion:  # fmt: skip
+        """Integrate in time and log the switches; without room, only the top is followed.
+
+        If the log is too short, the switches are an array of the right length, not filled.
+        """
+        p, time, values = len(directions), self.time, self.values
+        everything = log is not NO_SWITCHES
         out = np.empty((1 + p, 1 + len(heights) if everything else 2, time.size))
-        log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
         if self.memory:
             return self._with_memory(self.packed(rows, heights, drag), rtol, directions, out, log)
         stiff = bool(self.implicit)
@@ -148,7 +149,7 @@ class Plan(NamedTuple):
             tol, log = AS_ONE * rtol / len(rows), np.empty((4 * len(rows) + 64, 5))
             arguments = self.packed(rows, heights, drag), tol, self.max_steps, out[0], log
             ending = many.integrate_aggregate(*arguments, np.zeros(2, np.int64))
-            return _motion(AGGREGATE, ending, out, log)
+            return self._motion(rows, AGGREGATE, ending, out, log)
         start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
         if not stiff:
             cache.announce(taylor.integrate, "the solver")
@@ -159,14 +160,14 @@ class Plan(NamedTuple):
                 rows, heights, ends, mass, numbers, values, time, directions, start, out, log
             )
             if self.implicit is False or ending[0] not in _STIFF:
-                return _motion(TAYLOR, ending, out, log)
+                return self._motion(rows, TAYLOR, ending, out, log)
         margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
         scene = scenes.Scene(*self.packed(rows, heights, drag))
         tol = max(margin * rtol, LEAST_IMPLICIT)
         most = min(self.max_steps, MOST_IMPLICIT)
         samples = scenes.Samples(time, out[0], out[1:])
         *result, lost = steps.integrate_implicit(scene, tol, most, directions, start, samples, log)
-        return _motion(RADAU, result, out, log, lost)
+        return self._motion(rows, RADAU, result, out, log, lost)
 
     def _with_memory(
         self, scene: scenes.SceneTuple, rtol: float, directions: Directions, out: Array, log: Array
@@ -192,7 +193,7 @@ class Plan(NamedTuple):
                 raise SimulationError(message)
             if ending[0] == scenes.STEP_UNDERFLOW:  # more steps would not help
                 break
-        return _motion(TAYLOR, ending, out, log, one_sided=one_sided)
+        return self._motion(scene[0], TAYLOR, ending, out, log, one_sided=one_sided)
 
     def _fastest(self, scene: scenes.SceneTuple) -> tuple[float, str]:
         """Return the radians of the fastest process over the scene's duration, and its name."""
@@ -254,7 +255,7 @@ class Plan(NamedTuple):
                 elif slopes is not None and what == OWN_HEIGHT:
                     slopes.base_stress[p] -= eta * rate / heights[0]
         if not (fine and math.isfinite(kernels.total(stress))):
-            raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
+            raise scenes.failure(scenes.NOT_FINITE, self.top, self.values, rows)
         if not everything:
             if slopes is not None:
                 slopes = slopes._replace(displacement=slopes.displacement[:, -1:])
@@ -282,7 +283,7 @@ class Plan(NamedTuple):
             equilibrium.strains_along(rows, heights, stress, np.empty(1), strain, branches)
             strain[held] = 0.0
         if not np.isfinite(strain).all():
-            raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
+            raise scenes.failure(scenes.NOT_FINITE, self.top, self.values, rows)
         start[0, first:] = strain[:, 0]
         own = np.flatnonzero(directions[:, 0] >= first)
         if len(own):
@@ -293,6 +294,25 @@ class Plan(NamedTuple):
                 longer[p, spring] -= strain[spring, 0] if what == OWN_HEIGHT else 0.0
             start[1 + own, first:] = np.where(held, 0.0, longer / heights)
         return start
+
+    def _motion(
+        self,
+        rows: Array,
+        method: str,
+        ending: Sequence[Any],
+        out: Array,
+        log: Array,
+        lost: float = 0.0,
+        one_sided: Array = _NOTHING[:0],
+    ) -> Motion:
+        """Return the result of an integrator as a Motion; raise SimulationError if it failed."""
+        outcome, time, steps, switches = ending
+        if outcome != scenes.DONE:
+            raise scenes.failure(outcome, self.top, self.values, rows, steps=steps, time=time)
+        slopes = Slopes(out[1:, 1:], out[1:, 0], one_sided) if len(out) > 1 else None
+        if log is not NO_SWITCHES:
+            log = log[:switches] if switches <= len(log) else np.empty((switches, 5))
+        return Motion(out[0, 1:], out[0, 0], time, log, steps, method, slopes, lost)
 
     @property
     def _duration(self) -> float:
@@ -320,23 +340,6 @@ def _on_one_plateau(rows: Array, branches: NDArray[np.int64], directions: Direct
     together = (flat & (flat.sum(axis=0) > 1)).any(axis=1)
     marked = np.isin(directions[:, 1], (0, 2, 3)) & (directions[:, 0] >= 0)  # k0, dsigma, eps_a
     return np.where(marked, together[directions[:, 0]], 0.0)
-
-
-def _motion(
-    method: str,
-    ending: Sequence[Any],
-    out: Array,
-    log: Array,
-    lost: float = 0.0,
-    one_sided: Array = _NOTHING[:0],
-) -> Motion:
-    """Return the result of an integrator as a Motion; raise SimulationError if it failed."""
-    outcome, time, steps, switches = ending
-    if outcome != scenes.DONE:
-        raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=time))
-    slopes = Slopes(out[1:, 1:], out[1:, 0], one_sided) if len(out) > 1 else None
-    logged = log if log is NO_SWITCHES else log[:switches]
-    return Motion(out[0, 1:], out[0, 0], time, logged, steps, method, slopes, lost)
 
 
 def _time(t: ArrayLike) -> Array:

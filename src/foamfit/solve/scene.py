@@ -6,12 +6,27 @@ from typing import NamedTuple
 
 import numpy as np
 
+from foamfit.errors import SimulationError
+from foamfit.springs import kernels
 from foamfit.springs.kernels import Array, Branches, inner
+from foamfit.springs.law import UNILATERAL
 
 # Top of the chain: with a mass, with an onsite damper only, under known stress, in known motion.
 FREE, VISCOUS, STRESS, MOTION = range(4)
 # Outcomes of a run.
 DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE = range(5)
+_FAILURES = {
+    TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
+    "too fast to be followed (a light mass or a heavy dashpot)",
+    STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s, where the scene "
+    "changes faster than numbers can resolve (a strain at the end of its branch, a very light "
+    "mass, or many springs on a flat branch)",
+    FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
+    "that nothing slows; give the top a mass or the spring a dashpot",
+    NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
+    "branch (strain 1 on branch a, 1 + eps_star on branch c)",
+}
+_PULLED = (FLAT_UNDER_STRESS, NOT_FINITE)  # of a unilateral spring under a prescribed tension
 # Errors of the base stress are relative to its own size, or to this share of the largest stress in
 # a spring if that is more: a pulse that has not reached the base yet must not shorten steps.
 LEAST_BASE = 1e-6
@@ -73,6 +88,20 @@ def difference(one: Array, other: Array) -> float:
     """Return the largest difference of two curves over the range (0 included) of the first."""
     span = max(float(one.max()), 0.0) - min(float(one.min()), 0.0)
     return float(np.abs(one - other).max()) / span if span > 0.0 else 0.0
+
+
+def failure(outcome: int, top: int, values: Array, rows: Array, **ending: float) -> SimulationError:
+    """Return the error of a run that failed; `ending` has its number of steps and its last time."""
+    pulled = top == STRESS and outcome in _PULLED and values.min() < 0.0
+    loose = (rows[:, kernels.KIND] == UNILATERAL) & (rows[:, kernels.ETA] == 0.0)
+    if not (pulled and loose.any()):
+        return SimulationError(_FAILURES[outcome].format(**ending))
+    at = int(np.argmax(values < 0.0))
+    return SimulationError(
+        f"the prescribed stress {values[at]:g} Pa (sample {at}) is a tension, which spring "
+        f"{int(loose.argmax()) + 1} cannot carry because it is unilateral; give the spring a "
+        "dashpot or the top a mass, or keep the stress at zero or above"
+    )
 
 
 @inner

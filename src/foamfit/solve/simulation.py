@@ -273,7 +273,7 @@ def simulate(
         raise InputError(f"rtol = {rtol:g} is not admissible: it must be between 1e-14 and 0.1")
     directions, dashpots, relaxing = NO_DIRECTIONS, False, False
     if sensitivities:
-        wanted = [direction(chain.kinds, name, chain.relaxation) for name in sensitivities]
+        wanted = [direction(chain.laws, name, chain.relaxation) for name in sensitivities]
         by_height = any(what == OWN_HEIGHT for _, what in wanted)
         if by_height and chain.site_damping > 0.0:  # which changes η_site/H
             wanted.append((-1, DRAG))

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.springs import laws
+from foamfit.springs.laws.record import Law
 from foamfit.springs.spring import Spring, as_number, as_samples
 
 
@@ -131,14 +132,14 @@ class Chain:
         return math.fsum(self.heights)
 
     @cached_property
-    def kinds(self) -> tuple[str, ...]:
+    def laws(self) -> tuple[Law, ...]:
         """The law of each spring."""
-        return tuple(spring.law.kind for spring in self.springs)
+        return tuple(spring.law for spring in self.springs)
 
     @cached_property
     def is_registered(self) -> bool:
         """Whether a spring has a registered law."""
-        return any(laws.is_registered(kind) for kind in self.kinds)
+        return any(law.kind not in laws.PAPER for law in self.laws)
 
     @cached_property
     def relaxes(self) -> bool:

@@ -119,8 +119,8 @@ class Model:
         """Names of all parameters, in the order of the flat vector."""
         names = [
             f"s{i}_{short}"
-            for i, kind in enumerate(self.kinds, start=1)
-            for short in names_of(kind, self.relaxation)
+            for i, law in enumerate(self.laws, start=1)
+            for short in names_of(law, self.relaxation)
         ]
         if len(self.kinds) > 1:
             names += [f"s{i}_height" for i in range(1, len(self.kinds) + 1)]
@@ -135,7 +135,7 @@ class Model:
     def directions(self) -> NDArray[np.int64]:
         """Direction of the derivative by each parameter, (n, 2)."""
         terms = (self.relaxation,) * len(self.kinds)
-        return np.array([direction(self.kinds, name, terms) for name in self.names])
+        return np.array([direction(self.laws, name, terms) for name in self.names])
 
     def rows(self, values: Array) -> Array | None:
         """Return the rows for the solver, (n_springs, columns); None if not admissible."""

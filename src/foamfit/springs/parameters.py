@@ -11,11 +11,11 @@ from collections.abc import Iterable
 
 from foamfit.errors import InputError
 from foamfit.springs import laws
-from foamfit.springs.laws.record import COMMON, ETA, Param
+from foamfit.springs.laws.record import COMMON, ETA, Law, Param
 
-# Second number of a direction, apart from the parameters of a law (0, 1, …). The strength g_k of
-# relaxation term k = 1, 2, … is OWN_RELAXATION + 2 (k-1), its time τ_k the next number.
-OWN_ETA, OWN_HEIGHT, DRAG, OWN_RELAXATION = 20, 21, 22, 23
+# Second number of a direction, above those of the parameters of any law (0, 1, …). The strength g_k
+# of relaxation term k = 1, 2, … is OWN_RELAXATION + 2 (k-1), its time τ_k the next number.
+OWN_ETA, OWN_HEIGHT, DRAG, OWN_RELAXATION = range(1_000_000, 1_000_004)
 # Derivative of a single spring by a shift of the prescribed motion of all samples in contact.
 MOVED = -1
 
@@ -36,9 +36,8 @@ def relaxation_names(terms: int) -> tuple[str, ...]:
     return tuple(f"{name}{k}" for k in range(1, terms + 1) for name in ("g", "tau"))
 
 
-def names_of(kind: str, relaxation: int = 0) -> tuple[str, ...]:
-    """Return the names of the parameters of a kind of spring, with its relaxation terms."""
-    law = laws.law(kind)
+def names_of(law: Law, relaxation: int) -> tuple[str, ...]:
+    """Return the names of the parameters of a law, with its relaxation terms."""
     return law.names + (relaxation_names(relaxation) if law.hysteretic else ())
 
 
@@ -84,26 +83,26 @@ def unit_of(name: str) -> str:
 
 
 def direction(
-    kinds: tuple[str, ...], name: str, relaxation: tuple[int, ...] = ()
+    chain: tuple[Law, ...], name: str, relaxation: tuple[int, ...] = ()
 ) -> tuple[int, int]:
-    """Return the direction of the derivative by a parameter.
+    """Return the direction of the derivative by a parameter of springs of these laws.
 
     Raises InputError if springs with these numbers of relaxation terms do not have it.
     """
     if name == "site_eta":
         return -1, DRAG
     prefix, _, short = name.partition("_")
-    known = [f"s{i}" for i in range(1, len(kinds) + 1)]
+    known = [f"s{i}" for i in range(1, len(chain) + 1)]
     if prefix in known:
         spring = known.index(prefix)
-        law, terms = laws.law(kinds[spring]), relaxation[spring] if relaxation else 0
+        law, terms = chain[spring], relaxation[spring] if relaxation else 0
         if short == "height":
             return spring, OWN_HEIGHT
         if short == ETA.name:
             return spring, OWN_ETA
         if short in law.own:
             return spring, law.derivative(short)
-        if short in names_of(law.kind, terms):
+        if short in names_of(law, terms):
             return spring, OWN_RELAXATION + relaxation_names(terms).index(short)
     raise InputError(
         f"sensitivities: '{name}' is not a parameter of this chain; give names like s1_k0, "

@@ -275,10 +275,6 @@ class LawSpring(Spring):
         return followed.strain_along(self.record, self.numbers, stress)
 
     def _slope_along(self, strain: Array) -> Array:
-        step = 1e-6 * max(float(np.max(np.abs(strain))), 1e-9)
-        beside = [  # stresses after a small step backwards and forwards from each sample
-            [self._stress_along(np.append(strain[:j], strain[j - 1] + by))[0][-1] for by in steps]
-            for j in range(1, strain.size + 1)
-            for steps in ((-step, step),)
-        ]
-        return np.asarray(np.diff(beside, axis=1)[:, 0] / (2.0 * step))
+        from foamfit.springs.laws import followed
+
+        return followed.slope_along(self.record, self.numbers, strain)

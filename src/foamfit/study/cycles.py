@@ -48,7 +48,7 @@ def fit_cycles(
     InputError
         If the record or an option cannot be used for any cycle.
     """
-    Options.of("fit_cycles", options)  # rejects invalid options
+    chosen = Options.of("fit_cycles", options)  # rejects invalid options
     report = progress or (lambda *_: None)
     first = read_test(path, specimen)
     wanted = first.cycles if cycles is None else tuple(dict.fromkeys(cycles))
@@ -75,4 +75,5 @@ def fit_cycles(
             why = f"not fitted because {stopped} ended the command first"
             refused |= {later: why for later in wanted[i:] if later not in results}
             break
-    return CycleFits(first.name, model, first.cycles, results, refused)
+    made = first.data_sha256, chosen.stored(first, model, wanted)
+    return CycleFits(first.name, model, first.cycles, results, refused, *made)

@@ -54,6 +54,8 @@ class CycleFits(Shown):
     recorded: tuple[int, ...]  #: Numbers of all cycles in the record
     results: dict[int, Fit]  #: Fit of each cycle that could be read and fitted
     refused: dict[int, str]  #: Reason for each of the other cycles, one sentence
+    data_sha256: str = ""  #: Digest of the record
+    options: dict[str, Any] | None = None  #: As `Fit.options`, with the numbers of the cycles
 
     @property
     def varied(self) -> dict[str, list[ParameterEstimate | None]]:
@@ -90,6 +92,8 @@ class CycleFits(Shown):
             "recorded": self.recorded,
             "fitted": sorted(self.results),
             "refused": self.refused,
+            "data_sha256": self.data_sha256,
+            "options": self.options,
         }
         return dict(plain(content))
 

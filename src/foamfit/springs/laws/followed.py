@@ -170,6 +170,7 @@ def solver_row(law: Law, values: Array, terms: ArrayLike, room: int) -> Array | 
 
 # Columns of a relaxation term: strength g, time τ (s), and its state y (see `solve.relaxation`).
 STRENGTH, TIME, MEMORY = range(3)
+AT_START = -1.0  # as the time of a step: at the first sample every relaxation term is zero
 
 
 class Springs(NamedTuple):
@@ -186,9 +187,10 @@ class Loops(NamedTuple):
     """Compiled loops for springs of some laws; i is the spring, 0 at the base.
 
     start(i, row, state, 0) sets it to rest. step(i, springs, strain, h) takes it to a strain within
-    the time h (s; 0 for a jump) and returns its total stress, Pa; relaxation terms assume a stress
-    linear in time. to_stress(i, springs, stress, h) is the inverse. Both return NaN without a
-    solution. delayed(i, row, state, (rate, h)) is the stress that depends on time.
+    the time h (s; 0 for a jump, AT_START to start there in equilibrium) and returns its total
+    stress, Pa; relaxation terms assume a stress linear in time. to_stress(i, springs, stress, h) is
+    the inverse. Both return NaN without a solution. delayed(i, row, state, (rate, h)) is the stress
+    that depends on time.
     """
 
     start: Compiled
@@ -312,6 +314,9 @@ def loops_of(laws: tuple[Law, ...]) -> Loops:
         sigma = walk(i, row, state, eps)
         out = sigma
         for term in springs.terms[i]:
+            if h < 0.0:
+                term[MEMORY] = -sigma
+                continue
             x = h / term[TIME]
             decay, late = math.exp(-x), 0.5 * x
             if x > 1e-4:
@@ -360,6 +365,40 @@ def _along(law: Law) -> Compiled:
 
 
 @cache
+def _sloping(law: Law) -> Compiled:
+    """Return a loop that writes the slopes of one spring along a strain history from rest.
+
+    Each is a difference over small steps that continue the motion which led to the sample or, at
+    the end of a branch, over the last steps before it: never across a switch or a turn.
+    """
+    start, walk, _ = _own_loops(law)
+    leaves = compiled_functions(law).leaves
+
+    @inner
+    def beside(row: Array, state: Array, eps: float) -> float:
+        return walk(row, state.copy(), eps)
+
+    @compiled
+    def slopes(row: Array, state: Array, strain: Array, step: float, out: Array) -> None:
+        start(row, state, 0.0)
+        before, way = state.copy(), step
+        for j in range(strain.size):
+            eps, moved = strain[j], strain[j] - state[EPS]
+            if moved != 0.0:
+                way = math.copysign(step, moved)
+                before[:] = state
+            sigma = walk(row, state, eps)
+            side, origin, end = way, state, eps + 2.0 * way
+            ends = leaves(row, state, end) or not math.isfinite(beside(row, state, end))
+            if ends and abs(eps - before[EPS]) > 2.0 * step:
+                side, origin = -way, before
+            one, two = beside(row, origin, eps + side), beside(row, origin, eps + 2.0 * side)
+            out[j] = (4.0 * one - 3.0 * sigma - two) / (2.0 * side)
+
+    return slopes
+
+
+@cache
 def _back(law: Law) -> Compiled:
     """Return a loop that follows one spring of height 1 along a stress history, without time."""
     start, _, to_stress, _ = loops_of((law,))
@@ -391,6 +430,13 @@ def stress_along(law: Law, values: ArrayLike, strain: Array) -> tuple[Array, NDA
     out, branches = np.empty(strain.size), np.empty(strain.size, np.int64)
     _along(law)(*_row_and_state(law, values), strain, out, branches)
     return out, branches
+
+
+def slope_along(law: Law, values: ArrayLike, strain: Array) -> Array:
+    """Return the slope dσ/dε (Pa) along a strain history (n,), from rest."""
+    step, out = 1e-6 * max(float(np.abs(strain).max()), 1e-9), np.empty(strain.size)
+    _sloping(law)(*_row_and_state(law, values), strain, step, out)
+    return out
 
 
 def strain_along(law: Law, values: ArrayLike, stress: Array) -> Array:

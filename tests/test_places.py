@@ -1,0 +1,261 @@
+"""Where `foamfit fit` puts a result, which older result it replaces, and which it leaves alone."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+import fabricated
+import foamfit as ff
+from conftest import without_pictures
+from foamfit.cli import main
+
+TOML = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\nmass = "1 g"\n'
+FAST = ("--model", "linear", "--quiet", "--no-report")
+
+
+def write(path: Path, seed: int = 0) -> Path:
+    """Write a slow record of three cycles of a linear foam, as a rig would."""
+    strain = np.tile(np.concatenate([np.linspace(0, 0.4, 40), np.linspace(0.4, 0, 40)[1:-1]]), 3)
+    stress = 2.0 * strain + 2e-3 * np.random.default_rng(seed).standard_normal(strain.size)
+    table = np.column_stack([0.1 * np.arange(strain.size), stress, 10.0 * strain])
+    rows = [f"{t:.1f},{s:.6f},{e:.6f}" for t, s, e in table]
+    path.write_text("\n".join(["time (s),stress (MPa),displacement (mm)", *rows]) + "\n")
+    path.with_suffix(".toml").write_text(TOML)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Change to a folder with a record; the pictures of results are placeholders."""
+    monkeypatch.chdir(tmp_path)
+    without_pictures(monkeypatch)
+    return write(tmp_path / "foam.csv")
+
+
+def run(*args: object) -> Result:
+    return CliRunner().invoke(main, ["fit", "foam.csv", *map(str, args)])
+
+
+def fitted(*args: object) -> list[str]:
+    """Run a fit, and return all result folders of the test afterwards."""
+    told = run(*args)
+    assert told.exit_code == 0, told.output
+    return sorted(str(path.parent) for path in Path().rglob("*.json") if path.parent.parent.name)
+
+
+def refused(*args: object) -> str:
+    """Return the sentence with which a fit is refused before it is made; nothing changes."""
+    before = files()
+    with pytest.MonkeyPatch.context() as patch:
+        for made in ("foamfit.study.cycles.fit", "foamfit.api.fit"):
+            patch.setattr(made, lambda *_, **__: pytest.fail("the fit was made"))
+        told = run(*args)
+    assert (told.exit_code, told.stdout) == (1, ""), told.output
+    assert re.fullmatch(r"foamfit: [^\n]+\n", told.stderr)
+    assert files() == before
+    return told.stderr
+
+
+def files() -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
+
+
+def content(folder: str | Path) -> dict[str, Any]:
+    return json.loads((Path(folder) / "fit.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ("", "bistable"),
+        ("--drive displacement --seed 0 --cycle 1 --relaxation 0", "bistable"),
+        ("--no-report --figure-width one --quiet", "bistable"),
+        ("--specimen foam.toml", "bistable"),
+        ("--model linear+bistable", "linear+bistable"),
+        ("--model auto", "auto"),
+        ("--drive stress", "bistable-stress"),
+        ("--model microscale --drive stress --relaxation 1", "microscale-relaxation-1-stress"),
+        ("--cycle 2", "bistable-cycle-2"),
+        ("--model microscale --mullins --cycles 1-3", "microscale-mullins-cycles-1-3"),
+        ("--model microscale --stiffening --cycles 2-3", "microscale-stiffening-cycles-2-3"),
+        ("--specimen other.toml", "bistable-specimen-other"),
+        ("--fix s1_k0=5.5e6 --fix s1_eta=0", "bistable-fix-s1_eta=0,s1_k0=5.5e+06"),
+        ("--fix s1_k0=5512345.678 --vary s1_eta", "bistable-fix-s1_k0=5512345.678-vary-s1_eta"),
+        ("--interior-mass --model linear+bistable", "linear+bistable-interior-mass"),
+        ("--time-shift", "bistable-time-shift"),
+        ("--starts 2 --seed 3 --max-time 60", "bistable-max-time-60-seed-3-starts-2"),
+        ("--profile", "bistable-profile"),
+        ("--mcmc 500", "bistable-mcmc-draws-500"),
+    ],
+)
+def test_the_name_has_the_model_and_every_option_that_changes_the_numbers(
+    here: Path, monkeypatch: pytest.MonkeyPatch, options: str, name: str
+) -> None:
+    here.with_name("other.toml").write_text(TOML)
+    monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: fabricated.result())
+    assert fitted(*options.split()) == [f"fits/foam/{name}"]
+
+
+def test_a_long_name_is_cut_and_stays_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: fabricated.result())
+    given = [f"--fix=s1_{name}={1 / 7}" for name in ("k0", "kc", "eps_a", "kh_plus", "kh_minus")]
+    run(*given, "--fix=s1_eps_c=0.31")
+    names = [Path(place).name for place in fitted(*given, "--fix=s1_eps_c=0.32")]
+    assert len(set(names)) == 2
+    assert all(len(name) <= 120 for name in names)
+
+
+def test_a_default_drive_is_not_named_for_an_impact_either(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    striker = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
+    here.with_suffix(".toml").write_text(TOML + striker)
+    monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: fabricated.result())
+    first = here.read_text().splitlines()[:60]
+    here.write_text("\n".join(first) + "\n")
+    assert fitted("--drive", "impact") == ["fits/foam/bistable"]
+    assert "fits/foam/bistable-displacement" in fitted("--drive", "displacement")
+
+
+def test_other_options_and_cycles_get_folders_of_their_own() -> None:
+    assert fitted(*FAST) == ["fits/foam/linear"]
+    first = files()
+    for options in (["--seed", 1], ["--cycle", 2], ["--fix", "s1_eta=0"], ["--cycles", "1-2"]):
+        fitted(*FAST, *options)
+    assert sum(path.name == "fit.json" for path in files()) == 5
+    assert {path: one for path, one in files().items() if path in first} == first
+    assert content("fits/foam/linear")["options"] == {"model": "linear"}
+    assert content("fits/foam/linear-seed-1")["options"] == {"model": "linear", "seed": 1}
+
+
+@pytest.mark.parametrize("where", [[], ["--out", "fits/foam/linear"]])
+def test_a_result_of_the_same_data_and_options_is_replaced_as_a_whole(where: list[str]) -> None:
+    fitted(*FAST)
+    (Path("fits/foam/linear") / "ladder.csv").write_text("of an older result")
+    before = content("fits/foam/linear")
+    fitted("--model", "linear", "--quiet", "--drive", "displacement", *where)
+    names = {path.name for path in Path("fits/foam/linear").iterdir()}
+    assert "ladder.csv" not in names
+    assert "report.html" in names
+    after = content("fits/foam/linear")
+    del before["runtime_s"], after["runtime_s"]
+    assert after == before
+
+
+def test_a_result_of_other_data_or_options_is_replaced_by_force_alone(here: Path) -> None:
+    there = ("--out", "fits/foam/linear")
+    fitted(*FAST)
+    told = refused(*FAST, "--seed", 1, "--cycle", 2, *there)
+    assert "fits/foam/linear holds a result made with other options (seed, cycle)" in told
+    assert "--force" in told
+    assert "other options (model)" in refused("--quiet", *there)
+    write(here.with_name("other.csv"))
+    fitted(*FAST, "--specimen", "other.toml", "--out", "second")
+    assert "other options (specimen)" in refused(*FAST, "--out", "second")
+    write(here, seed=1)
+    assert "fits/foam/linear holds a result of other data" in refused(*FAST)
+    assert "other data" in refused(*FAST, *there)
+    fitted(*FAST, "--force")
+    after = content("fits/foam/linear")
+    assert after["data_sha256"] == ff.read_test(here).data_sha256
+    fitted(*FAST, "--seed", 1, "--force", *there)
+    assert content("fits/foam/linear")["seed"] == 1
+
+
+def test_a_corrected_toml_describes_the_same_test(here: Path) -> None:
+    fitted(*FAST)
+    here.with_suffix(".toml").write_text(TOML.replace("10 mm", "11 mm"))
+    assert fitted(*FAST) == ["fits/foam/linear"]
+    assert content("fits/foam/linear")["specimen"]["height"] == pytest.approx(11e-3)
+
+
+def test_what_does_not_say_with_which_options_it_was_made_is_left_alone() -> None:
+    """Results of older versions, of joint fits, and of parameters changed in Python."""
+    fitted(*FAST)
+    path = Path("fits/foam/linear/fit.json")
+    older = content(path.parent)
+    del older["options"]
+    path.write_text(json.dumps(older))
+    assert "does not say with which options it was made" in refused(*FAST)
+    fitted(*FAST, "--force")
+    test = ff.read_test("foam.csv")
+    ff.fit(test, model="linear", params=ff.make_params(test, "linear")).save("mine", report=False)
+    assert "does not say" in refused(*FAST, "--out", "mine")
+    Path("together").mkdir()
+    Path("together/joint.json").write_text('{"schema": 1, "foamfit": "0.2.0", "tests": {}}')
+    assert "together holds a joint result, so it is" in refused(*FAST, "--out", "together")
+
+
+def test_a_fit_from_python_is_compared_too() -> None:
+    test = ff.read_test("foam.csv", cycle=2)
+    made = ff.fit(test, model=" linear ", seed=1, drive="displacement", vary=["s1_eta"])
+    made.save("mine", report=False)
+    assert content("mine")["options"] == {
+        "model": "linear", "seed": 1, "vary": ["s1_eta"], "cycle": 2,
+    }  # fmt: skip
+    assert "(cycle)" in refused(*FAST, "--seed", 1, "--vary", "s1_eta", "--out", "mine")
+    fitted(*FAST, "--seed", 1, "--vary", "s1_eta", "--cycle", 2, "--out", "mine")
+    read = ff.load("mine")
+    assert isinstance(read, ff.FitResult)
+    read.save("again", report=False)
+    assert Path("again/fit.json").read_bytes() == Path("mine/fit.json").read_bytes()
+
+
+def test_cycles_one_by_one_share_a_folder_and_are_compared_as_one() -> None:
+    place = Path("fits/foam/linear-cycle-all")
+    fitted(*FAST, "--cycle", "all")
+    assert {path.name for path in place.iterdir() if path.is_dir()} == {
+        "cycle-1", "cycle-2", "cycle-3",
+    }  # fmt: skip
+    fitted(*FAST, "--cycle", "3,2,1")
+    assert [path.name for path in place.parent.iterdir()] == [place.name]
+    fitted(*FAST, "--cycle", "1,3")
+    assert {path.name for path in place.parent.iterdir()} == {place.name, "linear-cycle-1,3"}
+    told = refused(*FAST, "--cycle", "1,2", "--out", place)
+    assert f"{place} holds a result made with other options (cycle)" in told
+    assert "(cycle)" in refused(*FAST, "--out", place)
+    assert "(seed, cycle)" in refused(*FAST, "--seed", 1, "--cycle", 2, "--out", place)
+    read = ff.load(place)
+    assert isinstance(read, ff.CycleFits)
+    read.save("again", report=False)
+    assert Path("again/cycles.json").read_bytes() == (place / "cycles.json").read_bytes()
+
+
+def test_a_result_that_appears_during_the_fit_is_left_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The new result is written beside it."""
+
+    def fit(*_: object, **__: object) -> ff.FitResult:
+        other = {"model": "linear", "seed": 7}
+        fabricated.result(options=other).save("fits/foam/linear", report=False)
+        return replace(fabricated.result(), seed=1)
+
+    monkeypatch.setattr("foamfit.api.fit", fit)
+    told = run(*FAST)
+    assert told.exit_code == 1
+    assert "it is in fits/foam/linear-" in told.stderr
+    assert content("fits/foam/linear")["options"]["seed"] == 7
+    (beside,) = Path("fits/foam").glob("linear-*")
+    assert content(beside)["seed"] == 1
+
+
+def test_init_overwrites_a_toml_by_force_alone(here: Path) -> None:
+    toml, call = here.with_suffix(".toml"), ["init", "foam.csv"]
+    told = CliRunner().invoke(main, call)
+    assert (told.exit_code, told.stdout, toml.read_text()) == (1, "", TOML)
+    assert "foam.toml exists already" in told.stderr
+    assert "--force overwrites it" in told.stderr
+    assert CliRunner().invoke(main, [*call, "--force"]).exit_code == 0
+    asked = toml.read_text()
+    toml.unlink()
+    assert CliRunner().invoke(main, [*call, "--force"]).exit_code == 0
+    assert toml.read_text() == asked != TOML
