@@ -164,6 +164,30 @@ def bridge_outliers(record: Record) -> Record:
     return record
 
 
+def inner_samples(values: Array) -> slice:
+    """Return the samples without those at either end that are no part of the signal.
+
+    They are outside the range of the others by more than that range.
+    """
+    most = int(_MOST * values.size)
+    if not most:
+        return slice(None)
+    middle = values[most:-most]
+    size, centre = float(np.ptp(middle)), 0.5 * float(middle.max() + middle.min())
+    inside = np.flatnonzero(np.abs(values - centre) <= 1.5 * size)
+    first, end = int(inside[0]), int(inside[-1]) + 1
+    return slice(first if first <= most else 0, end if end >= values.size - most else None)
+
+
+def cut_strays(record: Record) -> Record:
+    """Drop rows at either end in which the stress is below zero by more than the whole range."""
+    kept, negative = inner_samples(record.stress), record.stress < 0.0
+    stray = np.ones(len(record), dtype=bool)
+    stray[kept] = False
+    why = "the stress jumps below zero by more than its range in the rest of the record"
+    return record.without(stray & negative, why)
+
+
 def mark_clipped(record: Record) -> Record:
     """Mark the samples of a clipped force: a flat top of equal values with steep flanks.
 

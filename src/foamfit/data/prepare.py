@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -51,23 +50,22 @@ def condition(
     *,
     striker: Striker | None = None,
     window: Window | None = None,
-    advice: Callable[[str], str] | None = None,
     spread: float = 0.0,
 ) -> Measurement:
     """Reduce all samples of a file to one loading and unloading; the test has no name yet.
 
-    A record with a striker and a time is an impact, any other a slow test. For `advice` see
-    `check_signs`; `spread` is the standard deviation of the striker's velocity, m/s. The result has
-    at most 1500 samples, and time and displacement are zero at the start of contact. The noise is
-    estimated from samples before contact or from those of a held channel.
+    A record with a striker and a time is an impact, any other a slow test. Channels are positive
+    in compression. `spread` is the standard deviation of the striker's velocity, m/s. The result
+    has at most 1500 samples, and time and displacement are zero at the start of contact. The noise
+    is estimated from samples before contact or from those of a held channel.
     """
     window, given = window or Window(), striker or Striker()
     impact = striker is not None and record.time is not None
     if impact and window.cycle not in (None, 1):
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
-    record = repair.mark_clipped(repair.bridge_outliers(cut_to_window(record, window)))
+    record = repair.cut_strays(cut_to_window(record, window))
+    record = repair.mark_clipped(repair.bridge_outliers(record))
     spikes = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
-    check_signs(record, advice)
     held = repair.noise_of_held(record)
     still = [] if impact else repair.find_standstills(record)
     record = repair.bridge_standstills(repair.fill_staircase(record), still, specimen.height)
@@ -168,32 +166,6 @@ def cut_to_window(record: Record, window: Window) -> Record:
         if np.ptp(values) == 0:
             raise InputError(f"the {name} is constant within [window]; it must vary.")
     return record
-
-
-def check_signs(record: Record, advice: Callable[[str], str] | None) -> None:
-    """Raise InputError, with `advice` on the channel, if one is negative in compression."""
-    stress, peak = record.stress, int(np.argmax(record.stress))
-    first, lowest = float(np.median(stress[:5])), stress.min()
-    negative = first - lowest > 2 * max(stress[peak] - first, 0) and abs(lowest) > stress[peak]
-    derived = "stress" in record.derived
-    wrong = ["stress"] if negative and not derived else []
-    if derived and record.displacement is not None:  # its turn shows its sign
-        w, low = record.displacement, int(np.argmin(record.displacement))
-        fallen, risen = w[0] - w[low], w[: low + 1].max() - w[0]
-        turned = low < 0.98 * len(w) and fallen > max(2 * risen, 0.3 * np.ptp(w))
-        wrong += ["displacement"] if turned else []
-    for name, values in record.curves().items():
-        moved = values[peak] - values[0]
-        if name != "stress" and not derived and moved < -0.5 * np.ptp(values[: peak + 1]):
-            wrong.append(name)
-    acceleration, velocity = record.acceleration, record.velocity
-    if record.displacement is None and acceleration is not None:
-        wrong += ["acceleration"] if np.dot(stress - first, acceleration) < 0 else []
-    elif record.displacement is None and velocity is not None:
-        wrong += ["velocity"] if velocity[0] < velocity[-1] else []
-    if wrong:
-        plain = f"{wrong[0]} is negative in compression; give it scale = -1 in [columns]"
-        raise InputError(f"the {advice(wrong[0]) if advice else plain}.")
 
 
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> Record:

@@ -41,6 +41,14 @@ class Source:
         """Return the factor from the numbers of a channel to SI."""
         return si_factor(self.table, channel, self.columns[channel], self.given.get(channel))
 
+    def name(self, channel: str) -> str:
+        """Return the quoted header of a channel."""
+        return self.table.name(self.columns[channel])
+
+    def measure(self, channel: str) -> str:
+        """Return the measure of strain or stress that a header names, "" if engineering."""
+        return self.table.headers[self.columns[channel]].measure(channel)
+
     def only(self, channels: Iterable[str]) -> Source:
         """Return a source with these channels only."""
         return replace(self, columns={c: k for c, k in self.columns.items() if c in channels})
@@ -140,24 +148,19 @@ class Source:
         rest = [repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in used]
         return f"Read {', '.join(parts)}" + (f"; not used: {', '.join(rest)}." if rest else ".")
 
-    def sign_advice(self, channel: str) -> str:
-        """Return how to correct a channel that is negative in compression."""
-        channel = next(c for c in _SOURCES.get(channel, (channel,)) if c in self.columns)
+    def sign_entry(self, channel: str) -> str:
+        """Return the entry of the TOML that reverses the sign of a channel."""
         given = self.given.get(channel, _NONE)
-        entry = f"{channel} = {{ column = {quoted(self.table, self.columns[channel])}"
         by = f'"{-given.scale:g} {given.scale_unit}"' if given.scale_unit else f"{-given.scale:g}"
-        wrong = "is negative in compression; it must be positive"
-        right = f"write {entry}, scale = {by} }}"
-        if channel.startswith("displacement"):
-            wrong = "is negative or decreases in compression; it must increase"
-            right = (
-                f"write {entry}, counts_down = true }} (for a gap or position, else scale = {by})"
-            )
-        if given.counts_down:
-            right = "leave counts_down = true out"
-        elif given.scale < 0.0:
-            right = f"leave the minus sign of scale = {given.scale:g} out"
-        return f"{channel} {wrong}: {right} in [columns]"
+        down = "counts_down = true" if channel.startswith("displacement") else f"scale = {by}"
+        column = quoted(self.table, self.columns[channel])
+        return f"{channel} = {{ column = {column}, {down} }}"
+
+    def stated_sign(self, channel: str) -> str:
+        """Return what reverses the sign of a channel in the TOML; "" if nothing does."""
+        given = self.given.get(channel, _NONE)
+        minus = f"the minus sign of scale = {given.scale:g}" if given.scale < 0.0 else ""
+        return "counts_down = true" if given.counts_down else minus
 
 
 def assign_columns(table: Table, given: dict[str, Column]) -> dict[str, int]:
