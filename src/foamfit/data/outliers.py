@@ -23,6 +23,7 @@ _OFF = 4.0  # least residual of an outlier, in standard deviations of leave-one-
 _ALONE = 2.5  # the same in standard deviations of its neighbours' residuals (large at a kink)
 _LEAST = 5e-3  # least residual of an outlier, as a share of the range
 _MOST = 0.02  # share of the samples: if more stand out, none is an outlier
+_FEWEST = 30  # samples of a record in which outliers can be found
 _WIDTH, _HALF = 9, 4  # samples of a local cubic, and on either side of its middle
 _EVEN = 0.02  # largest relative deviation of time steps that count as equal
 _PAUSE = 6.0  # a longer step, in usual steps, is a pause
@@ -60,7 +61,7 @@ def find_outliers(values: Array, time: Array | None = None) -> Mask:
     of the samples stand out, none is an outlier.
     """
     n = values.size
-    if n < 30:
+    if n < _FEWEST:
         return np.zeros(n, dtype=bool)
     least = _LEAST * float(np.ptp(np.quantile(values, (0.005, 0.995))))
     even, at = True, np.arange(n, dtype=np.float64)
@@ -165,27 +166,34 @@ def bridge_outliers(record: Record) -> Record:
 
 
 def inner_samples(values: Array) -> slice:
-    """Return the samples without those at either end that are no part of the signal.
+    """Return the samples without the few at either end that are no part of the signal.
 
     They are outside the range of the others by more than that range.
     """
-    most = int(_MOST * values.size)
-    if not most:
-        return slice(None)
+    most = max(_MAX_RUN, int(_MOST * values.size))
+    if values.size < _FEWEST:
+        return slice(0, values.size)
     middle = values[most:-most]
-    size, centre = float(np.ptp(middle)), 0.5 * float(middle.max() + middle.min())
-    inside = np.flatnonzero(np.abs(values - centre) <= 1.5 * size)
+    low, high = float(middle.min()), float(middle.max())
+    inside = np.flatnonzero(np.abs(values - 0.5 * (low + high)) <= 1.5 * (high - low))
     first, end = int(inside[0]), int(inside[-1]) + 1
-    return slice(first if first <= most else 0, end if end >= values.size - most else None)
+    return slice(first if first <= most else 0, end if end >= values.size - most else values.size)
 
 
 def cut_strays(record: Record) -> Record:
-    """Drop rows at either end in which the stress is below zero by more than the whole range."""
-    kept, negative = inner_samples(record.stress), record.stress < 0.0
-    stray = np.ones(len(record), dtype=bool)
-    stray[kept] = False
-    why = "the stress jumps below zero by more than its range in the rest of the record"
-    return record.without(stray & negative, why)
+    """Drop rows at either end in which stress or displacement are no part of the test.
+
+    A stress above the range may belong to the test: the record may start or end at its peak.
+    """
+    for name in ("stress", "displacement"):
+        values = record.channel(name)
+        if values is not None:
+            stray = np.ones(len(record), dtype=bool)
+            stray[inner_samples(values)] = False
+            stray &= (values < 0.0) | (name != "stress")
+            why = f"the {name} jumps there by more than its range in the rest of the record"
+            record = record.without(stray, why)
+    return record
 
 
 def mark_clipped(record: Record) -> Record:

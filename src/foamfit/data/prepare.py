@@ -281,6 +281,12 @@ def checks(
         cause = "the unit of displacement or strain" if motion == MEASURED else "the striker"
         raise InputError(f"strain reaches {strain:.3g}, beyond one; check height and {cause}.")
     peak = float(record.stress.max())
+    if peak <= 0.0:
+        least, most = (engineering(float(v), "Pa") for v in (record.stress.min(), peak + 0.0))
+        raise InputError(
+            f"the stress is never positive in the part that is used, only {least} to {most}; "
+            "correct its zero in the file, or choose another part or cycle by [window]."
+        )
     duration = 1.0 if record.time is None else float(np.ptp(record.time))
     sizes = height, specimen.area, strain, peak, peak / strain if strain > 0 else 1e3, duration
     for value, (name, (low, high, unit)) in zip(sizes, _USUAL.items(), strict=True):

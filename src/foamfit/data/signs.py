@@ -42,7 +42,8 @@ def negative_channels(channels: Mapping[str, Array], time: Array | None) -> tupl
     """
     force = next((c for c in FORCES if c in channels), "")
     motion = next((c for c in MOTIONS if c in channels), "")
-    kept = inner_samples(channels[force]) if force else slice(None)
+    inner = [inner_samples(channels[c]) for c in (force or motion or "velocity", motion) if c]
+    kept = slice(max(part.start for part in inner), min(part.stop for part in inner))
     smooth = {c: _smoothed(values[kept]) for c, values in channels.items()}
     time = None if time is None else time[kept]
     wrong, certain = list[str](), True

@@ -32,10 +32,17 @@ class Source:
     given: dict[str, Column]
 
     @classmethod
-    def of(cls, text: Text, given: dict[str, Column]) -> Source:
-        """Find the table in the text of a file and the columns of the channels."""
-        table = find_table(text, {column.column for column in given.values()})
-        return cls(table, assign_columns(table, given), given)
+    def of(
+        cls, text: Text, given: dict[str, Column], unclear: dict[str, list[int]] | None = None
+    ) -> Source:
+        """Find the table in the text of a file and the columns of the channels.
+
+        If several columns could be a channel, they are added to `unclear`. Without that, this
+        raises InputError, and for a table without headers, unless it is given numbers of columns.
+        """
+        names = {column.column for column in given.values()}
+        table = find_table(text, names if unclear is None else {*names, 1})
+        return cls(table, assign_columns(table, given, unclear), given)
 
     def factor(self, channel: str) -> float:
         """Return the factor from the numbers of a channel to SI."""
@@ -163,8 +170,13 @@ class Source:
         return "counts_down = true" if given.counts_down else minus
 
 
-def assign_columns(table: Table, given: dict[str, Column]) -> dict[str, int]:
-    """Return the column number of each channel, from [columns] or else from the headers."""
+def assign_columns(
+    table: Table, given: dict[str, Column], unclear: dict[str, list[int]] | None = None
+) -> dict[str, int]:
+    """Return the column number of each channel, from [columns] or else from the headers.
+
+    For `unclear` see `Source.of`.
+    """
     found: dict[str, int] = {}
     strained = "strain" in given or any(h.rank("strain") is not None for h in table.headers)
     for channel in _channels(table, given):
@@ -176,9 +188,14 @@ def assign_columns(table: Table, given: dict[str, Column]) -> dict[str, int]:
             taken = {found[c] for c in given if c in found}
             ranks = {k: r for k, r in ranks.items() if k not in taken}
         best = [k for k, r in ranks.items() if r == min(ranks.values())]
+        names = {k: table.headers[k] for k in best}  # prefer "stress" to "reference stress"
+        best = [k for k in best if not any(names[k].qualifies(names[other]) for other in best)]
         if len(best) > 1 and channel == "time":
             best = _clear_time(table, best)
         if len(best) > 1 and TWINS.get(channel) in given:
+            continue
+        if len(best) > 1 and unclear is not None:
+            unclear[channel] = best
             continue
         if len(best) > 1:
             both = " and ".join(map(table.name, best))
@@ -297,17 +314,15 @@ def _inverse(channel: str, unit: str, given: Column) -> float | None:
 
 
 def entries_of(table: Table, has: set[str], *channels: str) -> str:
-    """Suggest entries of [columns] for missing channels, using the units in the headers."""
+    """Suggest entries of [columns] for missing channels; a column only if its unit is unique."""
     entries = []
-    unnamed = [
-        k
-        for k, header in enumerate(table.headers)
-        if header.unit and all(header.rank(channel) is None for channel in CHANNELS)
-    ]
     for channel in channels:
-        units = ((k, table.headers[k].unit or "") for k in unnamed)
-        k = next((k for k, unit in units if in_si(channel, unit) is not None), None)
-        column = '"…"' if k is None else quoted(table, k)
-        unit = f', unit = "{channel_of(channel).unit}"' if k is None else ""
+        fits = [
+            k
+            for k, header in enumerate(table.headers)
+            if header.nameless and header.unit and in_si(channel, header.unit) is not None
+        ]
+        column = quoted(table, fits[0]) if len(fits) == 1 else '"…"'
+        unit = "" if len(fits) == 1 else f', unit = "{channel_of(channel).unit}"'
         entries += [f"{channel} = {{ column = {column}{unit} }}"] if channel not in has else []
     return listed(entries)

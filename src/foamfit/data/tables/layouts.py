@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import io
 import re
@@ -16,6 +17,13 @@ from foamfit.text import listed
 
 _LARGEST = 1 << 30  # most bytes of an unpacked .gz
 _FEW = 20  # number of lines used to find the positions of the columns
+# First bytes, in lower case, of files that are no tables.
+_FOREIGN = {
+    b"\xd0\xcf\x11\xe0": "an old Excel workbook (.xls)",
+    b"<html": "a web page",
+    b"<!doctype": "a web page",
+    b"<?xml": "an XML file",
+}
 _TOKEN = re.compile(r"\S+")
 _NAME = re.compile(r"[^\s(\[]+(?:\s?[(\[][^)\]]*[)\]])?")  # a word, with its unit in brackets
 _NUMBERS = re.compile(r"\s*(?:[+-]?[\d.,]*\d[.,]?(?:e[+-]?\d+)?(?:\s+|$)){2,}", re.I | re.A)
@@ -43,6 +51,9 @@ def unpacked(raw: bytes, sheet: str | None) -> bytes:
             raise InputError(f"unpacks to more than {_LARGEST >> 20} MB; cut it to the test.")
     if raw.startswith(b"PK\x03\x04"):
         return _sheet(raw, sheet)
+    for start, what in _FOREIGN.items():
+        if raw[:100].lstrip(codecs.BOM_UTF8 + b" \r\n\t").lower().startswith(start):
+            raise InputError(f"is {what}; open it in a spreadsheet and save it as CSV or .xlsx.")
     if sheet is not None:
         raise InputError("is not an Excel workbook; leave [data] sheet out.")
     return raw
