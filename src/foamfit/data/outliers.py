@@ -166,7 +166,7 @@ def bridge_outliers(record: Record) -> Record:
 
 
 def inner_samples(values: Array) -> slice:
-    """Return the samples without the few at either end that are no part of the signal.
+    """Return the samples without the few at either end that do not belong to the signal.
 
     They are outside the range of the others by more than that range.
     """
@@ -181,7 +181,7 @@ def inner_samples(values: Array) -> slice:
 
 
 def cut_strays(record: Record) -> Record:
-    """Drop rows at either end in which stress or displacement are no part of the test.
+    """Drop rows at either end whose stress or displacement does not belong to the test.
 
     A stress above the range may belong to the test: the record may start or end at its peak.
     """

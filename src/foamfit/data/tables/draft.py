@@ -33,6 +33,7 @@ _HELPS = (
     'stress = "20 kPa"',
     'displacement = "2 um"',
 )
+_EVEN = 1.1  # largest ratio of the steps of a clock
 # Groups of channels of which one is needed or useful, each with a question to the user.
 _WANTED = {
     ("stress", "force"): "needed: a force (N) or a stress (MPa)",
@@ -93,11 +94,14 @@ def _columns(text: Text) -> list[str]:
     present = source.columns.keys() | unclear.keys()
     for names, what in _WANTED.items():
         if not present & set(names):
-            braked = "stress" in names and present & {"acceleration", "velocity"}
-            more = ", or else the [striker] mass" if braked else ""
-            lines.append(f"# {_proposal(table, names, others)}  # {what}{more}")
+            entry = _proposal(table, names, others)
+            more = ", with the scale of its sensor" if "scale" in entry else ""
+            if "stress" in names and present & {"acceleration", "velocity"}:
+                more += ", or else the [striker] mass"
+            lines.append(f"# {entry}  # {what}{more}")
     rest = ", ".join(table.headers[k].text for k in others)
-    return [*lines, *([f"# not used: {printable(rest)}"] if rest else [])]
+    lines += [f"# not used: {printable(rest)}"] if rest else []
+    return lines if table.header_row else [*lines, "# give columns by number, like column = 1"]
 
 
 def _proposal(table: Table, names: tuple[str, ...], columns: list[int]) -> str:
@@ -130,4 +134,4 @@ def _is_clock(table: Table, column: int) -> bool | None:
     if values.size < MIN_ROWS or np.array_equal(values, np.round(values)):
         return None
     steps = np.diff(values)
-    return bool(steps.min() > 0.0 and steps.max() < 2.0 * np.median(steps))
+    return bool(steps.min() > 0.0 and steps.max() < _EVEN * steps.min())

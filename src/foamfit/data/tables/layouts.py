@@ -17,7 +17,7 @@ from foamfit.text import listed
 
 _LARGEST = 1 << 30  # most bytes of an unpacked .gz
 _FEW = 20  # number of lines used to find the positions of the columns
-# First bytes, in lower case, of files that are no tables.
+# First bytes, in lower case, of files other than tables.
 _FOREIGN = {
     b"\xd0\xcf\x11\xe0": "an old Excel workbook (.xls)",
     b"<html": "a web page",
