@@ -15,13 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.channels import (
-    Channels,
-    check_time,
-    engineering_strain,
-    read_channels,
-    turn_negative,
-)
 from foamfit.data.frames import Frames, join
 from foamfit.data.measurement import (
     Measurement,
@@ -33,6 +26,13 @@ from foamfit.data.measurement import (
 )
 from foamfit.data.noise import with_noise
 from foamfit.data.prepare import condition, stress_of_motion
+from foamfit.data.tables.channels import (
+    Channels,
+    check_time,
+    engineering_strain,
+    read_channels,
+    turn_negative,
+)
 from foamfit.data.tables.columns import TWINS, Source, si_factor
 from foamfit.data.tables.csv_table import read_numbers, read_text
 from foamfit.data.tables.draft import without_toml

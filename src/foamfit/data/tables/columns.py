@@ -187,25 +187,22 @@ def assign_columns(
         if interior_node(channel):  # the TOML may assign this column to the top
             taken = {found[c] for c in given if c in found}
             ranks = {k: r for k, r in ranks.items() if k not in taken}
-        best = [k for k, r in ranks.items() if r == min(ranks.values())]
-        names = {k: table.headers[k] for k in best}  # prefer "stress" to "reference stress"
-        best = [k for k in best if not any(names[k].qualifies(names[other]) for other in best)]
-        if len(best) > 1 and channel == "time":
-            best = _clear_time(table, best)
-        if len(best) > 1 and TWINS.get(channel) in given:
+        best = _best(table, channel, ranks)
+        if not best or (ranks[best[0]] == WEAK and strained):
             continue
-        if len(best) > 1 and unclear is not None:
-            unclear[channel] = best
+        if len(best) == 1:
+            found[channel] = best[0]
             continue
-        if len(best) > 1:
+        if TWINS.get(channel) in given:
+            continue
+        if unclear is None:
             both = " and ".join(map(table.name, best))
             entry = f"{channel} = {{ column = {quoted(table, best[0])} }}"
             raise InputError(
                 f"columns {both} could both be the {channel}; keep one, or write {entry} in "
                 "[columns]."
             )
-        if best and not (ranks[best[0]] == WEAK and strained):
-            found[channel] = best[0]
+        unclear[channel] = best
     # A channel given in the TOML takes precedence over a twin found by its header.
     for named, twin in TWINS.items():
         if named in given and twin not in given:
@@ -215,6 +212,14 @@ def assign_columns(
     if true and "stress" not in given and "force" in found:
         del found["stress"]
     return found
+
+
+def _best(table: Table, channel: str, ranks: dict[int, int]) -> list[int]:
+    """Return the columns that name a channel best."""
+    best = [k for k, rank in ranks.items() if rank == min(ranks.values())]
+    names = {k: table.headers[k] for k in best}  # "stress" is better than "reference stress"
+    best = [k for k in best if not any(names[k].qualifies(names[other]) for other in best)]
+    return _clear_time(table, best) if len(best) > 1 and channel == "time" else best
 
 
 def _channels(table: Table, given: dict[str, Column]) -> list[str]:

@@ -17,7 +17,6 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.cycles import find_turns
-from foamfit.data.measurement import interior_node
 from foamfit.data.noise import noise_level
 from foamfit.data.outliers import inner_samples
 
@@ -37,33 +36,28 @@ _SMOOTHED = 30, 5  # least number of samples for a running median, and its width
 def negative_channels(channels: Mapping[str, Array], time: Array | None) -> tuple[list[str], bool]:
     """Return the channels that are negative in compression, and whether the record proves it.
 
-    The channels, with a zero and a unit of their own, have the same rows. If the record shows that
-    force and motion contradict each other, but not which of them is wrong, both are returned.
+    The channels have the same rows, but any zero and unit. If force and motion contradict each
+    other and the record does not show which of them is wrong, both are returned.
     """
-    force = next((c for c in FORCES if c in channels), "")
-    motion = next((c for c in MOTIONS if c in channels), "")
+    force, motion = (next((c for c in names if c in channels), "") for names in (FORCES, MOTIONS))
     inner = [inner_samples(channels[c]) for c in (force or motion or "velocity", motion) if c]
     kept = slice(max(part.start for part in inner), min(part.stop for part in inner))
-    smooth = {c: _smoothed(values[kept]) for c, values in channels.items()}
-    time = None if time is None else time[kept]
-    wrong, certain = list[str](), True
+    upright = {c: _smoothed(values[kept]) for c, values in channels.items()}
     if force and motion:
-        signs = _signs(smooth[force], smooth[motion])
-        wrong = [c for c, s in zip((force, motion), signs or (-1, -1), strict=True) if s < 0]
-        certain = signs is not None
-    elif force:
-        wrong = [force] if _pulse_is_negative(smooth[force]) else []
-    elif motion:
-        wrong = [motion] if _falls(smooth[motion]) else []
-    if not certain:
-        return wrong, False
-    upright = {c: -v if c in wrong else v for c, v in smooth.items()}
+        signs = _signs(upright[force], upright[motion])
+        if signs is None:
+            return [force, motion], False
+        wrong = [c for c, sign in zip((force, motion), signs, strict=True) if sign < 0]
+    else:
+        wrong = [force] * bool(force and _pulse_is_negative(upright[force]))
+        wrong += [motion] * bool(motion and _falls(upright[motion]))
+    upright |= {c: -upright[c] for c in wrong}
     for channel, values in upright.items():
-        other = force if channel in FORCES else motion if channel in MOTIONS else ""
-        other = motion if interior_node(channel) else other
-        if other and channel != other:
-            wrong += [channel] if _opposite(values, upright[other]) else []
-    if time is not None and "velocity" in upright and _against(upright, force, motion, time):
+        other = force if channel in FORCES else motion
+        compared = other and channel not in (other, "velocity")
+        if compared and _opposite(values, upright[other]):
+            wrong.append(channel)
+    if time is not None and "velocity" in upright and _against(upright, force, motion, time[kept]):
         wrong.append("velocity")
     return wrong, True
 

@@ -10,9 +10,9 @@ import numpy as np
 from foamfit.arrays import Array, Integers, means
 from foamfit.data.measurement import MIN_ROWS, Dropped, Window
 from foamfit.data.outliers import fresh_samples
-from foamfit.data.signs import negative_channels
 from foamfit.data.tables.columns import Source
 from foamfit.data.tables.csv_table import read_numbers, without_cut_row
+from foamfit.data.tables.signs import negative_channels
 from foamfit.data.units import LARGEST
 from foamfit.errors import InputError
 
