@@ -168,16 +168,21 @@ def bridge_outliers(record: Record) -> Record:
 def inner_samples(values: Array) -> slice:
     """Return the samples without the few at either end that do not belong to the signal.
 
-    They are outside the range of the others by more than that range.
+    They are outside the range of the others by more than that range, after one jump.
     """
-    most = max(_MAX_RUN, int(_MOST * values.size))
-    if values.size < _FEWEST:
-        return slice(0, values.size)
-    middle = values[most:-most]
-    low, high = float(middle.min()), float(middle.max())
+    n, most = values.size, max(_MAX_RUN, int(_MOST * values.size))
+    if n < _FEWEST:
+        return slice(0, n)
+    low, high = float(values[most:-most].min()), float(values[most:-most].max())
     inside = np.flatnonzero(np.abs(values - 0.5 * (low + high)) <= 1.5 * (high - low))
-    first, end = int(inside[0]), int(inside[-1]) + 1
-    return slice(first if first <= most else 0, end if end >= values.size - most else values.size)
+
+    def strays(ahead: Array, count: int) -> int:
+        steps = np.abs(np.diff(ahead[: count + 1]))
+        jumps = 0 < count <= most and steps[-1] > _JUMP * steps[:-1].max(initial=0.0)
+        return count if jumps else 0
+
+    first, last = int(inside[0]), int(inside[-1])
+    return slice(strays(values, first), n - strays(values[::-1], n - 1 - last))
 
 
 def cut_strays(record: Record) -> Record:

@@ -132,7 +132,7 @@ def _pulse_is_negative(force: Array) -> bool:
 
     Pulses are parts in which the force differs from its level at the start.
     """
-    level = force - np.median(force[:5])
+    level = _from_start(force)
     size = float(np.dot(level, level)) / max(float(np.abs(level).sum()), 1e-300)
     sides = np.sign(level) * (np.abs(level) > max(_PULSE * size, _NOISE * noise_level(force)))
     starts = np.append(0, np.flatnonzero(np.diff(sides)) + 1)
@@ -151,7 +151,11 @@ def _falls(motion: Array) -> bool:
 
 def _opposite(values: Array, other: Array) -> bool:
     """Return whether a channel changes against another one."""
-    return bool(np.dot(values - values[0], other - other[0]) < 0.0)
+    return bool(np.dot(values - values.mean(), other - other.mean()) < 0.0)
+
+
+def _from_start(force: Array) -> Array:
+    return force - np.median(force[: max(5, force.size // 200)])
 
 
 def _against(channels: Mapping[str, Array], force: str, motion: str, time: Array) -> bool:
@@ -166,6 +170,6 @@ def _against(channels: Mapping[str, Array], force: str, motion: str, time: Array
     if not force:
         steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time)
         return _falls(np.append(0.0, np.cumsum(steps)))
-    level = channels[force] - np.median(channels[force][:5])
+    level = _from_start(channels[force])
     impulse = np.append(0.0, np.cumsum(0.5 * (level[1:] + level[:-1]) * np.diff(time)))
     return bool(np.dot(impulse, velocity - velocity[0]) > 0.0 and velocity[0] < 0.0)
