@@ -231,6 +231,8 @@ def test_rigol(tmp_path, end):
     test = read_test(write(tmp_path, lines, COLUMNS + SCALED % ("CH1", "CH2")))
     expect(test, (N - 1) * 5e-4)
     assert test.origins["contact_time"] == pytest.approx(-1e-3)
+    for damaged in ("Increment", "-1.0e-03"):
+        refused(write(tmp_path, [line.replace(damaged, "?") for line in lines]), "no column is a")
 
 
 def test_tds(tmp_path):

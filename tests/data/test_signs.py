@@ -283,6 +283,14 @@ def test_what_stays_ambiguous_is_refused_with_both_remedies(tmp_path: Path, offs
             refused(path, "the stress is never positive in the part that is used")
 
 
+def test_a_force_that_is_never_positive_is_refused(tmp_path: Path) -> None:
+    """It falls throughout, while the motion goes there and back."""
+    t = np.linspace(0.0, 10.0, 61)
+    columns = {"time_s": t, "force_N": -3.0 * t, "displacement_mm": 10 - 4 * np.sin(np.pi * t / 10)}
+    path = written(tmp_path, SPECIMEN + STRIKER, **columns)
+    refused(path, "the stress is never positive in the part that is used, only -300 kPa to 0 Pa")
+
+
 def test_a_sign_that_the_toml_states_is_not_reversed_again(tmp_path: Path) -> None:
     w = path_through([0, 5, 0])
     columns = {"time_s": 0.01 * np.arange(len(w)), "force_N": foam(w), "displacement_mm": w}

@@ -77,6 +77,8 @@ def condition(
     used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record), turn=0)
     if impact:
         start = contact.start_of_impact(first, levels)
+        if first.stress[start.first :].max() == 0.0:
+            raise _never_positive(first.stress)
         start = replace(start, gauge=zeros.gauge_before(first, start, levels, given))
         span = zeros.span_of_impact(first, start, levels)
         striker, notes = zeros.flight_of(first, start, span, levels, given, spread)
@@ -282,11 +284,7 @@ def checks(
         raise InputError(f"strain reaches {strain:.3g}, beyond one; check height and {cause}.")
     peak = float(record.stress.max())
     if peak <= 0.0:
-        least, most = (engineering(float(v), "Pa") for v in (record.stress.min(), peak + 0.0))
-        raise InputError(
-            f"the stress is never positive in the part that is used, only {least} to {most}; "
-            "correct its zero in the file, or choose another part or cycle by [window]."
-        )
+        raise _never_positive(record.stress)
     duration = 1.0 if record.time is None else float(np.ptp(record.time))
     sizes = height, specimen.area, strain, peak, peak / strain if strain > 0 else 1e3, duration
     for value, (name, (low, high, unit)) in zip(sizes, _USUAL.items(), strict=True):
@@ -326,6 +324,14 @@ def checks(
     if specimen.mass and not 1 < density < 3000:
         notes.append(f"Check: mass and volume give a density of {density:.3g} kg/m³.")
     return record.noted(*notes)
+
+
+def _never_positive(stress: Array) -> InputError:
+    least, most = (engineering(float(v) + 0.0, "Pa") for v in (stress.min(), stress.max()))
+    return InputError(
+        f"the stress is never positive in the part that is used, only {least} to {most}; correct "
+        "its zero in the file, or choose another part or cycle by [window]."
+    )
 
 
 def thin(record: Record) -> Record:

@@ -25,6 +25,7 @@ _FOREIGN = {
     b"<?xml": "an XML file",
 }
 _TOKEN = re.compile(r"\S+")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.I | re.A)
 _NAME = re.compile(r"[^\s(\[]+(?:\s?[(\[][^)\]]*[)\]])?")  # a word, with its unit in brackets
 _NUMBERS = re.compile(r"\s*(?:[+-]?[\d.,]*\d[.,]?(?:e[+-]?\d+)?(?:\s+|$)){2,}", re.I | re.A)
 
@@ -96,8 +97,10 @@ def scope_of(grid: list[list[str]]) -> Scope | None:
     words = [cell.casefold() for cell in first]
     if len(second) > 1 and words[0] == "x-axis":
         return Scope(_with_units(["Time", *first[1:]], second), 2)
-    if words[:1] == ["x"] and "start" in words and len(second) == len(first):
-        start, step = (float(second[words.index(name)]) for name in ("start", "increment"))
+    preamble = dict(zip(words, second, strict=False))
+    numbers = [preamble.get(name, "") for name in ("start", "increment")]
+    if words[:1] == ["x"] and len(second) == len(first) and all(map(_NUMBER.fullmatch, numbers)):
+        start, step = map(float, numbers)
         units = ["s", *second[1 : words.index("start")]]
         return Scope(_with_units(["Time", *first[1:]], units), 2, (start, step))
     if words[:1] == ["record length"] and len(first) > 4:
