@@ -349,10 +349,6 @@ def refused(path, *words):
             ["camera.csv: row 3", "goes back"],
         ),
         (
-            {"time (ms)": lambda t: 1e3 * t, "displacement (mm)": lambda t: -1e3 * press(t)},
-            ["negative or decreases", "in [motion.columns]"],
-        ),
-        (
             {"time (s)": lambda t: t + 1.0, "displacement (mm)": press},
             ["test.toml: [motion] camera.csv does not overlap in time"],
         ),

@@ -576,12 +576,6 @@ def test_strain_beyond_one_is_refused():
         condition(impact(), Specimen(3e-4, 1.9635e-5), striker=STRIKER)
 
 
-def test_an_acceleration_that_is_not_braking_is_refused():
-    record = impact(w="missing")
-    with pytest.raises(InputError, match="scale = -1"):
-        run(Record(record.time, record.stress, None, None, -record.stress))
-
-
 def test_noise_is_estimated_from_the_signal():
     random = np.random.default_rng(0)
     stress = pulse(np.linspace(0, DURATION, 4000))[0] + 1e4 * random.normal(size=4000)

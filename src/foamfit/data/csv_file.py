@@ -9,17 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from foamfit.arrays import Array, Integers, means
+from foamfit.arrays import Array
 from foamfit.data.frames import Frames, join
 from foamfit.data.measurement import (
-    MIN_ROWS,
-    Dropped,
     Measurement,
     Record,
     Striker,
@@ -28,16 +25,23 @@ from foamfit.data.measurement import (
     interior_node,
 )
 from foamfit.data.noise import with_noise
-from foamfit.data.outliers import fresh_samples
 from foamfit.data.prepare import condition, stress_of_motion
+from foamfit.data.tables.channels import (
+    Channels,
+    check_time,
+    engineering_strain,
+    read_channels,
+    turn_negative,
+)
 from foamfit.data.tables.columns import TWINS, Source, si_factor
-from foamfit.data.tables.csv_table import read_numbers, read_text, without_cut_row
+from foamfit.data.tables.csv_table import read_numbers, read_text
 from foamfit.data.tables.draft import without_toml
 from foamfit.data.tables.headers import CHANNELS, example
 from foamfit.data.toml_file import Column, Settings, is_range, read_settings, toml_beside
-from foamfit.data.units import LARGEST
 from foamfit.errors import InputError, naming
 from foamfit.text import engineering, percent
+
+_MOTION = "motion.columns"
 
 
 def _with_cycles(window: Window, cycle: int | None, cycles: tuple[int, int] | None) -> Window:
@@ -94,27 +98,26 @@ def read_test(
     text = read_text(path, "the CSV file of a test", settings.sheet)
     window = _with_cycles(settings.window, cycle, cycles)
     with naming(path):
-        source = Source.of(text, settings.columns)
-        record = _record(source, settings)
-    sha256, spreads, moved = text.sha256, source.scale_spreads(), source
+        parts = [
+            read_channels(Source.of(text, settings.columns).needed(settings), settings.duplicates)
+        ]
+    sha256 = text.sha256
     if settings.motion is not None:
-        moved, frames, notes = _read_motion(path, toml, settings)
+        parts.append(_read_motion(path, toml, settings))
+        sha256 = hashlib.sha256(f"{sha256} {parts[1].source.table.sha256}".encode()).hexdigest()
+    with naming(path):
+        turned = turn_negative(parts, window)
+        record = _record(parts[0], settings)
+    if settings.motion is not None:
+        frames, notes = _frames(parts[1], settings)
         with naming(toml):
             record = join(record.noted(*notes), frames)
-        spreads |= moved.scale_spreads()
-        sha256 = hashlib.sha256(f"{sha256} {moved.table.sha256}".encode()).hexdigest()
-
-    def advice(channel: str) -> str:
-        of_motion = moved is not source and channel.startswith("displacement")
-        return _of_motion(moved.sign_advice(channel)) if of_motion else source.sign_advice(channel)
-
     with naming(path):
         test = condition(
             record,
             settings.specimen,
             striker=settings.striker,
             window=window,
-            advice=advice,
             spread=settings.uncertainties.get("velocity", 0.0),
         )
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
@@ -130,7 +133,11 @@ def read_test(
         name=settings.name,
         path=path,
         data_sha256=sha256,
-        uncertainties=spreads | settings.uncertainties,
+        uncertainties={
+            name: spread for part in parts for name, spread in part.source.scale_spreads().items()
+        }
+        | settings.uncertainties,
+        turned=turned,
         noise=replace(settings.noise, estimated=test.noise.estimated),
         priors=settings.priors,
     )
@@ -148,47 +155,49 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
                 raise InputError(f"has no column for the {name}; it must be {wanted}.")
         headers = source.table.headers
         numbers, rows, _ = read_numbers(source.table, source.columns)
-        _check_time(numbers["time"], headers[source.columns["time"]].text, rows)
+        check_time(numbers["time"], source.name("time"), rows)
         for name, k in source.columns.items():
             in_si = None if headers[k].unit else Column(headers[k].text, CHANNELS[name].si)
             numbers[name] *= si_factor(source.table, name, k, in_si)
     return numbers["time"], numbers[channel]
 
 
-def _read_motion(path: Path, toml: Path, settings: Settings) -> tuple[Source, Frames, list[str]]:
-    """Read the file named in [motion]; return its source, its frames and notes."""
-    motion, spreads = settings.motion, settings.uncertainties
+def _read_motion(path: Path, toml: Path, settings: Settings) -> Channels:
+    """Read the channels of the file named in [motion]."""
+    motion = settings.motion
     assert motion is not None  # checked by the caller
-    name = motion.file.name
     if os.path.realpath(motion.file) == os.path.realpath(path):
         raise InputError(
-            f"{toml}: [motion] file = {name!r} is the file of the force; name one of its own."
+            f"{toml}: [motion] file = {motion.file.name!r} is the file of the force; name one of "
+            "its own."
         )
     text = read_text(motion.file, f"in [motion] file of {toml.name} the CSV file of the motion")
     try:
         with naming(motion.file):
             source = Source.of(text, motion.columns).of_motion()
-            numbers, _, dropped, notes = _channels(source, settings)
+            return read_channels(source, settings.duplicates, _MOTION, motion.delay)
     except InputError as error:
-        raise InputError(_of_motion(str(error))) from None
-    notes += [f"Not used: {item}." for item in dropped]
-    top = _one_of(numbers, "displacement", "strain", 1 / settings.specimen.height, "height", notes)
+        raise InputError(str(error).replace("[columns]", f"[{_MOTION}]")) from None
+
+
+def _frames(channels: Channels, settings: Settings) -> tuple[Frames, list[str]]:
+    """Return the motion of the file named in [motion], and notes."""
+    motion, height = settings.motion, settings.specimen.height
+    assert motion is not None  # checked by the caller
+    numbers, name = channels.engineering(), motion.file.name
+    notes = channels.notes + [f"Not used: {item}." for item in channels.dropped]
+    top = _one_of(numbers, "displacement", "strain", 1 / height, "height", notes)
     assert top is not None  # see `Source.of_motion`
     inside = {interior_channel(k): w for k, w in _inside(numbers, top, notes).items()}
-    moved = {"displacement": top} | inside
-    frames = Frames(name, numbers["time"], moved, motion.delay, spreads.get("delay"))
-    return source, frames, [f"{name}: {note}" for note in notes]
+    moved, spread = {"displacement": top} | inside, settings.uncertainties.get("delay")
+    frames = Frames(name, numbers["time"], moved, motion.delay, spread)
+    return frames, [f"{name}: {note}" for note in notes]
 
 
-def _of_motion(text: str) -> str:
-    return text.replace("[columns]", "[motion.columns]")
-
-
-def _record(source: Source, settings: Settings) -> Record:
-    """Read the channels needed for the test, in SI; notes name the columns used."""
-    source = source.needed(settings)
-    numbers, rows, dropped, notes = _channels(source, settings)
-    notes += _compare(source, numbers, settings)
+def _record(channels: Channels, settings: Settings) -> Record:
+    """Return the channels of a test in SI; notes name the columns used."""
+    numbers, notes, dropped = channels.engineering(), channels.notes, channels.dropped
+    notes += _compare(channels.source, numbers, settings)
     specimen, striker = settings.specimen, settings.striker or Striker()
     if settings.striker is not None and "time" not in numbers:
         notes.append(
@@ -222,63 +231,12 @@ def _record(source: Source, settings: Settings) -> Record:
         acceleration,
         interior=inside,
         cycle=numbers.get("cycle"),
-        numbers=rows,
+        numbers=channels.rows,
         dropped=tuple(dropped),
         derived=derived,
         braked=braked,
         notes=tuple(notes),
     )
-
-
-def _channels(
-    source: Source, settings: Settings
-) -> tuple[dict[str, Array], Integers, list[Dropped], list[str]]:
-    """Return the channels of a table in SI, their row numbers, dropped rows, and notes."""
-    table, dropped = without_cut_row(source.table)
-    factors = {channel: source.factor(channel) for channel in source.columns}
-    numbers, rows, empty = read_numbers(table, source.columns)
-    if rows.size < MIN_ROWS:
-        raise InputError(f"has fewer than {MIN_ROWS} rows; a test needs more.")
-    notes = [source.note()]
-    for channel, values in numbers.items():
-        header = table.headers[source.columns[channel]]
-        column, measure = f"column {header.text!r}", header.measure(channel)
-        if np.ptp(values) == 0:
-            raise InputError(f"{column} is constant; a {channel} must vary.")
-        numbers[channel] = _nominal(measure, values * factors[channel])
-        if not 1.0 / LARGEST < np.max(np.abs(numbers[channel])) < LARGEST:
-            raise InputError(
-                f"{column} is up to {np.max(np.abs(values)):.3g} in the file, which cannot be a "
-                f"{channel}; correct its numbers, its unit or its scale."
-            )
-        if measure:
-            notes.append(f"The strain is converted from the {measure} strain {header.text!r}.")
-    # Some instruments write the number of samples into the header.
-    for row, line in enumerate(table.content.split("\n", table.first_row)[: table.first_row], 1):
-        match = re.match(r"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE | re.ASCII)
-        if match and int(match[1]) != rows.size:
-            counts = f"{int(match[1])} samples, the table has {rows.size}"
-            notes.append(f"Check: row {row} announces {counts}.")
-            break
-    if empty.size:
-        dropped.append(Dropped.of(empty, "no numbers in the columns in use"))
-    if "time" in numbers:
-        if settings.duplicates == "average":
-            numbers, rows = _averaged(numbers, rows, dropped, notes)
-        _check_time(numbers["time"], table.headers[source.columns["time"]].text, rows)
-    return numbers, rows, dropped, notes
-
-
-def _nominal(measure: str, strain: Array) -> Array:
-    """Convert a strain of another measure to engineering strain, positive in compression."""
-    if measure == "logarithmic":
-        return 1.0 - np.exp(-strain)
-    if measure and strain.max() >= 0.5:
-        raise InputError(
-            f"the {measure} strain reaches {strain.max():.3g}; in compression it stays below 0.5, "
-            "so the column must contain another strain or have another unit."
-        )
-    return 1.0 - np.sqrt(1.0 - 2.0 * strain) if measure else strain
 
 
 def _compare(source: Source, numbers: dict[str, Array], settings: Settings) -> list[str]:
@@ -292,7 +250,7 @@ def _compare(source: Source, numbers: dict[str, Array], settings: Settings) -> l
         try:
             values = read_numbers(table, {channel: k})[0][channel]
             values = values * si_factor(table, channel, k, None)
-            values = _nominal(table.headers[k].measure(channel), values)
+            values = engineering_strain(table.headers[k].measure(channel), values)
         except InputError:  # not usable as an alternative
             continue
         used = TWINS.get(channel, channel)
@@ -328,40 +286,6 @@ def _inside(numbers: dict[str, Array], top: Array | None, notes: list[str]) -> d
         elif node:
             inside[node] = values
     return inside
-
-
-def _averaged(
-    numbers: dict[str, Array], rows: Integers, dropped: list[Dropped], notes: list[str]
-) -> tuple[dict[str, Array], Integers]:
-    """Average consecutive rows with the same time stamp, and count them as dropped."""
-    time = numbers["time"]
-    starts, _ = fresh_samples(time)
-    again = np.delete(rows, starts)
-    if not again.size:
-        return numbers, rows
-    dropped.append(Dropped.of(again, "the time stamp of the row before, averaged with it"))
-    notes.append(
-        f"Check: {again.size} of {len(time)} rows have the time stamp of the row before, the first "
-        f"in row {again[0]}; rows with the same stamp are averaged (or refused by [data] "
-        'duplicates = "refuse").'
-    )
-    averages = {channel: means(values, starts) for channel, values in numbers.items()}
-    return averages | {"time": time[starts]}, rows[starts]
-
-
-def _check_time(time: Array, name: str, rows: Integers) -> None:
-    """Raise InputError unless the time increases from row to row."""
-    back = np.flatnonzero(np.diff(time) <= 0)
-    if back.size:
-        i = int(back[0]) + 1
-        wrong, more = "goes back", ""
-        if time[i] == time[i - 1]:
-            more = ' (in a test, [data] duplicates = "average" averages rows with the same stamp)'
-            wrong = "repeats"
-        elif len(back) > len(time) / 2:
-            more = "; as the record runs backwards, reverse the order of its rows"
-        where = f"row {rows[i]}, column {name!r}"
-        raise InputError(f"{where}: time {wrong}; it must increase from row to row{more}.")
 
 
 def _one_of(

@@ -318,6 +318,8 @@ class Measurement(Samples):
         clock, and relative ones of scales: "stress_scale", "displacement_scale", ….
     standstills
         First and last time, s (or sample), of each interval with a stuck gauge.
+    turned
+        Channels of the file that were negative in compression; their sign is reversed.
     priors
         Prior knowledge of parameters from the TOML, like "5.5 ± 0.1 MPa".
     """
@@ -344,6 +346,7 @@ class Measurement(Samples):
     block: int = 1
     uncertainties: dict[str, float] = field(default_factory=dict)
     standstills: tuple[tuple[float, float], ...] = ()
+    turned: tuple[str, ...] = ()
     priors: dict[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:

@@ -43,8 +43,10 @@ def robust_variance(residual: Array) -> float:
 def quantum(values: Array) -> float:
     """Return the step of the digitiser: the smallest gap between levels; 0 if not digitised."""
     levels = np.unique(values)
+    if levels.size < 2:
+        return 0.0
     gaps = np.diff(levels)
-    gaps = gaps[gaps > 1e-9 * max(float(np.ptp(values)), 1e-300)]
+    gaps = gaps[gaps > 1e-9 * float(np.ptp(values))]
     # Digitised values have few levels. So has a motion to and fro at constant speed, but its steps
     # from sample to sample are all equal, while those of a digitised signal vary.
     if not gaps.size or levels.size >= 0.7 * values.size:

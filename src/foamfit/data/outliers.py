@@ -23,6 +23,7 @@ _OFF = 4.0  # least residual of an outlier, in standard deviations of leave-one-
 _ALONE = 2.5  # the same in standard deviations of its neighbours' residuals (large at a kink)
 _LEAST = 5e-3  # least residual of an outlier, as a share of the range
 _MOST = 0.02  # share of the samples: if more stand out, none is an outlier
+_FEWEST = 30  # samples of a record in which outliers can be found
 _WIDTH, _HALF = 9, 4  # samples of a local cubic, and on either side of its middle
 _EVEN = 0.02  # largest relative deviation of time steps that count as equal
 _PAUSE = 6.0  # a longer step, in usual steps, is a pause
@@ -60,7 +61,7 @@ def find_outliers(values: Array, time: Array | None = None) -> Mask:
     of the samples stand out, none is an outlier.
     """
     n = values.size
-    if n < 30:
+    if n < _FEWEST:
         return np.zeros(n, dtype=bool)
     least = _LEAST * float(np.ptp(np.quantile(values, (0.005, 0.995))))
     even, at = True, np.arange(n, dtype=np.float64)
@@ -161,6 +162,42 @@ def bridge_outliers(record: Record) -> Record:
             line = _bridged(values, wrong, record.instants)
             excess = record.excess | {name: np.where(wrong, values - line, 0.0)}
             record = replace(record.changed(name, line), excess=excess)
+    return record
+
+
+def inner_samples(values: Array) -> slice:
+    """Return the samples without the few at either end that do not belong to the signal.
+
+    They are outside the range of the others by more than that range, after one jump.
+    """
+    n, most = values.size, max(_MAX_RUN, int(_MOST * values.size))
+    if n < _FEWEST:
+        return slice(0, n)
+    low, high = float(values[most:-most].min()), float(values[most:-most].max())
+    inside = np.flatnonzero(np.abs(values - 0.5 * (low + high)) <= 1.5 * (high - low))
+
+    def strays(ahead: Array, count: int) -> int:
+        steps = np.abs(np.diff(ahead[: count + 1]))
+        jumps = 0 < count <= most and steps[-1] > _JUMP * steps[:-1].max(initial=0.0)
+        return count if jumps else 0
+
+    first, last = int(inside[0]), int(inside[-1])
+    return slice(strays(values, first), n - strays(values[::-1], n - 1 - last))
+
+
+def cut_strays(record: Record) -> Record:
+    """Drop rows at either end whose stress or displacement does not belong to the test.
+
+    A stress above the range may belong to the test: the record may start or end at its peak.
+    """
+    for name in ("stress", "displacement"):
+        values = record.channel(name)
+        if values is not None:
+            stray = np.ones(len(record), dtype=bool)
+            stray[inner_samples(values)] = False
+            stray &= (values < 0.0) | (name != "stress")
+            why = f"the {name} jumps there by more than its range in the rest of the record"
+            record = record.without(stray, why)
     return record
 
 

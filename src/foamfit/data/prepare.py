@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -52,23 +51,22 @@ def condition(
     *,
     striker: Striker | None = None,
     window: Window | None = None,
-    advice: Callable[[str], str] | None = None,
     spread: float = 0.0,
 ) -> Measurement:
     """Reduce all samples of a file to one loading and unloading; the test has no name yet.
 
-    A record with a striker and a time is an impact, any other a slow test. For `advice` see
-    `check_signs`; `spread` is the standard deviation of the striker's velocity, m/s. The result has
-    at most 1500 samples, and time and displacement are zero at the start of contact. The noise is
-    estimated from samples before contact or from those of a held channel.
+    A record with a striker and a time is an impact, any other a slow test. Channels are positive
+    in compression. `spread` is the standard deviation of the striker's velocity, m/s. The result
+    has at most 1500 samples, and time and displacement are zero at the start of contact. The noise
+    is estimated from samples before contact or from those of a held channel.
     """
     window, given = window or Window(), striker or Striker()
     impact = striker is not None and record.time is not None
     if impact and window.cycle not in (None, 1):
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
-    record = repair.mark_clipped(repair.bridge_outliers(cut_to_window(record, window)))
+    record = repair.cut_strays(cut_to_window(record, window))
+    record = repair.mark_clipped(repair.bridge_outliers(record))
     spikes = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
-    check_signs(record, advice)
     held = repair.noise_of_held(record)
     still = [] if impact else repair.find_standstills(record)
     record = repair.bridge_standstills(repair.fill_staircase(record), still, specimen.height)
@@ -80,6 +78,8 @@ def condition(
     used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record), turn=0)
     if impact:
         start = contact.start_of_impact(first, levels)
+        if first.stress[start.first :].max() == 0.0:
+            raise _never_positive(first.stress)
         start = replace(start, gauge=zeros.gauge_before(first, start, levels, given))
         span = zeros.span_of_impact(first, start, levels)
         striker, notes = zeros.flight_of(first, start, span, levels, given, spread)
@@ -189,32 +189,6 @@ def cut_to_window(record: Record, window: Window) -> Record:
         if np.ptp(values) == 0:
             raise InputError(f"the {name} is constant within [window]; it must vary.")
     return record
-
-
-def check_signs(record: Record, advice: Callable[[str], str] | None) -> None:
-    """Raise InputError, with `advice` on the channel, if one is negative in compression."""
-    stress, peak = record.stress, int(np.argmax(record.stress))
-    first, lowest = float(np.median(stress[:5])), stress.min()
-    negative = first - lowest > 2 * max(stress[peak] - first, 0) and abs(lowest) > stress[peak]
-    derived = "stress" in record.derived
-    wrong = ["stress"] if negative and not derived else []
-    if derived and record.displacement is not None:  # its turn shows its sign
-        w, low = record.displacement, int(np.argmin(record.displacement))
-        fallen, risen = w[0] - w[low], w[: low + 1].max() - w[0]
-        turned = low < 0.98 * len(w) and fallen > max(2 * risen, 0.3 * np.ptp(w))
-        wrong += ["displacement"] if turned else []
-    for name, values in record.curves().items():
-        moved = values[peak] - values[0]
-        if name != "stress" and not derived and moved < -0.5 * np.ptp(values[: peak + 1]):
-            wrong.append(name)
-    acceleration, velocity = record.acceleration, record.velocity
-    if record.displacement is None and acceleration is not None:
-        wrong += ["acceleration"] if np.dot(stress - first, acceleration) < 0 else []
-    elif record.displacement is None and velocity is not None:
-        wrong += ["velocity"] if velocity[0] < velocity[-1] else []
-    if wrong:
-        plain = f"{wrong[0]} is negative in compression; give it scale = -1 in [columns]"
-        raise InputError(f"the {advice(wrong[0]) if advice else plain}.")
 
 
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> Record:
@@ -330,6 +304,8 @@ def checks(
         cause = "the unit of displacement or strain" if motion == MEASURED else "the striker"
         raise InputError(f"strain reaches {strain:.3g}, beyond one; check height and {cause}.")
     peak = float(record.stress.max())
+    if peak <= 0.0:
+        raise _never_positive(record.stress)
     duration = 1.0 if record.time is None else float(np.ptp(record.time))
     sizes = height, specimen.area, strain, peak, peak / strain if strain > 0 else 1e3, duration
     for value, (name, (low, high, unit)) in zip(sizes, _USUAL.items(), strict=True):
@@ -369,6 +345,14 @@ def checks(
     if specimen.mass and not 1 < density < 3000:
         notes.append(f"Check: mass and volume give a density of {density:.3g} kg/m³.")
     return record.noted(*notes)
+
+
+def _never_positive(stress: Array) -> InputError:
+    least, most = (engineering(float(v) + 0.0, "Pa") for v in (stress.min(), stress.max()))
+    return InputError(
+        f"the stress is never positive in the part that is used, only {least} to {most}; correct "
+        "its zero in the file, or choose another part or cycle by [window]."
+    )
 
 
 def thin(record: Record) -> Record:

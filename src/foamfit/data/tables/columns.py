@@ -32,14 +32,29 @@ class Source:
     given: dict[str, Column]
 
     @classmethod
-    def of(cls, text: Text, given: dict[str, Column]) -> Source:
-        """Find the table in the text of a file and the columns of the channels."""
-        table = find_table(text, {column.column for column in given.values()})
-        return cls(table, assign_columns(table, given), given)
+    def of(
+        cls, text: Text, given: dict[str, Column], unclear: dict[str, list[int]] | None = None
+    ) -> Source:
+        """Find the table in the text of a file and the columns of the channels.
+
+        If several columns could be a channel, they are added to `unclear`. Without that, this
+        raises InputError, and for a table without headers, unless it is given numbers of columns.
+        """
+        names = {column.column for column in given.values()}
+        table = find_table(text, names if unclear is None else {*names, 1})
+        return cls(table, assign_columns(table, given, unclear), given)
 
     def factor(self, channel: str) -> float:
         """Return the factor from the numbers of a channel to SI."""
         return si_factor(self.table, channel, self.columns[channel], self.given.get(channel))
+
+    def name(self, channel: str) -> str:
+        """Return the quoted header of a channel."""
+        return self.table.name(self.columns[channel])
+
+    def measure(self, channel: str) -> str:
+        """Return the measure of strain or stress that a header names, "" if engineering."""
+        return self.table.headers[self.columns[channel]].measure(channel)
 
     def only(self, channels: Iterable[str]) -> Source:
         """Return a source with these channels only."""
@@ -140,28 +155,28 @@ class Source:
         rest = [repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in used]
         return f"Read {', '.join(parts)}" + (f"; not used: {', '.join(rest)}." if rest else ".")
 
-    def sign_advice(self, channel: str) -> str:
-        """Return how to correct a channel that is negative in compression."""
-        channel = next(c for c in _SOURCES.get(channel, (channel,)) if c in self.columns)
+    def sign_entry(self, channel: str) -> str:
+        """Return the entry of the TOML that reverses the sign of a channel."""
         given = self.given.get(channel, _NONE)
-        entry = f"{channel} = {{ column = {quoted(self.table, self.columns[channel])}"
         by = f'"{-given.scale:g} {given.scale_unit}"' if given.scale_unit else f"{-given.scale:g}"
-        wrong = "is negative in compression; it must be positive"
-        right = f"write {entry}, scale = {by} }}"
-        if channel.startswith("displacement"):
-            wrong = "is negative or decreases in compression; it must increase"
-            right = (
-                f"write {entry}, counts_down = true }} (for a gap or position, else scale = {by})"
-            )
-        if given.counts_down:
-            right = "leave counts_down = true out"
-        elif given.scale < 0.0:
-            right = f"leave the minus sign of scale = {given.scale:g} out"
-        return f"{channel} {wrong}: {right} in [columns]"
+        down = "counts_down = true" if channel.startswith("displacement") else f"scale = {by}"
+        column = quoted(self.table, self.columns[channel])
+        return f"{channel} = {{ column = {column}, {down} }}"
+
+    def stated_sign(self, channel: str) -> str:
+        """Return what reverses the sign of a channel in the TOML; "" if nothing does."""
+        given = self.given.get(channel, _NONE)
+        minus = f"the minus sign of scale = {given.scale:g}" if given.scale < 0.0 else ""
+        return "counts_down = true" if given.counts_down else minus
 
 
-def assign_columns(table: Table, given: dict[str, Column]) -> dict[str, int]:
-    """Return the column number of each channel, from [columns] or else from the headers."""
+def assign_columns(
+    table: Table, given: dict[str, Column], unclear: dict[str, list[int]] | None = None
+) -> dict[str, int]:
+    """Return the column number of each channel, from [columns] or else from the headers.
+
+    For `unclear` see `Source.of`.
+    """
     found: dict[str, int] = {}
     strained = "strain" in given or any(h.rank("strain") is not None for h in table.headers)
     for channel in _channels(table, given):
@@ -172,20 +187,22 @@ def assign_columns(table: Table, given: dict[str, Column]) -> dict[str, int]:
         if interior_node(channel):  # the TOML may assign this column to the top
             taken = {found[c] for c in given if c in found}
             ranks = {k: r for k, r in ranks.items() if k not in taken}
-        best = [k for k, r in ranks.items() if r == min(ranks.values())]
-        if len(best) > 1 and channel == "time":
-            best = _clear_time(table, best)
-        if len(best) > 1 and TWINS.get(channel) in given:
+        best = _best(table, channel, ranks)
+        if not best or (ranks[best[0]] == WEAK and strained):
             continue
-        if len(best) > 1:
+        if len(best) == 1:
+            found[channel] = best[0]
+            continue
+        if TWINS.get(channel) in given:
+            continue
+        if unclear is None:
             both = " and ".join(map(table.name, best))
             entry = f"{channel} = {{ column = {quoted(table, best[0])} }}"
             raise InputError(
                 f"columns {both} could both be the {channel}; keep one, or write {entry} in "
                 "[columns]."
             )
-        if best and not (ranks[best[0]] == WEAK and strained):
-            found[channel] = best[0]
+        unclear[channel] = best
     # A channel given in the TOML takes precedence over a twin found by its header.
     for named, twin in TWINS.items():
         if named in given and twin not in given:
@@ -195,6 +212,14 @@ def assign_columns(table: Table, given: dict[str, Column]) -> dict[str, int]:
     if true and "stress" not in given and "force" in found:
         del found["stress"]
     return found
+
+
+def _best(table: Table, channel: str, ranks: dict[int, int]) -> list[int]:
+    """Return the columns that name a channel best."""
+    best = [k for k, rank in ranks.items() if rank == min(ranks.values())]
+    names = {k: table.headers[k] for k in best}  # "stress" is better than "reference stress"
+    best = [k for k in best if not any(names[k].qualifies(names[other]) for other in best)]
+    return _clear_time(table, best) if len(best) > 1 and channel == "time" else best
 
 
 def _channels(table: Table, given: dict[str, Column]) -> list[str]:
@@ -294,17 +319,15 @@ def _inverse(channel: str, unit: str, given: Column) -> float | None:
 
 
 def entries_of(table: Table, has: set[str], *channels: str) -> str:
-    """Suggest entries of [columns] for missing channels, using the units in the headers."""
+    """Suggest entries of [columns] for missing channels; a column only if its unit is unique."""
     entries = []
-    unnamed = [
-        k
-        for k, header in enumerate(table.headers)
-        if header.unit and all(header.rank(channel) is None for channel in CHANNELS)
-    ]
     for channel in channels:
-        units = ((k, table.headers[k].unit or "") for k in unnamed)
-        k = next((k for k, unit in units if in_si(channel, unit) is not None), None)
-        column = '"…"' if k is None else quoted(table, k)
-        unit = f', unit = "{channel_of(channel).unit}"' if k is None else ""
+        fits = [
+            k
+            for k, header in enumerate(table.headers)
+            if header.nameless and header.unit and in_si(channel, header.unit) is not None
+        ]
+        column = quoted(table, fits[0]) if len(fits) == 1 else '"…"'
+        unit = "" if len(fits) == 1 else f', unit = "{channel_of(channel).unit}"'
         entries += [f"{channel} = {{ column = {column}{unit} }}"] if channel not in has else []
     return listed(entries)

@@ -25,6 +25,7 @@ from foamfit.errors import InputError, naming
 
 _HEAD_ROWS = 400
 _SEPARATORS = "\t", ";", "|", ","
+_HEADERS = 4  # most rows of a header, from its names to the numbers
 _ABOVE = 40  # number of rows compared with the last row
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII
@@ -92,14 +93,15 @@ def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
             text = raw.removeprefix(codecs.BOM_UTF8).decode("latin-1")
         if "\0" in text:
             raise InputError("is a binary file; it must be a text table (CSV) or .xlsx.")
-    return Text(path, text if "\n" in text else text.replace("\r", "\n"), sha256)
+    return Text(path, re.sub(r"\r*\n|\r", "\n", text) if "\r" in text else text, sha256)
 
 
 def find_table(text: Text, names: set[str | int]) -> Table:
     """Find separator, header row and decimal sign; `names` are the columns in the TOML."""
     lines = io.StringIO(text.content, newline=None)
-    head = [line.rstrip("\r\n") for line, _ in zip(lines, range(_HEAD_ROWS), strict=False)]
-    grids = {s: [[c.strip() for c in cells] for _, cells in _cells(head, s)] for s in _SEPARATORS}
+    head = [line.rstrip("\n") + "\n" for line, _ in zip(lines, range(_HEAD_ROWS), strict=False)]
+    read = {s: list(_cells(head, s)) for s in _SEPARATORS}
+    grids = {s: [[" ".join(c.split()) for c in row] for _, row in rows] for s, rows in read.items()}
     whole = text.path, text.content, text.sha256
     scope = scope_of(grids[","])
     if scope is not None:
@@ -118,22 +120,25 @@ def find_table(text: Text, names: set[str | int]) -> Table:
         first = next(k for k, cells in enumerate(grid) if _is_sample(cells))
         headers = tuple(Header(f"column {k}") for k in range(1, len(grid[first]) + 1))
         decimal = _decimal_sign(grid[first:], len(headers), separator)
-        return Table(*whole, separator, decimal, 0, (), first, headers)
+        above_rows = read[separator][first - 1][0] if first else 0
+        return Table(*whole, separator, decimal, 0, (), above_rows, headers)
+    row = read[separator][i][0]  # a cell may contain line breaks
     above = [k for k, cells in enumerate(grid[:i], 1) if _holds_numbers(cells)]
     if len(above) >= MIN_ROWS:
         raise InputError(
-            f"rows {above[0]} to {above[-1]} contain numbers above the header in row {i + 1}; a "
+            f"rows {above[0]} to {above[-1]} contain numbers above the header in row {row}; a "
             "file must contain one table with one header."
         )
     if (longest := max(map(len, grid[i]))) > LONGEST:
-        wrong = f"row {i + 1}: the name of a column has {longest} characters"
+        wrong = f"row {row}: the name of a column has {longest} characters"
         raise InputError(f"{wrong}; it must have {LONGEST} at most.")
     first, texts = _unit_row(grid, i)
     body = [cells for cells in grid[first:] if any(cells)]
     if not body:
-        raise InputError(f"has a header in row {i + 1} but no rows of numbers below it.")
+        raise InputError(f"has a header in row {row} but no rows of numbers below it.")
     decimal, headers = _decimal_sign(body, len(texts), separator), tuple(map(parse_header, texts))
-    return Table(*whole, separator, decimal, i + 1, tuple(grid[i]), first, headers)
+    last = read[separator][first - 1][0]
+    return Table(*whole, separator, decimal, row, tuple(grid[i]), last, headers)
 
 
 def _cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -172,7 +177,7 @@ def _above_numbers(grids: dict[str, list[list[str]]], names: set[str | int]) -> 
         if len(rows) < 3 or len({len(grid[k]) for k in rows[:3]}) > 1:
             continue
         above = [k for k in range(rows[0]) if sum(map(bool, grid[k])) > 1]
-        if above and _unit_row(grid, above[-1] - 1)[0] == above[-1] + 1:
+        if above and _units(grid[above[-1]]):
             above.pop()
         if above and above[-1] >= rows[0] - 3:
             return separator, above[-1]
@@ -232,30 +237,43 @@ def _decimal_sign(body: list[list[str]], width: int, separator: str) -> str:
 
 
 def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
-    """Return the first row of numbers, and the headers with the units from a row of units."""
+    """Return the first row of numbers, and the headers with the units from a row of units.
+
+    Units are in one of a few rows of words below the header, or in the row above it.
+    """
     texts = list(grid[i])
     entries = {cells[0].casefold(): cells[1:] for cells in grid[:i] if len(cells) > 1}
     above = [*entries.get("horizontal units", [])[:1], *entries.get("vertical units", [])]
     for k, unit in enumerate(above[: len(texts)]):  # from the preamble of a Tektronix MSO
         if unit and parse_header(texts[k]).unit is None:
             texts[k] = f"{texts[k]} ({unit})"
-    first = _below_rule(grid, i + 1)
-    below = [cell.strip("()[]") for cell in grid[first]] if first < len(grid) else []
-    units = list(filter(None, below))
-    known = [unit for unit in units if is_unit(unit, any_case=True) and not _is_number(unit)]
-    if not known or 2 * len(known) < len(units) or any(map(_is_number, units)):
-        return first, texts
-    for k, unit in enumerate(below[: len(texts)]):
+    first = i + 1
+    while first < min(len(grid), i + _HEADERS) and _is_words(grid[first]):
+        first += 1
+    units = next((u for u in map(_units, [*grid[i + 1 : first], *grid[i - 1 : i]]) if u), [])
+    for k, unit in enumerate(units[: len(texts)]):
         own = parse_header(texts[k]).unit
         if unit and texts[k] and (own is None or not texts[k].endswith((")", "]"))):
             texts[k] = f"{texts[k]} ({unit})"
-    return _below_rule(grid, first + 1), texts
+    return first, texts
 
 
-def _below_rule(grid: list[list[str]], i: int) -> int:
-    """Return the index after a row of dashes, if there is one."""
-    rule = i < len(grid) and re.fullmatch(r"[-=+:|\s]*[-=]{3}[-=+:|\s]*", "".join(grid[i]))
-    return i + 1 if rule else i
+def _units(cells: list[str]) -> list[str]:
+    """Return the units in a row that contains little else; [] for any other row."""
+    units = [cell.strip("()[]") for cell in cells]
+    filled = list(filter(None, units))
+    known = [unit for unit in filled if is_unit(unit, any_case=True) and not _is_number(unit)]
+    right = known and 2 * len(known) >= len(filled) and not any(map(_is_number, filled))
+    return units if right else []
+
+
+def _is_words(cells: list[str]) -> bool:
+    """Return whether a row below the header still belongs to it: a rule, or words only."""
+    filled = list(filter(None, cells))
+    rule = re.fullmatch(r"[-=+:|\s]*[-=]{3}[-=+:|\s]*", "".join(cells)) is not None
+    missing = {"n/a", "na", "nan", "null", "none", "inf"}
+    words = len(filled) > 1 and not any(re.match(r"[+-]?[.,]?\d", cell) for cell in filled)
+    return rule or (words and not {cell.casefold() for cell in filled} & missing)
 
 
 def read_numbers(
@@ -268,7 +286,7 @@ def read_numbers(
     places, empty = list(columns.values()), list[int]()
     read = _plain_numbers(table, places)
     if read is None:
-        read, rows, empty = _checked_numbers(table, places)
+        read, rows, empty = _checked_numbers(table, columns)
     else:
         rows = np.arange(table.first_row + 1, table.first_row + 1 + read.shape[1])
     for k, values in zip(places, read, strict=True):
@@ -297,27 +315,37 @@ def _plain_numbers(table: Table, places: list[int]) -> Array | None:
     return numbers if complete else None
 
 
-def _checked_numbers(table: Table, places: list[int]) -> tuple[Array, Integers, list[int]]:
-    """Read the columns (k, n) cell by cell; see `read_numbers`."""
+def _checked_numbers(table: Table, columns: dict[str, int]) -> tuple[Array, Integers, list[int]]:
+    """Read the columns (k, n) cell by cell; see `read_numbers`.
+
+    A row is without numbers if it has a time at most, or if it is text below the table.
+    """
     numbers, rows, empty, count = array("d"), array("q"), list[int](), len(table.headers)
+    places, below = list(columns.values()), list[tuple[int, InputError]]()
+    measured = [k for name, k in columns.items() if name != "time"] or places
     for row, cells in table.rows():
-        cells = [cell.strip() for cell in cells] + [""] * (count - len(cells))
+        cells = [" ".join(cell.split()) for cell in cells] + [""] * (count - len(cells))
         if tuple(cells) == table.header_cells:
             again = f"row {row} repeats the header of row {table.header_row}"
             raise InputError(f"{again}; a file must contain one table with one header.")
         if any(cells[count:]):
             wrong = f"row {row} has {len(cells)} cells, but the header has {count}"
             raise InputError(f"{wrong}; every row must have as many as the header.")
-        texts = [cells[k] for k in places]
-        if not any(texts):
+        if not any(cells[k] for k in measured):
             empty.append(row)
             continue
-        for k, text in zip(places, texts, strict=True):
-            if wrong := _wrong(text, table.decimal):
-                raise InputError(f"row {row}, column {table.headers[k].text!r} is {wrong}.")
-        numbers.extend(float(text.replace(",", ".")) for text in texts)
-        rows.append(row)
-    return np.array(numbers).reshape(-1, len(places)).T.copy(), np.array(rows), empty
+        wrongs = ((table.headers[k].text, _wrong(cells[k], table.decimal)) for k in places)
+        if bad := next((f"{name!r} is {wrong}" for name, wrong in wrongs if wrong), None):
+            below.append((row, InputError(f"row {row}, column {bad}.")))
+        if below and (not bad or any(_is_number(cells[k]) for k in places)):
+            raise below[0][1]
+        if not bad:
+            numbers.extend(float(cells[k].replace(",", ".")) for k in places)
+            rows.append(row)
+    if below and not rows:
+        raise below[0][1]
+    read = np.array(numbers).reshape(-1, len(places)).T.copy()
+    return read, np.array(rows), sorted([*empty, *(row for row, _ in below)])
 
 
 def _refuse_thousands(table: Table, column: int, values: Array) -> None:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from foamfit.data.tables.columns import Source, entries_of, quoted
-from foamfit.data.tables.csv_table import Text
-from foamfit.data.tables.headers import CHANNELS, channel_of
+import numpy as np
+
+from foamfit.data.measurement import MIN_ROWS
+from foamfit.data.tables.columns import Source, entries_of, quoted, si_factor
+from foamfit.data.tables.csv_table import Table, Text, read_numbers
+from foamfit.data.tables.headers import channel_of
 from foamfit.data.toml_file import LONGEST, toml_beside
-from foamfit.errors import InputError
+from foamfit.data.units import factor
+from foamfit.errors import InputError, naming
 from foamfit.terminal import printable
 from foamfit.text import listed
 
@@ -29,6 +33,7 @@ _HELPS = (
     'stress = "20 kPa"',
     'displacement = "2 um"',
 )
+_EVEN = 1.1  # largest ratio of the steps of a clock
 # Groups of channels of which one is needed or useful, each with a question to the user.
 _WANTED = {
     ("stress", "force"): "needed: a force (N) or a stress (MPa)",
@@ -39,7 +44,9 @@ _WANTED = {
 
 def draft(text: Text) -> tuple[str, list[str]]:
     """Return the text of a TOML with questions after "# ", and the entries still needed."""
-    columns, name = _columns(text), printable(toml_beside(text.path).stem[:LONGEST])
+    with naming(text.path):
+        columns = _columns(text)
+    name = printable(toml_beside(text.path).stem[:LONGEST])
     head = (
         f"# {printable(text.path.name)}: the data that foamfit needs for this test.",
         '# Lines that start with "# " are questions: enter your value and remove the "# ".',
@@ -68,28 +75,63 @@ def without_toml(toml: Path, text: Text) -> InputError:
 
 def _columns(text: Text) -> list[str]:
     """Return the lines of [columns]: known from the headers, or as questions."""
-    try:
-        source = Source.of(text, {})
-    except InputError as error:
-        units = ((names[0], CHANNELS[names[0]].unit, what) for names, what in _WANTED.items())
-        asked = (
-            f'# {c} = {{ column = "…", unit = "{unit}" }}  # {what}' for c, unit, what in units
-        )
-        return [f"# {printable(' '.join(str(error).split()))}", *asked]
+    unclear = dict[str, list[int]]()
+    source = Source.of(text, {}, unclear)
     lines, table = [], source.table
-    for channel, k in source.columns.items():
+    for channel, k in (source.columns | {c: places[0] for c, places in unclear.items()}).items():
         name = f"{channel} = {{ column = {quoted(table, k)}"
         try:
-            source.factor(channel)
-            lines.append(f"{name} }}")
+            si_factor(table, channel, k, None)
+            unit, why = "", ""
         except InputError as error:
+            unit = f', unit = "{channel_of(channel).unit}"'
             why = str(error).removeprefix("column ").partition(";")[0]
-            lines.append(f'# {name}, unit = "{channel_of(channel).unit}" }}  # needed: {why}')
-    others = [k for k in range(len(table.headers)) if k not in source.columns.values()]
+        if channel in unclear:
+            why = f"which of {listed(map(table.name, unclear[channel]))} is it?"
+        lines.append(f"# {name}{unit} }}  # needed: {why}" if why else f"{name} }}")
+    known = {*source.columns.values(), *(k for places in unclear.values() for k in places)}
+    others = [k for k, h in enumerate(table.headers) if h.text and k not in known]
+    present = source.columns.keys() | unclear.keys()
     for names, what in _WANTED.items():
-        if not source.columns.keys() & set(names):
-            first = quoted(table, others[0]) if others else '"…"'
-            entry = entries_of(table, set(), names[0]).replace('"…"', first)
-            lines.append(f"# {entry}  # {what}")
+        if not present & set(names):
+            entry = _proposal(table, names, others)
+            more = ", with the scale of its sensor" if "scale" in entry else ""
+            if "stress" in names and present & {"acceleration", "velocity"}:
+                more += ", or else the [striker] mass"
+            lines.append(f"# {entry}  # {what}{more}")
     rest = ", ".join(table.headers[k].text for k in others)
-    return [*lines, *([f"# not understood: {printable(rest)}"] if rest else [])]
+    lines += [f"# not used: {printable(rest)}"] if rest else []
+    return lines if table.header_row else [*lines, "# give columns by number, like column = 1"]
+
+
+def _proposal(table: Table, names: tuple[str, ...], columns: list[int]) -> str:
+    """Return an entry for a missing channel; it names a column only if no other can be meant.
+
+    That is the only one with a unit of the channel, the only voltage, or the only one without a
+    unit whose numbers are neither counts nor, except for a time, a clock.
+    """
+    nameless = [k for k in columns if table.headers[k].nameless]
+    for channel in names:
+        entry = entries_of(table, set(), channel)
+        if "…" not in entry:
+            return entry
+    volts = [k for k in nameless if factor(table.headers[k].unit or "", "V") is not None]
+    if len(volts) == 1 and "force" in names:
+        return f'force = {{ column = {quoted(table, volts[0])}, scale = "100 N/V" }}'
+    plain = [k for k in nameless if table.headers[k].unit is None]
+    clocks = {k: _is_clock(table, k) for k in plain}
+    fits = [k for k, clock in clocks.items() if clock == ("time" in names)]
+    column = quoted(table, fits[0]) if len(fits) == 1 else '"…"'
+    return f'{names[0]} = {{ column = {column}, unit = "{channel_of(names[0]).unit}" }}'
+
+
+def _is_clock(table: Table, column: int) -> bool | None:
+    """Return whether a column increases by even steps; None for counts, a constant or a text."""
+    try:
+        values = read_numbers(table, {"": column})[0][""]
+    except InputError:
+        return None
+    if values.size < MIN_ROWS or np.array_equal(values, np.round(values)):
+        return None
+    steps = np.diff(values)
+    return bool(steps.min() > 0.0 and steps.max() < _EVEN * steps.min())

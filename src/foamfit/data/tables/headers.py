@@ -53,6 +53,9 @@ _MEASURES = {
     "strain": {"logarithmic": _LOGARITHMIC | {"natural"}, "Green–Lagrange": {"green", "lagrange"}},
     "stress": {"true (Cauchy)": _LOGARITHMIC | {"cauchy"}},
 }
+# Words that add nothing to the name of a channel.
+_PLAIN = {"engineering", "nominal", "compressive", "axial", "normal", "measured", "actual"}
+_SIZES = {"height", "thickness", "length", "area"}  # words for the size of a specimen
 # Words in brackets that are not units.
 _ASIDE = _WORDS | _OTHER | _LOGARITHMIC | {"green", "lagrange", "cauchy", "natural"}
 # Units of mass that mean a weight if used for a force.
@@ -71,6 +74,16 @@ class Header:
         """Return the measure of strain or stress named, "" for engineering measures."""
         named = _MEASURES.get(channel, {}).items()
         return next((measure for measure, words in named if words & set(self.words)), "")
+
+    def qualifies(self, other: Header) -> bool:
+        """Return whether the name is that of another column with more words."""
+        return {*other.words} - _PLAIN < {*self.words} - _PLAIN
+
+    @property
+    def nameless(self) -> bool:
+        """Whether the column may be any channel: its name says no channel and nothing else."""
+        known = any(self.rank(channel) is not None for channel in CHANNELS)
+        return bool(self.words) and not known and not {*self.words} & (_OTHER | _SIZES)
 
     def rank(self, channel: str) -> int | None:
         """Return how well the header names a channel: 0 is best, None not at all."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import io
 import re
@@ -16,7 +17,15 @@ from foamfit.text import listed
 
 _LARGEST = 1 << 30  # most bytes of an unpacked .gz
 _FEW = 20  # number of lines used to find the positions of the columns
+# First bytes, in lower case, of files other than tables.
+_FOREIGN = {
+    b"\xd0\xcf\x11\xe0": "an old Excel workbook (.xls)",
+    b"<html": "a web page",
+    b"<!doctype": "a web page",
+    b"<?xml": "an XML file",
+}
 _TOKEN = re.compile(r"\S+")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.I | re.A)
 _NAME = re.compile(r"[^\s(\[]+(?:\s?[(\[][^)\]]*[)\]])?")  # a word, with its unit in brackets
 _NUMBERS = re.compile(r"\s*(?:[+-]?[\d.,]*\d[.,]?(?:e[+-]?\d+)?(?:\s+|$)){2,}", re.I | re.A)
 
@@ -43,6 +52,9 @@ def unpacked(raw: bytes, sheet: str | None) -> bytes:
             raise InputError(f"unpacks to more than {_LARGEST >> 20} MB; cut it to the test.")
     if raw.startswith(b"PK\x03\x04"):
         return _sheet(raw, sheet)
+    for start, what in _FOREIGN.items():
+        if raw[:100].lstrip(codecs.BOM_UTF8 + b" \r\n\t").lower().startswith(start):
+            raise InputError(f"is {what}; open it in a spreadsheet and save it as CSV or .xlsx.")
     if sheet is not None:
         raise InputError("is not an Excel workbook; leave [data] sheet out.")
     return raw
@@ -85,8 +97,10 @@ def scope_of(grid: list[list[str]]) -> Scope | None:
     words = [cell.casefold() for cell in first]
     if len(second) > 1 and words[0] == "x-axis":
         return Scope(_with_units(["Time", *first[1:]], second), 2)
-    if words[:1] == ["x"] and "start" in words and len(second) == len(first):
-        start, step = (float(second[words.index(name)]) for name in ("start", "increment"))
+    preamble = dict(zip(words, second, strict=False))
+    numbers = [preamble.get(name, "") for name in ("start", "increment")]
+    if words[:1] == ["x"] and len(second) == len(first) and all(map(_NUMBER.fullmatch, numbers)):
+        start, step = map(float, numbers)
         units = ["s", *second[1 : words.index("start")]]
         return Scope(_with_units(["Time", *first[1:]], units), 2, (start, step))
     if words[:1] == ["record length"] and len(first) > 4:

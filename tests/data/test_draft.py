@@ -1,0 +1,160 @@
+"""The TOML that `foamfit init` drafts: it proposes a column only if no other can be meant."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from conftest import DATA
+from foamfit.cli import main
+
+T = np.linspace(0.0, 2.0, 201)
+W = 4.0 * np.sin(0.5 * np.pi * T)
+F = 50.0 * W
+VOLTS = F / 100.0
+COUNTS = np.arange(201.0)
+
+
+def drafted(folder: Path, *head: str, columns: tuple[np.ndarray, ...] = (T, F, W)) -> list[str]:
+    """Return the lines of [columns] that init writes for a table."""
+    path = folder / "test.csv"
+    rows = [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]
+    path.write_text("\n".join([*head, *rows]) + "\n", encoding="utf-8")
+    return initialised(path)
+
+
+def initialised(path: Path) -> list[str]:
+    out = CliRunner().invoke(main, ["init", str(path)])
+    assert out.exit_code == 0, out.stderr
+    text = path.with_suffix(".toml").read_text(encoding="utf-8")
+    tomllib.loads(text)
+    lines = text.partition("[columns]\n")[2].partition("\n\n")[0].splitlines()
+    for line in lines:
+        if " = {" in line:
+            tomllib.loads(line.removeprefix("# "))  # every question is an entry
+    return lines
+
+
+@pytest.mark.parametrize(
+    ("others", "wanted"),
+    [
+        (["reference stress (MPa)", "engineering stress (MPa)"], "engineering stress (MPa)"),
+        (["engineering stress (MPa)", "filtered engineering stress (MPa)"],
+         "engineering stress (MPa)"),
+        (["stress (MPa)", "engineering stress (MPa)"], "stress (MPa)"),
+        (["true stress (MPa)", "nominal stress (MPa)"], "nominal stress (MPa)"),
+        (["command stress (MPa)", "measured stress (MPa)"], "measured stress (MPa)"),
+    ],
+)  # fmt: skip
+def test_a_plain_name_goes_before_a_qualified_one(
+    tmp_path: Path, others: list[str], wanted: str
+) -> None:
+    head = ",".join(["time (s)", *others, "displacement (mm)"])
+    lines = drafted(tmp_path, head, columns=(T, F, F / 2, W))
+    assert f'stress = {{ column = "{wanted}" }}' in lines
+
+
+def test_of_equals_the_user_chooses_and_the_rest_is_known(tmp_path: Path) -> None:
+    head = "time (s),left force (N),right force (N),displacement (mm)"
+    lines = drafted(tmp_path, head, columns=(T, F, F, W))
+    assert lines == [
+        'time = { column = "time (s)" }',
+        'displacement = { column = "displacement (mm)" }',
+        "# force = { column = \"left force (N)\" }  # needed: which of 'left force (N)' and "
+        "'right force (N)' is it?",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("head", "columns", "proposed"),
+    [
+        ("time (s),stress_std (MPa),displacement_std (mm)", (T, F, W), ["…", "…"]),
+        ("time (s),stress error (MPa),height (mm)", (T, F, W), ["…", "…"]),
+        ("time (s),x,y", (T, F, W), ["…", "…"]),
+        ("time (s),LVDT A (mm),LVDT B (mm)", (T, W, W), ["…", "…"]),
+        ("time (s),Marker,Step", (T, COUNTS, COUNTS // 50), ["…", "…"]),
+        ("time (s),Channel A (V),Channel B (V)", (T, VOLTS, W), ["…", "…"]),
+        ("time (s),Channel A (V),LVDT (mm)", (T, VOLTS, W), ["Channel A (V)", "LVDT (mm)"]),
+        ("time (s),load cell (N),Way,Step", (T, F, W, COUNTS), ["load cell (N)", "Way"]),
+    ],
+)
+def test_what_no_header_says_is_proposed_only_without_an_alternative(
+    tmp_path: Path, head: str, columns: tuple[np.ndarray, ...], proposed: list[str]
+) -> None:
+    lines = drafted(tmp_path, head, columns=columns)
+    asked = [line for line in lines if line.startswith("# ") and "needed" in line]
+    loads = [line for line in lines if "force =" in line or "stress =" in line]
+    ways = [line for line in lines if "displacement =" in line]
+    for (line,), name in zip((loads, ways), proposed, strict=True):
+        assert f'column = "{name}"' in line
+    if "load cell (N)" not in proposed:
+        assert len(asked) == 2
+    if "Channel A (V)" in proposed:
+        assert (
+            'scale = "100 N/V" }  # needed: a force (N) or a stress (MPa), with the scale'
+            in (loads[0])
+        )
+
+
+def test_the_preamble_of_an_oscilloscope_is_no_channel(tmp_path: Path) -> None:
+    said = ["Record Length,2.0e+02", "Sample Interval,1e-2", "Source,CH1", "Vertical Units,V",
+            "Horizontal Units,s", "Probe Atten,1.0e+00"]  # fmt: skip
+    left = said + [","] * (T.size - len(said))
+    path = tmp_path / "test.csv"
+    rows = zip(left, T, VOLTS, strict=True)
+    path.write_text("\n".join(f"{a},,{t:.4f},{v:.6f}," for a, t, v in rows) + "\n")
+    lines = initialised(path)
+    assert "time = { column = 4 }" in lines
+    assert [line for line in lines if "column = 5" in line and 'scale = "100 N/V"' in line]
+    assert not [line for line in lines if "column = 1" in line.partition("#")[0]]
+    head = "X,CH1,CH2,Start,Increment", "Sequence,VOLT,VOLT,-1.0e-03,5.0e-04"
+    path.with_suffix(".toml").unlink()
+    lines = drafted(tmp_path, *head, columns=(COUNTS, VOLTS, W))
+    assert [line for line in lines if "stress" in line and '"…"' in line]
+
+
+@pytest.mark.parametrize(
+    "content", ["time (s),force (N)\n", "<html>1</html>", "%PDF-1.4\n1 0 obj\n"]
+)
+def test_init_writes_nothing_for_a_file_without_a_table(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "test.csv"
+    path.write_text(content)
+    out = CliRunner().invoke(main, ["init", str(path)])
+    assert out.exit_code == 1
+    assert out.stderr.startswith(f"foamfit: {path}: ")
+    assert out.stderr.count("\n") == 1
+    assert not path.with_suffix(".toml").exists()
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not here")
+@pytest.mark.parametrize(
+    ("name", "entries", "never"),
+    [
+        (
+            "aluminium-foam/stress_strain_rate.csv",
+            ['time = { column = "time_s" }', 'stress = { column = "engineering_stress_MPa" }',
+             'strain = { column = "engineering_strain" }'],
+            "column = \"reference",
+        ),
+        (
+            "lattice-impact/Hex_Diamond_contact.csv",
+            ['displacement = { column = "displacement_m" }', "or else the [striker] mass"],
+            "column = \"displacement_std",
+        ),
+        ("cartilage-impact/test_1_raw.txt", ['# time = { column = "X_Value"'], 'column = "Comm'),
+        ("shoe-foam-twins/specimens.csv", ['# displacement = { column = "…"'], "column = \"dia"),
+    ],
+)  # fmt: skip
+def test_drafts_for_measured_records(
+    tmp_path: Path, name: str, entries: list[str], never: str
+) -> None:
+    path = tmp_path / Path(name).name
+    path.symlink_to(DATA / name)
+    text = "\n".join(initialised(path))
+    for entry in entries:
+        assert entry in text
+    assert never not in text

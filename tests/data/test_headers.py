@@ -1,0 +1,126 @@
+"""Headers of several rows, line ends, and files that look like a table but contain more or less."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conftest import refused
+from foamfit.data.csv_file import read_test
+
+SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
+T = np.linspace(0.0, 10.0, 201)
+W = 4.0 * np.sin(np.pi * T / 10.0)
+F = 50.0 * W
+PLAIN = "time (s),force (N),displacement (mm)"
+ROWS = [f"{t:.9g},{f:.9g},{w:.9g}" for t, f, w in zip(T, F, W, strict=True)]
+FIRST, NAMES = "Compression of a foam, sample 3", "Time,Force,Displacement"
+
+
+def written(folder: Path, lines: list[str], end: str = "\n", encoding: str = "utf-8") -> Path:
+    path = folder / "test.csv"
+    path.write_bytes((end.join(lines) + end).encode(encoding))
+    path.with_suffix(".toml").write_text(SPECIMEN)
+    return path
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        [FIRST, "", NAMES, "s,N,mm"],
+        [FIRST, "Operator,A. Person", NAMES, "(s),(N),(mm)"],
+        ["Run 1,Run 1,Run 1", NAMES, "[s],[N],[mm]"],
+        [NAMES, "s,N,mm", "double,double,double"],
+        [NAMES, "measured,measured,measured", "s,N,mm"],
+        [NAMES, "s,N,mm", "-----,-----,-----"],
+        ["s,N,mm", NAMES],
+        [FIRST, "s,N,mm", NAMES],
+        ['"Time\n(s)","Force\n(N)","Displacement\n(mm)"'],
+        [FIRST, '"Time\n(s)","Force\n\n(N)",Displacement / mm'],
+    ],
+)
+@pytest.mark.parametrize(("end", "encoding"), [("\n", "utf-8"), ("\r", "utf-8-sig")])
+def test_a_header_may_have_several_rows(
+    tmp_path: Path, head: list[str], end: str, encoding: str
+) -> None:
+    lines = [line.replace("\n", end) for line in head]
+    test = read_test(written(tmp_path, [*lines, *ROWS], end, encoding))
+    assert (test.rows.rows, test.rows.used) == (T.size, T.size)
+    assert test.stress.max() == pytest.approx(2e6)
+    assert test.displacement.max() == pytest.approx(4e-3)
+    assert test.time[-1] == pytest.approx(10.0)
+    broken = [*ROWS[:7], "0.35,x,1", *ROWS[8:]]
+    count = sum(line.count("\n") + 1 for line in head)
+    refused(written(tmp_path, [*lines, *broken], end, encoding), f"row {count + 8}, column")
+
+
+@pytest.mark.parametrize("end", ["\n", "\r", "\r\n", "\r\r\n"])
+def test_line_ends(tmp_path: Path, end: str) -> None:
+    test = read_test(written(tmp_path, [PLAIN, *ROWS], end))
+    assert (test.rows.rows, test.stress.max()) == (T.size, pytest.approx(2e6))
+    path = written(tmp_path, [PLAIN, *ROWS[:20], "1,x,1", *ROWS[21:]], end)
+    refused(path, "row 22, column 'force (N)' is 'x'")
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(512), "an old Excel workbook (.xls)"),
+        (b"\n<HTML><table><tr><td>Time (s)</td></tr></table></HTML>", "a web page"),
+        (b"<!DOCTYPE html>\n<p>1,2,3</p>", "a web page"),
+        (b'\xef\xbb\xbf<?xml version="1.0"?>\n<Workbook>1,2,3</Workbook>', "an XML file"),
+    ],
+)
+def test_a_workbook_in_another_format_can_be_saved_as_a_table(
+    tmp_path: Path, content: bytes, what: str
+) -> None:
+    path = tmp_path / "test.xls"
+    path.write_bytes(content)
+    path.with_suffix(".toml").write_text(SPECIMEN)
+    refused(path, f"is {what}; open it in a spreadsheet and save it as CSV or .xlsx.")
+
+
+@pytest.mark.parametrize(
+    ("rows", "unused"),
+    [
+        ([*ROWS, "# end of the test", "stopped by the operator,,"], 2),
+        ([*ROWS, *(f"{t:g},," for t in (10.1, 10.2, 10.3))], 3),
+        ([*ROWS[:50], "2.475,,", *ROWS[50:]], 1),
+    ],
+)
+def test_rows_without_a_force_and_a_motion_are_counted(
+    tmp_path: Path, rows: list[str], unused: int
+) -> None:
+    test = read_test(written(tmp_path, [PLAIN, *rows]))
+    assert (test.rows.rows, test.rows.used) == (T.size + unused, T.size)
+    (item,) = test.rows.dropped
+    assert (item.rows, item.why) == (unused, "no numbers in the columns in use")
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        (["0 s,0 N,0 mm", *ROWS[1:]], "row 2, column 'time (s)' is '0 s'"),
+        (["N/A,N/A,N/A", *ROWS[1:]], "row 2, column 'time (s)' is 'N/A'"),
+        ([*ROWS[:30], "here,the,force", *ROWS[30:]], "row 32, column 'time (s)' is 'here'"),
+        ([*ROWS, "max,200,4"], "row 203, column 'time (s)' is 'max'"),
+        ([*ROWS[:30], "1.5,,1", *ROWS[31:]], "row 32, column 'force (N)' is empty"),
+        ([f"{t},NaN,{w}" for t, w in zip(T, W, strict=True)], "row 2, column 'force (N)' is 'NaN'"),
+        ([f"{t},{f},n/a" for t, f in zip(T, F, strict=True)], "row 2, column 'displacement (mm)'"),
+        ([f"{t},0,0" for t in T], "column 'force (N)' is constant; a force must vary"),
+        ([f"{t},{f},3" for t, f in zip(T, F, strict=True)], "'displacement (mm)' is constant"),
+        (ROWS[:1], "fewer than 10 rows"),
+        ([], "a header in row 1 but no rows of numbers"),
+    ],
+)
+def test_samples_that_are_not_numbers_are_refused_by_row(
+    tmp_path: Path, rows: list[str], words: str
+) -> None:
+    refused(written(tmp_path, [PLAIN, *rows]), words)
+
+
+def test_a_stress_that_is_never_positive_is_refused(tmp_path: Path) -> None:
+    rows = [f"{t},{f - 300},{w}" for t, f, w in zip(T, F, W, strict=True)]
+    refused(written(tmp_path, [PLAIN, *rows]), "only -3 MPa to -1 MPa", "correct its zero")
