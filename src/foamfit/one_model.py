@@ -37,6 +37,7 @@ from foamfit.results import Fit, Intervals, plain
 from foamfit.settle import (
     back_to_plain,
     descend_again,
+    follow_samples,
     held_by_record,
     keep_to_record,
     refine,
@@ -406,7 +407,7 @@ def _search(
         if scan_places(tracker, problem.space()) or moved:
             refine(problem, tracker)
         problem, freed = keep_to_record(problem, tracker, asked, search_held)
-        record = replace(record, freed=freed)
+        problem, record = follow_samples(problem, tracker), replace(record, freed=freed)
         weigh_motion(problem, tracker)
         settle_ends(tracker, problem.space())
     except STOPPING as error:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Collection
+from dataclasses import replace
 
 import lmfit
 import numpy as np
@@ -133,6 +134,37 @@ def _misfit(problem: Problem, values: Array) -> float:
     objective = problem.objective
     rms = objective.rms(objective.plain(values))
     return max(value / float(np.ptp(objective.measured[name])) for name, value in rms.items())
+
+
+def sampled(problem: Problem) -> Problem:
+    """Return the problem with the samples of the driving motion, not its smooth curve."""
+    return replace(problem, objective=replace(problem.objective, followed=(None,)))
+
+
+def follow_samples(problem: Problem, tracker: Tracker) -> Problem:
+    """Follow the samples of a driving motion, if its smooth curve is followed 5 % worse.
+
+    The curve may be smoother than the motion.
+    """
+    smooth, ends = problem.objective, tracker.ends
+    if tracker.best_values is None or smooth.drive != "displacement" or smooth.motion is None:
+        return problem
+    values, cost = tracker.best_values, tracker.best_cost
+    rough = sampled(problem)
+    trial = Tracker(rough.objective, tracker.deadline, ends=[values])
+    try:
+        descend_again(rough, trial)
+        if trial.best_cost * WORSE**2 < cost:
+            trial.ends = [*trial.ends, *ends]
+            descend_again(rough, trial)
+    finally:
+        smooth.add_counts(rough.objective)
+    if trial.best_values is None or trial.best_cost * WORSE**2 >= cost:
+        return problem
+    rough.objective.evaluations, rough.objective.failures = smooth.evaluations, smooth.failures
+    tracker.objective, tracker.ends = rough.objective, trial.ends
+    tracker.best_values, tracker.best_cost = trial.best_values, trial.best_cost
+    return rough
 
 
 def weigh_motion(problem: Problem, tracker: Tracker) -> None:

@@ -24,7 +24,7 @@ from foamfit.fitting.search import Tracker, descend
 from foamfit.fitting.together import Together
 from foamfit.one_model import Options, Progress, identify
 from foamfit.report.folder import try_target
-from foamfit.settle import keep_to_record, weigh_motion
+from foamfit.settle import follow_samples, keep_to_record, sampled, weigh_motion
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
 from foamfit.study.joint_fit import Map, fit_jointly
@@ -289,7 +289,8 @@ def _own_fits(
     kept, vectors = list[_Test](), list[Array]()
     for t, fitted in sorted(found.items()):
         test, own = tests[t], fitted.values
-        test = replace(test, problem=test.problem.keeping(fitted.kept))
+        problem = sampled(test.problem) if fitted.sampled else test.problem
+        test = replace(test, problem=problem.keeping(fitted.kept))
         objective = test.problem.objective
         if fitted.weighed_at is not None:
             objective.weigh_motion(fitted.weighed_at)
@@ -311,13 +312,15 @@ class _Own:
     cost: float  # χ² per sample
     weighed_at: Array | None  # Point at which the uncertainty of the motion was weighed, if it was
     kept: Mapping[str, Prior]  # Nuisance parameters held where the record shows them
+    sampled: bool  # Whether the samples of the motion drive, not its smooth curve
 
     @classmethod
     def of(cls, problem: Problem, tracker: Tracker, values: Array) -> _Own:
         """Return the result of a search or a descent."""
         objective, plain = problem.objective, tracker.plain
         weighed_at = plain[0] if plain and objective.weighing is not None else None
-        return cls(values, tracker.best_cost / objective.n_data, weighed_at, problem.kept)
+        cost, is_sampled = tracker.best_cost / objective.n_data, objective.followed == (None,)
+        return cls(values, cost, weighed_at, problem.kept, is_sampled)
 
 
 def _own_fit(
@@ -345,5 +348,6 @@ def _own_fit(
     if tracker.best_values is None:
         return _own_fit(measurement, model, params, options, ())
     problem, _ = keep_to_record(problem, tracker, options.vary)
+    problem = follow_samples(problem, tracker)
     weigh_motion(problem, tracker)
     return _Own.of(problem, tracker, tracker.best_values)
