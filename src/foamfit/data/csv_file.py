@@ -97,11 +97,13 @@ def read_test(
         source = Source.of(text, settings.columns)
         record = _record(source, settings)
     sha256, spreads, moved = text.sha256, source.scale_spreads(), source
+    entries = source.entries()
     if settings.motion is not None:
         moved, frames, notes = _read_motion(path, toml, settings)
         with naming(toml):
             record = join(record.noted(*notes), frames)
         spreads |= moved.scale_spreads()
+        entries |= moved.entries("motion.columns")
         sha256 = hashlib.sha256(f"{sha256} {moved.table.sha256}".encode()).hexdigest()
 
     def advice(channel: str) -> str:
@@ -133,6 +135,7 @@ def read_test(
         uncertainties=spreads | settings.uncertainties,
         noise=replace(settings.noise, estimated=test.noise.estimated),
         priors=settings.priors,
+        entries=entries,
     )
     return with_noise(test)
 

@@ -62,7 +62,7 @@ def condition(
     estimated from samples before contact or from those of a held channel.
     """
     window, given = window or Window(), striker or Striker()
-    impact = striker is not None and record.time is not None
+    impact, flight = striker is not None and record.time is not None, None
     if impact and window.cycle not in (None, 1):
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     record = repair.mark_clipped(repair.bridge_outliers(cut_to_window(record, window)))
@@ -81,7 +81,7 @@ def condition(
         start = contact.start_of_impact(first, levels)
         start = replace(start, gauge=zeros.gauge_before(first, start, levels, given))
         span = zeros.span_of_impact(first, start, levels)
-        striker, notes = zeros.flight_of(first, start, span, levels, given, spread)
+        striker, flight, notes = zeros.flight_of(first, start, span, levels, given, spread)
         record = record.noted(*notes)
     else:  # contact starts in the first cycle
         start = contact.start_of_slow_test(first, levels)
@@ -129,6 +129,7 @@ def condition(
         derived=whole.derived,
         braked=whole.braked,
         block=block,
+        flight=flight,
         standstills=tuple((float(at[0]), float(at[-1])) for at in stood),
     )
 
