@@ -152,10 +152,14 @@ class Options:
         """The options that free further parameters of some springs."""
         return {name: getattr(self, name) for name in OPTIONS}
 
+    def drive_for(self, measurement: Measurement) -> str:
+        """Return the drive, which by default depends on the test."""
+        return self.drive or choose_drive(measurement, self.vary)
+
     def check(self, measurement: Measurement, model: str) -> None:
         """Reject options that the test or the model does not allow, before any simulation."""
         if self.time_shift:
-            check_time_shift(measurement, self.drive or choose_drive(measurement))
+            check_time_shift(measurement, self.drive_for(measurement))
         if model == "auto":
             self.check_auto()
         else:
@@ -179,7 +183,8 @@ class Options:
         if not (self.fix or self.vary):
             return None
         more: dict[str, Any] = {"time_shift": self.time_shift, "relaxation": self.relaxation}
-        made = make_params(measurement, model, self.drive, **more, **self.of_springs)
+        drive = self.drive_for(measurement)
+        made = make_params(measurement, model, drive, **more, **self.of_springs)
         return fix_and_vary(made, model, self.fix or {}, self.vary)
 
     def problem(

@@ -12,6 +12,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.codec import encode
+from foamfit.data.calibration import Contradiction
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement, interior_channel
 from foamfit.data.rate import loading_rate
@@ -399,6 +400,7 @@ class Fit:
     priors: dict[str, tuple[float, float]] = field(default_factory=dict)
     # Samples of a Markov chain, (walkers, steps) by parameter, SI; empty without a chain
     draws: dict[str, Array] = field(default_factory=dict)
+    contradictions: tuple[Contradiction, ...] = ()  # of the record, which the fit does not settle
 
     @property
     def springs(self) -> dict[str, Spring]:
@@ -493,6 +495,7 @@ class Fit:
             "ladder": self.ladder,
             "by_cycle": self.by_cycle,
             "priors": self.priors,
+            "contradictions": self.contradictions,
         }
         content = {
             "schema": SCHEMA,

@@ -9,6 +9,7 @@ agree. The zero of the force and its delay against the motion are left open.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,6 +68,13 @@ class Contradiction:
     says: str
     lines: tuple[tuple[str, str], ...]
 
+    def is_settled(self, vary: Iterable[str]) -> bool:
+        """Return whether it is settled by fitting these parameters."""
+        free, strong = set(vary), {"force_scale", "striker_mass"}
+        if self.quantity == "velocity":
+            return "velocity" in free
+        return bool(free & strong) and (self.quantity == "force_scale" or "velocity" in free)
+
 
 def contradictions(test: Measurement) -> tuple[Contradiction, ...]:
     """Return the numbers that the record of an impact contradicts, the velocity first."""
@@ -78,9 +86,9 @@ def contradictions(test: Measurement) -> tuple[Contradiction, ...]:
         ratio, limit = speed / striker.velocity, _limit(test, error / striker.velocity, "velocity")
         if abs(ratio - 1.0) > limit:
             line = f'velocity = "{rounded(speed, TENTH * limit)} m/s"'
-            moves = "before contact the displacement moves" if test.flight else "the motion starts"
-            says = f"{moves} at {speed:.4g} ± {error:.2g} m/s, but the striker's velocity is given "
-            says += f"as {striker.velocity:.4g} m/s"
+            when = "before" if test.flight else "at"
+            says = f"the velocity is given as {striker.velocity:.4g} m/s, but the motion shows "
+            says += f"{speed:.4g} ± {error:.2g} m/s {when} contact"
             found.append(Contradiction("velocity", ratio, limit, says, (("striker", line),)))
     if shown.force is not None:
         ratio, limit = shown.force[0], _limit(test, shown.force[1], "striker_mass", "stress_scale")
@@ -104,9 +112,8 @@ def _limit(test: Measurement, error: float, *quantities: str) -> float:
 def _of_force(test: Measurement, ratio: float, limit: float, mass: float) -> Contradiction:
     """Return the contradiction between mass, scale of the force and motion."""
     what = "acceleration" if test.braked else "force"
-    says = f"the impulse of the {what} is {1.0 / ratio:.2f} of the striker's change of momentum "
-    says += f"in the measured motion, so {'' if test.braked else 'mass, '}scale of the {what} and "
-    says += "motion do not agree"
+    says = f"the impulse of the {what} is {1.0 / ratio:.2f} of the change of momentum in the "
+    says += f"motion, so {'' if test.braked else 'mass, '}scale of the {what} and motion do not agree"
     entry = test.entries.get("stress", Entry(what, '"…"'))
     lines = [(entry.table, entry.times(ratio, TENTH * limit))]
     if not test.braked:  # otherwise the mass cancels
@@ -118,8 +125,7 @@ def _of_force(test: Measurement, ratio: float, limit: float, mass: float) -> Con
 
 def _of_motion(test: Measurement, ratio: float, limit: float) -> Contradiction:
     """Return the contradiction between the scale of the motion and all else."""
-    says = f"the measured motion is {ratio:.2f} times as large as mass, velocity and force imply, "
-    says += "before contact and during it"
+    says = f"the motion is {ratio:.2f} times as large as mass, velocity and force imply"
     entry = test.entries.get("displacement", Entry("displacement", '"…"'))
     line = entry.table, entry.times(1.0 / ratio, TENTH * limit)
     return Contradiction("motion_scale", 1.0 / ratio, limit, says, (line,))

@@ -334,17 +334,6 @@ def checks(
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
         after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"
         notes.append(f"The stress goes down to {after}; it is kept.")
-    if striker.velocity and record.time is not None and motion != INTEGRATED:
-        early = displacement <= 0.15 * displacement.max()
-        early[int(np.argmax(displacement)) :] = False
-        early &= record.sampled.get("displacement", True)
-        if early.sum() >= 3:
-            speed = float(np.polyfit(record.time[early], displacement[early], 1)[0])
-            if abs(speed / striker.velocity - 1) > 0.1:
-                notes.append(
-                    f"Check: the displacement starts at {speed:.3g} m/s, {zeros.CONTRADICTED} "
-                    f"{striker.velocity:.3g} m/s."
-                )
     density = (specimen.mass or 0.0) / (specimen.area * height)
     if specimen.mass and not 1 < density < 3000:
         notes.append(f"Check: mass and volume give a density of {density:.3g} kg/m³.")

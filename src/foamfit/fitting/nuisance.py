@@ -1,4 +1,4 @@
-"""Nuisance parameters: contact time, zeros of the channels, striker and time shift.
+"""Nuisance parameters: contact time, zeros of the channels, striker, force scale and time shift.
 
 They are fitted together with the parameters of the springs: all of them in an impact, the zeros of
 motion and stress under a driving motion. Times and zeros are relative to the values found by the
@@ -13,11 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from foamfit.data.measurement import Measurement
+from foamfit.data.measurement import INTEGRATED, Measurement
 from foamfit.springs.parameters import NUISANCE
 
 CONTACT_TIME, TIME_SHIFT = "contact_time", "time_shift"
 VELOCITY, STRIKER_MASS = "velocity", "striker_mass"
+FORCE_SCALE = "force_scale"  # true force over measured force
 # Zeros of the channels: the reading of a channel when the quantity is zero.
 ZEROS = {
     "displacement_zero": "displacement",
@@ -25,8 +26,9 @@ ZEROS = {
     "acceleration_zero": "acceleration",
 }
 STRIKER = (VELOCITY, STRIKER_MASS)
+POSITIVE = (*STRIKER, FORCE_SCALE)  # parameters that are scales of themselves
 UNDER_DRIVE = {
-    "impact": (CONTACT_TIME, *ZEROS, *STRIKER),
+    "impact": (CONTACT_TIME, *ZEROS, *STRIKER, FORCE_SCALE),
     "displacement": ("displacement_zero", "stress_zero"),
 }
 # Limits of a parameter with a prior, in standard deviations.
@@ -59,7 +61,7 @@ def names_of(drive: str, *, time_shift: bool) -> tuple[str, ...]:
 def values_of(measurement: Measurement) -> dict[str, float]:
     """Return the values given by the record and its TOML, SI."""
     striker = measurement.striker
-    values = dict.fromkeys(NUISANCE, 0.0)
+    values = dict.fromkeys(NUISANCE, 0.0) | {FORCE_SCALE: 1.0}
     values[VELOCITY] = (striker.velocity if striker else None) or math.nan
     values[STRIKER_MASS] = (striker.mass if striker else None) or math.nan
     return values
@@ -77,6 +79,7 @@ def priors_of(measurement: Measurement, drive: str) -> dict[str, Prior]:
     if drive != "impact":
         known["displacement_zero"] = None
     stated = {VELOCITY: "velocity", STRIKER_MASS: "striker_mass", TIME_SHIFT: "delay"}
+    stated[FORCE_SCALE] = "stress_scale"
     known |= {name: measurement.uncertainties.get(key) for name, key in stated.items()}
     if measurement.braked:
         del known[STRIKER_MASS]
@@ -84,14 +87,14 @@ def priors_of(measurement: Measurement, drive: str) -> dict[str, Prior]:
 
 
 def open_in(measurement: Measurement, drive: str, counted: Mapping[str, bool]) -> frozenset[str]:
-    """Return the nuisance parameters to fit, given which channels are `counted`.
+    """Return the nuisance parameters to fit by default, given which channels are `counted`.
 
     The zero of a motion is arbitrary in an impact, and in a slow test recorded from before the
     contact. The zero of a force or an acceleration is that of the file unless samples before the
     contact show another.
     """
     priors = priors_of(measurement, drive)
-    known = {name for name in priors if counted.get(ZEROS.get(name, ""), True)}
+    known = {name for name in priors if counted.get(ZEROS.get(name, ""), True)} - {FORCE_SCALE}
     if drive == "impact":
         moved = {"displacement_zero"} if counted.get("displacement", False) else set()
         return frozenset({CONTACT_TIME} | moved | known)
@@ -105,11 +108,13 @@ def limits_of(
 ) -> tuple[float, float]:
     """Return the limits of a nuisance parameter, SI."""
     prior, middle = priors_of(measurement, drive).get(name), values_of(measurement)[name]
+    if name == FORCE_SCALE and not _shows_force(measurement):
+        return middle, middle
     if prior is not None:
         reach = REACH * prior.sigma
-        reach = min(reach, 0.9 * middle) if name in STRIKER else reach
-    elif name in STRIKER:
-        return 0.1 * middle, 10.0 * middle
+        reach = min(reach, 0.9 * middle) if name in POSITIVE else reach
+    elif name in POSITIVE:
+        reach = 0.9 * middle
     elif name in ZEROS:
         values = measurement.channels().get(ZEROS[name])
         reach = 0.0 if values is None else LARGEST_ZERO * float(np.ptp(values))
@@ -117,6 +122,13 @@ def limits_of(
         reach = (LARGEST_CONTACT if name == CONTACT_TIME else LARGEST_SHIFT) * duration
     latest = _latest_contact(measurement) if name == CONTACT_TIME else 0.0
     return middle - reach, middle + max(reach, latest)
+
+
+def _shows_force(measurement: Measurement) -> bool:
+    """Return whether an impact shows the scale of its force: by a motion or an acceleration."""
+    moved = measurement.displacement is not None and measurement.motion != INTEGRATED
+    moved = moved and "displacement" not in measurement.derived
+    return "stress" not in measurement.derived and (moved or measurement.acceleration is not None)
 
 
 def _latest_contact(measurement: Measurement) -> float:

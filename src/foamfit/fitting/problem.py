@@ -23,6 +23,16 @@ from foamfit.springs.model import Model, with_options
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 
 
+# Why some parameters exist in the impact drive only.
+_MOVED = "a given motion needs no striker; choose the impact drive"
+ONLY_IMPACT = {
+    nuisance.VELOCITY: _MOVED,
+    nuisance.STRIKER_MASS: _MOVED,
+    nuisance.FORCE_SCALE: "along a given motion or stress, a scale of the force cannot be "
+    "distinguished from a scale of all stiffnesses; choose the impact drive",
+}
+
+
 def make_params(
     measurement: Measurement,
     model: str | Model = "bistable",
@@ -120,6 +130,8 @@ def check_fixed_and_varied(
 ) -> None:
     """Raise InputError for an unknown parameter, or one that is both fixed and varied."""
     for name in (*fix, *vary):
+        if name in ONLY_IMPACT and name not in names:
+            raise InputError(f"'{name}' cannot be fixed or varied here: {ONLY_IMPACT[name]}")
         if name not in names:
             raise InputError(
                 f"parameter '{name}' is not one of the model {model}; "
@@ -312,7 +324,7 @@ def _check_held(params: lmfit.Parameters) -> None:
     for name, parameter in params.items():
         if parameter.vary or parameter.expr is not None:
             continue
-        wanted = "positive" if name in nuisance.STRIKER else "finite"
+        wanted = "positive" if name in nuisance.POSITIVE else "finite"
         if name not in NUISANCE:
             wanted = any_param(split_name(name)[1]).admissible
         if abs(value := parameter.value) > LARGEST or not ADMISSIBLE[wanted](value):
@@ -367,7 +379,8 @@ def make_problem(
     Raises InputError if the test lacks data for the drive, or if a parameter is unknown.
     """
     model = Model.parse(model_name, relaxation)
-    drive = choose_drive(measurement) if drive is None else drive
+    if drive is None:
+        drive = choose_drive(measurement, [n for n, one in (params or {}).items() if one.vary])
     count = len(model.kinds)
     check_interior(measurement, count)
     notes: tuple[str, ...] = ()

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.calibration import Contradiction
 from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import ASKED, INTEGRATED
 from foamfit.data.zeros import CONTRADICTED
@@ -72,8 +73,12 @@ def make_checklist(
     record: SearchRecord,
     balance: EnergyAudit,
     intervals: Intervals,
+    contradictions: Sequence[Contradiction] = (),
 ) -> tuple[Check, ...]:
-    """Answer all questions, in the order of `sentences.toml`."""
+    """Answer all questions, in the order of `sentences.toml`.
+
+    `contradictions` are those of the balance that the fit does not settle.
+    """
     with_error = [name for name, item in estimates.items() if item.stderr is not None]
     checks = (
         *_of_search(best, record),
@@ -82,7 +87,7 @@ def make_checklist(
         _determined(best, estimates),
         _visited(best, estimates),
         *_of_intervals(best, estimates, intervals, with_error),
-        *_of_test(best, balance),
+        *_of_test(best, balance, contradictions),
         _time_shift(best, estimates, with_error),
         _damping(best, with_error),
     )
@@ -227,20 +232,27 @@ def _of_intervals(
     yield _check("bounds", not stuck, stuck=stuck, natural=natural)
 
 
-def _of_test(best: BestPoint, balance: EnergyAudit) -> Iterator[Check]:
-    test = best.problem.measurement
+def _of_test(
+    best: BestPoint, balance: EnergyAudit, contradictions: Sequence[Contradiction]
+) -> Iterator[Check]:
+    test, drive, found = best.problem.measurement, best.problem.objective.drive, contradictions
     wrong = [note for note in test.notes if CONTRADICTED in note]
     doubts = [note for note in test.notes if note.startswith(ASKED) and note not in wrong]
-    moves = best.problem.objective.drive == "impact" and test.displacement is not None
-    yield _check("velocity", not wrong if moves else None, warnings=wrong if moves else ())
+    if drive == "impact" and not balance.contradictions and wrong:  # a small difference
+        yield _check("calibration", False, warnings=wrong)
+    else:
+        facts: dict[str, Any] = {"found": found, "drive": drive, "ratio": balance.impulse_ratio}
+        known = balance.impulse_ratio is not None or test.flight is not None
+        yield _check("calibration", False if found else True if known else None, **facts)
     yield _check("input", not doubts, warnings=doubts)
-    absorbed, warnings = balance.absorbed_over_striker, balance.energy_warnings()
-    unknown = not warnings and (absorbed is None or balance.motion == INTEGRATED)
-    answer = None if unknown else not warnings
-    yield _check("energy", answer, warnings=warnings, taken=absorbed)
-    ratio, warnings = balance.impulse_ratio, balance.impulse_warnings()
-    answer = None if ratio is None else not warnings
-    yield _check("impulse", answer, warnings=() if ratio is None else warnings, ratio=ratio)
+    absorbed, warnings = balance.absorbed_over_striker, balance.loop_warnings()
+    # A contradiction explains why the energy is not that of the striker.
+    warnings += [] if balance.contradictions else balance.energy_warnings()
+    contradicted = bool(balance.contradictions)
+    unknown = absorbed is None or balance.motion == INTEGRATED or contradicted
+    answer = False if warnings else None if unknown else True
+    facts = {"taken": absorbed, "contradicted": contradicted}
+    yield _check("energy", answer, warnings=warnings, **facts)
 
 
 def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
