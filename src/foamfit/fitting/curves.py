@@ -40,18 +40,27 @@ def choose_drive(measurement: Measurement, vary: Iterable[str] = ()) -> str:
     of the force, unless these are among the parameters to `vary`. Raises InputError if no drive is
     possible.
     """
-    striker, varied = measurement.striker, set(vary)
+    striker = measurement.striker
     moving = striker is not None and striker.mass is not None and striker.velocity
-    if moving and measurement.time is not None:
-        wrong = [one for one in contradictions(measurement) if not one.is_settled(varied)]
-        if not wrong or "displacement" in measurement.derived:
-            return "impact"
+    if moving and measurement.time is not None and not replaces_striker(measurement, vary):
+        return "impact"
     if measurement.displacement is not None:
         return "displacement"
     raise InputError(
         f"{measurement.name}: no drive is possible; give a displacement or strain column, "
         "or time and a [striker] with mass and velocity"
     )
+
+
+def replaces_striker(measurement: Measurement, vary: Iterable[str] = ()) -> bool:
+    """Return whether the measured motion drives an impact, as its record contradicts the striker.
+
+    The contradiction may also be settled by parameters to `vary`.
+    """
+    if measurement.displacement is None or "displacement" in measurement.derived:
+        return False
+    varied = set(vary)
+    return any(not one.is_settled(varied) for one in contradictions(measurement))
 
 
 def check_drive(measurement: Measurement, drive: str) -> None:

@@ -16,7 +16,12 @@ from foamfit.data.units import LARGEST, parse_uncertain
 from foamfit.errors import InputError
 from foamfit.fitting import nuisance
 from foamfit.fitting.box import Scales, Space, others
-from foamfit.fitting.curves import check_interior, choose_drive, default_weights
+from foamfit.fitting.curves import (
+    check_interior,
+    choose_drive,
+    default_weights,
+    replaces_striker,
+)
 from foamfit.fitting.objective import Objective
 from foamfit.springs.laws.record import ADMISSIBLE, Between
 from foamfit.springs.model import Model, with_options
@@ -46,7 +51,8 @@ def make_params(
 
     The bounds follow from the scales of the test. In the impact drive one damping parameter varies:
     the dashpot of a single spring, or the onsite damper of the striker of a chain, as in the paper.
-    In the other drives all damping is fixed at zero by default. Heights are those of the specimen
+    In the other drives all damping is fixed at zero by default, except for the dashpot if the motion
+    of an impact replaces a contradicted striker. Heights are those of the specimen
     if it states them; otherwise they vary with a fixed sum.
 
     Parameters
@@ -82,8 +88,10 @@ def make_params(
         raise InputError(
             f"{measurement.name}: the stress of '{delayed[0].kind}' needs a time column"
         )
-    params = lmfit.Parameters()
-    count = len(model.kinds)
+    params, count = lmfit.Parameters(), len(model.kinds)
+    fast = drive == "impact"
+    if drive == "displacement" and count == 1:
+        fast = replaces_striker(measurement)
     for name in model.names:
         spring, short = split_name(name)
         if short == "height":
@@ -91,7 +99,7 @@ def make_params(
         param = model.param(name)
         value = param.start[0] * scales.unit(param.start[1])
         low, high = (bound * scales.unit(param.scale) for bound in param.bounds)
-        vary = short != "eta" or (drive == "impact" and (spring >= 0) == (count == 1))
+        vary = short != "eta" or (fast and (spring >= 0) == (count == 1))
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)
     late = nuisance.is_late(measurement, time_shift=time_shift)

@@ -52,7 +52,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         correlation = Correlation(best.names, spread.correlation, spread.stderr)
     balance, misfit = audit(measurement), objective.misfit(simulated)
     contradictions = unsettled(best, balance.contradictions)
-    settled = settle(best, contradictions)
+    settled = settle(best, contradictions, stopped=record.stopped is not None)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals, settled))
     checklist = make_checklist(
         best, estimates, misfit, record, balance, intervals, contradictions
@@ -253,7 +253,8 @@ def _varied(
         other = None if other is None else other + problem.measurement.origins.get(name, 0.0)
         facts = {"vibrates": objective.interior_mass, "there": other, "off": misfit, "curve": curve}
         state, why = "weak", say("why", "weak", why=why, unit=unit, **facts)
-    state, why = judged(settled, best, name, ends, (state, why))
+    zero = problem.measurement.origins.get(name, 0.0)
+    state, why = judged(settled, best, name, (ends[0] + zero, ends[1] + zero), (state, why))
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
     astray = name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf)

@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from foamfit.arrays import Array
 from foamfit.data.calibration import Contradiction
 from foamfit.fitting import nuisance
-from foamfit.fitting.search import Tracker, descend
+from foamfit.fitting.search import Tracker, descend, search
 from foamfit.springs.parameters import unit_of
 from foamfit.text import listed
 from foamfit.trust import say
@@ -20,7 +22,7 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import changed
 from foamfit.trust.covariance import Ends
 
-STEPS = 40  # of a descent from the best point
+STEPS, STARTS = 40, 4  # steps of a descent from the best point, start points of a search
 # Quantities of `budget.changed` in words.
 _WORDS = {
     "velocity": "velocity",
@@ -74,8 +76,14 @@ def ways(found: Iterable[Contradiction], *, braked: bool) -> list[Way]:
     return out if braked else [*out, speed | {"striker_mass": 1.0 / force}]
 
 
-def settle(best: BestPoint, found: Sequence[Contradiction]) -> tuple[Settled, ...]:
-    """Repeat the fit for each way to settle the contradictions in `found`."""
+def settle(
+    best: BestPoint, found: Sequence[Contradiction], *, stopped: bool = False
+) -> tuple[Settled, ...]:
+    """Repeat the fit for each way to settle the contradictions in `found`.
+
+    With a wrong striker an impact may be fitted best far from the right springs, so these are
+    searched for, unless the search of the fit was `stopped`.
+    """
     if not found or not best.names:
         return ()
     test, impact = best.problem.measurement, best.problem.objective.drive == "impact"
@@ -83,7 +91,7 @@ def settle(best: BestPoint, found: Sequence[Contradiction]) -> tuple[Settled, ..
     for way in ways(found, braked=test.braked):
         # A given motion needs no striker.
         way = {name: by for name, by in way.items() if impact or name not in nuisance.STRIKER}
-        again = _refitted(best, way) if way else plain
+        again = _refitted(best, way, starts=STARTS * (impact and not stopped)) if way else plain
         moved = None if again is None or plain is None else best.values + again - plain
         words = listed(f"{_WORDS[name]} × {by:.2f}" for name, by in way.items()) if way else ""
         out += [Settled(words, moved)] if way else []
@@ -95,21 +103,23 @@ def judged(
 ) -> tuple[str, str]:
     """Return state and reason of a parameter, which is not determined if it would move.
 
-    `ends` is its 95 % interval; `state` are its state and reason without the contradiction.
+    `ends` is its 95 % interval in the numbers of the file; `state` are its state and reason without
+    the contradiction.
     """
     for one in settled if state[0] == "determined" else ():
-        place, value, unit = best.index[name], None, unit_of(name)
+        there, unit = None, unit_of(name)
         if one.values is not None:
-            value = float(one.values[place])
-        if value is None or not ends[0] <= value <= ends[1]:
-            zero = float(best.problem.origins[place])
-            there = None if value is None else value + zero
+            there = float((one.values + best.problem.origins)[best.index[name]])
+        if there is None or not ends[0] <= there <= ends[1]:
             return "weak", say("why", "contested", way=one.words, there=there, unit=unit)
     return state
 
 
-def _refitted(best: BestPoint, way: Way) -> Array | None:
-    """Return the best point of the test with changed quantities, near the present one."""
+def _refitted(best: BestPoint, way: Way, starts: int = 0) -> Array | None:
+    """Return the best point of the test with changed quantities, near the present one.
+
+    With `starts` start points of a search, it may be far off.
+    """
     problem, values, test = best.problem, best.values.copy(), best.problem.measurement
     params, stresses = problem.params.copy(), way.get("stress_scale", 1.0)
     of_stress = [unit_of(name).startswith("Pa") for name in problem.names]
@@ -126,5 +136,8 @@ def _refitted(best: BestPoint, way: Way) -> Array | None:
     space = replace(problem, measurement=test, objective=objective, params=params).space()
     tracker = Tracker(objective)
     descend(tracker, space, space.encode(values), STEPS)
+    if starts:
+        rng = np.random.default_rng(0)
+        search(tracker, space, starts=starts, rng=rng, progress=lambda *_: None)
     problem.objective.add_counts(objective)
     return tracker.best_values
