@@ -87,7 +87,7 @@ def contradictions(test: Measurement) -> tuple[Contradiction, ...]:
         if abs(ratio - 1.0) > limit:
             line = f'velocity = "{rounded(speed, TENTH * limit)} m/s"'
             when = "before" if test.flight else "at"
-            says = f"the velocity is given as {striker.velocity:.4g} m/s, but the motion shows "
+            says = f"the velocity is given as {striker.velocity:.4g} m/s, the striker moves at "
             says += f"{speed:.4g} ± {error:.2g} m/s {when} contact"
             found.append(Contradiction("velocity", ratio, limit, says, (("striker", line),)))
     if shown.force is not None:
@@ -113,7 +113,7 @@ def _of_force(test: Measurement, ratio: float, limit: float, mass: float) -> Con
     """Return the contradiction between mass, scale of the force and motion."""
     what = "acceleration" if test.braked else "force"
     says = f"the impulse of the {what} is {1.0 / ratio:.2f} of the change of momentum in the "
-    says += f"motion, so {'' if test.braked else 'mass, '}scale of the {what} and motion do not agree"
+    says += f"motion, so {'' if test.braked else 'mass, '}scale of the {what} and motion disagree"
     entry = test.entries.get("stress", Entry(what, '"…"'))
     lines = [(entry.table, entry.times(ratio, TENTH * limit))]
     if not test.braked:  # otherwise the mass cancels

@@ -14,7 +14,6 @@ from foamfit.arrays import Array, means
 from foamfit.data import contact, cycles, frames, zeros
 from foamfit.data import outliers as repair
 from foamfit.data.measurement import (
-    INTEGRATED,
     MEASURED,
     MIN_ROWS,
     Dropped,

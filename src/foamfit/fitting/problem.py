@@ -27,7 +27,6 @@ from foamfit.springs.laws.record import ADMISSIBLE, Between
 from foamfit.springs.model import Model, with_options
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 
-
 # Why some parameters exist in the impact drive only.
 _MOVED = "a given motion needs no striker; choose the impact drive"
 ONLY_IMPACT = {
@@ -51,9 +50,9 @@ def make_params(
 
     The bounds follow from the scales of the test. In the impact drive one damping parameter varies:
     the dashpot of a single spring, or the onsite damper of the striker of a chain, as in the paper.
-    In the other drives all damping is fixed at zero by default, except for the dashpot if the motion
-    of an impact replaces a contradicted striker. Heights are those of the specimen
-    if it states them; otherwise they vary with a fixed sum.
+    In the other drives all damping is fixed at zero by default, except for the dashpot of a single
+    spring if the motion of an impact replaces a contradicted striker. Heights are those of the
+    specimen if it states them; otherwise they vary with a fixed sum.
 
     Parameters
     ----------

@@ -235,24 +235,30 @@ def _of_intervals(
 def _of_test(
     best: BestPoint, balance: EnergyAudit, contradictions: Sequence[Contradiction]
 ) -> Iterator[Check]:
-    test, drive, found = best.problem.measurement, best.problem.objective.drive, contradictions
-    wrong = [note for note in test.notes if CONTRADICTED in note]
-    doubts = [note for note in test.notes if note.startswith(ASKED) and note not in wrong]
-    if drive == "impact" and not balance.contradictions and wrong:  # a small difference
-        yield _check("calibration", False, warnings=wrong)
-    else:
-        facts: dict[str, Any] = {"found": found, "drive": drive, "ratio": balance.impulse_ratio}
-        known = balance.impulse_ratio is not None or test.flight is not None
-        yield _check("calibration", False if found else True if known else None, **facts)
+    test, drive = best.problem.measurement, best.problem.objective.drive
+    small = [note for note in test.notes if CONTRADICTED in note]
+    doubts = [note for note in test.notes if note.startswith(ASKED) and note not in small]
+    told: dict[bool, list[str]] = {True: [], False: []}
+    for one in contradictions:
+        told[one.quantity == "force_scale"].append(
+            say("contradiction", "said", one=one, drive=drive)
+        )
+    settled = len(contradictions) < len(balance.contradictions)
+    ratio, absorbed = balance.impulse_ratio, balance.absorbed_over_striker
+    wrong = told[False] or (small if drive == "impact" and not balance.contradictions else [])
+    known = ratio is not None or test.flight is not None
+    yield _check("velocity", False if wrong else True if known else None, warnings=wrong)
+    known = ratio is not None and not settled
+    answer = False if told[True] else True if known else None
+    yield _check("impulse", answer, warnings=told[True], ratio=ratio)
     yield _check("input", not doubts, warnings=doubts)
-    absorbed, warnings = balance.absorbed_over_striker, balance.loop_warnings()
+    warnings, loop = balance.energy_warnings(), balance.loop_warnings()
+    unknown = absorbed is None or balance.motion == INTEGRATED
+    unknown = settled or (unknown and not warnings)
+    answer = None if unknown and not loop else not (warnings or loop)
     # A contradiction explains why the energy is not that of the striker.
-    warnings += [] if balance.contradictions else balance.energy_warnings()
-    contradicted = bool(balance.contradictions)
-    unknown = absorbed is None or balance.motion == INTEGRATED or contradicted
-    answer = False if warnings else None if unknown else True
-    facts = {"taken": absorbed, "contradicted": contradicted}
-    yield _check("energy", answer, warnings=warnings, **facts)
+    warnings = loop if balance.contradictions else warnings + loop
+    yield _check("energy", answer, warnings=warnings, taken=absorbed)
 
 
 def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:

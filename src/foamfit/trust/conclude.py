@@ -54,9 +54,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
     contradictions = unsettled(best, balance.contradictions)
     settled = settle(best, contradictions, stopped=record.stopped is not None)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals, settled))
-    checklist = make_checklist(
-        best, estimates, misfit, record, balance, intervals, contradictions
-    )
+    checklist = make_checklist(best, estimates, misfit, record, balance, intervals, contradictions)
     springs = best.values[: len(problem.model.names)]
     return Fit(
         measurement=measurement,
