@@ -8,6 +8,7 @@ from typing import Any
 
 from foamfit.data.measurement import interior_channel
 from foamfit.fitting.branches import covered
+from foamfit.fitting.nuisance import POSITIVE
 from foamfit.report.plots import origin_word
 from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page, sentences, table, words
@@ -71,6 +72,7 @@ def _screen(
     stages = [(varied, True, 1), (varied, False, 1), (estimated, False, 1)]
     for shown, whole, across in [*stages, *((springs, False, i) for i in (1, 2, 3))]:
         left = [row for row in varied if row not in shown and row.name in NUISANCE]
+        left.sort(key=lambda row: row.name not in POSITIVE)  # the calibration first
         record = [f"{row.label} {row.with_unit(row.with_error)}" for row in left]
         more = {"whole": whole, "stated": across == 1, "of_record": record}
         foot = words("short", part="foot", **more, **values).split("\n")

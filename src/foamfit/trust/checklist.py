@@ -20,7 +20,6 @@ from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import InputError
 from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
-from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, Intervals, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, split_name
@@ -88,7 +87,7 @@ def make_checklist(
         _visited(best, estimates),
         *_of_intervals(best, estimates, intervals, with_error),
         *_of_test(best, balance, contradictions),
-        _time_shift(best, estimates, with_error),
+        _time_shift(best, estimates, with_error, contradicted=bool(contradictions)),
         _damping(best, with_error),
     )
     by_key = {check.key: check for check in checks}
@@ -274,18 +273,21 @@ def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
     return _check("damping", eta == 0.0, eta=eta)
 
 
-def _time_shift(best: BestPoint, estimates: Estimates, with_error: Sequence[str]) -> Check:
+def _time_shift(
+    best: BestPoint, estimates: Estimates, with_error: Sequence[str], *, contradicted: bool
+) -> Check:
     test, objective = best.problem.measurement, best.problem.objective
-    force = test.outliers.get("stress")
+    force, contradicted = test.outliers.get("stress"), contradicted and objective.drive == "impact"
     clipped = force is not None and force.clipped_at is not None
     facts: dict[str, Any] = {"held": False, "clipped": clipped, "shift": None}
+    facts["contradicted"] = contradicted
     if objective.time_shift:
         shift = estimates.get("time_shift")
         facts |= {"held": shift is None or not shift.vary, "shift": shift and shift.value}
         return _check("time_shift", None if facts["held"] else True, **facts)
     with suppress(InputError):
         check_time_shift(test, objective.drive)
-        if not clipped:
+        if not clipped and not contradicted:
             late = _shift_hint(best, with_error) or 0.0
             return _check("time_shift", late == 0.0, late=late, **facts)
     return _check("time_shift", None, **facts)
@@ -307,7 +309,7 @@ def _shift_hint(best: BestPoint, with_error: Sequence[str]) -> float | None:
     shift = _one_step(best, with_error, (late - early) / gap, gap)
     if shift is not None and abs(shift) > 0.25 * gap:
         return shift
-    return _shift_of_motion(best.problem)
+    return _shift_of_motion(best)
 
 
 def _one_step(
@@ -329,19 +331,20 @@ def _one_step(
     return float(move[-1]) if abs(move[-1]) > 4.0 * spread.stderr[-1] else None
 
 
-def _shift_of_motion(problem: Problem) -> float | None:
+def _shift_of_motion(best: BestPoint) -> float | None:
     """Return the delay (s) of the motion if the striker's equation of motion shows it clearly.
 
     With m w'' = -F, the force integrated twice gives the motion up to scale and zero. The delay is
     accepted if it exceeds the sampling interval and lowers the sum of squares to a tenth, or to
     half if the rest is at the noise.
     """
+    problem = best.problem
     test, striker = problem.measurement, problem.measurement.striker
     time, stress, motion = test.time, test.stress, test.displacement
     if problem.objective.drive != "impact" or time is None or stress is None or motion is None:
         return None
     assert striker is not None
-    assert striker.velocity is not None
+    velocity = float(best.values[best.index["velocity"]])
     dt = np.diff(time, prepend=min(time[0], 0.0))
     slowed = np.cumsum(dt * (stress - 0.5 * np.diff(stress, prepend=0.0)))
     braked = np.cumsum(dt * (slowed - 0.5 * np.diff(slowed, prepend=0.0)))
@@ -351,10 +354,11 @@ def _shift_of_motion(problem: Problem) -> float | None:
         when = time - late
         columns = np.column_stack([np.interp(when, time, braked), np.ones(time.size)])
         fall = 0.5 * (striker.gravity or 0.0) * when
-        free = motion - (striker.velocity + fall) * when
+        free = motion - (velocity + fall) * when
         left.append(float(np.linalg.lstsq(columns, free, rcond=None)[1].sum()))
-    best, none = int(np.argmin(left)), left[shifts.size // 2]
+    place, none = int(np.argmin(left)), left[shifts.size // 2]
     floor = 4.0 * problem.objective.noise("displacement_time").sigma ** 2 * time.size
-    clear = 0 < best < shifts.size - 1 and left[best] < (0.5 if left[best] < floor else 0.1) * none
+    inside, least = 0 < place < shifts.size - 1, left[place]
+    clear = inside and least < (0.5 if least < floor else 0.1) * none
     gap = float(np.median(np.diff(time)))
-    return float(shifts[best]) if clear and abs(shifts[best]) > gap else None
+    return float(shifts[place]) if clear and abs(shifts[place]) > gap else None

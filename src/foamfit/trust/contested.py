@@ -139,5 +139,4 @@ def _refitted(best: BestPoint, way: Way, starts: int = 0) -> Array | None:
     if starts:
         rng = np.random.default_rng(0)
         search(tracker, space, starts=starts, rng=rng, progress=lambda *_: None)
-    problem.objective.add_counts(objective)
     return tracker.best_values
