@@ -187,7 +187,7 @@ def test_the_terminal_prints_whole_lines(tmp_path: Path, monkeypatch: pytest.Mon
     )
     assert again.exit_code == 0
     assert "impact drive" in again.stdout
-    assert "of the record: velocity v₀ " in again.stdout
+    assert "velocity v₀" in again.stdout
     assert "force scale s_F" in again.stdout
 
 
