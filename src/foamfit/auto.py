@@ -23,7 +23,6 @@ from foamfit import one_model, text
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import SearchStoppedError, what_stopped
 from foamfit.one_model import Found, Options, Progress
@@ -172,7 +171,7 @@ class _Comparison:
 
     def __init__(self, measurement: Measurement, options: Options, progress: Progress) -> None:
         self.measurement, self.progress = measurement, progress
-        self.options = replace(options, drive=options.drive or choose_drive(measurement))
+        self.options = replace(options, drive=options.drive_for(measurement))
         self.began, limit = time.perf_counter(), options.max_time
         self.deadline = None if limit is None else time.monotonic() + limit
         self.skipped: list[str] = []  # each skipped model with the reason

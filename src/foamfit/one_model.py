@@ -179,7 +179,7 @@ class Options:
         every["vary"] = sorted(set(self.vary))
         every["draws"] = self.choice.draws if self.intervals == "mcmc" else None
         with suppress(InputError):  # a test without a drive is refused by the fit
-            if self.drive is not None and self.drive == choose_drive(measurement):
+            if self.drive is not None and self.drive == choose_drive(measurement, self.vary):
                 every["drive"] = None
         first, last = measurement.cycle, measurement.last_cycle
         if several:
@@ -192,10 +192,14 @@ class Options:
         changed = {n: value for n, value in every.items() if value and value != defaults.get(n)}
         return dict(plain({"model": model, **changed}))
 
+    def drive_for(self, measurement: Measurement) -> str:
+        """Return the drive, which by default depends on the test."""
+        return self.drive or choose_drive(measurement, self.vary)
+
     def check(self, measurement: Measurement, model: str) -> None:
         """Reject options that the test or the model does not allow, before any simulation."""
         if self.time_shift:
-            check_time_shift(measurement, self.drive or choose_drive(measurement))
+            check_time_shift(measurement, self.drive_for(measurement))
         if model == "auto":
             self.check_auto()
         else:
@@ -219,7 +223,8 @@ class Options:
         if not (self.fix or self.vary):
             return None
         more: dict[str, Any] = {"time_shift": self.time_shift, "relaxation": self.relaxation}
-        made = make_params(measurement, model, self.drive, **more, **self.of_springs)
+        drive = self.drive_for(measurement)
+        made = make_params(measurement, model, drive, **more, **self.of_springs)
         return fix_and_vary(made, model, self.fix or {}, self.vary)
 
     def problem(

@@ -12,6 +12,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.codec import encode
+from foamfit.data.calibration import Contradiction
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement, interior_channel
 from foamfit.data.rate import loading_rate
@@ -401,6 +402,7 @@ class Fit:
     options: dict[str, Any] | None = None
     # Samples of a Markov chain, (walkers, steps) by parameter, SI; empty without a chain
     draws: dict[str, Array] = field(default_factory=dict)
+    contradictions: tuple[Contradiction, ...] = ()  # of the record, which the fit does not settle
 
     @property
     def springs(self) -> dict[str, Spring]:
@@ -497,7 +499,7 @@ class Fit:
         head = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
         found = ("visited", "misfit", "weights", "statistics", "noise", "energy")
         model = Model.parse(self.model)
-        more = ("correlation", "ladder", "by_cycle", "priors", "options")
+        more = ("correlation", "ladder", "by_cycle", "priors", "options", "contradictions")
         optional = {"budget": self.budget and self.budget.contributions}
         optional |= {name: getattr(self, name) for name in more}
         content = {

@@ -52,6 +52,16 @@ def significant(value: float, digits: int = 2) -> str:
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
+def rounded(value: float, within: float) -> str:
+    """Write a number with three digits, or more to keep it within a relative difference."""
+    for digits in range(3, 12):
+        near = float(f"{value:.{digits}g}")
+        if abs(near - value) <= within * abs(value):
+            break
+    decimals = digits - 1 - math.floor(math.log10(abs(near))) if near else 0
+    return f"{near:.{max(decimals, 0)}f}"
+
+
 def percent(share: float, digits: int = 2) -> str:
     """Write a fraction as a percentage with a few significant digits: 1.384 gives "140 %"."""
     if 0.0 < abs(share) < 1e-5:

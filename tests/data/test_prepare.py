@@ -13,6 +13,7 @@ from scipy.signal import lfilter
 from conftest import EXPERIMENTS
 from foamfit import read_test
 from foamfit.data.cycles import find_turns
+from foamfit.data.energy import audit
 from foamfit.data.measurement import Record, Specimen, Striker, Window
 from foamfit.data.noise import noise_level
 from foamfit.data.outliers import fill_staircase
@@ -561,8 +562,9 @@ def test_short_records_are_not_thinned():
     ],
 )
 def test_what_smells_wrong_is_noted(specimen, striker, words):
-    notes = condition(impact(), specimen, striker=striker).notes
-    assert any(note.startswith("Check:") and words in note for note in notes)
+    done = condition(impact(), specimen, striker=striker)
+    told = (*done.notes, *audit(done).warnings())
+    assert any(note.startswith("Check:") and words in note for note in told)
     assert not any(note.startswith("Check:") for note in run(impact()).notes)
 
 

@@ -318,7 +318,7 @@ def test_a_clipped_force_is_no_shift_of_the_clocks():
     stress = np.minimum(test.stress, top)
     clipped = replace(test, stress=stress, outliers={"stress": found})
     results = [
-        ff.fit(each, starts=2, intervals="local")
+        ff.fit(each, drive="impact", starts=2, intervals="local")
         for each in (clipped, replace(clipped, outliers={}))
     ]
     told = [[w for w in result.warnings if "--time-shift" in w] for result in results]

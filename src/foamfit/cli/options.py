@@ -78,7 +78,8 @@ CYCLES = option(
 )
 DRIVE = option(
     "--drive",
-    "Default: impact if striker and time are known, else displacement.",
+    "Default: impact if striker and time are known and the record does not contradict them, else "
+    "displacement.",
     click.Choice(["impact", "stress", "displacement"]),
 )
 RELAXATION = option(

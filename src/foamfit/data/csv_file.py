@@ -140,6 +140,8 @@ def read_test(
         turned=turned,
         noise=replace(settings.noise, estimated=test.noise.estimated),
         priors=settings.priors,
+        entries=parts[0].source.entries()
+        | (parts[1].source.entries("motion.columns") if len(parts) > 1 else {}),
     )
     return with_noise(test)
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from foamfit.data.energy import EnergyAudit, largest_motion
 from foamfit.data.measurement import Measurement, Striker, interior_node
+from foamfit.data.zeros import CONTRADICTED
 from foamfit.text import engineering, labelled, listed, percent
 
 # Effect of 1 % of a quantity in an impact and in a slow test (None: no effect), largest first.
@@ -19,6 +20,8 @@ EFFECTS = {
 
 def describe(test: Measurement, audit: EnergyAudit) -> str:
     """Describe a test: its input, preparation, energy balance, and quantities without a ±."""
+    found = audit.contradictions
+    told = any(one.quantity == "velocity" for one in found)
     lines = [
         ("test", [test.name]),
         ("file", [str(test.path or "none")]),
@@ -26,8 +29,9 @@ def describe(test: Measurement, audit: EnergyAudit) -> str:
         ("rows", test.rows.sentences()),
         *_measured(test),
         ("noise", noise_sentences(test)),
-        ("done", test.notes),
+        ("done", [note for note in test.notes if not (told and CONTRADICTED in note)]),
         ("energy", audit.sentences()),
+        ("settle", [f"[{table}] {line}" for one in found for table, line in one.lines[:1]]),
     ]
     effects = {name.replace("_", " "): effect for name, effect in taken_for_exact(test).items()}
     if effects:

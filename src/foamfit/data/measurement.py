@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array, Integers, Mask
-from foamfit.text import engineering
+from foamfit.text import engineering, rounded
 
 MIN_ROWS = 10  # samples of a test
 
@@ -122,6 +122,31 @@ class Dropped:
             return f"row {self.first}: {self.why}"
         part = "" if self.rows == self.last - self.first + 1 else "of "
         return f"{part}rows {self.first} to {self.last} ({self.rows}): {self.why}"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Entry of [columns] by which a channel is read: `column` is written as in the TOML.
+
+    With `inverse`, the scale is a sensitivity, such as "2 mV/N".
+    """
+
+    channel: str
+    column: str
+    unit: str | None = None
+    scale: float = 1.0
+    scale_unit: str = ""
+    inverse: bool = False
+    counts_down: bool = False
+    table: str = "columns"
+
+    def times(self, factor: float, within: float) -> str:
+        """Return the line for a channel larger by a factor, rounded `within` a share of it."""
+        scale = rounded(self.scale * factor ** (-1.0 if self.inverse else 1.0), within)
+        scale = f'"{scale} {self.scale_unit}"' if self.scale_unit else scale
+        unit = f', unit = "{self.unit}"' if self.unit else ""
+        down = ", counts_down = true" * self.counts_down
+        return f"{self.channel} = {{ column = {self.column}{unit}, scale = {scale}{down} }}"
 
 
 @dataclass(frozen=True)
@@ -322,6 +347,11 @@ class Measurement(Samples):
         Channels of the file that were negative in compression; their sign is reversed.
     priors
         Prior knowledge of parameters from the TOML, like "5.5 ± 0.1 MPa".
+    entries
+        Entries of [columns] by which "stress" and "displacement" are read.
+    flight
+        Velocity of the striker at contact by its motion before contact, and standard error, m/s;
+        None if the gauge did not follow it.
     """
 
     name: str
@@ -348,6 +378,8 @@ class Measurement(Samples):
     standstills: tuple[tuple[float, float], ...] = ()
     turned: tuple[str, ...] = ()
     priors: dict[str, str] = field(default_factory=dict)
+    entries: dict[str, Entry] = field(default_factory=dict)
+    flight: tuple[float, float] | None = None
 
     def __repr__(self) -> str:
         """Return a summary without the samples."""

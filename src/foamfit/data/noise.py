@@ -143,10 +143,10 @@ def noise_about(values: Array, degree: int) -> tuple[float, float]:
     x = np.linspace(-1.0, 1.0, values.size)
     residual = values - np.polyval(np.polyfit(x, values, degree), x)
     variance = residual @ residual / (residual.size - degree - 1)
-    return float(np.sqrt(variance)), _residual_time(residual)
+    return float(np.sqrt(variance)), residual_time(residual)
 
 
-def _residual_time(residual: Array) -> float:
+def residual_time(residual: Array) -> float:
     """Return the correlation time, in samples, of residuals if it is significant, else 1."""
     phi = float(residual[1:] @ residual[:-1]) / max(float(residual @ residual), 1e-300)
     return correlation_time(phi) if 2 / np.sqrt(residual.size) < phi < 1 else 1.0
@@ -173,7 +173,7 @@ def mean_level(values: Array, noise: NoiseLevel) -> Level:
     """Return the mean of a signal at rest; `noise` applies if the samples are too few."""
     n, sigma, time, zero = len(values), noise.sigma, noise.time, float(values.mean())
     if n >= MIN_REST:
-        time = max(time, _residual_time(values - zero))
+        time = max(time, residual_time(values - zero))
     if n >= MIN_REST * time:
         sigma = float(np.std(values, ddof=1))
     return Level(zero, sigma * float(np.sqrt(min(time, n) / n)), n)

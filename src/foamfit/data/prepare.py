@@ -13,7 +13,6 @@ from foamfit.arrays import Array, means
 from foamfit.data import contact, cycles, frames, zeros
 from foamfit.data import outliers as repair
 from foamfit.data.measurement import (
-    INTEGRATED,
     MEASURED,
     MIN_ROWS,
     Dropped,
@@ -61,7 +60,7 @@ def condition(
     is estimated from samples before contact or from those of a held channel.
     """
     window, given = window or Window(), striker or Striker()
-    impact = striker is not None and record.time is not None
+    impact, flight = striker is not None and record.time is not None, None
     if impact and window.cycle not in (None, 1):
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     record = repair.cut_strays(cut_to_window(record, window))
@@ -82,7 +81,7 @@ def condition(
             raise _never_positive(first.stress)
         start = replace(start, gauge=zeros.gauge_before(first, start, levels, given))
         span = zeros.span_of_impact(first, start, levels)
-        striker, notes = zeros.flight_of(first, start, span, levels, given, spread)
+        striker, flight, notes = zeros.flight_of(first, start, span, levels, given, spread)
         record = record.noted(*notes)
     else:  # contact starts in the first cycle
         start = contact.start_of_slow_test(first, levels)
@@ -133,6 +132,7 @@ def condition(
         braked=whole.braked,
         rise=rise and rise._replace(time=rise.time - whole.origins.get("contact_time", 0.0)),
         block=block,
+        flight=flight,
         standstills=tuple((float(at[0]), float(at[-1])) for at in stood),
     )
 
@@ -330,17 +330,6 @@ def checks(
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
         after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"
         notes.append(f"The stress goes down to {after}; it is kept.")
-    if striker.velocity and record.time is not None and motion != INTEGRATED:
-        early = displacement <= 0.15 * displacement.max()
-        early[int(np.argmax(displacement)) :] = False
-        early &= record.sampled.get("displacement", True)
-        if early.sum() >= 3:
-            speed = float(np.polyfit(record.time[early], displacement[early], 1)[0])
-            if abs(speed / striker.velocity - 1) > 0.1:
-                notes.append(
-                    f"Check: the displacement starts at {speed:.3g} m/s, {zeros.CONTRADICTED} "
-                    f"{striker.velocity:.3g} m/s."
-                )
     density = (specimen.mass or 0.0) / (specimen.area * height)
     if specimen.mass and not 1 < density < 3000:
         notes.append(f"Check: mass and volume give a density of {density:.3g} kg/m³.")

@@ -186,9 +186,11 @@ def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker)
         return "other"
     top = int(np.argmax(w))
     early = slice(start.first, start.first + max(5, (top - start.first) // 6))
-    speed = striker.velocity or line_at(time[early], w[early], start.time)[1]
+    after = line_at(time[early], w[early], start.time)[1]
+    speed = striker.velocity or after
     slope = level_on_line(time[:before], w[:before], start.time, levels["displacement"])[1]
-    for gauge, expected in (("flight", speed), ("rest", 0.0)):
+    # The stated velocity may be wrong, but the striker does not change its speed at contact.
+    for gauge, expected in (("flight", speed), ("flight", after), ("rest", 0.0)):
         if abs(slope.value - expected) <= slope.error + 0.05 * speed:
             return gauge if slope.error < 0.2 * speed else "other"
     return "other"
@@ -208,14 +210,16 @@ def mark_flight(record: Record, start: Start, span: Span) -> Record:
 
 def flight_of(
     record: Record, start: Start, span: Span, levels: Levels, striker: Striker, spread: float
-) -> tuple[Striker, list[str]]:
+) -> tuple[Striker, tuple[float, float] | None, list[str]]:
     """Compare the striker's flight with its velocity ± `spread`, m/s, and detect free fall.
 
-    Return the striker, with gravity from its flight if the TOML does not give it, and notes.
+    Return the striker, with gravity from its flight if the TOML does not give it, its velocity in
+    flight with its standard error, m/s, or None, and notes.
     """
     n, w, given, notes = start.first - 2, record.displacement, striker.velocity, list[str]()
+    flight = None
     if not given:
-        return striker, notes
+        return striker, flight, notes
     gain = percent(share := GRAVITY * float(record.instants[span.end - 1] - start.time) / given)
     if w is not None and n >= 8:
         noise, t = levels["displacement"], record.instants[:n] - start.time
@@ -237,6 +241,7 @@ def flight_of(
             speed, error = level_on_line(t, w[:n], 0.0, noise)[1][:2]
         if striker.gravity is None and (falls or none):
             striker = replace(striker, gravity=GRAVITY if falls else 0.0)
+        flight = (float(speed), float(error)) if speed > 0.5 * given else None
         deviation, error = abs(speed - given), float(np.hypot(error, spread))
         if deviation > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
             notes.append(
@@ -249,7 +254,7 @@ def flight_of(
             "record does not show whether this one falls; write gravity = true or false under "
             "[striker]."
         )
-    return striker, notes
+    return striker, flight, notes
 
 
 def contact_end(stress: Array, noise: NoiseLevel) -> tuple[int, bool]:

@@ -85,7 +85,7 @@ class Scales:
     def of_parameter(self, model: Model, name: str, values: dict[str, float]) -> float:
         """Return the scale of a parameter, in its unit: what its relative change is divided by."""
         if name in NUISANCE:
-            return abs(values[name]) if name in nuisance.STRIKER else self._hundredth(name)
+            return abs(values[name]) if name in nuisance.POSITIVE else self._hundredth(name)
         param = model.param(name)
         if not param.least_size:
             return abs(values[name]) or 1.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy.linalg import lstsq
 from scipy.ndimage import convolve1d
 
 from foamfit.arrays import Array
+from foamfit.data.calibration import contradictions
 from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel
 from foamfit.data.motion import SmoothMotion, follow
 from foamfit.errors import InputError
@@ -32,14 +33,16 @@ EXACT, FOLLOWED = 1e-6, 1.5
 LATEST = 50.0
 
 
-def choose_drive(measurement: Measurement) -> str:
+def choose_drive(measurement: Measurement, vary: Iterable[str] = ()) -> str:
     """Return "impact" if striker and time are known, else "displacement".
 
-    Raises InputError if neither is possible.
+    A measured displacement also drives an impact whose record contradicts velocity, mass or scale
+    of the force, unless these are among the parameters to `vary`. Raises InputError if no drive is
+    possible.
     """
     striker = measurement.striker
     moving = striker is not None and striker.mass is not None and striker.velocity
-    if moving and measurement.time is not None:
+    if moving and measurement.time is not None and not replaces_striker(measurement, vary):
         return "impact"
     if measurement.displacement is not None:
         return "displacement"
@@ -47,6 +50,17 @@ def choose_drive(measurement: Measurement) -> str:
         f"{measurement.name}: no drive is possible; give a displacement or strain column, "
         "or time and a [striker] with mass and velocity"
     )
+
+
+def replaces_striker(measurement: Measurement, vary: Iterable[str] = ()) -> bool:
+    """Return whether the measured motion drives an impact, as its record contradicts the striker.
+
+    The contradiction may also be settled by parameters to `vary`.
+    """
+    if measurement.displacement is None or "displacement" in measurement.derived:
+        return False
+    varied = set(vary)
+    return any(not one.is_settled(varied) for one in contradictions(measurement))
 
 
 def check_drive(measurement: Measurement, drive: str) -> None:

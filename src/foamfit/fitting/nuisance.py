@@ -1,4 +1,4 @@
-"""Nuisance parameters: contact time, zeros of the channels, striker and time shift.
+"""Nuisance parameters: contact time, zeros of the channels, striker, force scale and time shift.
 
 They are fitted together with the parameters of the springs: all of them in an impact, the zeros of
 motion and stress under a driving motion. Times and zeros are relative to the values found by the
@@ -15,11 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from foamfit.data.measurement import Measurement
+from foamfit.data.measurement import INTEGRATED, Measurement
 from foamfit.springs.parameters import NUISANCE
 
 CONTACT_TIME, TIME_SHIFT = "contact_time", "time_shift"
 VELOCITY, STRIKER_MASS = "velocity", "striker_mass"
+FORCE_SCALE = "force_scale"  # true force over measured force
 # Zeros of the channels: the reading of a channel when the quantity is zero.
 ZEROS = {
     "displacement_zero": "displacement",
@@ -27,8 +28,9 @@ ZEROS = {
     "acceleration_zero": "acceleration",
 }
 STRIKER = (VELOCITY, STRIKER_MASS)
+POSITIVE = (*STRIKER, FORCE_SCALE)  # parameters that are scales of themselves
 UNDER_DRIVE = {
-    "impact": (CONTACT_TIME, *ZEROS, *STRIKER),
+    "impact": (CONTACT_TIME, *ZEROS, *STRIKER, FORCE_SCALE),
     "displacement": ("displacement_zero", "stress_zero"),
 }
 # Limits of a parameter with a prior, and of one that the first rise shows, in standard deviations.
@@ -65,7 +67,7 @@ def names_of(drive: str, *, time_shift: bool) -> tuple[str, ...]:
 def values_of(measurement: Measurement) -> dict[str, float]:
     """Return the values given by the record and its TOML, SI."""
     striker = measurement.striker
-    values = dict.fromkeys(NUISANCE, 0.0)
+    values = dict.fromkeys(NUISANCE, 0.0) | {FORCE_SCALE: 1.0}
     values[VELOCITY] = (striker.velocity if striker else None) or math.nan
     values[STRIKER_MASS] = (striker.mass if striker else None) or math.nan
     return values
@@ -83,6 +85,7 @@ def priors_of(measurement: Measurement, drive: str) -> dict[str, Prior]:
     if drive != "impact":
         known["displacement_zero"] = None
     stated = {VELOCITY: "velocity", STRIKER_MASS: "striker_mass", TIME_SHIFT: "delay"}
+    stated[FORCE_SCALE] = "stress_scale"
     known |= {name: measurement.uncertainties.get(key) for name, key in stated.items()}
     if measurement.braked:
         del known[STRIKER_MASS]
@@ -90,14 +93,14 @@ def priors_of(measurement: Measurement, drive: str) -> dict[str, Prior]:
 
 
 def open_in(measurement: Measurement, drive: str, counted: Mapping[str, bool]) -> frozenset[str]:
-    """Return the nuisance parameters to fit, given which channels are `counted`.
+    """Return the nuisance parameters to fit by default, given which channels are `counted`.
 
     The zero of a motion is arbitrary in an impact, and in a slow test recorded from before the
     contact. The zero of a force or an acceleration is that of the file unless samples before the
     contact show another.
     """
     priors = priors_of(measurement, drive)
-    known = {name for name in priors if counted.get(ZEROS.get(name, ""), True)}
+    known = {name for name in priors if counted.get(ZEROS.get(name, ""), True)} - {FORCE_SCALE}
     if drive == "impact":
         moved = {"displacement_zero"} if counted.get("displacement", False) else set()
         return frozenset({CONTACT_TIME} | moved | known)
@@ -149,14 +152,16 @@ def limits_of(
     """
     prior, middle = priors_of(measurement, drive).get(name), values_of(measurement)[name]
     rise = None if prior is not None else shown_by(measurement, drive).get(name)
+    if name == FORCE_SCALE and not _shows_force(measurement):
+        return middle, middle
     if prior is not None:
         reach = REACH * prior.sigma
-        reach = min(reach, 0.9 * middle) if name in STRIKER else reach
+        reach = min(reach, 0.9 * middle) if name in POSITIVE else reach
     elif rise is not None:
         ends = rise.mean - REACH_OF_RISE * rise.sigma, rise.mean + REACH_OF_RISE * rise.sigma
         return _within_height(name, measurement, min(*ends, middle), max(*ends, middle))
-    elif name in STRIKER:
-        return 0.1 * middle, 10.0 * middle
+    elif name in POSITIVE:
+        reach = 0.9 * middle
     elif name in ZEROS:
         values = measurement.channels().get(ZEROS[name])
         reach = 0.0 if values is None else LARGEST_ZERO * float(np.ptp(values))
@@ -174,6 +179,13 @@ def _within_height(
         return low, high
     least = float(measurement.displacement.max()) - LARGEST_STRAIN * measurement.specimen.height
     return min(max(low, least), 0.0), high
+
+
+def _shows_force(measurement: Measurement) -> bool:
+    """Return whether an impact shows the scale of its force: by a motion or an acceleration."""
+    moved = measurement.displacement is not None and measurement.motion != INTEGRATED
+    moved = moved and "displacement" not in measurement.derived
+    return "stress" not in measurement.derived and (moved or measurement.acceleration is not None)
 
 
 def _latest_contact(measurement: Measurement) -> float:

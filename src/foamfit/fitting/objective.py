@@ -42,6 +42,8 @@ from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, Stres
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import MOVED
 
+# Curves of the measured stress, which is the simulated one over the scale of the force.
+STRESSES = ("stress_time", "stress_strain")
 # Residual after a failed simulation, as a multiple of the measured range.
 PENALTY = 10.0
 NOWHERE = np.empty(0, np.int64)
@@ -349,6 +351,8 @@ class Objective:
         for at, name in zip(np.flatnonzero(~own), named, strict=True):
             if moved and name == zero:  # a larger zero means a smaller motion
                 by = {curve: -rows[-1] for curve, rows in carried.items()}
+            elif name == nuisances.FORCE_SCALE:
+                by = self._scale_slope(curves.curves, nuisance)
             else:
                 by = self._nuisance_slope(values, nuisance, name)
             for curve, rows in slopes.items():
@@ -359,6 +363,16 @@ class Objective:
         """Return whether a spring has a dashpot, or a derivative by one is requested."""
         eta = self._dashpots
         return bool(values[: eta.size][eta].any() or eta[places].any())
+
+    def _scale_slope(self, curves: dict[str, Array], nuisance: Array) -> dict[str, Array]:
+        """Return the derivative of the curves by the scale of the force."""
+        at = dict(zip(self.nuisance, nuisance.tolist(), strict=True))
+        return {
+            name: (at.get(self._zero_of.get(name, ""), 0.0) - curve) / at[nuisances.FORCE_SCALE]
+            if name in STRESSES
+            else np.zeros(curve.size)
+            for name, curve in curves.items()
+        }
 
     def _nuisance_slope(self, values: Array, nuisance: Array, name: str) -> dict[str, Array]:
         """Return the derivative of the curves by one nuisance parameter.
@@ -435,6 +449,9 @@ class Objective:
         if ACCELERATION in asked:
             parts[ACCELERATION] = self._acceleration(shown, drag, at, by_site)
         curves, slopes = dict[str, Array](), dict[str, Array]()
+        scale = at.get(nuisances.FORCE_SCALE, 1.0)
+        for name in STRESSES if scale != 1.0 else ():
+            parts |= {name: parts[name] / scale} if name in parts else {}
         for name, simulated in parts.items():
             seen, zero = self._late(name, self._sampled(simulated), late), self._zero_of.get(name)
             curves[name], slopes[name] = seen[0] + at[zero] if zero else seen[0], seen[1:]

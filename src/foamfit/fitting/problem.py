@@ -16,11 +16,25 @@ from foamfit.data.units import LARGEST, parse_uncertain
 from foamfit.errors import InputError
 from foamfit.fitting import nuisance
 from foamfit.fitting.box import Scales, Space, others
-from foamfit.fitting.curves import check_interior, choose_drive, default_weights
+from foamfit.fitting.curves import (
+    check_interior,
+    choose_drive,
+    default_weights,
+    replaces_striker,
+)
 from foamfit.fitting.objective import Objective
 from foamfit.springs.laws.record import ADMISSIBLE, Between
 from foamfit.springs.model import Model, with_options
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
+
+# Why some parameters exist in the impact drive only.
+_MOVED = "a given motion needs no striker; choose the impact drive"
+ONLY_IMPACT = {
+    nuisance.VELOCITY: _MOVED,
+    nuisance.STRIKER_MASS: _MOVED,
+    nuisance.FORCE_SCALE: "along a given motion or stress, a scale of the force cannot be "
+    "distinguished from a scale of all stiffnesses; choose the impact drive",
+}
 
 
 def make_params(
@@ -36,8 +50,9 @@ def make_params(
 
     The bounds follow from the scales of the test. In the impact drive one damping parameter varies:
     the dashpot of a single spring, or the onsite damper of the striker of a chain, as in the paper.
-    In the other drives all damping is fixed at zero by default. Heights are those of the specimen
-    if it states them; otherwise they vary with a fixed sum.
+    In the other drives all damping is fixed at zero by default, except for the dashpot of a single
+    spring if the motion of an impact replaces a contradicted striker. Heights are those of the
+    specimen if it states them; otherwise they vary with a fixed sum.
 
     Parameters
     ----------
@@ -72,8 +87,10 @@ def make_params(
         raise InputError(
             f"{measurement.name}: the stress of '{delayed[0].kind}' needs a time column"
         )
-    params = lmfit.Parameters()
-    count = len(model.kinds)
+    params, count = lmfit.Parameters(), len(model.kinds)
+    fast = drive == "impact"
+    if drive == "displacement" and count == 1:
+        fast = replaces_striker(measurement)
     for name in model.names:
         spring, short = split_name(name)
         if short == "height":
@@ -81,7 +98,7 @@ def make_params(
         param = model.param(name)
         value = param.start[0] * scales.unit(param.start[1])
         low, high = (bound * scales.unit(param.scale) for bound in param.bounds)
-        vary = short != "eta" or (drive == "impact" and (spring >= 0) == (count == 1))
+        vary = short != "eta" or (fast and (spring >= 0) == (count == 1))
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)
     late = nuisance.is_late(measurement, time_shift=time_shift)
@@ -120,6 +137,8 @@ def check_fixed_and_varied(
 ) -> None:
     """Raise InputError for an unknown parameter, or one that is both fixed and varied."""
     for name in (*fix, *vary):
+        if name in ONLY_IMPACT and name not in names:
+            raise InputError(f"'{name}' cannot be fixed or varied here: {ONLY_IMPACT[name]}")
         if name not in names:
             raise InputError(
                 f"parameter '{name}' is not one of the model {model}; "
@@ -322,7 +341,7 @@ def _check_held(params: lmfit.Parameters) -> None:
     for name, parameter in params.items():
         if parameter.vary or parameter.expr is not None:
             continue
-        wanted = "positive" if name in nuisance.STRIKER else "finite"
+        wanted = "positive" if name in nuisance.POSITIVE else "finite"
         if name not in NUISANCE:
             wanted = any_param(split_name(name)[1]).admissible
         if abs(value := parameter.value) > LARGEST or not ADMISSIBLE[wanted](value):
@@ -392,7 +411,8 @@ def make_problem(
     Raises InputError if the test lacks data for the drive, or if a parameter is unknown.
     """
     model = Model.parse(model_name, relaxation)
-    drive = choose_drive(measurement) if drive is None else drive
+    if drive is None:
+        drive = choose_drive(measurement, [n for n, one in (params or {}).items() if one.vary])
     count = len(model.kinds)
     check_interior(measurement, count)
     notes: tuple[str, ...] = ()

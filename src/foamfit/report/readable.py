@@ -20,6 +20,7 @@ _OTHERS = {
     "acceleration_zero": ("a", "0", "acceleration zero a₀"),
     "velocity": ("v", "0", "velocity v₀"),
     "striker_mass": ("m", "", "striker mass m"),
+    "force_scale": ("s", "F", "force scale s_F"),
     "time_shift": ("Δt", "", "time shift Δt"),
 }
 UNITS = {

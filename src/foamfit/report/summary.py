@@ -8,6 +8,7 @@ from typing import Any
 
 from foamfit.data.measurement import interior_channel
 from foamfit.fitting.branches import covered
+from foamfit.fitting.nuisance import POSITIVE
 from foamfit.report.plots import origin_word
 from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page, sentences, table, words
@@ -46,12 +47,13 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
         "fixed": [f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed"],
         "determined": determined(result),
         "unknown": _unknown({n: p for n, p in result.parameters.items() if n not in NUISANCE}),
+        "remedies": [one.lines[0] for one in result.contradictions],
     }
     *lines, last = _screen(result, rows, values, verbose=verbose)
     if verbose:
         values |= {"rows": rows, "conclusions": conclusions(result), "answers": ANSWERS}
         lines.append("\n" + words("summary", **values, **tables(result)) + "\n")
-    return "\n".join([*lines, last])
+    return "\n".join([*lines, last, *(line for _, line in values["remedies"])])
 
 
 def _screen(
@@ -66,9 +68,11 @@ def _screen(
     estimated = [row for row in varied if row.state != "not determined"]
     springs = [row for row in estimated if row.name not in NUISANCE]
     lines, kept = 10**6 if verbose else LINES, min(len(warnings), WARNING_LINES)
+    lines -= len(values["remedies"])
     stages = [(varied, True, 1), (varied, False, 1), (estimated, False, 1)]
     for shown, whole, across in [*stages, *((springs, False, i) for i in (1, 2, 3))]:
         left = [row for row in varied if row not in shown and row.name in NUISANCE]
+        left.sort(key=lambda row: row.name not in POSITIVE)  # the calibration first
         record = [f"{row.label} {row.with_unit(row.with_error)}" for row in left]
         more = {"whole": whole, "stated": across == 1, "of_record": record}
         foot = words("short", part="foot", **more, **values).split("\n")

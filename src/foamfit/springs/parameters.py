@@ -27,6 +27,7 @@ NUISANCE = {
     "acceleration_zero": "m/s^2",
     "velocity": "m/s",
     "striker_mass": "kg",
+    "force_scale": "",
     "time_shift": "s",
 }
 

@@ -17,6 +17,7 @@ from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate, rate_error
 from foamfit.errors import InputError, SimulationError, naming
+from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.nuisance import Prior
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params
@@ -189,7 +190,8 @@ def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters
     A named parameter varies in the tests in which it varies by default, or else in all tests.
     """
     model = Model.parse(study.model, study.relaxation)
-    every = [make_params(test, model, study.drive) for test in tests]
+    drives = [study.drive or choose_drive(test, study.kinds) for test in tests]
+    every = [make_params(test, model, by) for test, by in zip(tests, drives, strict=True)]
     for name in (*study.kinds, *study.held):
         varies = [params[name].vary for params in every if name in params]
         if not varies:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.calibration import contradictions
 from foamfit.fitting.links import RATES
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
@@ -34,6 +35,8 @@ from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import POOR, UNACCEPTABLE, status_of, warnings_of
 from foamfit.trust.conclude import conclude, noise_of
+from foamfit.trust.contested import judged, settle, unsettled
+from foamfit.trust.covariance import Ends
 
 # Largest number of result folders written in this process: each takes a second or two.
 FEW_FOLDERS = 3
@@ -254,11 +257,30 @@ def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
 def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, JointParameter]:
     """Return all parameters of the joint fit, those of the springs first."""
     problems = fit.found.problems
-    return {
+    found = {
         name: parameter_of(fit, tests, name)
         for name in (*problems[0].model.names, *NUISANCE)
         if any(name in one.index and not one.is_exact(name) for one in problems)
     }
+    for test, best in zip(tests, fit.point.bests, strict=True):
+        settled = settle(best, unsettled(best, contradictions(best.problem.measurement)))
+        for name in best.problem.free() if settled else ():
+            found[name] = _contested(found[name], test, partial(judged, settled, best, name))
+    return found
+
+
+def _contested(
+    one: JointParameter, test: str, judge: Callable[[Ends, tuple[str, str]], tuple[str, str]]
+) -> JointParameter:
+    """Return a parameter with the states that contradictions in the record of a test leave it."""
+    if one.ci95 is not None and one.state is not None and one.why is not None:
+        state, why = judge(one.ci95, (one.state, one.why))
+        one = replace(one, state=state, why=why)
+    at = one.tests[test] if one.tests is not None else None
+    if at is None or at.ci95 is None:
+        return one
+    state, why = judge(at.ci95, (at.state, at.why))
+    return replace(one, tests={**(one.tests or {}), test: replace(at, state=state, why=why)})
 
 
 def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParameter:
@@ -395,6 +417,11 @@ def with_words(result: JointResult) -> JointResult:
         "joint_warnings",
         refused=[(Path(file).name, why.rstrip(".")) for file, why in result.refused.items()],
         lost=list(lost),
+        wrong=[
+            (test, one, best.problem.objective.drive)
+            for test, best in zip(result.tests, result.fit.point.bests, strict=True)
+            for one in unsettled(best, contradictions(best.problem.measurement))
+        ],
         large=large,
         top=(top, share) if len(result.tests) > 3 and share > DOMINANT else None,
         gap=result.bic - result.alone.bic(result.alone.n_eff),

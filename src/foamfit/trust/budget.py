@@ -31,7 +31,7 @@ STEP = 1e-4
 ROUNDING = 1e-6
 # Nuisance parameters by the source of uncertainty to which they contribute.
 _CONTACT = (nuisance.CONTACT_TIME, *nuisance.ZEROS)
-_STRIKER = (*nuisance.STRIKER, nuisance.TIME_SHIFT)
+_STRIKER = (*nuisance.POSITIVE, nuisance.TIME_SHIFT)
 # Owner and field of each quantity in a test, and its source of uncertainty.
 _QUANTITIES = {
     "height": ("specimen", "height", "height"),
@@ -48,11 +48,12 @@ def responses(best: BestPoint) -> dict[str, Array]:
     The quantities are those of `Measurement.uncertainties` that are not fitted. NaN if the changed
     test cannot be simulated.
     """
-    measurement, free = best.problem.measurement, best.problem.free()
+    measurement, free = best.problem.measurement, {"delay", *best.problem.free()}
+    free |= {"stress_scale"} if nuisance.FORCE_SCALE in free else set()
     return {
         quantity: response(best, quantity, sigma / _value(measurement, quantity))
         for quantity, sigma in measurement.uncertainties.items()
-        if quantity != "delay" and quantity not in free
+        if quantity not in free
     }
 
 

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.calibration import Contradiction
 from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import ASKED, INTEGRATED
 from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import InputError
 from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
-from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, Intervals, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, split_name
@@ -74,8 +74,12 @@ def make_checklist(
     record: SearchRecord,
     balance: EnergyAudit,
     intervals: Intervals,
+    contradictions: Sequence[Contradiction] = (),
 ) -> tuple[Check, ...]:
-    """Answer all questions, in the order of `sentences.toml`."""
+    """Answer all questions, in the order of `sentences.toml`.
+
+    `contradictions` are those of the balance that the fit does not settle.
+    """
     with_error = [name for name in best.names if estimates[name].stderr is not None]
     checks = (
         *_of_search(best, record),
@@ -85,8 +89,8 @@ def make_checklist(
         _determined(best, estimates),
         _visited(best, estimates),
         *_of_intervals(best, estimates, intervals, with_error),
-        *_of_test(best, balance),
-        _time_shift(best, estimates, with_error),
+        *_of_test(best, balance, contradictions),
+        _time_shift(best, estimates, with_error, contradicted=bool(contradictions)),
         _damping(best, with_error),
     )
     by_key = {check.key: check for check in checks}
@@ -255,20 +259,33 @@ def _of_intervals(
     yield _check("bounds", not stuck, stuck=stuck, natural=natural)
 
 
-def _of_test(best: BestPoint, balance: EnergyAudit) -> Iterator[Check]:
-    test = best.problem.measurement
-    wrong = [note for note in test.notes if CONTRADICTED in note]
-    doubts = [note for note in test.notes if note.startswith(ASKED) and note not in wrong]
-    moves = best.problem.objective.drive == "impact" and test.displacement is not None
-    yield _check("velocity", not wrong if moves else None, warnings=wrong if moves else ())
+def _of_test(
+    best: BestPoint, balance: EnergyAudit, contradictions: Sequence[Contradiction]
+) -> Iterator[Check]:
+    test, drive = best.problem.measurement, best.problem.objective.drive
+    small = [note for note in test.notes if CONTRADICTED in note]
+    doubts = [note for note in test.notes if note.startswith(ASKED) and note not in small]
+    told: dict[bool, list[str]] = {True: [], False: []}
+    for one in contradictions:
+        told[one.quantity == "force_scale"].append(
+            say("contradiction", "said", one=one, drive=drive)
+        )
+    settled = len(contradictions) < len(balance.contradictions)
+    ratio, absorbed = balance.impulse_ratio, balance.absorbed_over_striker
+    wrong = told[False] or (small if drive == "impact" and not balance.contradictions else [])
+    known = ratio is not None or test.flight is not None
+    yield _check("velocity", False if wrong else True if known else None, warnings=wrong)
+    known = ratio is not None and not settled
+    answer = False if told[True] else True if known else None
+    yield _check("impulse", answer, warnings=told[True], ratio=ratio)
     yield _check("input", not doubts, warnings=doubts)
-    absorbed, warnings = balance.absorbed_over_striker, balance.energy_warnings()
-    unknown = not warnings and (absorbed is None or balance.motion == INTEGRATED)
-    answer = None if unknown else not warnings
+    warnings, loop = balance.energy_warnings(), balance.loop_warnings()
+    unknown = absorbed is None or balance.motion == INTEGRATED
+    unknown = settled or (unknown and not warnings)
+    answer = None if unknown and not loop else not (warnings or loop)
+    # A contradiction explains why the energy is not that of the striker.
+    warnings = loop if balance.contradictions else warnings + loop
     yield _check("energy", answer, warnings=warnings, taken=absorbed)
-    ratio, warnings = balance.impulse_ratio, balance.impulse_warnings()
-    answer = None if ratio is None else not warnings
-    yield _check("impulse", answer, warnings=() if ratio is None else warnings, ratio=ratio)
 
 
 def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
@@ -284,18 +301,21 @@ def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
     return _check("damping", eta == 0.0, eta=eta)
 
 
-def _time_shift(best: BestPoint, estimates: Estimates, with_error: Sequence[str]) -> Check:
+def _time_shift(
+    best: BestPoint, estimates: Estimates, with_error: Sequence[str], *, contradicted: bool
+) -> Check:
     test, objective = best.problem.measurement, best.problem.objective
-    force = test.outliers.get("stress")
+    force, contradicted = test.outliers.get("stress"), contradicted and objective.drive == "impact"
     clipped = force is not None and force.clipped_at is not None
     facts: dict[str, Any] = {"held": False, "clipped": clipped, "shift": None}
+    facts["contradicted"] = contradicted
     if objective.time_shift:
         shift = estimates.get("time_shift")
         facts |= {"held": shift is None or not shift.vary, "shift": shift and shift.value}
         return _check("time_shift", None if facts["held"] else True, **facts)
     with suppress(InputError):
         check_time_shift(test, objective.drive)
-        if not clipped:
+        if not clipped and not contradicted:
             late = _shift_hint(best, with_error) or 0.0
             return _check("time_shift", late == 0.0, late=late, **facts)
     return _check("time_shift", None, **facts)
@@ -317,7 +337,7 @@ def _shift_hint(best: BestPoint, with_error: Sequence[str]) -> float | None:
     shift = _one_step(best, with_error, (late - early) / gap, gap)
     if shift is not None and abs(shift) > 0.25 * gap:
         return shift
-    return _shift_of_motion(best.problem)
+    return _shift_of_motion(best)
 
 
 def _one_step(
@@ -339,19 +359,20 @@ def _one_step(
     return float(move[-1]) if abs(move[-1]) > 4.0 * spread.stderr[-1] else None
 
 
-def _shift_of_motion(problem: Problem) -> float | None:
+def _shift_of_motion(best: BestPoint) -> float | None:
     """Return the delay (s) of the motion if the striker's equation of motion shows it clearly.
 
     With m w'' = -F, the force integrated twice gives the motion up to scale and zero. The delay is
     accepted if it exceeds the sampling interval and lowers the sum of squares to a tenth, or to
     half if the rest is at the noise.
     """
+    problem = best.problem
     test, striker = problem.measurement, problem.measurement.striker
     time, stress, motion = test.time, test.stress, test.displacement
     if problem.objective.drive != "impact" or time is None or stress is None or motion is None:
         return None
     assert striker is not None
-    assert striker.velocity is not None
+    velocity = float(best.values[best.index["velocity"]])
     dt = np.diff(time, prepend=min(time[0], 0.0))
     slowed = np.cumsum(dt * (stress - 0.5 * np.diff(stress, prepend=0.0)))
     braked = np.cumsum(dt * (slowed - 0.5 * np.diff(slowed, prepend=0.0)))
@@ -361,10 +382,11 @@ def _shift_of_motion(problem: Problem) -> float | None:
         when = time - late
         columns = np.column_stack([np.interp(when, time, braked), np.ones(time.size)])
         fall = 0.5 * (striker.gravity or 0.0) * when
-        free = motion - (striker.velocity + fall) * when
+        free = motion - (velocity + fall) * when
         left.append(float(np.linalg.lstsq(columns, free, rcond=None)[1].sum()))
-    best, none = int(np.argmin(left)), left[shifts.size // 2]
+    place, none = int(np.argmin(left)), left[shifts.size // 2]
     floor = 4.0 * problem.objective.noise("displacement_time").sigma ** 2 * time.size
-    clear = 0 < best < shifts.size - 1 and left[best] < (0.5 if left[best] < floor else 0.1) * none
+    inside, least = 0 < place < shifts.size - 1, left[place]
+    clear = inside and least < (0.5 if least < floor else 0.1) * none
     gap = float(np.median(np.diff(time)))
-    return float(shifts[best]) if clear and abs(shifts[best]) > gap else None
+    return float(shifts[place]) if clear and abs(shifts[place]) > gap else None

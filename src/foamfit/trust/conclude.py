@@ -27,6 +27,7 @@ from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
 from foamfit.trust.budget import make_budget
 from foamfit.trust.checklist import POOR, make_checklist, may_vanish, status_of, warnings_of
+from foamfit.trust.contested import Settled, judged, settle, unsettled
 from foamfit.trust.covariance import Ends
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
@@ -49,9 +50,11 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         }
         insight = look(best, noise)
         correlation = Correlation(best.names, spread.correlation, spread.stderr)
-    estimates, budget = make_budget(best, _estimates(best, insight, intervals))
     balance, misfit = audit(measurement), objective.misfit(simulated)
-    checklist = make_checklist(best, estimates, misfit, record, balance, intervals)
+    contradictions = unsettled(best, balance.contradictions)
+    settled = settle(best, contradictions, stopped=record.stopped is not None)
+    estimates, budget = make_budget(best, _estimates(best, insight, intervals, settled))
+    checklist = make_checklist(best, estimates, misfit, record, balance, intervals, contradictions)
     springs = best.values[: len(problem.model.names)]
     return Fit(
         measurement=measurement,
@@ -63,6 +66,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         chain=problem.model.chain(springs, specimen.height, specimen.area),
         params=problem.told(),
         parameters=estimates,
+        contradictions=contradictions,
         visited=visited(problem, simulated),
         misfit=misfit,
         weights=objective.weights,
@@ -199,7 +203,7 @@ def _inner_loops(best: BestPoint) -> dict[str, Any] | None:
 
 
 def _estimates(
-    best: BestPoint, insight: Insight | None, intervals: Intervals
+    best: BestPoint, insight: Insight | None, intervals: Intervals, settled: Sequence[Settled]
 ) -> dict[str, ParameterEstimate]:
     """Return the estimates of all parameters; their standard errors are also set in lmfit's."""
     problem, out = best.problem, {}
@@ -209,7 +213,7 @@ def _estimates(
         parameter = problem.params[name]
         if name in best.names:
             assert insight is not None
-            estimate = _varied(best, name, insight, intervals)
+            estimate = _varied(best, name, insight, intervals, settled)
         else:
             vary, spring = bool(parameter.vary), split_name(name)[0] + 1
             state, key = ("not determined", "unreached") if vary else ("fixed", "held")
@@ -226,7 +230,7 @@ def _estimates(
 
 
 def _varied(
-    best: BestPoint, name: str, insight: Insight, intervals: Intervals
+    best: BestPoint, name: str, insight: Insight, intervals: Intervals, settled: Sequence[Settled]
 ) -> ParameterEstimate:
     """Return the estimate of a varied parameter whose branch was reached."""
     (low, high), column = best.limits(name), best.names.index(name)
@@ -251,6 +255,8 @@ def _varied(
         other = None if other is None else other + problem.measurement.origins.get(name, 0.0)
         facts = {"vibrates": objective.interior_mass, "there": other, "off": misfit, "curve": curve}
         state, why = "weak", say("why", "weak", why=why, unit=unit, **facts)
+    zero = problem.measurement.origins.get(name, 0.0)
+    state, why = judged(settled, best, name, (ends[0] + zero, ends[1] + zero), (state, why))
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
     astray = name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf)

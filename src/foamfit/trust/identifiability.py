@@ -17,6 +17,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.fitting.box import scale_in_words
 from foamfit.fitting.branches import sections
+from foamfit.fitting.nuisance import POSITIVE
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import listed
 from foamfit.trust import say
@@ -28,7 +29,7 @@ PART = 0.05  # smallest component of a direction that counts
 NAMED = 0.3  # smallest component, relative to the largest, that is named in a sentence
 MOST = 3  # largest number of parameters named in a joint change
 # Times and zeros have an arbitrary origin, so that powers of them are meaningless.
-OF_NO_POWER = set(NUISANCE) - {"velocity", "striker_mass"}
+OF_NO_POWER = set(NUISANCE) - set(POSITIVE)
 
 
 @dataclass(frozen=True, eq=False)

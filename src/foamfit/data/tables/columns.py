@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from foamfit.data.measurement import Striker, interior_channel, interior_node
+from foamfit.data.measurement import Entry, Striker, interior_channel, interior_node
 from foamfit.data.tables.csv_table import Table, Text, find_table, read_numbers
 from foamfit.data.tables.headers import CHANNELS, WEAK, WEIGHTS, channel_of, example, in_si
 from foamfit.data.toml_file import Column, Settings
@@ -135,6 +135,19 @@ class Source:
             del used["acceleration"]
         spreads = {f"{name}_scale": self.given.get(c, _NONE).spread for name, c in used.items()}
         return {name: spread for name, spread in spreads.items() if spread}
+
+    def entries(self, table: str = "columns") -> dict[str, Entry]:
+        """Return the entries of a table of the TOML by which stress and displacement are read."""
+        found = dict[str, Entry]()
+        for name, channels in _SOURCES.items():
+            channel = next((c for c in channels if c in self.columns), None)
+            if channel is not None:
+                k, one = self.columns[channel], self.given.get(channel, _NONE)
+                unit = one.unit or self.table.headers[k].unit or ""
+                over, column = _inverse(channel, unit, one) is not None, quoted(self.table, k)
+                scale = one.scale, one.scale_unit, over, one.counts_down
+                found[name] = Entry(channel, column, one.unit, *scale, table)
+        return found
 
     def note(self) -> str:
         """Return a note with the column of each channel and the unused columns."""

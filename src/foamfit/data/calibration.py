@@ -1,0 +1,220 @@
+"""Compare velocity, mass and calibration of an impact with its measured motion.
+
+The motion of a rigid striker follows from its equation of motion, whatever the law of the specimen:
+w = w₀ + v t + g t²/2 − (A/m) ∬σ. Fitted to the measured motion by least squares, it shows the
+velocity v at contact, and the factor of the double integral, which is 1 if mass, force and motion
+agree. The zero of the force and its delay against the motion are left open.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.data.measurement import GRAVITY, INTEGRATED, Entry, Measurement
+from foamfit.data.noise import residual_time, with_noise
+from foamfit.text import engineering, rounded
+
+# Two numbers contradict each other if they differ by more than this many standard deviations. A
+# number without a ± has one of this share, so the limit is 3 % if no ± is stated.
+BEYOND, UNSTATED = 3.0, 0.01
+# Standard deviation of the zero of the force, as a share of its peak, and of the delay between
+# force and motion, as a share of the time under load.
+ZERO, DELAY = 0.01, 0.1
+TENTH = 0.1  # of the limit: to this share a number in a line of the TOML is rounded
+_LOADED = 0.05  # largest stress at the first sample, as a share of the peak, if it is at contact
+_FEWEST = 12  # samples of the motion
+_ROUNDS = 3  # fits, each with the scatter left by the one before
+
+Shown = tuple[float, float]  # a number that a record shows, and its standard error
+
+
+@dataclass(frozen=True)
+class Balance:
+    """What the equation of motion of the striker shows; None if it does not show a number.
+
+    `velocity` is that at contact, m/s; `force` is the factor by which the measured force must be
+    multiplied, 1 if mass, force and motion agree.
+    """
+
+    velocity: Shown | None = None
+    force: Shown | None = None
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A number that the record contradicts.
+
+    Attributes
+    ----------
+    quantity
+        "velocity", "force_scale" or "motion_scale".
+    ratio, limit
+        Number that the record shows over the number in use, and the largest difference of this
+        ratio from 1 of numbers that agree.
+    says
+        What contradicts what, a clause.
+    lines
+        Tables and lines of the TOML, each of which would settle it, the likelier one first.
+    """
+
+    quantity: str
+    ratio: float
+    limit: float
+    says: str
+    lines: tuple[tuple[str, str], ...]
+
+    def is_settled(self, vary: Iterable[str]) -> bool:
+        """Return whether it is settled by fitting these parameters."""
+        free, strong = set(vary), {"force_scale", "striker_mass"}
+        if self.quantity == "velocity":
+            return "velocity" in free
+        return bool(free & strong) and (self.quantity == "force_scale" or "velocity" in free)
+
+
+def contradictions(test: Measurement) -> tuple[Contradiction, ...]:
+    """Return the numbers that the record of an impact contradicts, the velocity first."""
+    shown, striker, found = balance(test), test.striker, list[Contradiction]()
+    if striker is None or not striker.velocity or not striker.mass:
+        return ()
+    if shown.velocity is not None:
+        speed, error = shown.velocity
+        ratio, limit = speed / striker.velocity, _limit(test, error / striker.velocity, "velocity")
+        if abs(ratio - 1.0) > limit:
+            line = f'velocity = "{rounded(speed, TENTH * limit)} m/s"'
+            when = "before" if test.flight else "at"
+            says = f"the velocity is given as {striker.velocity:.4g} m/s, the striker moves at "
+            says += f"{speed:.4g} ± {error:.2g} m/s {when} contact"
+            found.append(Contradiction("velocity", ratio, limit, says, (("striker", line),)))
+    if shown.force is not None:
+        ratio, limit = shown.force[0], _limit(test, shown.force[1], "striker_mass", "stress_scale")
+        if abs(ratio - 1.0) > limit:
+            found.append(_of_force(test, ratio, limit, striker.mass))
+    # If the motion is too fast and too long by one factor, its scale alone may be wrong.
+    if len(found) == 2 and abs(found[0].ratio / found[1].ratio - 1.0) < found[1].limit:
+        return (_of_motion(test, found[1].ratio, found[1].limit),)
+    return tuple(found)
+
+
+def _limit(test: Measurement, error: float, *quantities: str) -> float:
+    """Return the largest relative difference of these quantities from a motion that agrees."""
+    striker, stated = test.striker, test.uncertainties
+    sizes = {"velocity": striker and striker.velocity, "striker_mass": striker and striker.mass}
+    spreads = [stated.get(name, 0.0) / (sizes.get(name) or 1.0) for name in quantities]
+    more = stated.get("displacement_scale", stated.get("velocity_scale", 0.0))
+    return BEYOND * math.hypot(error, 0.0 if all(spreads) else UNSTATED, more, *spreads)
+
+
+def _of_force(test: Measurement, ratio: float, limit: float, mass: float) -> Contradiction:
+    """Return the contradiction between mass, scale of the force and motion."""
+    what = "acceleration" if test.braked else "force"
+    says = f"the impulse of the {what} is {1.0 / ratio:.2f} of the change of momentum in the "
+    says += f"motion, so {'' if test.braked else 'mass, '}scale of the {what} and motion disagree"
+    entry = test.entries.get("stress", Entry(what, '"…"'))
+    lines = [(entry.table, entry.times(ratio, TENTH * limit))]
+    if not test.braked:  # otherwise the mass cancels
+        lines.append(("striker", f'mass = "{engineering(1e3 * mass / ratio, "g")}"'))
+        if test.uncertainties.keys() & {"stress_scale", "striker_mass"} == {"stress_scale"}:
+            lines.reverse()  # the mass is the number without a ±
+    return Contradiction("force_scale", ratio, limit, says, tuple(lines))
+
+
+def _of_motion(test: Measurement, ratio: float, limit: float) -> Contradiction:
+    """Return the contradiction between the scale of the motion and all else."""
+    says = f"the motion is {ratio:.2f} times as large as mass, velocity and force imply"
+    entry = test.entries.get("displacement", Entry("displacement", '"…"'))
+    line = entry.table, entry.times(1.0 / ratio, TENTH * limit)
+    return Contradiction("motion_scale", 1.0 / ratio, limit, says, (line,))
+
+
+def balance(test: Measurement) -> Balance:
+    """Return what the equation of motion of the striker shows in an impact."""
+    striker, w, stress, time = test.striker, test.displacement, test.stress, test.time
+    if striker is None or w is None or stress is None or time is None:
+        return Balance()
+    if not (striker.mass and striker.velocity) or test.motion == INTEGRATED:
+        return Balance()
+    integrated = "displacement" in test.derived  # from the acceleration, with the stated velocity
+    force = test.outliers.get("stress")
+    clipped = force is not None and force.clipped_at is not None
+    if clipped or (test.braked and integrated) or float(stress.max()) <= 0.0:
+        return Balance(test.flight)
+    fitted = _fitted(with_noise(test), striker.mass, w, stress, time)
+    if fitted is None:
+        return Balance(test.flight)
+    begins = test.flight is not None or stress[0] <= _LOADED * float(stress.max())
+    return Balance(
+        fitted[0] if begins and not integrated else None,
+        None if "stress" in test.derived else fitted[1],
+    )
+
+
+def _fitted(
+    test: Measurement, mass: float, w: Array, stress: Array, time: Array
+) -> tuple[Shown, Shown] | None:
+    """Fit the equation of motion; return velocity, m/s, and factor of the force."""
+    kept = test.sampled.get("displacement", np.ones(time.size, dtype=bool))
+    if (outliers := test.outliers.get("displacement")) is not None:
+        kept = kept & ~outliers.left_out
+    if np.count_nonzero(kept) < _FEWEST:
+        return None
+    per_mass, gravity = test.specimen.area / mass, test.striker and test.striker.gravity
+    integrals = _integrals(time, stress * per_mass)
+    # Priors of the zero of the force, which acts like an unknown gravity, and of the delay.
+    peak, loaded = float(stress.max()), float(np.ptp(time[stress > 0.02 * stress.max()]))
+    zero = max(min(test.zeros.get("stress", np.inf), ZERO * peak), 1e-6 * peak) * per_mass
+    known = [] if test.flight is None else [(1, *test.flight)]
+    known.append((3, 0.0, math.hypot(zero, GRAVITY if gravity is None else 0.0)))
+    late, most = 0.0, math.hypot(test.uncertainties.get("delay", 0.0), DELAY * loaded)
+    noise, of_force = test.noise.of("displacement"), test.noise.of("stress")
+    assert noise is not None
+    assert of_force is not None
+    scatter, steps = max(noise.sigma, 1e-9 * float(np.ptp(w))), noise.time
+    for _ in range(_ROUNDS):
+        rows = kept & (time - late <= time[-1])  # the force there is in the record
+        t = time[rows]
+        slowed, braked = (np.interp(t - late, time, part) for part in integrals)
+        columns = np.column_stack([np.ones(t.size), t, -braked, 0.5 * t**2, slowed])
+        y, priors = w[rows] - 0.5 * (gravity or 0.0) * t**2, [*known, (4, -late, most)]
+        found, errors = _solved(columns, y, scatter * math.sqrt(steps), priors)
+        left, late = y - columns @ found, late + float(found[4] / found[2])
+        rms = math.sqrt(left @ left / max(left.size - found.size, 1))
+        scatter, steps = max(scatter, rms), max(steps, residual_time(left))
+    if found[2] <= 0.0:
+        return None
+    # The inertia of the specimen, and the noise of the force, which the integral sums up.
+    inertia = 0.5 * (test.specimen.mass or 0.0) / mass
+    summed = of_force.sigma * math.sqrt(of_force.time / time.size) / float(stress.mean())
+    speed, factor = found[1:3].tolist()
+    error = math.hypot(errors[1], inertia * speed)
+    return (speed, error), (factor, math.hypot(errors[2], inertia, summed))
+
+
+def _integrals(time: Array, rate: Array) -> tuple[Array, Array]:
+    """Return first and second integral of a rate from time zero on, linear between samples."""
+    dt, lead = np.diff(time), max(float(time[0]), 0.0)
+    first = np.append(0.0, np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))) + 0.5 * lead * rate[0]
+    steps = first[:-1] * dt + dt**2 * (2.0 * rate[:-1] + rate[1:]) / 6.0
+    return first, np.append(0.0, np.cumsum(steps)) + lead**2 * rate[0] / 6.0
+
+
+def _solved(
+    columns: Array, y: Array, scatter: float, known: list[tuple[int, float, float]]
+) -> tuple[Array, Array]:
+    """Return the coefficients of the columns and their standard errors.
+
+    `scatter` is the standard deviation of y; `known` are index, mean and standard deviation of
+    coefficients with a prior.
+    """
+    rows = np.zeros((len(known), columns.shape[1]))
+    for row, (at, _, sigma) in zip(rows, known, strict=True):
+        row[at] = 1.0 / sigma
+    matrix = np.concatenate([columns / scatter, rows])
+    right = np.append(y / scatter, [mean / sigma for _, mean, sigma in known])
+    sizes = np.linalg.norm(matrix, axis=0)
+    inverse = np.linalg.pinv(matrix / sizes)
+    return inverse @ right / sizes, np.linalg.norm(inverse, axis=1) / sizes
