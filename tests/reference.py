@@ -3,8 +3,10 @@
 Nothing here uses the package. Springs and chains are any objects with the attributes of `Bistable`,
 `Linear` and `Chain` below. Derived points are roots of the branch functions, found by bracketing.
 Motions are integrated with DOP853 on fixed branches; the integration stops exactly at every switch
-and restarts there. Springs between two nodes that have mass (or are clamped or driven) form a
-group: they are in series and carry the same stress, which follows from the group's state.
+and restarts there. States at samples and switches are ends of steps: the error of a step is bounded
+by the tolerance, that of the interpolant of lower order between steps is not. Springs between two
+nodes that have mass (or are clamped or driven) form a group: they are in series and carry the same
+stress, which follows from the group's state.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.integrate import solve_ivp
+from scipy.integrate import DOP853, solve_ivp
 from scipy.optimize import brentq
 
 Array = NDArray[np.float64]
@@ -515,7 +517,7 @@ def _integrate(
         return system.solve(here, state.tolist())[1][0]
 
     off_contact.terminal, off_contact.direction = True, -1  # type: ignore[attr-defined]
-    longest = (t[-1] - t[0]) / steps
+    longest, entered = (t[-1] - t[0]) / steps, dict[int, float]()
     for j in range(len(knots) - 1):
         here, stop = float(knots[j]), float(knots[j + 1])
         if samples is not None:
@@ -547,30 +549,54 @@ def _integrate(
                 if not _missed(found, functions, meaning):
                     break
                 step = 0.2 * min(step, float(np.diff(found.t).max()))
-            reached = found.t[-1]
+            ends = [
+                gap for gap, at in zip(functions, found.t_events or (), strict=False) if len(at)
+            ]
+            reached = _event(system, found, ends[0]) if ends else found.t[-1]
             for k in np.flatnonzero((t > here) & (t <= reached)):
-                record(int(k), t[k], found.sol(t[k]) if t[k] < reached else found.y[:, -1])
-            here, y = reached, found.y[:, -1].copy()
+                record(int(k), t[k], _state(system, found, t[k]))
+            here, y = reached, _state(system, found, reached)
             if found.status == 0:
                 break
-            flipped = set()
             for times, (i, following) in zip(found.t_events, meaning, strict=True):
                 if len(times) and i == -1:
                     _fly(system, out, here, y)
                     return out
                 if len(times):
                     system.branch[i] = following
-                    flipped.add(i)
+                    entered[i] = here
                     out.switches.append((here, i, following))
             # other springs may switch at the same instant
             strain = system.solve(here, y.tolist())[0]
-            for i in set(range(system.n)) - flipped:
+            for i in range(system.n):
+                if here - entered.get(i, -np.inf) <= 1e-9 * longest:
+                    continue  # rounding must not send it back
                 for where, sense, following in system.laws[i].bounds(system.branch[i]):
                     if (strain[i] - where) * sense > 0.0:
-                        system.branch[i] = following
+                        system.branch[i], entered[i] = following, here
                         out.switches.append((here, i, following))
                         break
     return out
+
+
+def _state(system: _System, found: Any, at: float) -> Array:
+    """Return the state at a time, by a step of the method from the last step before it."""
+    last = int(np.clip(np.searchsorted(found.t, at) - 1, 0, found.t.size - 2))
+    start, y, h = found.t[last], found.y[:, last], at - found.t[last]
+    k = np.zeros((DOP853.n_stages, y.size))
+    for i in range(DOP853.n_stages):
+        k[i] = system.rhs(start + DOP853.C[i] * h, y + h * (DOP853.A[i, :i] @ k[:i]))
+    return np.asarray(y + h * (DOP853.B @ k))
+
+
+def _event(system: _System, found: Any, gap: Callable[[float, Any], float]) -> float:
+    """Return the time of an event, moved by a secant from where the interpolant has it."""
+    at = float(found.t[-1])
+    back = 1e-3 * (at - float(found.t[-2]))
+    now, before = (gap(end, _state(system, found, end)) for end in (at, at - back))
+    if now == before:
+        return at
+    return at + float(np.clip(-now * back / (now - before), -back, back))
 
 
 def _missed(found: Any, functions: Sequence[Any], meaning: Sequence[tuple[int, str]]) -> bool:

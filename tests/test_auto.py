@@ -731,7 +731,7 @@ def test_the_command_writes_to_auto(loop_file, tmp_path, monkeypatch):
     assert done.exit_code == 0, done.output
     assert "chosen of 1 model tried: bistable: its residuals are random" in done.stdout
     assert "no richer model was tried" in done.stdout
-    folder = tmp_path / "fits" / "loop" / "auto"
+    folder = tmp_path / "fits" / "loop" / "auto-starts-2"
     content = json.loads((folder / "fit.json").read_text())
     assert content["model"] == "bistable"
     assert [rung["chosen"] for rung in content["ladder"]["rungs"]] == [True]
@@ -759,4 +759,4 @@ def test_no_acceptable_rung_is_exit_code_two(loop_file, tmp_path):
     done = run("fit", loop_file, "--model", "auto", "--starts", 1, "--no-report")
     assert done.exit_code == 2
     assert "no acceptable fit" in done.stderr
-    assert (tmp_path / "fits" / "loop" / "auto" / "ladder.csv").is_file()
+    assert (tmp_path / "fits" / "loop" / "auto-starts-1" / "ladder.csv").is_file()

@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 
 import fabricated
 import foamfit as ff
-from conftest import without_pictures
+from conftest import synthetic_impact, without_pictures
 from foamfit.cli import main
 
 TOML = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\nmass = "1 g"\n'
@@ -116,11 +116,14 @@ def test_a_long_name_is_cut_and_stays_apart(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_default_drive_is_not_named_for_an_impact_either(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    striker = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
-    here.with_suffix(".toml").write_text(TOML + striker)
+    _, test = synthetic_impact()
+    striker = '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\ngravity = false\n'
+    size = f'height = "{test.specimen.height} m"\narea = "{test.specimen.area} m^2"\n'
+    here.with_suffix(".toml").write_text(f"[specimen]\n{size}{striker}")
     monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: fabricated.result())
-    first = here.read_text().splitlines()[:60]
-    here.write_text("\n".join(first) + "\n")
+    table = np.column_stack([test.time, test.stress, test.displacement])
+    header = "time (s),stress (Pa),displacement (m)"
+    np.savetxt(here, table, "%.12g", ",", header=header, comments="")
     assert fitted("--drive", "impact") == ["fits/foam/bistable"]
     assert "fits/foam/bistable-displacement" in fitted("--drive", "displacement")
 

@@ -99,7 +99,7 @@ def settle(
 
 
 def judged(
-    settled: Iterable[Settled], best: BestPoint, name: str, ends: Ends, state: tuple[str, str]
+    settled: Sequence[Settled], best: BestPoint, name: str, ends: Ends, state: tuple[str, str]
 ) -> tuple[str, str]:
     """Return state and reason of a parameter, which is not determined if it would move.
 
@@ -112,6 +112,10 @@ def judged(
             there = float((one.values + best.problem.origins)[best.index[name]])
         if there is None or not ends[0] <= there <= ends[1]:
             return "weak", say("why", "contested", way=one.words, there=there, unit=unit)
+    # The law errs in an impact, and the contradiction may be the reason.
+    held = best.problem.kept and best.problem.objective.drive == "impact"
+    if state[0] == "determined" and held and settled:
+        return "weak", say("why", "contested_held")
     return state
 
 
@@ -122,6 +126,8 @@ def _refitted(best: BestPoint, way: Way, starts: int = 0) -> Array | None:
     """
     problem, values, test = best.problem, best.values.copy(), best.problem.measurement
     params, stresses = problem.params.copy(), way.get("stress_scale", 1.0)
+    for name in problem.kept if way else ():  # held for an error that may be the contradiction's
+        params[name].set(vary=True)
     of_stress = [unit_of(name).startswith("Pa") for name in problem.names]
     values[of_stress] *= stresses  # a good start, exact along a given motion
     for name, by in way.items():
