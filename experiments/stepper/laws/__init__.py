@@ -1,0 +1,1 @@
+"""Laws for the stepper, one in a file."""
