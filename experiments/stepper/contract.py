@@ -2,7 +2,7 @@
 
 The stepper is compiled once for all laws; a law is compiled alone, and a registered one runs as
 fast as a built-in one. A spring is a row of numbers, which `fill` computes from its parameters, and
-a memory of `MEMORY` numbers, which only its law changes, at switches of branch.
+a memory of RESULTS numbers, which only its law changes, at switches of branch.
 
     evaluate(row, memory, eps, x, want, out) -> sigma
         Fill out[SLOPE] = dσ/dε and out[MISS] = ε(x) - ε, and if `want` is not 0 the derivatives of
@@ -27,17 +27,19 @@ from llvmlite import ir
 from numba import cfunc, njit, types
 from numba.extending import intrinsic
 
+# A spring is one row of numbers: its memory, the results of its law, values now, and constants.
 # Memory: branch; strains at its ends; TURNS: 1 (-1) if it ends where the strain stops rising
 # (falling); numbers held until a switch; then whatever the law keeps.
-BRANCH, LOW, HIGH, TURNS, HELD, OWN, MEMORY = 0, 1, 2, 3, 4, 6, 16
-HELD_NUMBERS = 2
+BRANCH, LOW, HIGH, TURNS, HELD, OWN, HELD_NUMBERS = 0, 1, 2, 3, 4, 6, 2
 # Results of `evaluate`; of `switch`, for each held number.
 SLOPE, MISS, BY, BY_HELD, RESULTS = 0, 1, 2, 14, 16
-OF_STRESS, OF_HELD, OF_PARAMETER, CHANGE = 0, 1, 3, 16
+OF_STRESS, OF_HELD, OF_PARAMETER, CHANGE, CHANGES = 0, 1, 3, 16, 32
+# Values now and before; height, dashpot, 1 + Σ g; the row of the law; g and τ of relaxation terms.
+EPS, RATE, SIGMA, STRESS, DRIFT, OLD_EPS, OLD_RATE = range(64, 71)
+HEIGHT, ETA, GAIN, ROW, RELAX = 72, 73, 74, 80, 96
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 _INSIDE: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-maker = njit(**_INSIDE)
 # Without reference counts, which take longer than the loops.
 inner = njit(**_INSIDE, _nrt=False)
 inlined = njit(**_INSIDE, _nrt=False, forceinline=True)
@@ -58,34 +60,48 @@ class Law(NamedTuple):
 
 
 @intrinsic
-def call_law(typing, address, i, rows, memory, eps, x, flag, out):
-    """Call evaluate or switch of spring i; rows of the arrays are passed as pointers."""
+def start(typing, array):
+    """Return the pointer to the first element of an array."""
 
     def emit(context, builder, signature, args):
-        def row_of(index, which):
-            array = context.make_array(signature.args[which])(context, builder, args[which])
-            stride = builder.extract_value(array.shape, 1)
-            return builder.gep(array.data, [builder.mul(index, stride)])
+        return context.make_array(signature.args[0])(context, builder, args[0]).data
 
-        given = row_of(args[1], 2), row_of(args[1], 3), args[4], args[5], args[6]
-        values = [*given, row_of(args[1], 7)]
-        kind = ir.FunctionType(ir.DoubleType(), [value.type for value in values])
-        return builder.call(builder.inttoptr(args[0], kind.as_pointer()), values)
-
-    return _F(_I, _I, rows, memory, _F, _F, _I, out), emit
+    return types.CPointer(array.dtype)(array), emit
 
 
 @intrinsic
-def call_begin(typing, address, i, rows, memory):
-    """Call begin of spring i."""
+def past(typing, pointer, count):
+    """Return the pointer to the element number `count`."""
 
     def emit(context, builder, signature, args):
-        values = []
-        for which in (2, 3):
-            array = context.make_array(signature.args[which])(context, builder, args[which])
-            stride = builder.extract_value(array.shape, 1)
-            values.append(builder.gep(array.data, [builder.mul(args[1], stride)]))
-        kind = ir.FunctionType(ir.DoubleType(), [value.type for value in values])
-        return builder.call(builder.inttoptr(args[0], kind.as_pointer()), values)
+        return builder.gep(args[0], [args[1]])
 
-    return _F(_I, _I, rows, memory), emit
+    return pointer(pointer, _I), emit
+
+
+def _call(builder, address, values):
+    kind = ir.FunctionType(ir.DoubleType(), [value.type for value in values])
+    return builder.call(builder.inttoptr(address, kind.as_pointer()), values)
+
+
+@intrinsic
+def call_law(typing, address, spring, eps, x, flag, results):
+    """Call evaluate or switch of a spring; its results go to the column `results`."""
+
+    def emit(context, builder, signature, args):
+        row = builder.gep(args[1], [ir.Constant(ir.IntType(64), ROW)])
+        out = builder.gep(args[1], [args[5]])
+        return _call(builder, args[0], [row, args[1], args[2], args[3], args[4], out])
+
+    return _F(_I, _P, _F, _F, _I, _I), emit
+
+
+@intrinsic
+def call_begin(typing, address, spring):
+    """Call begin of a spring."""
+
+    def emit(context, builder, signature, args):
+        row = builder.gep(args[1], [ir.Constant(ir.IntType(64), ROW)])
+        return _call(builder, args[0], [row, args[1]])
+
+    return _F(_I, _P), emit

@@ -20,12 +20,13 @@ A zero-mass node therefore needs no equation to be solved, and its derivatives a
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from contract import (
-    BRANCH, BY, BY_HELD, CHANGE, HELD, HELD_NUMBERS, HIGH, LOW, MEMORY, OF_HELD, OF_PARAMETER,
-    OF_STRESS, OPTIONS, RESULTS, SLOPE, TURNS, call_begin, call_law, inlined, inner, maker,
+    BY, BY_HELD, CHANGE, CHANGES, DRIFT, EPS, ETA, GAIN, HEIGHT, HELD_NUMBERS, HIGH, LOW, OF_HELD,
+    OF_PARAMETER, OF_STRESS, OLD_EPS, OLD_RATE, OPTIONS, RATE, RELAX, RESULTS, SIGMA, SLOPE, STRESS,
+    TURNS, call_begin, call_law, inner, past, start,
 )  # fmt: skip
 from numba import njit
 from numpy.typing import NDArray
@@ -38,628 +39,633 @@ STAGES, ALL_STAGES = 12, 16
 _A = np.zeros((ALL_STAGES, ALL_STAGES))
 _A[:, : pair.A.shape[1]] = pair.A
 _A[STAGES, :STAGES] = pair.B
-# Coefficients without zeros: stage s is the sum of WEIGHT[k] K[FROM[k]] for FIRST[s] <= k < FIRST[s+1].
-_ROWS = [np.flatnonzero(row) for row in _A]
-_D = np.zeros((4, ALL_STAGES))
-_D[:, :] = pair.D
-_ROWS += [np.flatnonzero(row) for row in _D]
+# Coefficients without zeros: stage s is the sum of WEIGHT[k] K[FROM[k]], FIRST[s] <= k < FIRST[s+1];
+# after the stages come the four higher terms of the dense output, and the errors of order 5 and 3.
+_FULL = np.zeros((22, ALL_STAGES))
+_FULL[:16], _FULL[16:20], _FULL[20, :13], _FULL[21, :13] = _A, pair.D, pair.E5, pair.E3
+_ROWS = [np.flatnonzero(row) for row in _FULL]
 FIRST = np.cumsum([0] + [len(row) for row in _ROWS])
 FROM = np.concatenate(_ROWS)
-WEIGHT = np.concatenate([full[row] for full, row in zip(np.vstack([_A, _D]), _ROWS, strict=True)])
-E3, E5 = pair.E3[:13].copy(), pair.E5[:13].copy()
+WEIGHT = np.concatenate([full[row] for full, row in zip(_FULL, _ROWS, strict=True)])
 
 # Directions of derivatives apart from the parameters of a law, as in foamfit.
 OWN_ETA, OWN_HEIGHT, DRAG, RELAXING = 20, 21, 22, 23
 DONE, TOO_MANY, UNDERFLOW = range(3)
-# Columns: of a spring; of its places in the state (-1: none); of its values now.
-HEIGHT, ETA, GAIN, OF_SPRING = range(4)
-EPS_AT, X_AT, Z_AT, D_EPS_AT, D_Z_AT, IMPLICIT, PLACES = range(7)
-EPS, RATE, SIGMA, STRESS, DRIFT, NOW = range(6)
+# Places of a spring in the state (-1: none), and addresses of its law.
+EPS_AT, X_AT, Z_AT, D_EPS_AT, D_Z_AT, IMPLICIT, LAW, PLACES = 0, 1, 2, 3, 4, 5, 6, 10
 RISEN = 1e-9  # base stress over the largest stress above which its return to zero ends the contact
 
 
 class Chain(NamedTuple):
-    """The constants of a run, and what is known at the present point."""
+    """A chain in a run: pointers and sizes."""
 
-    rows: Array
-    memory: Array
-    laws: Integers  #: addresses, (springs, 3)
-    spring: Array  #: (springs, OF_SPRING)
-    relax: Array  #: g and tau, (springs, 2 terms)
-    ends: Integers
-    mass: Array
+    springs: Any  #: rows of `width` numbers, see `contract`
+    places: Any  #: rows of PLACES integers
+    ends: Any  #: one past the last spring of each group
+    directions: Any  #: of the derivatives, (p, 2)
+    mass: Any  #: of the nodes, over the area
+    carried: Any  #: stress of each group, and the push on the top
+    own: Any  #: derivatives of height and of eta of each spring; of drag
+    held: Any  #: of the held numbers of each spring
+    part: Any  #: of the stress of each spring at fixed strain, then of its T at fixed strain
+    common: Any  #: of the stress of each group, of the push; two rows to work with
+    strain: Any  #: of the strains
+    width: int
+    count: int  #: springs
+    groups: int
+    p: int
+    base: int  #: values before the derivatives in the state
+    terms: int  #: of relaxation
     drag: float
-    place: Integers  #: (springs, PLACES)
-    now: Array  #: (springs, NOW)
-    by: Array  #: results of the laws, (springs, RESULTS)
-    carried: Array  #: stress of each group, (groups + 1,)
-    directions: Integers
-    own: Array  #: derivatives of height and eta, (springs, 2, p), and of the drag, in the last row
-    d_held: Array  #: derivatives of held numbers, (springs, HELD_NUMBERS, p)
-    part: Array  #: derivatives of stress at fixed strain; at fixed strain and z, total; (2 springs, p)
-    d_now: Array  #: of the stresses of the groups, (groups + 1, p); of one elongation and its rate
-    d_eps: Array  #: of the strains, (springs, p)
 
 
-@inlined
-def follow_group(c, g, y, f, reach, rate, want):
+@inner
+def follow_group(c, g, y, f, want):
     """Fill the values of the springs of a group and their part of the rates `f`; return S."""
     i0, i1 = (c.ends[g - 1] if g > 0 else 0), c.ends[g]
-    damped, weight, total, loose, flat = 0, 0.0, rate, -1, -1
+    reach, rate = y[2 * g], y[2 * g + 1]
+    if g > 0:
+        reach, rate = reach - y[2 * g - 2], rate - y[2 * g - 1]
+    weight, total, loose, flat = 0.0, rate, -1, -1
     for i in range(i0, i1):
-        h, eta, gain, at, z_at = c.spring[i, HEIGHT], c.spring[i, ETA], c.spring[i, GAIN], c.place[i, X_AT], c.place[i, Z_AT]
-        eps = reach / h if c.place[i, EPS_AT] < 0 else y[c.place[i, EPS_AT]]
-        x = y[at] if at >= 0 else 0.0
-        sigma = call_law(c.laws[i, 0], i, c.rows, c.memory, eps, x, want, c.by)
+        s, place = past(c.springs, i * c.width), past(c.places, i * PLACES)
+        h, eta, gain = s[HEIGHT], s[ETA], s[GAIN]
+        eps = reach / h if place[EPS_AT] < 0 else y[place[EPS_AT]]
+        x = y[place[X_AT]] if place[X_AT] >= 0 else 0.0
+        sigma = call_law(place[LAW], s, eps, x, want, RESULTS)
         stress, drift = gain * sigma, 0.0
-        if gain != 1.0:
-            for k in range(c.relax.shape[1] // 2):
-                z = y[z_at + k]
-                f[z_at + k] = dz = -(z + sigma) / c.relax[i, 2 * k + 1]
-                stress += c.relax[i, 2 * k] * z
-                drift += c.relax[i, 2 * k] * dz
-        c.now[i, EPS], c.now[i, SIGMA], c.now[i, STRESS], c.now[i, DRIFT] = eps, sigma, stress, drift
+        for k in range(c.terms):
+            z, at = y[place[Z_AT] + k], RELAX + 2 * k
+            dz = -(z + sigma) / s[at + 1]
+            f[place[Z_AT] + k] = dz
+            stress += s[at] * z
+            drift += s[at] * dz
+        s[EPS], s[SIGMA], s[STRESS], s[DRIFT] = eps, sigma, stress, drift
         if eta > 0.0:
-            damped += 1
             weight += h / eta
             total += h / eta * stress
         else:
             loose = i
-            if c.by[i, SLOPE] == 0.0:
+            if s[RESULTS + SLOPE] == 0.0:
                 flat = i
+    s = past(c.springs, i0 * c.width)
     if i1 - i0 == 1:
-        c.now[i0, RATE] = rate / c.spring[i0, HEIGHT]
-        common = c.now[i0, STRESS] + c.spring[i0, ETA] * c.now[i0, RATE]
-    elif loose < 0:
-        common = total / weight
-    else:
-        common, soft, rest = c.now[loose, STRESS], 0.0, rate
+        s[RATE] = rate / s[HEIGHT]
+        common = s[STRESS] + s[ETA] * s[RATE]
+        if c.places[i0 * PLACES + X_AT] >= 0:
+            f[c.places[i0 * PLACES + X_AT]] = s[RESULTS + SLOPE] * s[RATE]
+        c.carried[g] = common
+        return common
+    soft, common = 0.0, total / weight
+    if loose >= 0:
+        common, total = c.springs[loose * c.width + STRESS], rate
         for i in range(i0, i1):
-            h = c.spring[i, HEIGHT]
-            if c.spring[i, ETA] > 0.0:
-                rest -= h * (common - c.now[i, STRESS]) / c.spring[i, ETA]
+            s = past(c.springs, i * c.width)
+            if s[ETA] > 0.0:
+                total -= s[HEIGHT] * (common - s[STRESS]) / s[ETA]
             elif flat < 0:
-                compliance = h / (c.spring[i, GAIN] * c.by[i, SLOPE])
+                compliance = s[HEIGHT] / (s[GAIN] * s[RESULTS + SLOPE])
                 soft += compliance
-                rest += compliance * c.now[i, DRIFT]
-        for i in range(i0, i1):
-            if c.spring[i, ETA] == 0.0:
-                if flat < 0:
-                    c.now[i, RATE] = (rest / soft - c.now[i, DRIFT]) / (c.spring[i, GAIN] * c.by[i, SLOPE])
-                else:
-                    c.now[i, RATE] = rest / c.spring[i, HEIGHT] if i == flat else 0.0
+                total += compliance * s[DRIFT]
     for i in range(i0, i1):
-        if i1 - i0 > 1:
-            if c.spring[i, ETA] > 0.0:
-                c.now[i, RATE] = (common - c.now[i, STRESS]) / c.spring[i, ETA]
-            f[c.place[i, EPS_AT]] = c.now[i, RATE]
-        if c.place[i, X_AT] >= 0:
-            f[c.place[i, X_AT]] = c.by[i, SLOPE] * c.now[i, RATE]
+        s, place = past(c.springs, i * c.width), past(c.places, i * PLACES)
+        if s[ETA] > 0.0:
+            s[RATE] = (common - s[STRESS]) / s[ETA]
+        elif flat < 0:
+            s[RATE] = (total / soft - s[DRIFT]) / (s[GAIN] * s[RESULTS + SLOPE])
+        else:
+            s[RATE] = total / s[HEIGHT] if i == flat else 0.0
+        f[place[EPS_AT]] = s[RATE]
+        if place[X_AT] >= 0:
+            f[place[X_AT]] = s[RESULTS + SLOPE] * s[RATE]
     c.carried[g] = common
     return common
 
 
-@inlined
-def derive_spring(c, i, y, f):
-    """Fill the derivatives of the stress of a spring at fixed strain, and at fixed z, total."""
-    p, count = c.directions.shape[0], c.ends[-1]
-    part, total = c.part[i], c.part[count + i]
-    gain, at, terms = c.spring[i, GAIN], c.place[i, D_Z_AT], c.relax.shape[1] // 2
-    if c.place[i, IMPLICIT] > 0:
-        a, b = c.by[i, BY_HELD], c.by[i, BY_HELD + 1]
+@inner
+def derive_spring(c, i, y):
+    """Fill the derivatives of the stress of a spring at fixed strain, and of T at fixed strain."""
+    s, place, p = past(c.springs, i * c.width), past(c.places, i * PLACES), c.p
+    part, total = past(c.part, i * p), past(c.part, (c.count + i) * p)
+    if place[IMPLICIT] > 0:
+        a, b, held = s[RESULTS + BY_HELD], s[RESULTS + BY_HELD + 1], past(c.held, 2 * i * p)
         for j in range(p):
-            part[j] = a * c.d_held[i, 0, j] + b * c.d_held[i, 1, j]
-        for j in range(p):
-            if c.directions[j, 0] == i and c.directions[j, 1] < OWN_ETA:
-                part[j] += c.by[i, BY + c.directions[j, 1]]
+            part[j] = a * held[j] + b * held[p + j]
     else:
         for j in range(p):
-            if c.directions[j, 0] == i and c.directions[j, 1] < OWN_ETA:
-                part[j] = c.by[i, BY + c.directions[j, 1]]
+            part[j] = 0.0
     for j in range(p):
-        total[j] = gain * part[j]
-    if terms > 0:
-        for k in range(terms):
-            g = c.relax[i, 2 * k]
-            for j in range(p):
-                total[j] += g * y[at + k * p + j]
+        what = c.directions[2 * j + 1]
+        if c.directions[2 * j] == i and what < OWN_ETA:
+            part[j] += s[RESULTS + BY + what]
+        total[j] = s[GAIN] * part[j]
+    for k in range(c.terms):
+        g, dz = s[RELAX + 2 * k], past(y, place[D_Z_AT] + k * p)
         for j in range(p):
-            what = c.directions[j, 1] - RELAXING
-            if c.directions[j, 0] == i and what >= 0 and what % 2 == 0:
-                total[j] += c.now[i, SIGMA] + y[c.place[i, Z_AT] + what // 2]
-
-
-@inlined
-def relax_spring(c, i, y, f):
-    """Fill the rates of the derivatives of the relaxation terms."""
-    d_eps, p, terms = c.d_eps[i], c.directions.shape[0], c.relax.shape[1] // 2
-    for k in range(terms):
-        at, per = c.place[i, D_Z_AT] + k * p, 1.0 / c.relax[i, 2 * k + 1]
-        for j in range(p):
-            f[at + j] = -per * (y[at + j] + c.by[i, SLOPE] * d_eps[j] + c.part[i, j])
-    for j in range(p):
-        what = c.directions[j, 1] - RELAXING
-        if c.directions[j, 0] == i and what >= 0 and what % 2 == 1:
-            z_at, tau = c.place[i, Z_AT] + what // 2, c.relax[i, what]
-            f[c.place[i, D_Z_AT] + what // 2 * p + j] += (y[z_at] + c.now[i, SIGMA]) / (tau * tau)
-
-
-@inlined
-def derive_group(c, g, base, y, f):
-    """Fill the derivatives of the stress of a group, and of the rates of its springs."""
-    i0, i1, p, nodes = (c.ends[g - 1] if g > 0 else 0), c.ends[g], c.directions.shape[0], c.mass.size
-    d_reach, d_rate, out, count = c.d_now[nodes + 1], c.d_now[nodes + 2], c.d_now[g], c.ends[-1]
-    at = base + 2 * g * p
-    for j in range(p):
-        d_reach[j], d_rate[j] = y[at + j], y[at + p + j]
-    if g > 0:
-        for j in range(p):
-            d_reach[j] -= y[at - 2 * p + j]
-            d_rate[j] -= y[at - p + j]
-    for i in range(i0, i1):
-        derive_spring(c, i, y, f)
-    if i1 - i0 == 1:
-        i, total, h_own, eta_own = i0, c.part[count + i0], c.own[2 * i0], c.own[2 * i0 + 1]
-        h, eta, rate, eps = 1.0 / c.spring[i, HEIGHT], c.spring[i, ETA], c.now[i, RATE], c.now[i, EPS]
-        slope = c.by[i, SLOPE] * c.spring[i, GAIN]
-        d_eps = c.d_eps[i]
-        for j in range(p):
-            d_eps[j] = (d_reach[j] - eps * h_own[j]) * h
-            out[j] = slope * d_eps[j] + total[j]
-        for j in range(p):
-            out[j] += eta_own[j] * rate + eta * h * (d_rate[j] - rate * h_own[j])
-        relax_spring(c, i, y, f)
-        return
-    loose, soft, weight, flat = -1, 0.0, 0.0, -1
-    for i in range(i0, i1):
-        if c.spring[i, ETA] > 0.0:
-            weight += c.spring[i, HEIGHT] / c.spring[i, ETA]
-            continue
-        loose = i
-        if c.by[i, SLOPE] == 0.0:
-            flat = i
-        else:
-            soft += c.spring[i, HEIGHT] / (c.spring[i, GAIN] * c.by[i, SLOPE])
-    for i in range(i0, i1):  # of damped springs `total` becomes the whole derivative
-        total, h, eta = c.part[count + i], c.spring[i, HEIGHT], c.spring[i, ETA]
-        slope, mine = c.spring[i, GAIN] * c.by[i, SLOPE], c.place[i, D_EPS_AT]
-        if eta > 0.0:
-            for j in range(p):
-                total[j] += slope * y[mine + j]
-        if loose < 0:
-            over = c.now[i, STRESS] - c.carried[g]
-            for j in range(p):
-                d_rate[j] += h / eta * total[j] + over / eta * (c.own[2 * i, j] - h / eta * c.own[2 * i + 1, j])
-        else:
-            for j in range(p):
-                d_reach[j] -= c.now[i, EPS] * c.own[2 * i, j]
-                if eta > 0.0:
-                    d_reach[j] -= h * y[mine + j]
-                elif flat < 0:
-                    d_reach[j] += h / slope * total[j]
-    for j in range(p):
-        out[j] = d_rate[j] / weight if loose < 0 else d_reach[j] / soft if flat < 0 else c.part[count + flat, j]
-        d_reach[j] -= out[j] * soft  # left for a flat branch
-    for i in range(i0, i1):
-        total, eta, mine = c.part[count + i], c.spring[i, ETA], c.place[i, D_EPS_AT]
-        slope = c.spring[i, GAIN] * c.by[i, SLOPE]
-        for j in range(p):
-            if eta > 0.0:
-                f[mine + j] = (out[j] - total[j] - c.now[i, RATE] * c.own[2 * i + 1, j]) / eta
-                c.d_eps[i, j] = y[mine + j]
-            elif i == flat:
-                c.d_eps[i, j] = d_reach[j] / c.spring[i, HEIGHT]
-            else:
-                c.d_eps[i, j] = (out[j] - total[j]) / slope if slope > 0.0 else 0.0
-        relax_spring(c, i, y, f)
-
-
-@inlined
-def rates(c, base, y, f, push, want):
-    """Fill the rates f of a state y (with derivatives if `want`)."""
-    last, p = c.mass.size - 1, c.directions.shape[0]
-    for g in range(last + 1):
-        reach, rate = y[2 * g], y[2 * g + 1]
-        if g > 0:
-            reach, rate = reach - y[2 * g - 2], rate - y[2 * g - 1]
-        follow_group(c, g, y, f, reach, rate, want)
-        if want:
-            derive_group(c, g, base, y, f)
-    c.carried[last + 1] = push
-    for g in range(last + 1):
-        f[2 * g] = y[2 * g + 1]
-        drag, per = (c.drag if g == last else 0.0), 1.0 / c.mass[g]
-        f[2 * g + 1] = (c.carried[g + 1] - c.carried[g] - drag * y[2 * g + 1]) * per
-        if want:
-            at, of_drag = base + 2 * g * p, c.own[2 * c.ends[-1]]
-            here, above = c.d_now[g], c.d_now[g + 1]
-            for j in range(p):
-                f[at + j] = y[at + p + j]
-                f[at + p + j] = (above[j] - here[j] - drag * y[at + p + j]) * per
-            if g == last:
-                for j in range(p):
-                    f[at + p + j] -= of_drag[j] * y[2 * g + 1] * per
-
-
-@inlined
-def combine(stage, n, first, last, scale, start, out):
-    """Fill out = start + scale Σ WEIGHT[k] stage[FROM[k]]."""
-    for i in range(0, n, 4):
-        a = b = c = d = 0.0
-        for k in range(first, last):
-            weight, q = WEIGHT[k], FROM[k]
-            a += weight * stage[q, i]
-            b += weight * stage[q, i + 1]
-            c += weight * stage[q, i + 2]
-            d += weight * stage[q, i + 3]
-        out[i] = start[i] + scale * a
-        out[i + 1] = start[i + 1] + scale * b
-        out[i + 2] = start[i + 2] + scale * c
-        out[i + 3] = start[i + 3] + scale * d
-
-
-@inlined
-def dense(line, y, n, x, out):
-    """Fill the state at the share x of the step."""
-    z = 1.0 - x
-    for i in range(n):
-        value = line[4, i] + z * (line[5, i] + x * line[6, i])
-        value = line[2, i] + z * (line[3, i] + x * value)
-        out[i] = y[i] + x * (line[0, i] + z * (line[1, i] + x * value))
+            total[j] += g * dz[j]
+            if c.directions[2 * j] == i and c.directions[2 * j + 1] == RELAXING + 2 * k:
+                total[j] += s[SIGMA] + y[place[Z_AT] + k]
 
 
 @inner
-def look(c, base, line, y, x, state, f, push):
-    """Fill the values of the springs at the share x of the step."""
-    dense(line, y, base, x, state)
-    rates(c, base, state, f, push, 0)
+def relax_spring(c, i, y, f):
+    """Fill the rates of the derivatives of the relaxation terms of a spring."""
+    s, place, p = past(c.springs, i * c.width), past(c.places, i * PLACES), c.p
+    part, strain = past(c.part, i * p), past(c.strain, i * p)
+    for k in range(c.terms):
+        at, per = place[D_Z_AT] + k * p, 1.0 / s[RELAX + 2 * k + 1]
+        more = (y[place[Z_AT] + k] + s[SIGMA]) * per * per
+        for j in range(p):
+            f[at + j] = -per * (y[at + j] + s[RESULTS + SLOPE] * strain[j] + part[j])
+            if c.directions[2 * j] == i and c.directions[2 * j + 1] == RELAXING + 2 * k + 1:
+                f[at + j] += more
+
+
+@inner
+def derive_group(c, g, y, f):
+    """Fill the derivatives of the stress of a group, and of the rates of its springs."""
+    i0, i1, p = (c.ends[g - 1] if g > 0 else 0), c.ends[g], c.p
+    out, reach, rate = past(c.common, g * p), past(c.common, (c.groups + 1) * p), past(c.common, (c.groups + 2) * p)
+    dw = past(y, c.base + 2 * g * p)
+    for j in range(p):
+        reach[j], rate[j] = dw[j], dw[p + j]
+    if g > 0:
+        below = past(y, c.base + 2 * (g - 1) * p)
+        for j in range(p):
+            reach[j] -= below[j]
+            rate[j] -= below[p + j]
+    if i1 - i0 == 1:
+        derive_spring(c, i0, y)
+        s, own, strain = past(c.springs, i0 * c.width), past(c.own, 2 * i0 * p), past(c.strain, i0 * p)
+        per, eta, total = 1.0 / s[HEIGHT], s[ETA], past(c.part, (c.count + i0) * p)
+        slope = s[RESULTS + SLOPE] * s[GAIN]
+        for j in range(p):
+            strain[j] = (reach[j] - s[EPS] * own[j]) * per
+            faster = (rate[j] - s[RATE] * own[j]) * per
+            out[j] = slope * strain[j] + total[j] + own[p + j] * s[RATE] + eta * faster
+        relax_spring(c, i0, y, f)
+        return
+    loose, soft, weight, flat = -1, 0.0, 0.0, -1
+    for i in range(i0, i1):
+        s = past(c.springs, i * c.width)
+        if s[ETA] > 0.0:
+            weight += s[HEIGHT] / s[ETA]
+            continue
+        loose = i
+        if s[RESULTS + SLOPE] == 0.0:
+            flat = i
+        else:
+            soft += s[HEIGHT] / (s[GAIN] * s[RESULTS + SLOPE])
+    for i in range(i0, i1):  # of damped springs `total` becomes the whole derivative
+        derive_spring(c, i, y)
+        s, own, total = past(c.springs, i * c.width), past(c.own, 2 * i * p), past(c.part, (c.count + i) * p)
+        slope, mine, share = s[GAIN] * s[RESULTS + SLOPE], c.places[i * PLACES + D_EPS_AT], 0.0
+        if s[ETA] > 0.0:
+            share = s[HEIGHT] / s[ETA]
+            for j in range(p):
+                total[j] += slope * y[mine + j]
+        elif flat < 0:
+            share = s[HEIGHT] / slope
+        over = (s[STRESS] - c.carried[g]) / s[ETA] if loose < 0 else 0.0
+        for j in range(p):
+            if loose < 0:
+                rate[j] += share * total[j] + over * (own[j] - share * own[p + j])
+            else:
+                reach[j] -= s[EPS] * own[j] + (s[HEIGHT] * y[mine + j] if s[ETA] > 0.0 else -share * total[j])
+    if flat < 0:
+        per = 1.0 / (weight if loose < 0 else soft)
+        for j in range(p):
+            out[j] = per * (rate[j] if loose < 0 else reach[j])
+    else:
+        for j in range(p):
+            out[j] = c.part[(c.count + flat) * p + j]
+            reach[j] -= out[j] * soft  # left for the flat branch
+    for i in range(i0, i1):
+        s, own, total = past(c.springs, i * c.width), past(c.own, 2 * i * p), past(c.part, (c.count + i) * p)
+        slope, mine, strain = s[GAIN] * s[RESULTS + SLOPE], c.places[i * PLACES + D_EPS_AT], past(c.strain, i * p)
+        per = 1.0 / (s[ETA] if s[ETA] > 0.0 else s[HEIGHT] if i == flat else slope)
+        for j in range(p):
+            if s[ETA] > 0.0:
+                f[mine + j] = per * (out[j] - total[j] - s[RATE] * own[p + j])
+                strain[j] = y[mine + j]
+            else:
+                strain[j] = per * (reach[j] if i == flat else out[j] - total[j])
+        relax_spring(c, i, y, f)
+
+
+@inner
+def rates(c, y, f, want):
+    """Fill the rates f of a state y (with derivatives if `want`)."""
+    p = c.p
+    for g in range(c.groups):
+        follow_group(c, g, y, f, want)
+        if want:
+            derive_group(c, g, y, f)
+    for g in range(c.groups):
+        v, per = y[2 * g + 1], 1.0 / c.mass[g]
+        drag = c.drag if g == c.groups - 1 else 0.0
+        f[2 * g] = v
+        f[2 * g + 1] = (c.carried[g + 1] - c.carried[g] - drag * v) * per
+        if want:
+            dv, df = past(y, c.base + (2 * g + 1) * p), past(f, c.base + 2 * g * p)
+            here, above, of_drag = past(c.common, g * p), past(c.common, (g + 1) * p), past(c.own, 2 * c.count * p)
+            for j in range(p):
+                df[j] = dv[j]
+            for j in range(p):
+                df[p + j] = (above[j] - here[j] - drag * dv[j]) * per
+            if g == c.groups - 1:
+                for j in range(p):
+                    df[p + j] -= of_drag[j] * v * per
+
+
+@inner
+def combine(stage, wide, n, row, scale, begin, out):
+    """Fill out = begin + scale Σ WEIGHT[k] stage[FROM[k]] of a row of coefficients."""
+    for i in range(0, n, 4):
+        a = b = c = d = 0.0
+        for k in range(FIRST[row], FIRST[row + 1]):
+            weight, at = WEIGHT[k], FROM[k] * wide + i
+            a += weight * stage[at]
+            b += weight * stage[at + 1]
+            c += weight * stage[at + 2]
+            d += weight * stage[at + 3]
+        out[i] = begin[i] + scale * a
+        out[i + 1] = begin[i + 1] + scale * b
+        out[i + 2] = begin[i + 2] + scale * c
+        out[i + 3] = begin[i + 3] + scale * d
+
+
+@inner
+def dense(line, wide, y, n, x, out):
+    """Fill the state at the share x of the step."""
+    z = 1.0 - x
+    for i in range(n):
+        value = line[4 * wide + i] + z * (line[5 * wide + i] + x * line[6 * wide + i])
+        value = line[2 * wide + i] + z * (line[3 * wide + i] + x * value)
+        out[i] = y[i] + x * (line[i] + z * (line[wide + i] + x * value))
+
+
+@inner
+def make_dense(stage, wide, y, new, dt, nil, line):
+    """Fill the polynomials of a step."""
+    for i in range(wide):
+        rise, last = new[i] - y[i], stage[STAGES * wide + i]
+        line[i], line[wide + i] = rise, dt * stage[i] - rise
+        line[2 * wide + i] = 2.0 * rise - dt * (last + stage[i])
+    for q in range(4):
+        combine(stage, wide, wide, ALL_STAGES + q, dt, nil, past(line, (3 + q) * wide))
 
 
 @inner
 def excess(c, i, kind):
-    """Return how far a spring is past an end of its branch (positive), or the contact past its."""
+    """Return how far a spring is past the end of its branch, or the contact past its own."""
+    s = past(c.springs, i * c.width)
     if kind == 3:
         return -c.carried[0]
     if kind == 2:
-        return -c.memory[i, TURNS] * c.now[i, RATE]
-    eps = c.now[i, EPS]
-    return eps - c.memory[i, HIGH] if kind == 0 else c.memory[i, LOW] - eps
+        return -s[TURNS] * s[RATE]
+    return s[EPS] - s[HIGH] if kind == 0 else s[LOW] - s[EPS]
 
 
 @inner
-def first_event(c, base, line, y, state, f, push, risen):
+def look(c, line, wide, y, x, state, f, i, kind):
+    """Return the excess of a spring at the share x of the step."""
+    dense(line, wide, y, c.base, x, state)
+    rates(c, state, f, 0)
+    return excess(c, i, kind)
+
+
+@inner
+def locate(c, line, wide, y, low, high, state, f, i, kind):
+    """Return where an excess becomes positive between two shares, by Illinois' method."""
+    f_low = look(c, line, wide, y, low, state, f, i, kind)
+    f_high, side = look(c, line, wide, y, high, state, f, i, kind), 0
+    if f_low >= 0.0:
+        return low
+    for _ in range(60):
+        middle = high - f_high * (high - low) / (f_high - f_low)
+        if high - low <= 4e-16 or not low < middle < high:
+            break
+        value = look(c, line, wide, y, middle, state, f, i, kind)
+        if kind < 2 and abs(value) < 1e-15:
+            return middle
+        if value > 0.0:
+            f_low *= 0.5 if side == 1 else 1.0
+            high, f_high, side = middle, value, 1
+        else:
+            f_high *= 0.5 if side == -1 else 1.0
+            low, f_low, side = middle, value, -1
+    return high
+
+
+@inner
+def first_event(c, line, wide, y, state, f, risen):
     """Return share, spring and kind of the first switch in a step; kind -1 if there is none."""
     at, who, what, before = 1.0, -1, -1, 0.0
     for piece in range(1, 5):
         x = 0.25 * piece
-        look(c, base, line, y, x, state, f, push)
-        found = False
-        for i in range(c.ends[-1]):
+        for i in range(c.count):
             for kind in range(4):
                 if kind == 3 and (i > 0 or not risen):
                     continue
-                if not excess(c, i, kind) > 0.0:
-                    continue
-                # Illinois' method between the last look and this one
-                low, high = before, x
-                look(c, base, line, y, low, state, f, push)
-                f_low = excess(c, i, kind)
-                look(c, base, line, y, high, state, f, push)
-                f_high, side = excess(c, i, kind), 0
-                if f_low >= 0.0:
-                    high = low
-                for _ in range(60):
-                    if high - low <= 4e-16 or f_high == 0.0:
-                        break
-                    middle = high - f_high * (high - low) / (f_high - f_low)
-                    if not low < middle < high:
-                        break
-                    look(c, base, line, y, middle, state, f, push)
-                    value = excess(c, i, kind)
-                    if value > 0.0:
-                        high, f_high = middle, value
-                        f_low = 0.5 * f_low if side == 1 else f_low
-                        side = 1
-                    else:
-                        low, f_low = middle, value
-                        f_high = 0.5 * f_high if side == -1 else f_high
-                        side = -1
-                    if abs(value) < 1e-15 * abs(c.now[i, EPS]) and kind < 2:
-                        high = middle
-                        break
-                if what < 0 or high < at:
-                    at, who, what, found = high, i, kind, True
-                look(c, base, line, y, x, state, f, push)
-        if found:
+                if look(c, line, wide, y, x, state, f, i, kind) > 0.0:
+                    found = locate(c, line, wide, y, before, x, state, f, i, kind)
+                    if what < 0 or found < at:
+                        at, who, what = found, i, kind
+        if what >= 0:
             break
         before = x
     return at, who, what
 
 
 @inner
-def suspicious(c, old, dt, risen):
-    """Whether a step may contain a switch, by the values at both ends (`old` and now)."""
+def suspicious(c, dt, risen):
+    """Whether a step may contain a switch, by the values at both ends."""
     if risen and c.carried[0] <= 0.0:
         return True
-    for i in range(c.ends[-1]):
-        eps, low, high = c.now[i, EPS], c.memory[i, LOW], c.memory[i, HIGH]
-        if eps > high or eps < low or c.memory[i, TURNS] * c.now[i, RATE] < 0.0:
+    for i in range(c.count):
+        s = past(c.springs, i * c.width)
+        eps, old, low, high = s[EPS], s[OLD_EPS], s[LOW], s[HIGH]
+        if eps > high or eps < low or s[TURNS] * s[RATE] < 0.0:
             return True
-        first, last = old[i, RATE] * dt, c.now[i, RATE] * dt
-        if first * last < 0.0:  # an extremum is no further away than this
-            most = 0.5 * max(abs(first), abs(last))
-            if max(eps, old[i, EPS]) + most > high or min(eps, old[i, EPS]) - most < low:
+        if s[OLD_RATE] * s[RATE] < 0.0:  # an extremum is no further away than this
+            most = 0.5 * dt * max(abs(s[OLD_RATE]), abs(s[RATE]))
+            if max(eps, old) + most > high or min(eps, old) - most < low:
                 return True
     return False
 
 
 @inner
-def change_branch(c, i, up, y, changes):
+def change_branch(c, i, up, y):
     """Change the branch of a spring, and the derivatives of its held numbers."""
-    at, p = c.place[i, X_AT], c.directions.shape[0]
-    x = y[at] if at >= 0 else 0.0
-    x = call_law(c.laws[i, 1], i, c.rows, c.memory, c.now[i, EPS], x, up, changes)
-    if at < 0:
+    s, place, p = past(c.springs, i * c.width), past(c.places, i * PLACES), c.p
+    x = y[place[X_AT]] if place[X_AT] >= 0 else 0.0
+    x = call_law(place[LAW + 1], s, s[EPS], x, up, CHANGES)
+    if place[IMPLICIT] == 0:
         return
-    y[at] = x
+    y[place[X_AT]] = x
+    held = past(c.held, 2 * i * p)
     for j in range(p):
-        d_sigma = c.by[i, SLOPE] * c.d_eps[i, j] + c.part[i, j]
-        first, second = c.d_held[i, 0, j], c.d_held[i, 1, j]
+        d_sigma = s[RESULTS + SLOPE] * c.strain[i * p + j] + c.part[i * p + j]
+        first, second = held[j], held[p + j]
         for h in range(HELD_NUMBERS):
-            by = h * CHANGE
-            value = changes[i, by + OF_STRESS] * d_sigma
-            value += changes[i, by + OF_HELD] * first + changes[i, by + OF_HELD + 1] * second
-            if c.directions[j, 0] == i and c.directions[j, 1] < OWN_ETA:
-                value += changes[i, by + OF_PARAMETER + c.directions[j, 1]]
-            c.d_held[i, h, j] = value
+            by = past(s, CHANGES + h * CHANGE)
+            value = by[OF_STRESS] * d_sigma + by[OF_HELD] * first + by[OF_HELD + 1] * second
+            if c.directions[2 * j] == i and c.directions[2 * j + 1] < OWN_ETA:
+                value += by[OF_PARAMETER + c.directions[2 * j + 1]]
+            held[h * p + j] = value
 
 
-@maker
-def lay_out(rows, laws, implicit, spring, relax, ends, mass, drag, directions):
-    """Return the chain at rest, the numbers of values and of all columns, and kinds of values."""
-    count, nodes, p, terms = ends[-1], mass.size, directions.shape[0], relax.shape[1] // 2
-    place, kinds = np.full((count, PLACES), -1), np.zeros(2 * nodes + count * (2 + terms), np.int64)
-    for g in range(nodes):
-        kinds[2 * g + 1] = 1
-    base, carried, i0 = 2 * nodes, 2 * nodes, 0
-    for g in range(nodes):
-        for i in range(i0, ends[g]):
-            place[i, IMPLICIT] = implicit[i]
-            if ends[g] - i0 > 1:
-                place[i, EPS_AT], kinds[base] = base, 2
-                base += 1
-                if spring[i, ETA] > 0.0:
-                    place[i, D_EPS_AT] = carried
-                    carried += 1
-            if implicit[i] > 0:
-                place[i, X_AT], kinds[base] = base, 3
-                base += 1
-            spring[i, GAIN] = 1.0
-            if terms > 0:
-                place[i, Z_AT], place[i, D_Z_AT] = base, carried
-                for k in range(terms):
-                    spring[i, GAIN] += relax[i, 2 * k]
-                    kinds[base + k] = 3
-                base += terms
-                carried += terms
-        i0 = ends[g]
-    for i in range(count):
-        for at in (D_EPS_AT, D_Z_AT):
-            place[i, at] = base + place[i, at] * p if place[i, at] >= 0 else -1
-    own = np.zeros((2 * count + 1, p))
-    for j in range(p):
-        i, what = directions[j]
-        if what == OWN_HEIGHT:
-            own[2 * i, j] = 1.0
-        elif what == OWN_ETA:
-            own[2 * i + 1, j] = 1.0
-        elif what == DRAG:
-            own[2 * count, j] = 1.0
-    memory = np.zeros((count, MEMORY))
-    c = Chain(
-        rows, memory, laws, spring, relax, ends, mass, drag, place, np.zeros((count, NOW)),
-        np.zeros((count, RESULTS)), np.zeros(nodes + 1), directions, own,
-        np.zeros((count, HELD_NUMBERS, p)), np.zeros((2 * count, p)), np.zeros((nodes + 3, p)),
-        np.zeros((count, p)),
-    )  # fmt: skip
-    for i in range(count):
-        call_begin(laws[i, 2], i, rows, memory)
-    return c, base, base + carried * p, kinds
-
-
-@inlined
-def error_of(stage, y, new, base, kinds, scales, tol, dt):
-    """Return the error of a step over the tolerance, and raise the scales to its values."""
+@inner
+def error_of(c, errors, wide, y, new, kinds, scales, tol):
+    """Return the error of a step over the tolerance."""
     five = three = 0.0
-    for i in range(base):
-        a = b = 0.0
-        for q in range(13):
-            a += E5[q] * stage[q, i]
-            b += E3[q] * stage[q, i]
-        scale = scales[kinds[i]]
-        size = max(abs(y[i]), abs(new[i]))
-        scale = 1.0 / (tol * max(scale, size))
-        five += (a * scale) ** 2
-        three += (b * scale) ** 2
-    if five == 0.0:
-        return 0.0
-    return dt * five / math.sqrt(base * (five + 0.01 * three))
+    for i in range(c.base):
+        scale = 1.0 / (tol * max(scales[kinds[i]], max(abs(y[i]), abs(new[i]))))
+        five += (errors[i] * scale) ** 2
+        three += (errors[wide + i] * scale) ** 2
+    return five / math.sqrt(c.base * (five + 0.01 * three)) if five != 0.0 else 0.0
 
 
 @inner
 def first_step(c, tol):
     """Return a first step, from the fastest vibration of a node at rest."""
     fastest, before = 0.0, 0.0
-    for g in range(c.mass.size - 1, -1, -1):
+    for g in range(c.groups - 1, -1, -1):
         soft = 0.0
         for i in range(c.ends[g - 1] if g > 0 else 0, c.ends[g]):
-            stiff = c.spring[i, GAIN] * c.by[i, SLOPE]
-            soft += c.spring[i, HEIGHT] / stiff if stiff > 0.0 else math.inf
+            s = past(c.springs, i * c.width)
+            soft += s[HEIGHT] / (s[GAIN] * s[RESULTS + SLOPE])
         fastest = max(fastest, (1.0 / soft + before) / c.mass[g])
         before = 1.0 / soft
     return 4.0 * tol**0.125 / math.sqrt(fastest)
 
 
 @inner
-def fly(c, base, y, f, t, first, now, out, slope):
+def fly(c, y, acceleration, t, first, now, out, slope):
     """Fill the samples after the end of contact at `now`; `slope` is dS/dt there."""
-    p, top = c.directions.shape[0], 2 * c.mass.size - 2
+    top, p = 2 * c.groups - 2, c.p
     for k in range(first, t.size):
         out[0, 0, k], out[0, 1, k] = 0.0, y[top] + y[top + 1] * (t[k] - now)
     for j in range(p):
-        at = base + top * p + j
-        later = -c.d_now[0, j] / slope if slope < 0.0 else 0.0  # derivative of the end
-        d_v = y[at + p] + f[top + 1] * later
+        at = c.base + top * p + j
+        # velocity at an end that comes later or earlier
+        dv = y[at + p] - acceleration * c.common[j] / slope
         for k in range(first, t.size):
-            out[1 + j, 0, k], out[1 + j, 1, k] = 0.0, y[at] + d_v * (t[k] - now)
+            out[1 + j, 0, k], out[1 + j, 1, k] = 0.0, y[at] + dv * (t[k] - now)
 
 
 @inner
-def march(c, base, n, kinds, numbers, t, work, old, changes, scales, out):
-    """Take the steps of `integrate`."""
-    push, speed, tol, most = numbers[1], numbers[2], numbers[3], numbers[4]
-    p, count, wide = c.directions.shape[0], c.ends[-1], work.shape[1]
+def keep_values(c):
+    """Keep strains and rates of the beginning of a step; return the largest stress."""
+    largest = 0.0
+    for i in range(c.count):
+        s = past(c.springs, i * c.width)
+        s[OLD_EPS], s[OLD_RATE] = s[EPS], s[RATE]
+        largest = max(largest, abs(s[STRESS]))
+    return largest
+
+
+@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False)
+def integrate(springs, whole, work, numbers, t, out):
+    """Integrate an impact over sample times; return outcome, end of contact, steps, rejections.
+
+    `springs` (springs, width) are rows of `contract`; `whole` and `work` are laid out by
+    `Prepared`. `numbers`: drag, weight over area, speed, tolerance, bound on steps. `out`
+    (1 + p, 2, n) becomes base stress and displacement of the top, and their derivatives.
+    """
+    drag, push, speed, tol, most = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    count, groups, p, base, n, terms = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
+    wide, places = (n + 3) // 4 * 4, past(start(whole), 8)
+    ends = past(places, count * PLACES)
+    directions = past(ends, groups)
+    kinds = past(directions, 2 * p)
+    mass = start(work)
+    scales = past(mass, groups)
+    carried = past(scales, 4)
+    own = past(carried, groups + 1)
+    held = past(own, (2 * count + 1) * p)
+    part = past(held, 2 * count * p)
+    common = past(part, 2 * count * p)
+    strain = past(common, (groups + 3) * p)
+    stage = past(strain, count * p)
+    line, y, new = past(stage, 16 * wide), past(stage, 23 * wide), past(stage, 24 * wide)
+    state, f, nil = past(stage, 25 * wide), past(stage, 26 * wide), past(stage, 27 * wide)
+    errors = past(stage, 13 * wide)  # where the stages of the dense output follow
+    c = Chain(
+        start(springs), places, ends, directions, mass, carried, own, held, part, common, strain,
+        springs.shape[1], count, groups, p, base, terms, drag,
+    )  # fmt: skip
+    for i in range(count):
+        call_begin(places[i * PLACES + LAW + 2], past(c.springs, i * c.width))
     want = 1 if p > 0 else 0
-    stage, line = work[:ALL_STAGES], work[ALL_STAGES : ALL_STAGES + 7]
-    y, new, state, f = work[ALL_STAGES + 7], work[ALL_STAGES + 8], work[ALL_STAGES + 9], work[ALL_STAGES + 10]
-    top, at, now, end, steps, lost, dt = 2 * c.mass.size - 2, 0, 0.0, t[-1], 0, 0, 0.0
-    y[top + 1] = scales[1] = speed
+    top, at, now, end, steps, lost, dt = 2 * groups - 2, 0, 0.0, t[-1], 0, 0, 0.0
+    y[top + 1] = speed
+    scales[1], carried[groups] = speed, push
     while at < t.size and t[at] < 0.0:
         out[0, 0, at], out[0, 1, at] = 0.0, speed * t[at]
         for j in range(p):
             out[1 + j, 0, at] = out[1 + j, 1, at] = 0.0
         at += 1
-    s, largest, risen, last_error, pending, kind, before, landed = 0, 0.0, False, 1e-4, -1, 0, 0.0, False
+    fresh, largest, risen, last_error, who, kind, before = True, 0.0, False, 1e-4, -1, 0, 0.0
     while True:
-        # one stage of a step
-        if s == 0:
-            rates(c, base, y, stage[0], push, want)
-            if landed:
-                fly(c, base, y, stage[0], t, at, now, out, before)
-                return DONE, now, steps, lost
-            if pending >= 0:
-                before = c.by[pending, SLOPE]
-                change_branch(c, pending, kind, y, changes)
-                pending = -2 - pending
-                continue
-            if pending < -1:
-                after = c.by[-2 - pending, SLOPE]
-                dt *= min(max(math.sqrt(before / after), 0.2), 2.0) if after > 0.0 else 2.0
-                pending = -1
-            if steps == 0:
-                dt = first_step(c, tol)
-            for i in range(count):
-                old[i, EPS], old[i, RATE] = c.now[i, EPS], c.now[i, RATE]
-            s = 1
-            steps += 1
-            if steps > most:
-                return TOO_MANY, now, steps, lost
-            if dt > end - now:
-                dt = end - now
-            scales[0] = max(scales[0], abs(speed) * dt)
-            for i in range(base):
-                scales[kinds[i]] = max(scales[kinds[i]], abs(stage[0, i]) * dt * 0.1)
-        target = new if s == STAGES else state
-        combine(stage, n, FIRST[s], FIRST[s + 1], dt, y, target)
-        rates(c, base, target, stage[s], push, want)
-        s += 1
-        if s <= STAGES:
-            continue
-        if s == STAGES + 1:
-            error = error_of(stage, y, new, base, kinds, scales, tol, dt)
-            if not error <= 1.0:
-                lost += 1
+        s, doubtful, target = 1, False, state
+        if fresh:
+            s = 0
+        else:
+            keep_values(c)
+            dt = min(dt, end - now)
+        while True:  # the stages of a step
+            if s > 0:
+                target = new if s == STAGES else state
+                combine(stage, wide, n, s, dt, y, target)
+            else:
+                target = y
+            rates(c, target, past(stage, s * wide), want)
+            if s == 0:
+                if kind == 3:
+                    fly(c, y, stage[top + 1], t, at, now, out, before)
+                    return DONE, now, steps, lost
+                if who >= 0:
+                    before = springs[who, RESULTS + SLOPE]
+                    change_branch(c, who, kind, y)
+                    who = -2 - who
+                    continue
+                if who < -1:
+                    after = springs[-2 - who, RESULTS + SLOPE]
+                    dt *= min(max(math.sqrt(before / after), 0.2), 2.0) if after > 0.0 else 2.0
+                    who = -1
+                if steps == 0:
+                    dt = first_step(c, tol)
+                keep_values(c)
+                dt, fresh = min(dt, end - now), False
+                scales[0] = max(scales[0], speed * dt)
+                for i in range(base):
+                    scales[kinds[i]] = max(scales[kinds[i]], 0.1 * dt * abs(stage[i]))
+            s += 1
+            if s == STAGES + 1:
                 steps += 1
-                dt *= max(0.2, 0.9 * error**-0.125) if error < math.inf else 0.2
-                if now + dt == now or steps > most:
-                    return UNDERFLOW, now, steps, lost
-                s = 1
-                continue
-            grow = 6.0
-            if error > 1e-8:
-                grow = min(6.0, max(0.3, 0.9 * error**-0.115 * last_error**0.02))
-            last_error = max(error, 1e-4)
-            doubtful = suspicious(c, old, dt, risen)
-            for i in range(count):
-                largest = max(largest, abs(c.now[i, STRESS]))
-            ends_at = c.carried[0]
-            sampled = at < t.size and t[at] <= now + dt
-            if sampled or doubtful:
-                for i in range(count):
-                    old[i, EPS], old[i, RATE] = c.now[i, EPS], c.now[i, RATE]
-                continue
-        elif s < ALL_STAGES:
-            continue
-        # the end of an accepted step
-        share, who, kind = 1.0, -1, -1
+                for q in range(2):
+                    combine(stage, wide, base, 20 + q, dt, nil, past(errors, q * wide))
+                error = error_of(c, errors, wide, y, new, kinds, scales, tol)
+                if not error <= 1.0:
+                    lost += 1
+                    dt *= max(0.2, 0.9 * error**-0.125) if error < math.inf else 0.2
+                    if now + dt == now or steps > most:
+                        return UNDERFLOW, now, steps, lost
+                    s = 1
+                    continue
+                grow = 6.0
+                if error > 1e-8:
+                    grow = min(6.0, max(0.3, 0.9 * error**-0.115 * last_error**0.02))
+                last_error = max(error, 1e-4)
+                doubtful = suspicious(c, dt, risen)
+                if not (doubtful or t[at] <= now + dt):
+                    break
+            if s == ALL_STAGES:
+                break
+        share, here = 1.0, carried[0]
+        who = kind = -1
         if s == ALL_STAGES:
-            for i in range(0, wide):
-                rise = new[i] - y[i]
-                line[0, i], line[1, i] = rise, dt * stage[0, i] - rise
-                line[2, i] = 2.0 * rise - dt * (stage[12, i] + stage[0, i])
-                f[i] = 0.0
-            for q in range(4):
-                first = ALL_STAGES + q
-                combine(stage, n, FIRST[first], FIRST[first + 1], dt, f, line[3 + q])
+            make_dense(stage, wide, y, new, dt, nil, line)
             if doubtful:
-                share, who, kind = first_event(c, base, line, y, state, f, push, risen)
-            reached = now + share * dt
-            if who < 0 and now + dt >= end:
-                reached = end
+                share, who, kind = first_event(c, line, wide, y, state, f, risen)
+            reached = end if who < 0 and now + dt >= end else now + share * dt
             while at < t.size and t[at] <= reached:
-                dense(line, y, n, (t[at] - now) / dt, state)
-                out[0, 0, at] = follow_group(c, 0, state, f, state[0], state[1], want)
-                out[0, 1, at] = state[top]
+                dense(line, wide, y, n, (t[at] - now) / dt, state)
+                out[0, 0, at], out[0, 1, at] = follow_group(c, 0, state, f, want), state[top]
                 if want:
-                    derive_group(c, 0, base, state, f)
+                    derive_group(c, 0, state, f)
                     for j in range(p):
-                        out[1 + j, 0, at], out[1 + j, 1, at] = c.d_now[0, j], state[base + top * p + j]
+                        out[1 + j, 0, at], out[1 + j, 1, at] = common[j], state[base + top * p + j]
                 at += 1
-        if at == t.size:
-            return DONE, math.nan, steps, lost
-        risen = risen or (s == ALL_STAGES or who < 0) and ends_at > RISEN * largest
+            if at == t.size:
+                return DONE, math.nan, steps, lost
+            if who < 0:  # values at the end of the step
+                rates(c, new, f, 0)
+                here = carried[0]
+        if steps >= most:
+            return TOO_MANY, now, steps, lost
         if who >= 0:
             if kind == 3:  # dS/dt at the end of contact
-                look(c, base, line, y, share * (1.0 - 1e-4), state, f, push)
-                before = -c.carried[0] / (1e-4 * share * dt)
-                landed = True
-            dense(line, y, n, share, state)
+                before = look(c, line, wide, y, share * (1.0 - 1e-4), state, f, 0, 3) / (1e-4 * share * dt)
+            elif kind == 2:
+                kind = int(springs[who, TURNS] < 0.0)
+            else:
+                kind = 1 - kind
+            dense(line, wide, y, n, share, state)
             for i in range(n):
                 y[i] = state[i]
             now += share * dt
-            if kind < 3:
-                up = kind == 0
-                if kind == 2:
-                    up = c.memory[who, TURNS] < 0.0
-                pending, kind = who, int(up)
-            s = 0
+            fresh = True
             dt *= min(grow, 1.0)
         else:
+            largest = max(largest, keep_values(c))
+            risen = risen or here > RISEN * largest
             for i in range(wide):
-                y[i], stage[0, i] = new[i], stage[STAGES, i]
+                y[i], stage[i] = new[i], stage[STAGES * wide + i]
             now += dt
             dt *= grow
-            if s == STAGES + 1:
-                for i in range(count):
-                    old[i, EPS], old[i, RATE] = c.now[i, EPS], c.now[i, RATE]
-            s = 1
-            steps += 1
-            if steps > most:
-                return TOO_MANY, now, steps, lost
-            if dt > end - now:
-                dt = end - now
         for i in range(base):
             scales[kinds[i]] = max(scales[kinds[i]], abs(y[i]))
 
 
-@njit(**OPTIONS, no_cfunc_wrapper=True)
-def integrate(rows, laws, implicit, spring, relax, ends, mass, numbers, t, directions, out):
-    """Integrate an impact over sample times; return outcome, end of contact, steps, rejections.
+class Prepared:
+    """A chain under an impact, laid out for repeated runs.
 
-    `numbers`: drag, weight over area, speed, tolerance, bound on steps. `out` (1 + p, 2, n) becomes
-    base stress and displacement of the top, and their derivatives.
+    `laws` and `relaxation` (g, τ pairs) are those of the springs, `ends` and `mass` (over the area)
+    of the nodes with mass, `directions` (p, 2) the derivatives.
     """
-    c, base, n, kinds = lay_out(rows, laws, implicit, spring, relax, ends, mass, numbers[0], directions)
-    work, count = np.zeros((ALL_STAGES + 11, (n + 3) // 4 * 4)), ends[-1]
-    old, changes = np.zeros((count, NOW)), np.zeros((count, HELD_NUMBERS * CHANGE))
-    return march(c, base, n, kinds, numbers, t, work, old, changes, np.zeros(4), out)
+
+    def __init__(self, laws, ends, mass, terms, etas, directions=()):
+        count, groups, self.p, self.terms = len(laws), len(ends), len(directions), terms
+        p, place, kinds = self.p, np.full((count, PLACES), -1), [0, 1] * groups
+        base, carried, i0 = 2 * groups, 2 * groups, 0
+        for end in ends:
+            for i in range(i0, end):
+                place[i, IMPLICIT], place[i, LAW : LAW + 3] = laws[i].implicit, laws[i].addresses
+                if end - i0 > 1:
+                    place[i, EPS_AT], base = base, base + 1
+                    kinds.append(2)
+                    if etas[i] > 0.0:
+                        place[i, D_EPS_AT], carried = carried, carried + 1
+                if laws[i].implicit:
+                    place[i, X_AT], base = base, base + 1
+                    kinds.append(3)
+                place[i, Z_AT], place[i, D_Z_AT] = base, carried
+                base, carried = base + terms, carried + terms
+                kinds += [3] * terms
+            i0 = end
+        for at in (D_EPS_AT, D_Z_AT):
+            place[:, at] = np.where(place[:, at] >= 0, base + place[:, at] * p, -1)
+        n = base + carried * p
+        head = [count, groups, p, base, n, terms, 0, 0]
+        self.whole = np.concatenate(
+            [head, place.ravel(), ends, np.array(directions, np.int64).ravel(), kinds]
+        ).astype(np.int64)
+        own = np.zeros((2 * count + 1, p))
+        for j, (i, what) in enumerate(directions):
+            if what in (OWN_ETA, OWN_HEIGHT, DRAG):
+                own[{OWN_HEIGHT: 2 * i, OWN_ETA: 2 * i + 1, DRAG: 2 * count}[what], j] = 1.0
+        size = groups + 4 + groups + 1 + own.size + (5 * count + groups + 3) * p
+        self.work = np.zeros(size + 28 * ((n + 3) // 4 * 4))
+        self.work[:groups] = mass
+        self.work[2 * groups + 5 : 2 * groups + 5 + own.size] = own.ravel()
+
+    def run(self, springs, numbers, t):
+        """Return outcome, end, steps, rejections, and `out` of `integrate`."""
+        out = np.empty((1 + self.p, 2, t.size))
+        return integrate(springs.copy(), self.whole, self.work.copy(), numbers, t, out), out
+
+
+def row(law, values, height, eta=0.0, relaxation=(), terms=0):
+    """Return the row of a spring."""
+    from contract import ROW
+
+    out, own = np.zeros(RELAX + 2 * terms), law.fill(*values)
+    out[ROW : ROW + own.size], out[HEIGHT], out[ETA], out[GAIN] = own, height, eta, 1.0
+    out[RELAX + 1 :: 2] = math.inf
+    for k, (g, tau) in enumerate(relaxation):
+        out[RELAX + 2 * k : RELAX + 2 * k + 2] = g, tau
+        out[GAIN] += g
+    return out
