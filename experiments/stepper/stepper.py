@@ -50,6 +50,7 @@ WEIGHT = np.concatenate([full[row] for full, row in zip(_FULL, _ROWS, strict=Tru
 
 # Directions of derivatives apart from the parameters of a law, as in foamfit.
 OWN_ETA, OWN_HEIGHT, DRAG, RELAXING = 20, 21, 22, 23
+LAST_TERM = 1e-3  # share of the last term of the dense output that counts as its error
 DONE, TOO_MANY, UNDERFLOW = range(3)
 # Places of a spring in the state (-1: none), and addresses of its law.
 EPS_AT, X_AT, Z_AT, D_EPS_AT, D_Z_AT, IMPLICIT, LAW, PLACES = 0, 1, 2, 3, 4, 5, 6, 10
@@ -428,6 +429,18 @@ def error_of(c, errors, wide, y, new, kinds, scales, tol):
 
 
 @inner
+def last_term(c, line, wide, new, kinds, scales, tol):
+    """Return the last term of the dense output over the tolerance.
+
+    Where fast processes have died out, it exceeds the error at the end of the step by far.
+    """
+    size = 0.0
+    for i in range(c.base):
+        size = max(size, abs(line[6 * wide + i]) / max(scales[kinds[i]], abs(new[i])))
+    return LAST_TERM / tol * size
+
+
+@inner
 def first_step(c, tol):
     """Return a first step, from the fastest vibration of a node at rest."""
     fastest, before = 0.0, 0.0
@@ -509,7 +522,7 @@ def integrate(springs, whole, work, numbers, t, out):
         at += 1
     fresh, largest, risen, last_error, who, kind, before = True, 0.0, False, 1e-4, -1, 0, 0.0
     while True:
-        s, doubtful, target = 1, False, state
+        s, doubtful, again, target = 1, False, False, state
         if fresh:
             s = 0
         else:
@@ -549,7 +562,7 @@ def integrate(springs, whole, work, numbers, t, out):
                     combine(stage, wide, base, 20 + q, dt, nil, past(errors, q * wide))
                 error = error_of(c, errors, wide, y, new, kinds, scales, tol)
                 if not error <= 1.0:
-                    lost += 1
+                    lost, again = lost + 1, True
                     dt *= max(0.2, 0.9 * error**-0.125) if error < math.inf else 0.2
                     if now + dt == now or steps > most:
                         return UNDERFLOW, now, steps, lost
@@ -558,16 +571,26 @@ def integrate(springs, whole, work, numbers, t, out):
                 grow = 6.0
                 if error > 1e-8:
                     grow = min(6.0, max(0.3, 0.9 * error**-0.115 * last_error**0.02))
+                if again:
+                    grow, again = min(grow, 1.0), False
                 last_error = max(error, 1e-4)
                 doubtful = suspicious(c, dt, risen)
                 if not (doubtful or t[at] <= now + dt):
                     break
             if s == ALL_STAGES:
+                make_dense(stage, wide, y, new, dt, nil, line)
+                size = last_term(c, line, wide, new, kinds, scales, tol)
+                if size > 1.0 and dt > 1e-12 * end:
+                    lost, again = lost + 1, True
+                    dt *= max(0.3, 0.9 * size**-0.143)
+                    s = 1
+                    continue
+                if size > 0.0:
+                    grow = min(grow, 0.9 * size**-0.143)
                 break
         share, here = 1.0, carried[0]
         who = kind = -1
         if s == ALL_STAGES:
-            make_dense(stage, wide, y, new, dt, nil, line)
             if doubtful:
                 share, who, kind = first_event(c, line, wide, y, state, f, risen)
             reached = end if who < 0 and now + dt >= end else now + share * dt
