@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 from contract import (
-    BY, BY_HELD, CHANGE, CHANGES, EPS, HELD_NUMBERS, HIGH, LOW, MISS, OF_HELD, OF_PARAMETER,
-    OF_STRESS, OPTIONS, RELAX, RESULTS, SIGMA, SLOPE, TURNS, call_begin, call_law, inner, past,
+    BY, BY_HELD, CHANGE, CHANGES, EPS, HELD_NUMBERS, HIGH, LOW, MISS, OF_HELD, OF_LAW,
+    OF_PARAMETER, OF_STRESS, OPTIONS, RELAX, RESULTS, SIGMA, SLOPE, TURNS, call_begin, call_evaluate, call_switch, inner, past,
     start,
 )  # fmt: skip
 from numba import njit
@@ -28,12 +28,15 @@ LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the mi
 @inner
 def settle(address, s, eps, x, implicit, want):
     """Bring a spring to a strain on its branch, from a guess x; return its stress."""
-    s[EPS] = eps
+    s[EPS], s[SIGMA], out = eps, x, past(s, RESULTS)
+    here, guess = past(s, EPS), past(s, SIGMA)
     if not implicit:
-        s[SIGMA] = call_law(address, s, eps, x, want, RESULTS)
+        call_evaluate(address, s, here, guess, 1, want, out)
+        s[SIGMA] = out[OF_LAW]
         return s[SIGMA]
     for _ in range(60):
-        call_law(address, s, eps, x, want, RESULTS)
+        s[SIGMA] = x
+        call_evaluate(address, s, here, guess, 1, want, out)
         change = s[RESULTS + MISS] * s[RESULTS + SLOPE]
         if x != 0.0 and not abs(change) < 0.5 * abs(x):
             change = math.copysign(0.5 * abs(x), change)
@@ -57,7 +60,7 @@ def derive(s, directions, p, held, seed, out):
 @inner
 def change_branch(address, s, up, directions, p, held, d_sigma):
     """Change the branch, and the derivatives of held numbers."""
-    s[SIGMA] = call_law(address, s, s[EPS], s[SIGMA], up, CHANGES)
+    s[SIGMA] = call_switch(address, s, s[EPS], s[SIGMA], up, CHANGES)
     for j in range(p):
         first, second = held[j], held[p + j]
         for h in range(HELD_NUMBERS):
@@ -166,11 +169,11 @@ def follow(springs, whole, work, eps, t, tol, out):
                         d_first[c] = d_last[c]
                     derive(s, directions, p, held, seed, d_last)
                 half = origin + 0.5 * step
+                s[EPS], s[SIGMA] = half, middle
+                call_evaluate(whole[0], s, past(s, EPS), past(s, SIGMA), 1, want, past(s, RESULTS))
+                s[EPS], s[SIGMA], bump = part, last, s[RESULTS + OF_LAW] - middle
                 if implicit:
-                    call_law(whole[0], s, half, middle, want, RESULTS)
                     bump = -s[RESULTS + MISS] * s[RESULTS + SLOPE]
-                else:
-                    bump = call_law(whole[0], s, half, middle, want, RESULTS) - middle
                 size = max(largest, abs(last))
                 if FOLLOWED * weight * abs(bump) > tol * size and share > LEAST_STEP:
                     s[EPS], s[SIGMA], s[RESULTS + SLOPE] = origin, first, slope

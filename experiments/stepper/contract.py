@@ -4,10 +4,10 @@ The stepper is compiled once for all laws; a law is compiled alone, and a regist
 fast as a built-in one. A spring is a row of numbers, which `fill` computes from its parameters, and
 a memory of RESULTS numbers, which only its law changes, at switches of branch.
 
-    evaluate(row, memory, eps, x, want, out) -> sigma
-        Fill out[SLOPE] = dσ/dε and out[MISS] = ε(x) - ε, and if `want` is not 0 the derivatives of
-        the stress at fixed strain: by parameter c in out[BY + c], by held number h of the memory in
-        out[BY_HELD + h].
+    evaluate(row, memory, eps, x, count, want, out)
+        Fill, for `count` points on the present branch, the columns of `out` (columns, count):
+        OF_LAW = σ, SLOPE = dσ/dε and MISS = ε(x) - ε, and if `want` is not 0 the derivatives of the
+        stress at fixed strain: by parameter c in column BY + c, by held number h in BY_HELD + h.
     switch(row, memory, eps, x, up, out) -> x
         Change the branch at its upper (up = 1) or lower (0) end or at a turning point. Fill, for
         each held number h, out[h * CHANGE :] with its derivatives by stress, by each held number
@@ -32,11 +32,11 @@ from numba.extending import intrinsic
 # (falling); numbers held until a switch; then whatever the law keeps.
 BRANCH, LOW, HIGH, TURNS, HELD, OWN, HELD_NUMBERS = 0, 1, 2, 3, 4, 6, 2
 # Results of `evaluate`; of `switch`, for each held number.
-SLOPE, MISS, BY, BY_HELD, RESULTS = 0, 1, 2, 14, 16
+SLOPE, MISS, BY, BY_HELD, OF_LAW, COLUMNS, RESULTS = 0, 1, 2, 12, 14, 15, 16
 OF_STRESS, OF_HELD, OF_PARAMETER, CHANGE, CHANGES = 0, 1, 3, 16, 32
 # Values now and before; height, dashpot, 1 + Σ g; the row of the law; g and τ of relaxation terms.
 EPS, RATE, SIGMA, STRESS, DRIFT, OLD_EPS, OLD_RATE = range(64, 71)
-HEIGHT, ETA, GAIN, ROW, RELAX = 72, 73, 74, 80, 96
+HEIGHT, ETA, GAIN, PER_HEIGHT, ROW, RELAX = 72, 73, 74, 75, 80, 96
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 _INSIDE: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
@@ -45,7 +45,7 @@ inner = njit(**_INSIDE, _nrt=False)
 inlined = njit(**_INSIDE, _nrt=False, forceinline=True)
 
 _F, _I, _P = types.float64, types.int64, types.CPointer(types.float64)
-evaluating = cfunc(_F(_P, _P, _F, _F, _I, _P), **OPTIONS)
+evaluating = cfunc(_F(_P, _P, _P, _P, _I, _I, _P), **OPTIONS)
 switching = cfunc(_F(_P, _P, _F, _F, _I, _P), **OPTIONS)
 beginning = cfunc(_F(_P, _P), **OPTIONS)
 
@@ -85,8 +85,19 @@ def _call(builder, address, values):
 
 
 @intrinsic
-def call_law(typing, address, spring, eps, x, flag, results):
-    """Call evaluate or switch of a spring; its results go to the column `results`."""
+def call_evaluate(typing, address, spring, eps, x, count, want, out):
+    """Call evaluate of a spring."""
+
+    def emit(context, builder, signature, args):
+        row = builder.gep(args[1], [ir.Constant(ir.IntType(64), ROW)])
+        return _call(builder, args[0], [row, *args[1:]])
+
+    return _F(_I, _P, _P, _P, _I, _I, _P), emit
+
+
+@intrinsic
+def call_switch(typing, address, spring, eps, x, up, results):
+    """Call switch of a spring; its results go to the column `results`."""
 
     def emit(context, builder, signature, args):
         row = builder.gep(args[1], [ir.Constant(ir.IntType(64), ROW)])

@@ -24,9 +24,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from contract import (
-    BY, BY_HELD, CHANGE, CHANGES, DRIFT, EPS, ETA, GAIN, HEIGHT, HELD_NUMBERS, HIGH, LOW, OF_HELD,
-    OF_PARAMETER, OF_STRESS, OLD_EPS, OLD_RATE, OPTIONS, RATE, RELAX, RESULTS, SIGMA, SLOPE, STRESS,
-    TURNS, call_begin, call_law, inner, past, start,
+    BY, BY_HELD, CHANGE, CHANGES, COLUMNS, DRIFT, EPS, ETA, GAIN, HEIGHT, HELD_NUMBERS, HIGH, LOW,
+    OF_HELD, OF_LAW, OF_PARAMETER, OF_STRESS, OLD_EPS, OLD_RATE, OPTIONS, PER_HEIGHT, RATE, RELAX, RESULTS,
+    SIGMA, SLOPE, STRESS, TURNS, call_begin, call_evaluate, call_switch, inner, past, start,
 )  # fmt: skip
 from numba import njit
 from numpy.typing import NDArray
@@ -54,6 +54,7 @@ LAST_TERM = 1e-3  # share of the last term of the dense output that counts as it
 DONE, TOO_MANY, UNDERFLOW = range(3)
 # Places of a spring in the state (-1: none), and addresses of its law.
 EPS_AT, X_AT, Z_AT, D_EPS_AT, D_Z_AT, IMPLICIT, LAW, PLACES = 0, 1, 2, 3, 4, 5, 6, 10
+BATCH = 64  # samples that are computed together
 RISEN = 1e-9  # base stress over the largest stress above which its return to zero ends the contact
 
 
@@ -64,7 +65,8 @@ class Chain(NamedTuple):
     places: Any  #: rows of PLACES integers
     ends: Any  #: one past the last spring of each group
     directions: Any  #: of the derivatives, (p, 2)
-    mass: Any  #: of the nodes, over the area
+    owned: Any  #: where the list of directions of each spring begins and ends, and these lists
+    per_mass: Any  #: of the nodes, area over mass
     carried: Any  #: stress of each group, and the push on the top
     own: Any  #: derivatives of height and of eta of each spring; of drag
     held: Any  #: of the held numbers of each spring
@@ -81,27 +83,44 @@ class Chain(NamedTuple):
 
 
 @inner
+def follow_spring(c, i, eps, y, f, want):
+    """Fill the values of a spring at a strain, and the rates of its relaxation terms."""
+    s, place = past(c.springs, i * c.width), past(c.places, i * PLACES)
+    s[EPS] = eps
+    if place[X_AT] >= 0:
+        s[SIGMA] = y[place[X_AT]]
+    call_evaluate(place[LAW], s, past(s, EPS), past(s, SIGMA), 1, want, past(s, RESULTS))
+    s[SIGMA] = sigma = s[RESULTS + OF_LAW]
+    stress, drift = s[GAIN] * sigma, 0.0
+    for k in range(c.terms):
+        z, at = y[place[Z_AT] + k], RELAX + 2 * k
+        dz = -(z + sigma) / s[at + 1]
+        f[place[Z_AT] + k] = dz
+        stress += s[at] * z
+        drift += s[at] * dz
+    s[STRESS], s[DRIFT] = stress, drift
+    return stress
+
+
+@inner
 def follow_group(c, g, y, f, want):
     """Fill the values of the springs of a group and their part of the rates `f`; return S."""
     i0, i1 = (c.ends[g - 1] if g > 0 else 0), c.ends[g]
     reach, rate = y[2 * g], y[2 * g + 1]
     if g > 0:
         reach, rate = reach - y[2 * g - 2], rate - y[2 * g - 1]
+    if i1 - i0 == 1:
+        s, per = past(c.springs, i0 * c.width), c.springs[i0 * c.width + PER_HEIGHT]
+        s[RATE] = rate = rate * per
+        common = follow_spring(c, i0, reach * per, y, f, want) + s[ETA] * rate
+        if c.places[i0 * PLACES + X_AT] >= 0:
+            f[c.places[i0 * PLACES + X_AT]] = s[RESULTS + SLOPE] * rate
+        c.carried[g] = common
+        return common
     weight, total, loose, flat = 0.0, rate, -1, -1
     for i in range(i0, i1):
         s, place = past(c.springs, i * c.width), past(c.places, i * PLACES)
-        h, eta, gain = s[HEIGHT], s[ETA], s[GAIN]
-        eps = reach / h if place[EPS_AT] < 0 else y[place[EPS_AT]]
-        x = y[place[X_AT]] if place[X_AT] >= 0 else 0.0
-        sigma = call_law(place[LAW], s, eps, x, want, RESULTS)
-        stress, drift = gain * sigma, 0.0
-        for k in range(c.terms):
-            z, at = y[place[Z_AT] + k], RELAX + 2 * k
-            dz = -(z + sigma) / s[at + 1]
-            f[place[Z_AT] + k] = dz
-            stress += s[at] * z
-            drift += s[at] * dz
-        s[EPS], s[SIGMA], s[STRESS], s[DRIFT] = eps, sigma, stress, drift
+        h, eta, stress = s[HEIGHT], s[ETA], follow_spring(c, i, y[place[EPS_AT]], y, f, want)
         if eta > 0.0:
             weight += h / eta
             total += h / eta * stress
@@ -109,15 +128,7 @@ def follow_group(c, g, y, f, want):
             loose = i
             if s[RESULTS + SLOPE] == 0.0:
                 flat = i
-    s = past(c.springs, i0 * c.width)
-    if i1 - i0 == 1:
-        s[RATE] = rate / s[HEIGHT]
-        common = s[STRESS] + s[ETA] * s[RATE]
-        if c.places[i0 * PLACES + X_AT] >= 0:
-            f[c.places[i0 * PLACES + X_AT]] = s[RESULTS + SLOPE] * s[RATE]
-        c.carried[g] = common
-        return common
-    soft, common = 0.0, total / weight
+    soft, common = 0.0, total / weight if loose < 0 else 0.0
     if loose >= 0:
         common, total = c.springs[loose * c.width + STRESS], rate
         for i in range(i0, i1):
@@ -152,14 +163,14 @@ def derive_spring(c, i, y):
         a, b, held = s[RESULTS + BY_HELD], s[RESULTS + BY_HELD + 1], past(c.held, 2 * i * p)
         for j in range(p):
             part[j] = a * held[j] + b * held[p + j]
+        for k in range(c.owned[i], c.owned[i + 1]):
+            part[c.owned[k]] += s[RESULTS + BY + c.directions[2 * c.owned[k] + 1]]
     else:
-        for j in range(p):
-            part[j] = 0.0
+        for k in range(c.owned[i], c.owned[i + 1]):
+            part[c.owned[k]] = s[RESULTS + BY + c.directions[2 * c.owned[k] + 1]]
+    gain = s[GAIN]
     for j in range(p):
-        what = c.directions[2 * j + 1]
-        if c.directions[2 * j] == i and what < OWN_ETA:
-            part[j] += s[RESULTS + BY + what]
-        total[j] = s[GAIN] * part[j]
+        total[j] = gain * part[j]
     for k in range(c.terms):
         g, dz = s[RELAX + 2 * k], past(y, place[D_Z_AT] + k * p)
         for j in range(p):
@@ -186,26 +197,25 @@ def relax_spring(c, i, y, f):
 def derive_group(c, g, y, f):
     """Fill the derivatives of the stress of a group, and of the rates of its springs."""
     i0, i1, p = (c.ends[g - 1] if g > 0 else 0), c.ends[g], c.p
-    out, reach, rate = past(c.common, g * p), past(c.common, (c.groups + 1) * p), past(c.common, (c.groups + 2) * p)
-    dw = past(y, c.base + 2 * g * p)
-    for j in range(p):
-        reach[j], rate[j] = dw[j], dw[p + j]
-    if g > 0:
-        below = past(y, c.base + 2 * (g - 1) * p)
-        for j in range(p):
-            reach[j] -= below[j]
-            rate[j] -= below[p + j]
+    out, dw = past(c.common, g * p), past(y, c.base + 2 * g * p)
+    below = past(y, c.base + 2 * max(g - 1, 0) * p)
     if i1 - i0 == 1:
         derive_spring(c, i0, y)
         s, own, strain = past(c.springs, i0 * c.width), past(c.own, 2 * i0 * p), past(c.strain, i0 * p)
-        per, eta, total = 1.0 / s[HEIGHT], s[ETA], past(c.part, (c.count + i0) * p)
-        slope = s[RESULTS + SLOPE] * s[GAIN]
+        per, eta, total = s[PER_HEIGHT], s[ETA], past(c.part, (c.count + i0) * p)
+        slope, eps, faster = s[RESULTS + SLOPE] * s[GAIN], s[EPS], s[RATE]
+        some = 1.0 if g > 0 else 0.0
         for j in range(p):
-            strain[j] = (reach[j] - s[EPS] * own[j]) * per
-            faster = (rate[j] - s[RATE] * own[j]) * per
-            out[j] = slope * strain[j] + total[j] + own[p + j] * s[RATE] + eta * faster
+            longer = (dw[j] - some * below[j] - eps * own[j]) * per
+            quicker = (dw[p + j] - some * below[p + j] - faster * own[j]) * per
+            strain[j] = longer
+            out[j] = slope * longer + total[j] + own[p + j] * faster + eta * quicker
         relax_spring(c, i0, y, f)
         return
+    reach, rate = past(c.common, (c.groups + 1) * p), past(c.common, (c.groups + 2) * p)
+    some = 1.0 if g > 0 else 0.0
+    for j in range(p):
+        reach[j], rate[j] = dw[j] - some * below[j], dw[p + j] - some * below[p + j]
     loose, soft, weight, flat = -1, 0.0, 0.0, -1
     for i in range(i0, i1):
         s = past(c.springs, i * c.width)
@@ -263,7 +273,7 @@ def rates(c, y, f, want):
         if want:
             derive_group(c, g, y, f)
     for g in range(c.groups):
-        v, per = y[2 * g + 1], 1.0 / c.mass[g]
+        v, per = y[2 * g + 1], c.per_mass[g]
         drag = c.drag if g == c.groups - 1 else 0.0
         f[2 * g] = v
         f[2 * g + 1] = (c.carried[g + 1] - c.carried[g] - drag * v) * per
@@ -364,13 +374,17 @@ def first_event(c, line, wide, y, state, f, risen):
     """Return share, spring and kind of the first switch in a step; kind -1 if there is none."""
     at, who, what, before = 1.0, -1, -1, 0.0
     for piece in range(1, 5):
-        x = 0.25 * piece
+        x, missed = 0.25 * piece, True
         for i in range(c.count):
             for kind in range(4):
                 if kind == 3 and (i > 0 or not risen):
                     continue
-                if look(c, line, wide, y, x, state, f, i, kind) > 0.0:
+                if missed:  # or else still known
+                    look(c, line, wide, y, x, state, f, i, kind)
+                    missed = False
+                if excess(c, i, kind) > 0.0:
                     found = locate(c, line, wide, y, before, x, state, f, i, kind)
+                    missed = True
                     if what < 0 or found < at:
                         at, who, what = found, i, kind
         if what >= 0:
@@ -401,7 +415,7 @@ def change_branch(c, i, up, y):
     """Change the branch of a spring, and the derivatives of its held numbers."""
     s, place, p = past(c.springs, i * c.width), past(c.places, i * PLACES), c.p
     x = y[place[X_AT]] if place[X_AT] >= 0 else 0.0
-    x = call_law(place[LAW + 1], s, s[EPS], x, up, CHANGES)
+    x = call_switch(place[LAW + 1], s, s[EPS], x, up, CHANGES)
     if place[IMPLICIT] == 0:
         return
     y[place[X_AT]] = x
@@ -449,7 +463,7 @@ def first_step(c, tol):
         for i in range(c.ends[g - 1] if g > 0 else 0, c.ends[g]):
             s = past(c.springs, i * c.width)
             soft += s[HEIGHT] / (s[GAIN] * s[RESULTS + SLOPE])
-        fastest = max(fastest, (1.0 / soft + before) / c.mass[g])
+        fastest = max(fastest, (1.0 / soft + before) * c.per_mass[g])
         before = 1.0 / soft
     return 4.0 * tol**0.125 / math.sqrt(fastest)
 
@@ -469,6 +483,84 @@ def fly(c, y, acceleration, t, first, now, out, slope):
 
 
 @inner
+def polynomial(line, wide, y, i, shares, n, out):
+    """Fill component i of the state at n shares of the step."""
+    a, b, c, d = line[i], line[wide + i], line[2 * wide + i], line[3 * wide + i]
+    e, g, h, first = line[4 * wide + i], line[5 * wide + i], line[6 * wide + i], y[i]
+    for k in range(n):
+        x = shares[k]
+        z = 1.0 - x
+        out[k] = first + x * (a + z * (b + x * (c + z * (d + x * (e + z * (g + x * h))))))
+
+
+@inner
+def sample_one(c, line, wide, y, now, dt, t, at, n, batch, out):
+    """Fill n samples from `at` on if one spring carries the base stress, BATCH at a time."""
+    s, place, p, top = c.springs, c.places, c.p, 2 * c.groups - 2
+    shares, eps, x, work = batch, past(batch, BATCH), past(batch, 2 * BATCH), past(batch, 3 * BATCH)
+    w, v, results = past(batch, 4 * BATCH), past(batch, 5 * BATCH), past(batch, 6 * BATCH)
+    per, eta, gain, want = s[PER_HEIGHT], s[ETA], s[GAIN], 1 if p > 0 else 0
+    for k in range(n):
+        shares[k] = (t[at + k] - now) / dt
+    polynomial(line, wide, y, 0, shares, n, w)
+    polynomial(line, wide, y, 1, shares, n, v)
+    for k in range(n):
+        eps[k] = w[k] * per
+    if place[X_AT] >= 0:
+        polynomial(line, wide, y, place[X_AT], shares, n, x)
+    call_evaluate(place[LAW], s, eps, x, n, want, results)
+    sigma, slope = past(results, OF_LAW * n), past(results, SLOPE * n)
+    for k in range(n):
+        out[0, 0, at + k] = gain * sigma[k] + eta * per * v[k]
+    for m in range(c.terms):
+        polynomial(line, wide, y, place[Z_AT] + m, shares, n, work)
+        for k in range(n):
+            out[0, 0, at + k] += s[RELAX + 2 * m] * work[k]
+        for j in range(p):
+            if c.directions[2 * j] == 0 and c.directions[2 * j + 1] == RELAXING + 2 * m:
+                for k in range(n):
+                    out[1 + j, 0, at + k] = sigma[k] + work[k]
+    if top > 0:
+        polynomial(line, wide, y, top, shares, n, work)
+        for k in range(n):
+            out[0, 1, at + k] = work[k]
+    else:
+        for k in range(n):
+            out[0, 1, at + k] = w[k]
+    for j in range(p):
+        what, mine = c.directions[2 * j + 1], c.directions[2 * j] == 0
+        if not (mine and what >= RELAXING and (what - RELAXING) % 2 == 0):
+            for k in range(n):
+                out[1 + j, 0, at + k] = 0.0
+        polynomial(line, wide, y, c.base + j, shares, n, work)
+        own_h, own_eta = c.own[j], c.own[p + j]
+        for k in range(n):
+            out[1 + j, 1, at + k] = work[k]
+            out[1 + j, 0, at + k] += gain * slope[k] * per * (work[k] - own_h * eps[k])
+        if mine and what < OWN_ETA:
+            by = past(results, (BY + what) * n)
+            for k in range(n):
+                out[1 + j, 0, at + k] += gain * by[k]
+        if place[IMPLICIT] > 0:
+            first, second = gain * c.held[j], gain * c.held[p + j]
+            by = past(results, BY_HELD * n)
+            for k in range(n):
+                out[1 + j, 0, at + k] += first * by[k] + second * by[n + k]
+        if eta > 0.0 or own_eta > 0.0:
+            polynomial(line, wide, y, c.base + p + j, shares, n, work)
+            for k in range(n):
+                out[1 + j, 0, at + k] += per * (own_eta * v[k] + eta * (work[k] - own_h * per * v[k]))
+        for m in range(c.terms):
+            polynomial(line, wide, y, place[D_Z_AT] + m * p + j, shares, n, work)
+            for k in range(n):
+                out[1 + j, 0, at + k] += s[RELAX + 2 * m] * work[k]
+        if top > 0:
+            polynomial(line, wide, y, c.base + top * p + j, shares, n, work)
+            for k in range(n):
+                out[1 + j, 1, at + k] = work[k]
+
+
+@inner
 def keep_values(c):
     """Keep strains and rates of the beginning of a step; return the largest stress."""
     largest = 0.0
@@ -480,11 +572,11 @@ def keep_values(c):
 
 
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False)
-def integrate(springs, whole, work, numbers, t, out):
+def integrate(whole, work, numbers, t, out):
     """Integrate an impact over sample times; return outcome, end of contact, steps, rejections.
 
-    `springs` (springs, width) are rows of `contract`; `whole` and `work` are laid out by
-    `Prepared`. `numbers`: drag, weight over area, speed, tolerance, bound on steps. `out`
+    `whole` and `work`, which begins with the rows of `contract`, are laid out by `Prepared`;
+    `work` is overwritten. `numbers`: drag, weight over area, speed, tolerance, bound on steps. `out`
     (1 + p, 2, n) becomes base stress and displacement of the top, and their derivatives.
     """
     drag, push, speed, tol, most = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
@@ -492,9 +584,11 @@ def integrate(springs, whole, work, numbers, t, out):
     wide, places = (n + 3) // 4 * 4, past(start(whole), 8)
     ends = past(places, count * PLACES)
     directions = past(ends, groups)
-    kinds = past(directions, 2 * p)
-    mass = start(work)
-    scales = past(mass, groups)
+    owned = past(directions, 2 * p)
+    kinds = past(owned, owned[count])
+    width, springs = RELAX + 2 * terms, start(work)
+    per_mass = past(springs, count * width)
+    scales = past(per_mass, groups)
     carried = past(scales, 4)
     own = past(carried, groups + 1)
     held = past(own, (2 * count + 1) * p)
@@ -504,12 +598,14 @@ def integrate(springs, whole, work, numbers, t, out):
     stage = past(strain, count * p)
     line, y, new = past(stage, 16 * wide), past(stage, 23 * wide), past(stage, 24 * wide)
     state, f, nil = past(stage, 25 * wide), past(stage, 26 * wide), past(stage, 27 * wide)
+    batch = past(stage, 28 * wide)
     errors = past(stage, 13 * wide)  # where the stages of the dense output follow
     c = Chain(
-        start(springs), places, ends, directions, mass, carried, own, held, part, common, strain,
-        springs.shape[1], count, groups, p, base, terms, drag,
+        springs, places, ends, directions, owned, per_mass, carried, own, held, part, common,
+        strain, width, count, groups, p, base, terms, drag,
     )  # fmt: skip
     for i in range(count):
+        springs[i * width + PER_HEIGHT] = 1.0 / springs[i * width + HEIGHT]
         call_begin(places[i * PLACES + LAW + 2], past(c.springs, i * c.width))
     want = 1 if p > 0 else 0
     top, at, now, end, steps, lost, dt = 2 * groups - 2, 0, 0.0, t[-1], 0, 0, 0.0
@@ -540,12 +636,12 @@ def integrate(springs, whole, work, numbers, t, out):
                     fly(c, y, stage[top + 1], t, at, now, out, before)
                     return DONE, now, steps, lost
                 if who >= 0:
-                    before = springs[who, RESULTS + SLOPE]
+                    before = springs[who * width + RESULTS + SLOPE]
                     change_branch(c, who, kind, y)
                     who = -2 - who
                     continue
                 if who < -1:
-                    after = springs[-2 - who, RESULTS + SLOPE]
+                    after = springs[(-2 - who) * width + RESULTS + SLOPE]
                     dt *= min(max(math.sqrt(before / after), 0.2), 2.0) if after > 0.0 else 2.0
                     who = -1
                 if steps == 0:
@@ -594,6 +690,12 @@ def integrate(springs, whole, work, numbers, t, out):
             if doubtful:
                 share, who, kind = first_event(c, line, wide, y, state, f, risen)
             reached = end if who < 0 and now + dt >= end else now + share * dt
+            while c.ends[0] == 1 and at < t.size and t[at] <= reached:
+                last = at + 1
+                while last < t.size and last - at < BATCH and t[last] <= reached:
+                    last += 1
+                sample_one(c, line, wide, y, now, dt, t, at, last - at, batch, out)
+                at = last
             while at < t.size and t[at] <= reached:
                 dense(line, wide, y, n, (t[at] - now) / dt, state)
                 out[0, 0, at], out[0, 1, at] = follow_group(c, 0, state, f, want), state[top]
@@ -611,9 +713,11 @@ def integrate(springs, whole, work, numbers, t, out):
             return TOO_MANY, now, steps, lost
         if who >= 0:
             if kind == 3:  # dS/dt at the end of contact
-                before = look(c, line, wide, y, share * (1.0 - 1e-4), state, f, 0, 3) / (1e-4 * share * dt)
+                near = look(c, line, wide, y, share * (1.0 - 1e-3), state, f, 0, 3)
+                far = look(c, line, wide, y, share * (1.0 - 2e-3), state, f, 0, 3)
+                before = (4.0 * near - far) / (2e-3 * share * dt)
             elif kind == 2:
-                kind = int(springs[who, TURNS] < 0.0)
+                kind = int(springs[who * width + TURNS] < 0.0)
             else:
                 kind = 1 - kind
             dense(line, wide, y, n, share, state)
@@ -663,22 +767,27 @@ class Prepared:
             place[:, at] = np.where(place[:, at] >= 0, base + place[:, at] * p, -1)
         n = base + carried * p
         head = [count, groups, p, base, n, terms, 0, 0]
+        mine = [[j for j, one in enumerate(directions) if one[0] == i and one[1] < OWN_ETA] for i in range(count)]
+        lists = [np.cumsum([count + 1, *map(len, mine)]), *mine]
         self.whole = np.concatenate(
-            [head, place.ravel(), ends, np.array(directions, np.int64).ravel(), kinds]
+            [head, place.ravel(), ends, np.array(directions, np.int64).ravel(), *lists, kinds]
         ).astype(np.int64)
         own = np.zeros((2 * count + 1, p))
         for j, (i, what) in enumerate(directions):
             if what in (OWN_ETA, OWN_HEIGHT, DRAG):
                 own[{OWN_HEIGHT: 2 * i, OWN_ETA: 2 * i + 1, DRAG: 2 * count}[what], j] = 1.0
         size = groups + 4 + groups + 1 + own.size + (5 * count + groups + 3) * p
-        self.work = np.zeros(size + 28 * ((n + 3) // 4 * 4))
-        self.work[:groups] = mass
-        self.work[2 * groups + 5 : 2 * groups + 5 + own.size] = own.ravel()
+        self.rows = count * (RELAX + 2 * terms)
+        self.work = np.zeros(self.rows + size + 28 * ((n + 3) // 4 * 4) + (6 + COLUMNS) * BATCH)
+        self.work[self.rows : self.rows + groups] = 1.0 / np.array(mass)
+        at = self.rows + 2 * groups + 5  # after scales and stresses
+        self.work[at : at + own.size] = own.ravel()
 
     def run(self, springs, numbers, t):
         """Return outcome, end, steps, rejections, and `out` of `integrate`."""
-        out = np.empty((1 + self.p, 2, t.size))
-        return integrate(springs.copy(), self.whole, self.work.copy(), numbers, t, out), out
+        out, work = np.empty((1 + self.p, 2, t.size)), self.work.copy()
+        work[: self.rows] = springs.ravel()
+        return integrate(self.whole, work, numbers, t, out), out
 
 
 def row(law, values, height, eta=0.0, relaxation=(), terms=0):

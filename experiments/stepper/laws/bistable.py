@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from contract import (
-    BRANCH, BY, HIGH, LOW, MISS, SLOPE, TURNS, Law, beginning, evaluating, switching,
+    BRANCH, BY, HIGH, LOW, MISS, OF_LAW, SLOPE, TURNS, Law, beginning, evaluating, past, switching,
 )  # fmt: skip
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
@@ -34,39 +34,47 @@ def fill(k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus):
 
 
 @evaluating
-def evaluate(row, memory, eps, x, want, out):
+def evaluate(row, memory, eps, x, count, want, out):
     branch, k0, kc = memory[BRANCH], row[0], row[1]
-    out[MISS] = 0.0
-    if branch == A or branch == C:
-        k, r = (k0, eps) if branch == A else (kc, eps - row[EPS_STAR])
-        q = 1.0 / (1.0 - r)
-        out[SLOPE] = slope = k * q * q
-        sigma = k * r * q if r < 1.0 else math.inf
+    sigma, slope = past(out, OF_LAW * count), past(out, SLOPE * count)
+    curved = branch == A or branch == C
+    if curved:
+        k, origin = (k0, 0.0) if branch == A else (kc, row[EPS_STAR])
+        for j in range(count):
+            r = eps[j] - origin
+            q = 1.0 / (1.0 - r)
+            sigma[j] = k * r * q if r < 1.0 else math.inf
+            slope[j] = k * q * q
     else:
-        slope = row[5] if branch == D else row[6]
-        r = eps - (row[3] if branch == D else row[4])
-        out[SLOPE], sigma = slope, (row[SIGMA_A] if branch == D else row[SIGMA_C]) + slope * r
-        q = 0.0
-    if want:
-        for c in range(7):
-            out[BY + c] = 0.0
+        k, origin, start = row[5], row[3], row[SIGMA_A]
+        if branch == E:
+            k, origin, start = row[6], row[4], row[SIGMA_C]
+        for j in range(count):
+            sigma[j], slope[j] = start + k * (eps[j] - origin), k
+    if want == 0:
+        return 0.0
+    for j in range(count):
+        out[MISS * count + j] = 0.0
+    # of slope k, strain origin and stress origin
+    one, stiff = 1.0 / (1.0 - row[3]), 1.0 / (kc + row[SIGMA_C])
+    for c in range(7):
+        on_k = on_origin = on_start = 0.0
+        of_a = row[3] * one if c == 0 else k0 * one * one if c == 3 else 0.0
+        of_c = of_a + (1.0 if c == 2 else 0.0)
         if branch == A:
-            out[BY] = r * q
-            return sigma
-        one = 1.0 / (1.0 - row[3])
-        by_k0, by_a = row[3] * one, k0 * one * one  # of σ_a
-        if branch == D:
-            out[BY], out[BY + 3], out[BY + 5] = by_k0, by_a - slope, r
+            on_k = 1.0 if c == 0 else 0.0
+        elif branch == D:
+            on_k, on_origin, on_start = (1.0 if c == 5 else 0.0), (1.0 if c == 3 else 0.0), of_a
         elif branch == E:
-            out[BY], out[BY + 2], out[BY + 3] = by_k0, 1.0, by_a
-            out[BY + 4], out[BY + 6] = -slope, r
+            on_k, on_origin, on_start = (1.0 if c == 6 else 0.0), (1.0 if c == 4 else 0.0), of_c
         else:
-            stiff = 1.0 / (kc + row[SIGMA_C])
-            back = slope * kc * stiff * stiff  # -dσ/dε dε_*/dσ_c
-            out[BY], out[BY + 2], out[BY + 3] = back * by_k0, back, back * by_a
-            out[BY + 1] = r * q - slope * row[SIGMA_C] * stiff * stiff
-            out[BY + 4] = -slope
-    return sigma
+            on_k = (1.0 if c == 1 else 0.0)
+            on_origin = (1.0 if c == 4 else 0.0) - (kc * of_c - row[SIGMA_C] * on_k) * stiff * stiff
+        by = past(out, (BY + c) * count)
+        for j in range(count):
+            on = sigma[j] / k if curved else eps[j] - origin
+            by[j] = on * on_k - slope[j] * on_origin + on_start
+    return 0.0
 
 
 @switching

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from contract import BY, HIGH, LOW, MISS, SLOPE, TURNS, Law, beginning, evaluating, switching
+from contract import BY, HIGH, LOW, MISS, OF_LAW, SLOPE, TURNS, Law, beginning, evaluating, switching
 
 
 def fill(k0):
@@ -12,9 +12,11 @@ def fill(k0):
 
 
 @evaluating
-def evaluate(row, memory, eps, x, want, out):
-    out[SLOPE], out[MISS], out[BY] = row[0], 0.0, eps
-    return row[0] * eps
+def evaluate(row, memory, eps, x, count, want, out):
+    for k in range(count):
+        out[OF_LAW * count + k], out[SLOPE * count + k] = row[0] * eps[k], row[0]
+        out[MISS * count + k], out[BY * count + k] = 0.0, eps[k]
+    return 0.0
 
 
 @switching

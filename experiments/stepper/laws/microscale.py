@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 from contract import (
-    BRANCH, BY, BY_HELD, CHANGE, HELD, HIGH, LOW, MISS, OF_HELD, OF_PARAMETER, OF_STRESS, OWN,
-    SLOPE, TURNS, Law, beginning, evaluating, inlined, inner, switching,
+    BRANCH, BY, CHANGE, HELD, HIGH, LOW, MISS, OF_HELD, OF_LAW, OF_PARAMETER, OF_STRESS, OWN,
+    SLOPE, TURNS, Law, beginning, evaluating, inlined, inner, past, switching,
 )  # fmt: skip
 
 NAMES = (
@@ -80,57 +80,62 @@ def strain(row, memory, branch, sigma):
 
 
 @evaluating
-def evaluate(row, memory, eps, x, want, out):
-    branch, sigma = memory[BRANCH], x
-    k0, kc, star, n = row[0], row[1], row[2], row[N]
-    p, rest, never, rank, wide, pace, weight = memory[P], memory[REST], memory[NEVER], 0.0, 1.0, 0.0, 0.0
-    if branch > FIXED:
-        back = branch == BACK
-        place = row[5] if back else (row[3] if branch == SNAP else row[LOG_AGAIN])
-        wide = 1.0 / row[6 if back else 4]
-        rank = (math.log(sigma) - place) * wide
-        p, rest = shares(rank)
-        weight, pace = _TURN * math.exp(-0.5 * rank * rank), wide / sigma
-    elif want and p > 0.0:
-        rank = memory[W]
-        weight = _TURN * math.exp(-0.5 * rank * rank)
-    two = 1.0 / (kc + sigma)
-    fresh, worn = rest, 0.0
-    if branch != SNAP and row[REMEMBERS] > 0.0 and never < 1.0:
-        fresh = min(never, rest)
-        worn = rest - fresh
-    main, soft, by_n = on_a(n, k0, sigma)
-    one, slope_one, by_n_one = main, soft, by_n
-    if branch != SNAP and row[WORN] != k0 and never < 1.0:
-        one, slope_one, by_n_one = on_a(n, row[WORN], sigma)
-    softness = fresh * soft + worn * slope_one
-    on_c = star + sigma * two
-    by_rank = weight * (on_c - one)
-    slope = 1.0 / (softness + p * kc * two * two + by_rank * pace)
-    out[SLOPE] = slope
-    out[MISS] = fresh * main + worn * one + p * on_c - eps
-    if want:
-        out[BY] = slope * sigma * softness / k0
-        out[BY + 1], out[BY + 2] = slope * p * sigma * two * two, -slope * p
-        for c in range(3, 10):
-            out[BY + c] = 0.0
-        out[BY_HELD] = out[BY_HELD + 1] = 0.0
-        if branch <= FIXED:
-            out[BY_HELD] = -slope * by_rank
-        else:
-            first = 5 if branch == BACK else 3
+def evaluate(row, memory, eps, x, count, want, out):
+    branch = memory[BRANCH]
+    k0, kc, star, n, remembers = row[0], row[1], row[2], row[N], row[REMEMBERS] > 0.0
+    p, rest, never, rank, pace, weight = memory[P], memory[REST], memory[NEVER], 0.0, 0.0, 0.0
+    moves, first = branch > FIXED, 5 if branch == BACK else 3
+    place = row[LOG_AGAIN] if branch >= BOTH else row[first]
+    wide, through = 1.0 / row[first + 1], 0.0
+    by_median = math.exp(-row[first]) if want and moves else 0.0
+    # shares on branch a of what never and what once snapped
+    mixed = remembers and branch != SNAP and never < 1.0
+    softened = mixed and row[WORN] != k0
+    on_most = 0.0
+    if want and mixed:
+        on_most = _TURN * math.exp(-0.5 * memory[MOST] * memory[MOST])
+    if want and not moves and p > 0.0:
+        weight = _TURN * math.exp(-0.5 * memory[W] * memory[W])
+    for j in range(count):
+        sigma = x[j]
+        if moves:
+            rank = (math.log(sigma) - place) * wide
+            p, rest = shares(rank)
+            weight, pace = _TURN * math.exp(-0.5 * rank * rank), wide / sigma
+        two = 1.0 / (kc + sigma)
+        fresh, worn = rest, 0.0
+        if mixed:
+            fresh = min(never, rest)
+            worn = rest - fresh
+        main, soft, by_n = on_a(n, k0, sigma)
+        one, slope_one, by_n_one = main, soft, by_n
+        if softened:
+            one, slope_one, by_n_one = on_a(n, row[WORN], sigma)
+        softness = fresh * soft + worn * slope_one
+        on_c = star + sigma * two
+        by_rank = weight * (on_c - one)
+        slope = 1.0 / (softness + p * kc * two * two + by_rank * pace)
+        out[OF_LAW * count + j], out[SLOPE * count + j] = sigma, slope
+        out[MISS * count + j] = fresh * main + worn * one + p * on_c - eps[j]
+        if want == 0:
+            continue
+        by = past(out, BY * count + j)
+        by[0] = slope * sigma * softness / k0
+        by[count], by[2 * count] = slope * p * sigma * two * two, -slope * p
+        for c in range(3, 12):
+            by[c * count] = 0.0
+        if moves:
             through = slope * by_rank * wide
-            out[BY + first] = through * math.exp(-row[first])
-            out[BY + first + 1] = through * rank
+            by[first * count], by[(first + 1) * count] = through * by_median, through * rank
             if branch >= BOTH:
-                out[BY + 9] = -through
-        if row[REMEMBERS] > 0.0:
-            out[BY + 7] = -slope * (fresh * by_n + worn * by_n_one)
-            out[BY + 8] = -slope * worn * sigma * slope_one
-            if branch != SNAP and never < 1.0:
-                most = memory[MOST]
-                out[BY_HELD + 1] = -slope * _TURN * math.exp(-0.5 * most * most) * (one - main)
-    return sigma
+                by[9 * count] = -through
+        else:
+            by[10 * count] = -slope * by_rank
+        if remembers:
+            by[7 * count] = -slope * (fresh * by_n + worn * by_n_one)
+            by[8 * count] = -slope * worn * sigma * slope_one
+            by[11 * count] = -slope * on_most * (one - main)
+    return 0.0
 
 
 @inner
