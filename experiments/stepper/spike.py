@@ -4,7 +4,7 @@ Method. Both run in one process, in turns, as a fit runs them: a prepared scene,
 displacement of the top at all samples, with and without derivatives. Errors are the largest over
 range against the judge of the stability study (`independent.py`), those of derivatives against the
 present solver at rtol 1e-12. For an asked error each solver gets its loosest setting that reaches
-it (powers of 10), and the time is the best of many repeats; "rtol = 1e-6" is the setting of a fit.
+it (half powers of 10), and the time is the best of many repeats; "rtol = 1e-6" is the setting of a fit.
 Compile times are processor seconds of fresh processes without a cache.
 
     python experiments/stepper/spike.py            # the table: about 2 minutes
@@ -35,7 +35,7 @@ import cases
 import independent
 
 ROUNDS, SHORTEST = 15, 2e-3  # turns of each competitor; s, shorter runs are timed together
-SETTINGS = [10.0**-k for k in range(2, 14)]
+SETTINGS = [10.0 ** (-0.5 * k) for k in range(4, 27)]
 ASKED = (1e-6, 1e-9)
 Array = np.ndarray
 Answer = tuple[Array, Array]
