@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 from contract import (
-    BY, BY_HELD, CHANGE, CHANGES, EPS, HELD_NUMBERS, HIGH, LOW, MISS, OF_HELD, OF_LAW,
+    BY, BY_HELD, CHANGE, CHANGES, COLUMNS, EPS, HELD_NUMBERS, HIGH, LOW, MISS, OF_HELD, OF_LAW,
     OF_PARAMETER, OF_STRESS, OPTIONS, RELAX, RESULTS, SIGMA, SLOPE, TURNS, call_begin, call_evaluate, call_switch, inner, past,
     start,
 )  # fmt: skip
 from numba import njit
-from stepper import OWN_ETA, OWN_HEIGHT, RELAXING
+from stepper import BATCH, OWN_ETA, OWN_HEIGHT, RELAXING
 
 MOMENTS, OF_STEP, TABLE = 0, 6, 8  # columns of the table of a relaxation term
 NEAR = 1e-9  # relative correction of the stress that is the last
@@ -134,7 +134,27 @@ def follow(springs, whole, work, eps, t, tol, out):
         derive(s, directions, p, held, seed, d_last)
     for k in range(terms):
         weight += s[RELAX + 2 * k] * min(1.0, (t[-1] - t[0]) / s[RELAX + 2 * k + 1])
+    batch, ahead = past(d_last, p), 0
     for j in range(t.size):
+        if j < ahead:
+            continue
+        if terms == 0 and not implicit and s[LOW] <= eps[j] <= s[HIGH]:
+            # several samples on one branch of an explicit law
+            ahead = j + 1
+            while ahead < t.size and ahead - j < BATCH and s[LOW] <= eps[ahead] <= s[HIGH]:
+                ahead += 1
+            n, here = ahead - j, past(start(eps), j)
+            call_evaluate(whole[0], s, here, here, n, want, batch)
+            for k in range(n):
+                out[0, j + k] = batch[OF_LAW * n + k]
+            for c in range(p):
+                own, slope = directions[c] < OWN_ETA, past(batch, SLOPE * n)
+                by = past(batch, (BY + (directions[c] if own else 0)) * n)
+                for k in range(n):
+                    out[1 + c, j + k] = seed[c] * here[k] * slope[k] + (by[k] if own else 0.0)
+            s[EPS], s[SIGMA] = here[n - 1], batch[OF_LAW * n + n - 1]
+            s[RESULTS + SLOPE] = batch[SLOPE * n + n - 1]
+            continue
         begun, left = s[EPS], 1.0
         between = t[j] - t[j - 1] if j > 0 else 0.0
         pace = 1.0
@@ -226,7 +246,7 @@ class Prepared:
         what, p = [int(own) for _, own in directions], len(directions)
         self.p = p
         self.whole = np.array([*law.addresses, law.implicit, terms, p, *what], np.int64)
-        self.work = np.zeros(3 * p + terms * (1 + p) + terms * TABLE + 3 * p)
+        self.work = np.zeros(3 * p + terms * (1 + p) + terms * TABLE + 3 * p + COLUMNS * BATCH)
         self.work[:p] = [-1.0 / height if own == OWN_HEIGHT else 0.0 for own in what]
 
     def run(self, row, eps, t, tol):

@@ -36,7 +36,7 @@ SLOPE, MISS, BY, BY_HELD, OF_LAW, COLUMNS, RESULTS = 0, 1, 2, 12, 14, 15, 16
 OF_STRESS, OF_HELD, OF_PARAMETER, CHANGE, CHANGES = 0, 1, 3, 16, 32
 # Values now and before; height, dashpot, 1 + Σ g; the row of the law; g and τ of relaxation terms.
 EPS, RATE, SIGMA, STRESS, DRIFT, OLD_EPS, OLD_RATE = range(64, 71)
-HEIGHT, ETA, GAIN, PER_HEIGHT, ROW, RELAX = 72, 73, 74, 75, 80, 96
+HEIGHT, ETA, GAIN, PER_HEIGHT, ROW, RELAX = 72, 73, 74, 75, 80, 192
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 _INSIDE: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}

@@ -80,6 +80,7 @@ class Chain(NamedTuple):
     base: int  #: values before the derivatives in the state
     terms: int  #: of relaxation
     drag: float
+    none: int  #: 0; a literal is another type, for which functions are compiled again
 
 
 @inner
@@ -342,19 +343,24 @@ def excess(c, i, kind):
 def look(c, line, wide, y, x, state, f, i, kind):
     """Return the excess of a spring at the share x of the step."""
     dense(line, wide, y, c.base, x, state)
-    rates(c, state, f, 0)
+    rates(c, state, f, c.none)
     return excess(c, i, kind)
 
 
 @inner
-def locate(c, line, wide, y, low, high, state, f, i, kind):
+def locate(c, line, wide, y, dt, low, high, state, f, i, kind):
     """Return where an excess becomes positive between two shares, by Illinois' method."""
     f_low = look(c, line, wide, y, low, state, f, i, kind)
     f_high, side = look(c, line, wide, y, high, state, f, i, kind), 0
     if f_low >= 0.0:
         return low
+    s, value, slope, middle = past(c.springs, i * c.width), f_high, 0.0, high
     for _ in range(60):
-        middle = high - f_high * (high - low) / (f_high - f_low)
+        if kind < 2:  # Newton's method
+            slope = (s[RATE] if kind == 0 else -s[RATE]) * dt
+            middle -= value / slope
+        if kind >= 2 or not low < middle < high:
+            middle = high - f_high * (high - low) / (f_high - f_low)
         if high - low <= 4e-16 or not low < middle < high:
             break
         value = look(c, line, wide, y, middle, state, f, i, kind)
@@ -370,11 +376,16 @@ def locate(c, line, wide, y, low, high, state, f, i, kind):
 
 
 @inner
-def first_event(c, line, wide, y, state, f, risen):
+def first_event(c, line, wide, y, dt, state, f, risen):
     """Return share, spring and kind of the first switch in a step; kind -1 if there is none."""
-    at, who, what, before = 1.0, -1, -1, 0.0
-    for piece in range(1, 5):
-        x, missed = 0.25 * piece, True
+    at, who, what, before, pieces = 1.0, -1, -1, 0.0, 1
+    look(c, line, wide, y, 1.0, state, f, c.none, c.none)
+    for i in range(c.count):
+        s = past(c.springs, i * c.width)
+        if s[OLD_RATE] * s[RATE] <= 0.0:  # otherwise one look at the end tells
+            pieces = 4
+    for piece in range(1, pieces + 1):
+        x, missed = piece / pieces, True
         for i in range(c.count):
             for kind in range(4):
                 if kind == 3 and (i > 0 or not risen):
@@ -383,7 +394,7 @@ def first_event(c, line, wide, y, state, f, risen):
                     look(c, line, wide, y, x, state, f, i, kind)
                     missed = False
                 if excess(c, i, kind) > 0.0:
-                    found = locate(c, line, wide, y, before, x, state, f, i, kind)
+                    found = locate(c, line, wide, y, dt, before, x, state, f, i, kind)
                     missed = True
                     if what < 0 or found < at:
                         at, who, what = found, i, kind
@@ -494,18 +505,21 @@ def polynomial(line, wide, y, i, shares, n, out):
 
 
 @inner
-def sample_one(c, line, wide, y, now, dt, t, at, n, batch, out):
-    """Fill n samples from `at` on if one spring carries the base stress, BATCH at a time."""
-    s, place, p, top = c.springs, c.places, c.p, 2 * c.groups - 2
+def sample_one(c, first, line, wide, y, now, dt, t, at, n, batch, out):
+    """Fill n samples from `at` on where the stress of one spring, `first`, is the base stress."""
+    s, place, p, top = past(c.springs, first * c.width), past(c.places, first * PLACES), c.p, 2 * c.groups - 2
     shares, eps, x, work = batch, past(batch, BATCH), past(batch, 2 * BATCH), past(batch, 3 * BATCH)
     w, v, results = past(batch, 4 * BATCH), past(batch, 5 * BATCH), past(batch, 6 * BATCH)
     per, eta, gain, want = s[PER_HEIGHT], s[ETA], s[GAIN], 1 if p > 0 else 0
     for k in range(n):
         shares[k] = (t[at + k] - now) / dt
-    polynomial(line, wide, y, 0, shares, n, w)
-    polynomial(line, wide, y, 1, shares, n, v)
-    for k in range(n):
-        eps[k] = w[k] * per
+    polynomial(line, wide, y, c.none, shares, n, w)
+    polynomial(line, wide, y, c.none + 1, shares, n, v)
+    if place[EPS_AT] >= 0:
+        polynomial(line, wide, y, place[EPS_AT], shares, n, eps)
+    else:
+        for k in range(n):
+            eps[k] = w[k] * per
     if place[X_AT] >= 0:
         polynomial(line, wide, y, place[X_AT], shares, n, x)
     call_evaluate(place[LAW], s, eps, x, n, want, results)
@@ -542,10 +556,10 @@ def sample_one(c, line, wide, y, now, dt, t, at, n, batch, out):
             for k in range(n):
                 out[1 + j, 0, at + k] += gain * by[k]
         if place[IMPLICIT] > 0:
-            first, second = gain * c.held[j], gain * c.held[p + j]
+            held, ever = gain * c.held[j], gain * c.held[p + j]
             by = past(results, BY_HELD * n)
             for k in range(n):
-                out[1 + j, 0, at + k] += first * by[k] + second * by[n + k]
+                out[1 + j, 0, at + k] += held * by[k] + ever * by[n + k]
         if eta > 0.0 or own_eta > 0.0:
             polynomial(line, wide, y, c.base + p + j, shares, n, work)
             for k in range(n):
@@ -602,12 +616,15 @@ def integrate(whole, work, numbers, t, out):
     errors = past(stage, 13 * wide)  # where the stages of the dense output follow
     c = Chain(
         springs, places, ends, directions, owned, per_mass, carried, own, held, part, common,
-        strain, width, count, groups, p, base, terms, drag,
+        strain, width, count, groups, p, base, terms, drag, whole[6],
     )  # fmt: skip
     for i in range(count):
         springs[i * width + PER_HEIGHT] = 1.0 / springs[i * width + HEIGHT]
         call_begin(places[i * PLACES + LAW + 2], past(c.springs, i * c.width))
-    want = 1 if p > 0 else 0
+    want, first = 1 if p > 0 else 0, 0 if ends[0] == 1 else -1
+    for i in range(ends[0]):  # without a dashpot it carries the stress of its group
+        if p == 0 and springs[i * width + ETA] == 0.0:
+            first = i
     top, at, now, end, steps, lost, dt = 2 * groups - 2, 0, 0.0, t[-1], 0, 0, 0.0
     y[top + 1] = speed
     scales[1], carried[groups] = speed, push
@@ -688,34 +705,33 @@ def integrate(whole, work, numbers, t, out):
         who = kind = -1
         if s == ALL_STAGES:
             if doubtful:
-                share, who, kind = first_event(c, line, wide, y, state, f, risen)
+                share, who, kind = first_event(c, line, wide, y, dt, state, f, risen)
             reached = end if who < 0 and now + dt >= end else now + share * dt
-            while c.ends[0] == 1 and at < t.size and t[at] <= reached:
+            while first >= 0 and at < t.size and t[at] <= reached:
                 last = at + 1
                 while last < t.size and last - at < BATCH and t[last] <= reached:
                     last += 1
-                sample_one(c, line, wide, y, now, dt, t, at, last - at, batch, out)
+                sample_one(c, first, line, wide, y, now, dt, t, at, last - at, batch, out)
                 at = last
             while at < t.size and t[at] <= reached:
                 dense(line, wide, y, n, (t[at] - now) / dt, state)
-                out[0, 0, at], out[0, 1, at] = follow_group(c, 0, state, f, want), state[top]
+                out[0, 0, at], out[0, 1, at] = follow_group(c, c.none, state, f, want), state[top]
                 if want:
-                    derive_group(c, 0, state, f)
+                    derive_group(c, c.none, state, f)
                     for j in range(p):
                         out[1 + j, 0, at], out[1 + j, 1, at] = common[j], state[base + top * p + j]
                 at += 1
             if at == t.size:
                 return DONE, math.nan, steps, lost
             if who < 0:  # values at the end of the step
-                rates(c, new, f, 0)
+                rates(c, new, f, c.none)
                 here = carried[0]
         if steps >= most:
             return TOO_MANY, now, steps, lost
         if who >= 0:
             if kind == 3:  # dS/dt at the end of contact
-                near = look(c, line, wide, y, share * (1.0 - 1e-3), state, f, 0, 3)
-                far = look(c, line, wide, y, share * (1.0 - 2e-3), state, f, 0, 3)
-                before = (4.0 * near - far) / (2e-3 * share * dt)
+                after = look(c, line, wide, y, share + 1e-3, state, f, c.none, 3 + c.none)
+                before = (after - look(c, line, wide, y, share - 1e-3, state, f, c.none, 3 + c.none)) / (-2e-3 * dt)
             elif kind == 2:
                 kind = int(springs[who * width + TURNS] < 0.0)
             else:

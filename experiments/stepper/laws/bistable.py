@@ -9,7 +9,7 @@ from contract import (
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 A, D, C, E = range(4)
-SIGMA_A, SIGMA_C, EPS_STAR, HAT_A, HAT_C = range(7, 12)
+HAT_A, HAT_C, TABLE, WIDE = 10, 11, 12, 24  # columns
 
 
 def fill(k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus):
@@ -30,50 +30,40 @@ def fill(k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus):
     elif b < 0.0 and square >= 0.0:
         hat_a = eps_a - 2.0 * v * v * fall / (math.sqrt(square) - b)
     own = (k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus)
-    return np.array([*own, sigma_a, sigma_c, star, hat_a, eps_c + y])
+    # of each branch: slope, origins of strain and stress, and their derivatives
+    zero, one = np.zeros(7), np.eye(7)
+    of_a = eps_a / v * one[0] + k0 / (v * v) * one[3]
+    of_c, stiff = of_a + one[2], kc + sigma_c
+    of_star = one[4] - (kc * of_c - sigma_c * one[1]) / stiff**2
+    table = [
+        (k0, 0.0, 0.0, *one[0], *zero, *zero), (kh_plus, eps_a, sigma_a, *one[5], *one[3], *of_a),
+        (kc, star, 0.0, *one[1], *of_star, *zero), (kh_minus, eps_c, sigma_c, *one[6], *one[4], *of_c),
+    ]  # fmt: skip
+    return np.array([*own, sigma_a, sigma_c, star, hat_a, eps_c + y, *np.ravel(table)])
 
 
 @evaluating
 def evaluate(row, memory, eps, x, count, want, out):
-    branch, k0, kc = memory[BRANCH], row[0], row[1]
+    branch = memory[BRANCH]
+    line = past(row, TABLE + int(branch) * WIDE)
     sigma, slope = past(out, OF_LAW * count), past(out, SLOPE * count)
-    curved = branch == A or branch == C
-    if curved:
-        k, origin = (k0, 0.0) if branch == A else (kc, row[EPS_STAR])
+    factor = past(out, MISS * count)  # of the derivative of the slope; an explicit law has no miss
+    k, origin, start = line[0], line[1], line[2]
+    if branch == A or branch == C:
         for j in range(count):
             r = eps[j] - origin
             q = 1.0 / (1.0 - r)
             sigma[j] = k * r * q if r < 1.0 else math.inf
-            slope[j] = k * q * q
+            slope[j], factor[j] = k * q * q, r * q
     else:
-        k, origin, start = row[5], row[3], row[SIGMA_A]
-        if branch == E:
-            k, origin, start = row[6], row[4], row[SIGMA_C]
         for j in range(count):
-            sigma[j], slope[j] = start + k * (eps[j] - origin), k
-    if want == 0:
-        return 0.0
-    for j in range(count):
-        out[MISS * count + j] = 0.0
-    # of slope k, strain origin and stress origin
-    one, stiff = 1.0 / (1.0 - row[3]), 1.0 / (kc + row[SIGMA_C])
-    for c in range(7):
-        on_k = on_origin = on_start = 0.0
-        of_a = row[3] * one if c == 0 else k0 * one * one if c == 3 else 0.0
-        of_c = of_a + (1.0 if c == 2 else 0.0)
-        if branch == A:
-            on_k = 1.0 if c == 0 else 0.0
-        elif branch == D:
-            on_k, on_origin, on_start = (1.0 if c == 5 else 0.0), (1.0 if c == 3 else 0.0), of_a
-        elif branch == E:
-            on_k, on_origin, on_start = (1.0 if c == 6 else 0.0), (1.0 if c == 4 else 0.0), of_c
-        else:
-            on_k = (1.0 if c == 1 else 0.0)
-            on_origin = (1.0 if c == 4 else 0.0) - (kc * of_c - row[SIGMA_C] * on_k) * stiff * stiff
-        by = past(out, (BY + c) * count)
+            r = eps[j] - origin
+            sigma[j], slope[j], factor[j] = start + k * r, k, r
+    if want:
         for j in range(count):
-            on = sigma[j] / k if curved else eps[j] - origin
-            by[j] = on * on_k - slope[j] * on_origin + on_start
+            for c in range(7):
+                by = line[3 + c] * factor[j] - line[10 + c] * slope[j] + line[17 + c]
+                out[(BY + c) * count + j] = by
     return 0.0
 
 
