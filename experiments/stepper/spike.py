@@ -128,15 +128,23 @@ def measure(scene: cases.Scene) -> list[dict[str, object]]:
 
 
 COMPILED = """
-import sys, time
+import os, resource, sys, time
 sys.path[:0] = {path!r}
-import numpy as np, numba
-import foamfit as ff, cases
+def spent():
+    both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(one.ru_utime + one.ru_stime for one in both)
+import numba, numpy, pandas, foamfit, scipy.integrate
+began = spent()
+if {which!r} == "stepped":
+    import contract
+    from laws import {law}
+laws = spent() - began
+import cases
 scene = [one for one in cases.scenes() if one.name == {name!r}][0]
-loaded = time.process_time()
-run = cases.{which}(scene, {derive})
+loaded = spent()
+run = cases.{which}(scene, True)
 run(1e-6)
-print(time.process_time() - loaded)
+print("%.1f s" % (spent() - loaded + laws), "of it the law %.1f s" % laws)
 """
 
 
@@ -146,7 +154,8 @@ def compile_times() -> None:
     for name in names:
         for which in ("present", "stepped"):
             with tempfile.TemporaryDirectory() as folder:
-                code = COMPILED.format(path=sys.path[:4], name=name, which=which, derive=True)
+                law = "microscale" if "micro" in name else "bistable"
+                code = COMPILED.format(path=sys.path[:4], name=name, which=which, law=law)
                 env = os.environ | {"NUMBA_CACHE_DIR": folder, "FOAMFIT_CACHE_DIR": folder}
                 began = time.perf_counter()
                 out = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)

@@ -44,9 +44,14 @@ _A[STAGES, :STAGES] = pair.B
 _FULL = np.zeros((22, ALL_STAGES))
 _FULL[:16], _FULL[16:20], _FULL[20, :13], _FULL[21, :13] = _A, pair.D, pair.E5, pair.E3
 _ROWS = [np.flatnonzero(row) for row in _FULL]
+NONE = np.array([-row.size % 4 for row in _ROWS])  # zeros at the end of a row
+_ROWS = [np.append(row, [row[-1] if row.size else 0] * (-row.size % 4)).astype(int) for row in _ROWS]
 FIRST = np.cumsum([0] + [len(row) for row in _ROWS])
 FROM = np.concatenate(_ROWS)
-WEIGHT = np.concatenate([full[row] for full, row in zip(_FULL, _ROWS, strict=True)])
+WEIGHT = np.concatenate(
+    [np.where(np.arange(row.size) < row.size - more, full[row], 0.0)
+     for full, row, more in zip(_FULL, _ROWS, NONE, strict=True)]
+)  # fmt: skip
 
 # Directions of derivatives apart from the parameters of a law, as in foamfit.
 OWN_ETA, OWN_HEIGHT, DRAG, RELAXING = 20, 21, 22, 23
@@ -293,18 +298,31 @@ def rates(c, y, f, want):
 @inner
 def combine(stage, wide, n, row, scale, begin, out):
     """Fill out = begin + scale Σ WEIGHT[k] stage[FROM[k]] of a row of coefficients."""
-    for i in range(0, n, 4):
-        a = b = c = d = 0.0
-        for k in range(FIRST[row], FIRST[row + 1]):
-            weight, at = WEIGHT[k], FROM[k] * wide + i
-            a += weight * stage[at]
-            b += weight * stage[at + 1]
-            c += weight * stage[at + 2]
-            d += weight * stage[at + 3]
-        out[i] = begin[i] + scale * a
-        out[i + 1] = begin[i + 1] + scale * b
-        out[i + 2] = begin[i + 2] + scale * c
-        out[i + 3] = begin[i + 3] + scale * d
+    first, last = FIRST[row], FIRST[row + 1]
+    if n <= 8:
+        for i in range(0, n, 4):
+            a = b = c = d = 0.0
+            for k in range(first, last - NONE[row]):
+                weight, at = WEIGHT[k], FROM[k] * wide + i
+                a += weight * stage[at]
+                b += weight * stage[at + 1]
+                c += weight * stage[at + 2]
+                d += weight * stage[at + 3]
+            out[i] = begin[i] + scale * a
+            out[i + 1] = begin[i + 1] + scale * b
+            out[i + 2] = begin[i + 2] + scale * c
+            out[i + 3] = begin[i + 3] + scale * d
+        return
+    source = begin
+    for k in range(first, last, 4):  # loops that are vectorised; rows are filled up with zeros
+        one, two, three, four = scale * WEIGHT[k], scale * WEIGHT[k + 1], scale * WEIGHT[k + 2], scale * WEIGHT[k + 3]
+        a, b, c, d = (
+            past(stage, FROM[k] * wide), past(stage, FROM[k + 1] * wide),
+            past(stage, FROM[k + 2] * wide), past(stage, FROM[k + 3] * wide),
+        )
+        for i in range(n):
+            out[i] = source[i] + (one * a[i] + two * b[i] + (three * c[i] + four * d[i]))
+        source = out
 
 
 @inner
@@ -522,8 +540,10 @@ def sample_one(c, first, line, wide, y, now, dt, t, at, n, batch, out):
             eps[k] = w[k] * per
     if place[X_AT] >= 0:
         polynomial(line, wide, y, place[X_AT], shares, n, x)
-    call_evaluate(place[LAW], s, eps, x, n, want, results)
-    sigma, slope = past(results, OF_LAW * n), past(results, SLOPE * n)
+    sigma, slope = x, past(results, SLOPE * n)
+    if place[X_AT] < 0 or want:  # otherwise the state says it
+        call_evaluate(place[LAW], s, eps, x, n, want, results)
+        sigma = past(results, OF_LAW * n)
     for k in range(n):
         out[0, 0, at + k] = gain * sigma[k] + eta * per * v[k]
     for m in range(c.terms):
