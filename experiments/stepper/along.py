@@ -13,11 +13,35 @@ from typing import Any
 
 import numpy as np
 from contract import (
-    BY, BY_HELD, CHANGE, CHANGES, COLUMNS, EPS, HELD_NUMBERS, HIGH, LOW, MISS, OF_HELD, OF_LAW,
-    OF_PARAMETER, OF_STRESS, OPTIONS, RELAX, RESULTS, SIGMA, SLOPE, TURNS, call_begin, call_evaluate, call_switch, inner, past,
+    BY,
+    BY_HELD,
+    CHANGE,
+    CHANGES,
+    COLUMNS,
+    EPS,
+    HELD_NUMBERS,
+    HIGH,
+    LOW,
+    MISS,
+    OF_HELD,
+    OF_LAW,
+    OF_PARAMETER,
+    OF_STRESS,
+    OPTIONS,
+    RELAX,
+    RESULTS,
+    SIGMA,
+    SLOPE,
+    TURNS,
+    call_begin,
+    call_evaluate,
+    call_switch,
+    inner,
+    past,
     start,
 )  # fmt: skip
 from numba import njit
+
 from stepper import BATCH, OWN_ETA, OWN_HEIGHT, RELAXING
 
 MOMENTS, OF_STEP, TABLE = 0, 6, 8  # columns of the table of a relaxation term
@@ -65,7 +89,9 @@ def change_branch(address, s, up, directions, p, held, d_sigma):
         first, second = held[j], held[p + j]
         for h in range(HELD_NUMBERS):
             by = past(s, CHANGES + h * CHANGE)
-            held[h * p + j] = by[OF_STRESS] * d_sigma[j] + by[OF_HELD] * first + by[OF_HELD + 1] * second
+            held[h * p + j] = (
+                by[OF_STRESS] * d_sigma[j] + by[OF_HELD] * first + by[OF_HELD + 1] * second
+            )
             if directions[j] < OWN_ETA:
                 held[h * p + j] += by[OF_PARAMETER + directions[j]]
 
@@ -91,7 +117,9 @@ def tabulate(x, h, table):
 
 
 @inner
-def relax(s, terms, h, tables, z, dz, first, low, high, bump, d_first, d_middle, d_last, directions, p):
+def relax(
+    s, terms, h, tables, z, dz, first, low, high, bump, d_first, d_middle, d_last, directions, p
+):
     """Advance the relaxation terms and their derivatives over a step.
 
     The stress is first + low r + … : slopes `low` and `high` at the ends, `bump` 16 r² (1-r)².
@@ -103,15 +131,27 @@ def relax(s, terms, h, tables, z, dz, first, low, high, bump, d_first, d_middle,
         tau, table = s[RELAX + 2 * k + 1], past(tables, k * TABLE)
         x = h / tau
         decay = math.exp(-x)
-        total = first * table[0] + low * table[1] + square * table[2] + cube * table[3] + fourth * table[4]
+        total = (
+            first * table[0]
+            + low * table[1]
+            + square * table[2]
+            + cube * table[3]
+            + fourth * table[4]
+        )
         if p > 0:
-            change = first * (table[1] - table[0]) + low * (table[2] - table[1]) + square * (table[3] - table[2])
+            change = (
+                first * (table[1] - table[0])
+                + low * (table[2] - table[1])
+                + square * (table[3] - table[2])
+            )
             change += cube * (table[4] - table[3]) + fourth * (table[5] - table[4])
             by_tau = (decay * z[k] + total + x * change) * x / tau
             one, two = table[1], table[2]
             a, b, c = table[0] - 3.0 * one + 2.0 * two, 4.0 * (one - two), 2.0 * two - one
             for j in range(p):
-                mine = decay * dz[k * p + j] - x * (a * d_first[j] + b * d_middle[j] + c * d_last[j])
+                mine = decay * dz[k * p + j] - x * (
+                    a * d_first[j] + b * d_middle[j] + c * d_last[j]
+                )
                 dz[k * p + j] = mine + (by_tau if directions[j] == RELAXING + 2 * k + 1 else 0.0)
         z[k] = decay * z[k] - x * total
 
@@ -175,7 +215,11 @@ def follow(springs, whole, work, eps, t, tol, out):
             share, part = left - until, goal
             if pace < share:
                 share, leaving = pace, False
-                part = eps[j] + (left - share) / left * (s[EPS] - eps[j]) if until == 0.0 else s[EPS] + share / (left - until) * (goal - s[EPS])
+                part = (
+                    eps[j] + (left - share) / left * (s[EPS] - eps[j])
+                    if until == 0.0
+                    else s[EPS] + share / (left - until) * (goal - s[EPS])
+                )
             first, origin, slope = s[SIGMA], s[EPS], s[RESULTS + SLOPE]
             step, h = part - origin, share * between
             guess = first + step * (slope + 0.5 * bend * step)
@@ -209,7 +253,23 @@ def follow(springs, whole, work, eps, t, tol, out):
                 for k in range(terms):
                     if abs(h - tables[k * TABLE + OF_STEP]) > 1e-13 * h:
                         tabulate(h / s[RELAX + 2 * k + 1], h, past(tables, k * TABLE))
-                relax(s, terms, h, tables, z, dz, first, low, high, bump, d_first, d_middle, d_last, directions, p)
+                relax(
+                    s,
+                    terms,
+                    h,
+                    tables,
+                    z,
+                    dz,
+                    first,
+                    low,
+                    high,
+                    bump,
+                    d_first,
+                    d_middle,
+                    d_last,
+                    directions,
+                    p,
+                )
             elif p > 0:
                 derive(s, directions, p, held, seed, d_last)
             largest = max(largest, abs(last))

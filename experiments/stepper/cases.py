@@ -17,8 +17,9 @@ from foamfit.springs.parameters import direction
 sys.path[:0] = [str(Path(__file__).parents[1] / "error_vs_runtime"), str(Path(__file__).parent)]
 import along
 import scenes as kinds
-import stepper
 from laws import bistable, linear, microscale
+
+import stepper
 
 Array = NDArray[np.float64]
 # The parameters of a microscale law as foamfit numbers them and as the law here does.
@@ -152,7 +153,9 @@ def stepped(scene: Scene, derive: bool):
     masses[-1] += drive.mass
     ends = np.flatnonzero(masses > 0.0) + 1
     etas = [spring.eta for spring in chain.springs]
-    made = stepper.Prepared(laws, ends.tolist(), masses[ends - 1] / chain.area, terms, etas, directions)
+    made = stepper.Prepared(
+        laws, ends.tolist(), masses[ends - 1] / chain.area, terms, etas, directions
+    )
 
     def run(tol: float):
         numbers = np.array((chain.site_damping / chain.height, 0.0, drive.velocity, tol, MOST))

@@ -107,12 +107,17 @@ def measure(scene: cases.Scene) -> list[dict[str, object]]:
     rows, slopes = [], answer_of(cases.present(scene, True)(1e-12))
     for derive in (False, True):
         old, new = cases.present(scene, derive), cases.stepped(scene, derive)
-        pairs = [(f"{asked:.0e}", loosest(old, true, asked)[0], loosest(new, true, asked)[0]) for asked in ASKED]
+        pairs = [
+            (f"{asked:.0e}", loosest(old, true, asked)[0], loosest(new, true, asked)[0])
+            for asked in ASKED
+        ]
         pairs.append(("rtol = 1e-6", 1e-6, 1e-6))
         for asked, mine, other in pairs:
             runs = [lambda s=mine: old(s), lambda s=other: new(s)]
             if not derive:
-                runs.append(lambda s=mine: ff.simulate(scene.chain, scene.drive, scene.time, max(s, 1e-13)))
+                runs.append(
+                    lambda s=mine: ff.simulate(scene.chain, scene.drive, scene.time, max(s, 1e-13))
+                )
             times = take_turns(runs)
             found = answer_of(old(mine)), answer_of(new(other))
             rows.append({
@@ -150,7 +155,12 @@ print("%.1f s" % (spent() - loaded + laws), "of it the law %.1f s" % laws)
 
 def compile_times() -> None:
     """Print processor seconds of the first run in fresh processes, after the imports."""
-    names = ("one spring, impact", "two springs, zero-mass node, one dashpot, impact", "microscale, relaxation, impact", "microscale, relaxation, motion")
+    names = (
+        "one spring, impact",
+        "two springs, zero-mass node, one dashpot, impact",
+        "microscale, relaxation, impact",
+        "microscale, relaxation, motion",
+    )
     for name in names:
         for which in ("present", "stepped"):
             with tempfile.TemporaryDirectory() as folder:
@@ -158,8 +168,16 @@ def compile_times() -> None:
                 code = COMPILED.format(path=sys.path[:4], name=name, which=which, law=law)
                 env = os.environ | {"NUMBA_CACHE_DIR": folder, "FOAMFIT_CACHE_DIR": folder}
                 began = time.perf_counter()
-                out = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
-                print(name, which, out.stdout.strip(), f"wall {time.perf_counter() - began:.1f} s", out.stderr.strip()[-300:])
+                out = subprocess.run(
+                    [sys.executable, "-c", code], env=env, capture_output=True, text=True
+                )
+                print(
+                    name,
+                    which,
+                    out.stdout.strip(),
+                    f"wall {time.perf_counter() - began:.1f} s",
+                    out.stderr.strip()[-300:],
+                )
 
 
 def main() -> None:
@@ -172,7 +190,10 @@ def main() -> None:
             continue
         rows += measure(scene)
         table = pd.DataFrame(rows)
-        print(table.tail(6).to_string(float_format=lambda x: f"{x:.3g}", header=len(rows) == 6), flush=True)
+        print(
+            table.tail(6).to_string(float_format=lambda x: f"{x:.3g}", header=len(rows) == 6),
+            flush=True,
+        )
     if not wanted:
         table.to_csv(HERE / "spike.csv", index=False, float_format="%.4g")
 

@@ -24,9 +24,40 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from contract import (
-    BY, BY_HELD, CHANGE, CHANGES, COLUMNS, DRIFT, EPS, ETA, GAIN, HEIGHT, HELD_NUMBERS, HIGH, LOW,
-    OF_HELD, OF_LAW, OF_PARAMETER, OF_STRESS, OLD_EPS, OLD_RATE, OPTIONS, PER_HEIGHT, RATE, RELAX, RESULTS,
-    SIGMA, SLOPE, STRESS, TURNS, call_begin, call_evaluate, call_switch, inner, past, start,
+    BY,
+    BY_HELD,
+    CHANGE,
+    CHANGES,
+    COLUMNS,
+    DRIFT,
+    EPS,
+    ETA,
+    GAIN,
+    HEIGHT,
+    HELD_NUMBERS,
+    HIGH,
+    LOW,
+    OF_HELD,
+    OF_LAW,
+    OF_PARAMETER,
+    OF_STRESS,
+    OLD_EPS,
+    OLD_RATE,
+    OPTIONS,
+    PER_HEIGHT,
+    RATE,
+    RELAX,
+    RESULTS,
+    SIGMA,
+    SLOPE,
+    STRESS,
+    TURNS,
+    call_begin,
+    call_evaluate,
+    call_switch,
+    inner,
+    past,
+    start,
 )  # fmt: skip
 from numba import njit
 from numpy.typing import NDArray
@@ -45,7 +76,9 @@ _FULL = np.zeros((22, ALL_STAGES))
 _FULL[:16], _FULL[16:20], _FULL[20, :13], _FULL[21, :13] = _A, pair.D, pair.E5, pair.E3
 _ROWS = [np.flatnonzero(row) for row in _FULL]
 NONE = np.array([-row.size % 4 for row in _ROWS])  # zeros at the end of a row
-_ROWS = [np.append(row, [row[-1] if row.size else 0] * (-row.size % 4)).astype(int) for row in _ROWS]
+_ROWS = [
+    np.append(row, [row[-1] if row.size else 0] * (-row.size % 4)).astype(int) for row in _ROWS
+]
 FIRST = np.cumsum([0] + [len(row) for row in _ROWS])
 FROM = np.concatenate(_ROWS)
 WEIGHT = np.concatenate(
@@ -207,7 +240,11 @@ def derive_group(c, g, y, f):
     below = past(y, c.base + 2 * max(g - 1, 0) * p)
     if i1 - i0 == 1:
         derive_spring(c, i0, y)
-        s, own, strain = past(c.springs, i0 * c.width), past(c.own, 2 * i0 * p), past(c.strain, i0 * p)
+        s, own, strain = (
+            past(c.springs, i0 * c.width),
+            past(c.own, 2 * i0 * p),
+            past(c.strain, i0 * p),
+        )
         per, eta, total = s[PER_HEIGHT], s[ETA], past(c.part, (c.count + i0) * p)
         slope, eps, faster = s[RESULTS + SLOPE] * s[GAIN], s[EPS], s[RATE]
         some = 1.0 if g > 0 else 0.0
@@ -235,7 +272,11 @@ def derive_group(c, g, y, f):
             soft += s[HEIGHT] / (s[GAIN] * s[RESULTS + SLOPE])
     for i in range(i0, i1):  # of damped springs `total` becomes the whole derivative
         derive_spring(c, i, y)
-        s, own, total = past(c.springs, i * c.width), past(c.own, 2 * i * p), past(c.part, (c.count + i) * p)
+        s, own, total = (
+            past(c.springs, i * c.width),
+            past(c.own, 2 * i * p),
+            past(c.part, (c.count + i) * p),
+        )
         slope, mine, share = s[GAIN] * s[RESULTS + SLOPE], c.places[i * PLACES + D_EPS_AT], 0.0
         if s[ETA] > 0.0:
             share = s[HEIGHT] / s[ETA]
@@ -248,7 +289,9 @@ def derive_group(c, g, y, f):
             if loose < 0:
                 rate[j] += share * total[j] + over * (own[j] - share * own[p + j])
             else:
-                reach[j] -= s[EPS] * own[j] + (s[HEIGHT] * y[mine + j] if s[ETA] > 0.0 else -share * total[j])
+                reach[j] -= s[EPS] * own[j] + (
+                    s[HEIGHT] * y[mine + j] if s[ETA] > 0.0 else -share * total[j]
+                )
     if flat < 0:
         per = 1.0 / (weight if loose < 0 else soft)
         for j in range(p):
@@ -258,8 +301,16 @@ def derive_group(c, g, y, f):
             out[j] = c.part[(c.count + flat) * p + j]
             reach[j] -= out[j] * soft  # left for the flat branch
     for i in range(i0, i1):
-        s, own, total = past(c.springs, i * c.width), past(c.own, 2 * i * p), past(c.part, (c.count + i) * p)
-        slope, mine, strain = s[GAIN] * s[RESULTS + SLOPE], c.places[i * PLACES + D_EPS_AT], past(c.strain, i * p)
+        s, own, total = (
+            past(c.springs, i * c.width),
+            past(c.own, 2 * i * p),
+            past(c.part, (c.count + i) * p),
+        )
+        slope, mine, strain = (
+            s[GAIN] * s[RESULTS + SLOPE],
+            c.places[i * PLACES + D_EPS_AT],
+            past(c.strain, i * p),
+        )
         per = 1.0 / (s[ETA] if s[ETA] > 0.0 else s[HEIGHT] if i == flat else slope)
         for j in range(p):
             if s[ETA] > 0.0:
@@ -285,7 +336,11 @@ def rates(c, y, f, want):
         f[2 * g + 1] = (c.carried[g + 1] - c.carried[g] - drag * v) * per
         if want:
             dv, df = past(y, c.base + (2 * g + 1) * p), past(f, c.base + 2 * g * p)
-            here, above, of_drag = past(c.common, g * p), past(c.common, (g + 1) * p), past(c.own, 2 * c.count * p)
+            here, above, of_drag = (
+                past(c.common, g * p),
+                past(c.common, (g + 1) * p),
+                past(c.own, 2 * c.count * p),
+            )
             for j in range(p):
                 df[j] = dv[j]
             for j in range(p):
@@ -315,10 +370,17 @@ def combine(stage, wide, n, row, scale, begin, out):
         return
     source = begin
     for k in range(first, last, 4):  # loops that are vectorised; rows are filled up with zeros
-        one, two, three, four = scale * WEIGHT[k], scale * WEIGHT[k + 1], scale * WEIGHT[k + 2], scale * WEIGHT[k + 3]
+        one, two, three, four = (
+            scale * WEIGHT[k],
+            scale * WEIGHT[k + 1],
+            scale * WEIGHT[k + 2],
+            scale * WEIGHT[k + 3],
+        )
         a, b, c, d = (
-            past(stage, FROM[k] * wide), past(stage, FROM[k + 1] * wide),
-            past(stage, FROM[k + 2] * wide), past(stage, FROM[k + 3] * wide),
+            past(stage, FROM[k] * wide),
+            past(stage, FROM[k + 1] * wide),
+            past(stage, FROM[k + 2] * wide),
+            past(stage, FROM[k + 3] * wide),
         )
         for i in range(n):
             out[i] = source[i] + (one * a[i] + two * b[i] + (three * c[i] + four * d[i]))
@@ -525,7 +587,12 @@ def polynomial(line, wide, y, i, shares, n, out):
 @inner
 def sample_one(c, first, line, wide, y, now, dt, t, at, n, batch, out):
     """Fill n samples from `at` on where the stress of one spring, `first`, is the base stress."""
-    s, place, p, top = past(c.springs, first * c.width), past(c.places, first * PLACES), c.p, 2 * c.groups - 2
+    s, place, p, top = (
+        past(c.springs, first * c.width),
+        past(c.places, first * PLACES),
+        c.p,
+        2 * c.groups - 2,
+    )
     shares, eps, x, work = batch, past(batch, BATCH), past(batch, 2 * BATCH), past(batch, 3 * BATCH)
     w, v, results = past(batch, 4 * BATCH), past(batch, 5 * BATCH), past(batch, 6 * BATCH)
     per, eta, gain, want = s[PER_HEIGHT], s[ETA], s[GAIN], 1 if p > 0 else 0
@@ -583,7 +650,9 @@ def sample_one(c, first, line, wide, y, now, dt, t, at, n, batch, out):
         if eta > 0.0 or own_eta > 0.0:
             polynomial(line, wide, y, c.base + p + j, shares, n, work)
             for k in range(n):
-                out[1 + j, 0, at + k] += per * (own_eta * v[k] + eta * (work[k] - own_h * per * v[k]))
+                out[1 + j, 0, at + k] += per * (
+                    own_eta * v[k] + eta * (work[k] - own_h * per * v[k])
+                )
         for m in range(c.terms):
             polynomial(line, wide, y, place[D_Z_AT] + m * p + j, shares, n, work)
             for k in range(n):
@@ -751,7 +820,9 @@ def integrate(whole, work, numbers, t, out):
         if who >= 0:
             if kind == 3:  # dS/dt at the end of contact
                 after = look(c, line, wide, y, share + 1e-3, state, f, c.none, 3 + c.none)
-                before = (after - look(c, line, wide, y, share - 1e-3, state, f, c.none, 3 + c.none)) / (-2e-3 * dt)
+                before = (
+                    after - look(c, line, wide, y, share - 1e-3, state, f, c.none, 3 + c.none)
+                ) / (-2e-3 * dt)
             elif kind == 2:
                 kind = int(springs[who * width + TURNS] < 0.0)
             else:
@@ -803,7 +874,10 @@ class Prepared:
             place[:, at] = np.where(place[:, at] >= 0, base + place[:, at] * p, -1)
         n = base + carried * p
         head = [count, groups, p, base, n, terms, 0, 0]
-        mine = [[j for j, one in enumerate(directions) if one[0] == i and one[1] < OWN_ETA] for i in range(count)]
+        mine = [
+            [j for j, one in enumerate(directions) if one[0] == i and one[1] < OWN_ETA]
+            for i in range(count)
+        ]
         lists = [np.cumsum([count + 1, *map(len, mine)]), *mine]
         self.whole = np.concatenate(
             [head, place.ravel(), ends, np.array(directions, np.int64).ravel(), *lists, kinds]

@@ -4,7 +4,19 @@ import math
 
 import numpy as np
 from contract import (
-    BRANCH, BY, HIGH, LOW, MISS, OF_LAW, SLOPE, TURNS, Law, beginning, evaluating, past, switching,
+    BRANCH,
+    BY,
+    HIGH,
+    LOW,
+    MISS,
+    OF_LAW,
+    SLOPE,
+    TURNS,
+    Law,
+    beginning,
+    evaluating,
+    past,
+    switching,
 )  # fmt: skip
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")

@@ -3,7 +3,19 @@
 import math
 
 import numpy as np
-from contract import BY, HIGH, LOW, MISS, OF_LAW, SLOPE, TURNS, Law, beginning, evaluating, switching
+from contract import (
+    BY,
+    HIGH,
+    LOW,
+    MISS,
+    OF_LAW,
+    SLOPE,
+    TURNS,
+    Law,
+    beginning,
+    evaluating,
+    switching,
+)
 
 
 def fill(k0):

@@ -12,8 +12,27 @@ import math
 
 import numpy as np
 from contract import (
-    BRANCH, BY, CHANGE, HELD, HIGH, LOW, MISS, OF_HELD, OF_LAW, OF_PARAMETER, OF_STRESS, OWN,
-    SLOPE, TURNS, Law, beginning, evaluating, inlined, inner, past, switching,
+    BRANCH,
+    BY,
+    CHANGE,
+    HELD,
+    HIGH,
+    LOW,
+    MISS,
+    OF_HELD,
+    OF_LAW,
+    OF_PARAMETER,
+    OF_STRESS,
+    OWN,
+    SLOPE,
+    TURNS,
+    Law,
+    beginning,
+    evaluating,
+    inlined,
+    inner,
+    past,
+    switching,
 )  # fmt: skip
 
 NAMES = (
