@@ -10,7 +10,7 @@ every misfit at most 100 %, the run time at most 60 s? The loops of these and ot
 fitted by plain least squares of the same law along the measured motion (SciPy's `least_squares`,
 25 random starts, zeros as prepared).
 
-Answer. No fit accepts what its record excludes, and no loop is followed worse than by 1.05 times
+Answer. No fit accepts what its record excludes, and no loop is followed worse than 1.05 times
 plain least squares: see README.md. Also written: fits.csv and loops.csv.
 
     FOAMFIT_DATA=path/to/data python experiments/real_records/real_records.py   # 15 minutes
