@@ -84,9 +84,12 @@ def errs(best: BestPoint) -> bool:
 
 
 def descend_again(problem: Problem, tracker: Tracker) -> None:
-    """Descend from the ends of the search after other parameters have become free or held."""
-    space, starts = problem.space(), [*tracker.ends]
-    starts += [] if tracker.best_values is None else [tracker.best_values]
+    """Descend from the ends of the search after other parameters have become free or held.
+
+    The best point comes first, so that the tracker keeps it if the time limit is reached.
+    """
+    space, best = problem.space(), tracker.best_values
+    starts = [*([] if best is None else [best]), *tracker.ends]
     tracker.best_values, tracker.best_cost, tracker.ends = None, math.inf, []
     ranked = rank(tracker, space, [space.encode(values) for values in starts])
     for _, point in distinct(ranked)[:MINIMA]:
@@ -183,14 +186,12 @@ def weigh_motion(problem: Problem, tracker: Tracker) -> None:
     back_to_plain(problem, tracker)
 
 
-def back_to_plain(problem: Problem, tracker: Tracker) -> bool:
+def back_to_plain(problem: Problem, tracker: Tracker) -> None:
     """Return to plain least squares if the best point follows the record more than 5 % worse."""
     objective = problem.objective
     if tracker.plain is None or objective.weighing is None or tracker.best_values is None:
-        return False
+        return
     values, cost = tracker.plain
     residual = objective.plain(tracker.best_values)
-    if float(residual @ residual) <= WORSE**2 * cost:
-        return False
-    objective.weighing, tracker.best_values, tracker.best_cost = None, values, cost
-    return True
+    if float(residual @ residual) > WORSE**2 * cost:
+        objective.weighing, tracker.best_values, tracker.best_cost = None, values, cost

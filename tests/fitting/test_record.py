@@ -14,6 +14,9 @@ import pytest
 from scipy.optimize import least_squares
 
 import foamfit as ff
+from foamfit.fitting.search import SearchStoppedError, Tracker
+from foamfit.one_model import Options, identify
+from foamfit.settle import descend_again
 
 HEIGHT, AREA = 15e-3, 7.07e-4  # m, m²
 OFFSET, BIAS = 3.1e-3, 0.21e6  # zeros of motion, m, and stress, Pa, in the file
@@ -154,6 +157,20 @@ def test_where_the_law_is_true_contact_and_zeros_stay_free(tmp_path):
     check = next(one for one in result.checklist if one.key == "record")
     assert check.answer is True
     assert replace(check, warnings=()) == check
+
+
+def test_a_time_limit_does_not_lose_the_best_point_when_zeros_become_free(tmp_path):
+    """The limit is reached at the first evaluation after the search with zeros held."""
+    test = ff.read_test(crushed(tmp_path)[0])
+    found = identify(test, "bistable", None, Options(starts=4), lambda *_: None)
+    problem, best = found.problem, found.best().values
+    worse = [0.8 * best, 1.1 * best]  # ends of the search
+    tracker = Tracker(problem.objective, deadline=0.0, ends=worse)
+    tracker.consider(best)
+    cost = tracker.best_cost
+    with pytest.raises(SearchStoppedError):
+        descend_again(problem, tracker)
+    assert tracker.best_cost == pytest.approx(cost, rel=1e-6)
 
 
 def test_points_are_drawn_in_the_coordinates_of_the_measured_curve(tmp_path):

@@ -28,7 +28,7 @@ ZEROS = {
     "acceleration_zero": "acceleration",
 }
 STRIKER = (VELOCITY, STRIKER_MASS)
-POSITIVE = (*STRIKER, FORCE_SCALE)  # parameters that are scales of themselves
+POSITIVE = (*STRIKER, FORCE_SCALE)  # positive parameters, each of which is its own scale
 UNDER_DRIVE = {
     "impact": (CONTACT_TIME, *ZEROS, *STRIKER, FORCE_SCALE),
     "displacement": ("displacement_zero", "stress_zero"),
