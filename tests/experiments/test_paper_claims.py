@@ -50,7 +50,7 @@ def test_foams_mass_oscillates_where_branches_change(drive: claims.Drive) -> Non
 
 def test_without_mass_nothing_oscillates(drive: claims.Drive) -> None:
     still = claims.oscillation(drive, 0.0, 0.0)
-    assert still["stress"] == 0.0
+    assert still["stress"] < 100.0 * 8 * np.finfo(float).eps  # %, of rounding
     assert still["displacement"] < 1e-6
     assert still["turns"] == still["turns_w"] == 0
 

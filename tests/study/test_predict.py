@@ -421,7 +421,8 @@ def test_a_law_of_rate_is_taken_at_the_rate_of_the_test():
         found = ff.predict(InMemory(content), loop(rate=0.5, seed=0), draws=DRAWS)
         assert found.parameters["s1_sigma_plus"].value == pytest.approx(1.1e5 * factor, rel=5e-3)
         clean = loop(sigma_plus=found.parameters["s1_sigma_plus"].value).stress
-        assert found.curves["stress_strain"].predicted == pytest.approx(clean, abs=1.0)
+        by_motion = LAW["s1_k0"] * 1e-7 / HEIGHT  # Pa, of the motion's noise, which is smoothed
+        assert found.curves["stress_strain"].predicted == pytest.approx(clean, abs=by_motion)
 
 
 def test_a_law_of_rate_needs_a_rate():
