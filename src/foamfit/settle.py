@@ -122,6 +122,15 @@ def keep_to_record(
     if tracker.best_values is None:
         tracker.best_values, tracker.best_cost, tracker.ends = values, cost, found
         return problem, None
+    if tracker.best_cost < cost:  # the search with these free had missed a minimum
+        free = replace(tracker, ends=[tracker.best_values], best_values=None, best_cost=math.inf)
+        descend_again(problem, free)
+        assert free.best_values is not None
+        if not errs(BestPoint(problem, free.best_values)):
+            tracker.best_values, tracker.best_cost = free.best_values, free.best_cost
+            tracker.ends += free.ends
+            return problem, None
+        values = free.best_values
     pairs = zip(problem.names, tracker.best_values.tolist(), values.tolist(), strict=True)
     springs = {name for name in problem.free() if name not in NUISANCE}
     return held, Freed(

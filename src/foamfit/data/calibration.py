@@ -9,7 +9,7 @@ agree. The zero of the force and its delay against the motion are left open.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,7 @@ BEYOND, UNSTATED = 3.0, 0.01
 # force and motion, as a share of the time under load.
 ZERO, DELAY = 0.01, 0.1
 TENTH = 0.1  # of the limit: to this share a number in a line of the TOML is rounded
+LATE = 4.0  # standard errors of a delay beyond which the clocks of force and motion disagree
 _LOADED = 0.05  # largest stress at the first sample, as a share of the peak, if it is at contact
 _FEWEST = 12  # samples of the motion
 _ROUNDS = 3  # fits, each with the scatter left by the one before
@@ -38,11 +39,12 @@ class Balance:
     """What the equation of motion of the striker shows; None if it does not show a number.
 
     `velocity` is that at contact, m/s; `force` is the factor by which the measured force must be
-    multiplied, 1 if mass, force and motion agree.
+    multiplied, 1 if mass, force and motion agree; `delay` is that of the motion against the force.
     """
 
     velocity: Shown | None = None
     force: Shown | None = None
+    delay: Shown | None = None
 
 
 @dataclass(frozen=True)
@@ -52,10 +54,11 @@ class Contradiction:
     Attributes
     ----------
     quantity
-        "velocity", "force_scale" or "motion_scale".
+        "velocity", "force_scale", "motion_scale" or "time_shift".
     ratio, limit
         Number that the record shows over the number in use, and the largest difference of this
-        ratio from 1 of numbers that agree.
+        ratio from 1 of numbers that agree. Of a time shift, the delay of the motion against the
+        force, s, and the largest one that may be noise.
     says
         What contradicts what, a clause.
     lines
@@ -71,8 +74,8 @@ class Contradiction:
     def is_settled(self, vary: Iterable[str]) -> bool:
         """Return whether it is settled by fitting these parameters."""
         free, strong = set(vary), {"force_scale", "striker_mass"}
-        if self.quantity == "velocity":
-            return "velocity" in free
+        if self.quantity in ("velocity", "time_shift"):
+            return self.quantity in free
         return bool(free & strong) and (self.quantity == "force_scale" or "velocity" in free)
 
 
@@ -96,8 +99,8 @@ def contradictions(test: Measurement) -> tuple[Contradiction, ...]:
             found.append(_of_force(test, ratio, limit, striker.mass))
     # If the motion is too fast and too long by one factor, its scale alone may be wrong.
     if len(found) == 2 and abs(found[0].ratio / found[1].ratio - 1.0) < found[1].limit:
-        return (_of_motion(test, found[1].ratio, found[1].limit),)
-    return tuple(found)
+        found = [_of_motion(test, found[1].ratio, found[1].limit)]
+    return (*found, *_of_delay(test, shown.delay))
 
 
 def _limit(test: Measurement, error: float, *quantities: str) -> float:
@@ -131,6 +134,18 @@ def _of_motion(test: Measurement, ratio: float, limit: float) -> Contradiction:
     return Contradiction("motion_scale", 1.0 / ratio, limit, says, (line,))
 
 
+def _of_delay(test: Measurement, delay: Shown | None) -> Iterator[Contradiction]:
+    """Yield the contradiction between the clocks of force and motion, if they disagree."""
+    if delay is None or test.time is None:
+        return
+    late, stated = delay[0], test.uncertainties.get("delay", 0.0)
+    limit = max(LATE * math.hypot(delay[1], stated), float(np.median(np.diff(test.time))))
+    if abs(late) > limit:
+        says = f"the motion is {'late' if late > 0.0 else 'early'} against the force by "
+        says += f"{engineering(abs(late), 's')} ± {engineering(delay[1], 's')}"
+        yield Contradiction("time_shift", late, limit, says, ())
+
+
 def balance(test: Measurement) -> Balance:
     """Return what the equation of motion of the striker shows in an impact."""
     striker, w, stress, time = test.striker, test.displacement, test.stress, test.time
@@ -150,13 +165,14 @@ def balance(test: Measurement) -> Balance:
     return Balance(
         fitted[0] if begins and not integrated else None,
         None if "stress" in test.derived else fitted[1],
+        None if integrated or "stress" in test.derived or not begins else fitted[2],
     )
 
 
 def _fitted(
     test: Measurement, mass: float, w: Array, stress: Array, time: Array
-) -> tuple[Shown, Shown] | None:
-    """Fit the equation of motion; return velocity, m/s, and factor of the force."""
+) -> tuple[Shown, Shown, Shown] | None:
+    """Fit the equation of motion; return velocity, m/s, factor of the force, and delay, s."""
     kept = test.sampled.get("displacement", np.ones(time.size, dtype=bool))
     if (outliers := test.outliers.get("displacement")) is not None:
         kept = kept & ~outliers.left_out
@@ -191,7 +207,8 @@ def _fitted(
     summed = of_force.sigma * math.sqrt(of_force.time / time.size) / float(stress.mean())
     speed, factor = found[1:3].tolist()
     error = math.hypot(errors[1], inertia * speed)
-    return (speed, error), (factor, math.hypot(errors[2], inertia, summed))
+    force = factor, math.hypot(errors[2], inertia, summed)
+    return (speed, error), force, (late, float(errors[4]) / factor)
 
 
 def _integrals(time: Array, rate: Array) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ _FEWEST = 3  # least number of rows for a zero
 _FEW = 20  # with fewer rows before contact, a flat end of the record gives a better zero
 _TAIL = 0.04  # share of a record taken as its end
 _HIGHEST = 0.1  # highest level of the end, as a share of the range
+_DRIFTS = 0.005  # share of its range by which a stress that drifts changes at least
 _MATTERS = 0.01  # relative gain of velocity in a fall above which gravity must be specified
 # Part of a note if motion and given velocity are inconsistent; the checklist searches for it.
 CONTRADICTED = "but the striker's velocity is given as"
@@ -127,6 +128,31 @@ def take_zeros(
     return replace(record, zeros=errors)
 
 
+def without_drift(record: Record, start: Start, levels: Levels) -> Record:
+    """Take off a linear drift of the stress that the rest before and after an impact both show."""
+    n, time, stress, noise = start.resting, record.instants, record.stress, levels["stress"]
+    if n < MIN_REST or "stress" in record.derived:
+        return record
+    level, slope = level_on_line(time[:n], stress[:n], start.time, noise)
+    straight = stress - level.value - slope.value * (time - start.time)
+    found, returned = contact_end(straight[start.first :], noise)
+    end = start.first + found
+    if not returned or len(stress) - end < _LEAST_LEAD:
+        return record
+    after, apart = mean_level(straight[end:], noise), float(time[end:].mean() - time[:n].mean())
+    error = float(np.hypot(after.error, slope.error * apart))
+    drift = abs(slope.value) * apart
+    if abs(after.value) > 3.0 * error or drift < max(4.0 * error, _DRIFTS * float(np.ptp(stress))):
+        return record
+    rest = np.r_[:n, end : len(stress)]
+    slope = level_on_line(time[rest], stress[rest], start.time, noise)[1]
+    record = record.noted(
+        f"The stress drifts by {engineering(slope.value * apart, 'Pa')} from before contact to "
+        "after it; this line is taken off."
+    )
+    return record.changed("stress", stress - slope.value * (time - start.time))
+
+
 def _zero_at_rest(
     name: str, rest: Array, unit: str, size: float, noise: NoiseLevel
 ) -> tuple[Level, str]:
@@ -223,12 +249,11 @@ def flight_of(
     gain = percent(share := GRAVITY * float(record.instants[span.end - 1] - start.time) / given)
     if w is not None and n >= 8:
         noise, t = levels["displacement"], record.instants[:n] - start.time
-        (half, speed, _), variance = np.polyfit(t, w[:n], 2, cov="unscaled")
+        (half, *_), variance = np.polyfit(t, w[:n], 2, cov="unscaled")
         sigma = noise.sigma * float(np.sqrt(noise.time))
         gravity, error = 2.0 * float(half), 2.0 * sigma * float(np.sqrt(variance[0, 0]))
         none = start.gauge == "flight" and 4.0 * error < GRAVITY
         if falls := gravity > 4.0 * error and abs(gravity - GRAVITY) < 0.2 * GRAVITY + 2.0 * error:
-            error = sigma * float(np.sqrt(variance[1, 1]))
             text = (
                 f"before contact the striker accelerates by {engineering(gravity, 'm/s²')}: it "
                 f"falls, and gains {gain} of its velocity over the contact"
@@ -237,10 +262,12 @@ def flight_of(
                 notes.append(f"Check: {text}, but [striker] gravity is false.")
             else:
                 notes.append(f"{text[0].upper()}{text[1:]}. The fit includes gravity.")
-        else:
-            speed, error = level_on_line(t, w[:n], 0.0, noise)[1][:2]
         if striker.gravity is None and (falls or none):
             striker = replace(striker, gravity=GRAVITY if falls else 0.0)
+        fall = 0.5 * (striker.gravity or 0.0) * t**2
+        speed, error = level_on_line(t, w[:n] - fall, 0.0, noise)[1][:2]
+        if striker.gravity is None:  # the line has the mean velocity of a fall
+            error = float(np.hypot(error, 0.5 * GRAVITY * np.ptp(t)))
         flight = (float(speed), float(error)) if speed > 0.5 * given else None
         deviation, error = abs(speed - given), float(np.hypot(error, spread))
         if deviation > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:

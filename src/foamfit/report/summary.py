@@ -47,7 +47,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
         "fixed": [f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed"],
         "determined": determined(result),
         "unknown": _unknown({n: p for n, p in result.parameters.items() if n not in NUISANCE}),
-        "remedies": [one.lines[0] for one in result.contradictions],
+        "remedies": [one.lines[0] for one in result.contradictions if one.lines],
     }
     *lines, last = _screen(result, rows, values, verbose=verbose)
     if verbose:

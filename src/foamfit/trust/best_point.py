@@ -20,6 +20,7 @@ from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
 from foamfit.fitting.branches import unreached
 from foamfit.fitting.links import LOG_RATE, RATES, factor
+from foamfit.fitting.nuisance import CONTACT_TIME
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together
@@ -131,7 +132,22 @@ class BestPoint:
             np.eye(len(self.names)),
             self.gradient if any(error.found for error in errors) else None,
             (np.abs(self.box - self.values[self.places]) / self.sizes).T,
+            shifts=self.shifts if self.problem.kept else None,
         )
+
+    @cached_property
+    def shifts(self) -> Array:
+        """Change of the residual by one standard error of each held parameter, (n_data, q).
+
+        A zero of the motion that is its value at the contact is off together with the contact.
+        """
+        kept, zero = self.problem.kept, "displacement_zero"
+        slopes = self.problem.slopes(self.values, tuple(kept)).T
+        out = {one.name: one.sigma * row for one, row in zip(kept.values(), slopes, strict=True)}
+        at_rest = any(prior.name == zero for prior in self.problem.objective.priors)
+        if {zero, CONTACT_TIME} <= out.keys() and not at_rest:
+            out[zero] = out[zero] + out.pop(CONTACT_TIME)
+        return np.array([*out.values()]).T
 
     def gradient(self, places: NDArray[np.intp], step: Array) -> Array:
         """Return half the gradient of the cost after a step of the parameters at `places`.

@@ -90,7 +90,7 @@ def make_checklist(
         _visited(best, estimates),
         *_of_intervals(best, estimates, intervals, with_error),
         *_of_test(best, balance, contradictions),
-        _time_shift(best, estimates, with_error, contradicted=bool(contradictions)),
+        _time_shift(best, estimates, with_error, contradictions),
         _damping(best, with_error),
     )
     by_key = {check.key: check for check in checks}
@@ -266,13 +266,17 @@ def _of_test(
     small = [note for note in test.notes if CONTRADICTED in note]
     doubts = [note for note in test.notes if note.startswith(ASKED) and note not in small]
     told: dict[bool, list[str]] = {True: [], False: []}
+    clocks = [one for one in balance.contradictions if one.quantity == "time_shift"]
     for one in contradictions:
+        if one.quantity == "time_shift":
+            continue  # see `_time_shift`
         told[one.quantity == "force_scale"].append(
             say("contradiction", "said", one=one, drive=drive)
         )
     settled = len(contradictions) < len(balance.contradictions)
     ratio, absorbed = balance.impulse_ratio, balance.absorbed_over_striker
-    wrong = told[False] or (small if drive == "impact" and not balance.contradictions else [])
+    unsaid = drive == "impact" and len(balance.contradictions) == len(clocks)
+    wrong = told[False] or (small if unsaid else [])
     known = ratio is not None or test.flight is not None
     yield _check("velocity", False if wrong else True if known else None, warnings=wrong)
     known = ratio is not None and not settled
@@ -302,10 +306,15 @@ def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
 
 
 def _time_shift(
-    best: BestPoint, estimates: Estimates, with_error: Sequence[str], *, contradicted: bool
+    best: BestPoint,
+    estimates: Estimates,
+    with_error: Sequence[str],
+    contradictions: Sequence[Contradiction],
 ) -> Check:
     test, objective = best.problem.measurement, best.problem.objective
-    force, contradicted = test.outliers.get("stress"), contradicted and objective.drive == "impact"
+    force = test.outliers.get("stress")
+    clocks = [one for one in contradictions if one.quantity == "time_shift"]
+    contradicted = len(contradictions) > len(clocks) and objective.drive == "impact"
     clipped = force is not None and force.clipped_at is not None
     facts: dict[str, Any] = {"held": False, "clipped": clipped, "shift": None}
     facts["contradicted"] = contradicted
@@ -313,6 +322,9 @@ def _time_shift(
         shift = estimates.get("time_shift")
         facts |= {"held": shift is None or not shift.vary, "shift": shift and shift.value}
         return _check("time_shift", None if facts["held"] else True, **facts)
+    for one in clocks:
+        warning = say("contradiction", "said", one=one, drive=objective.drive)
+        return _check("time_shift", False, warnings=[warning], late=one.ratio, **facts)
     with suppress(InputError):
         check_time_shift(test, objective.drive)
         if not clipped and not contradicted:

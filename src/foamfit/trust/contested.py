@@ -13,10 +13,12 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.calibration import Contradiction
+from foamfit.data.measurement import Measurement
 from foamfit.fitting import nuisance
+from foamfit.fitting.curves import later
 from foamfit.fitting.search import Tracker, descend, search
 from foamfit.springs.parameters import unit_of
-from foamfit.text import listed
+from foamfit.text import engineering, listed
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import changed
@@ -30,8 +32,10 @@ _WORDS = {
     "stress_scale": "force",
     "displacement_scale": "motion",
 }
+# A force whose zero is known no better than this share of its peak is doubtful.
+DOUBTFUL = 0.005
 
-Way = Mapping[str, float]  # factor of each quantity that is changed
+Way = Mapping[str, float]  # factor of each quantity that is changed, and the time shift, s
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +59,8 @@ def unsettled(best: BestPoint, found: Sequence[Contradiction]) -> tuple[Contradi
     force = ratios[nuisance.FORCE_SCALE] / ratios[nuisance.STRIKER_MASS]
 
     def agrees(one: Contradiction) -> bool:
+        if one.quantity == nuisance.TIME_SHIFT:
+            return bool(abs(one.ratio - values.get(nuisance.TIME_SHIFT, 0.0)) <= one.limit)
         off = {"velocity": (speed,), "force_scale": (force,)}
         wanted = off.get(one.quantity, (1.0 / speed, 1.0 / force))
         return all(abs(one.ratio / ratio - 1.0) <= one.limit for ratio in wanted)
@@ -67,11 +73,12 @@ def ways(found: Iterable[Contradiction], *, braked: bool) -> list[Way]:
     ratios = {one.quantity: one.ratio for one in found}
     out, motion = list[Way](), ratios.get("motion_scale")
     if motion is not None:
-        out.append({"displacement_scale": motion})
-        ratios = {"velocity": 1.0 / motion, "force_scale": 1.0 / motion}
-    speed = {"velocity": ratios["velocity"]} if "velocity" in ratios else {}
+        late = {name: by for name, by in ratios.items() if name == nuisance.TIME_SHIFT}
+        out.append({"displacement_scale": motion} | late)
+        ratios = {"velocity": 1.0 / motion, "force_scale": 1.0 / motion} | late
+    speed = {name: ratios[name] for name in ("velocity", nuisance.TIME_SHIFT) if name in ratios}
     if (force := ratios.get("force_scale")) is None:
-        return [speed] if speed else []
+        return [*out, speed] if speed else out
     out.append(speed | {"stress_scale": force})
     return out if braked else [*out, speed | {"striker_mass": 1.0 / force}]
 
@@ -93,9 +100,16 @@ def settle(
         way = {name: by for name, by in way.items() if impact or name not in nuisance.STRIKER}
         again = _refitted(best, way, starts=STARTS * (impact and not stopped)) if way else plain
         moved = None if again is None or plain is None else best.values + again - plain
-        words = listed(f"{_WORDS[name]} × {by:.2f}" for name, by in way.items()) if way else ""
+        words = listed(_in_words(name, by) for name, by in way.items()) if way else ""
         out += [Settled(words, moved)] if way else []
     return tuple(out)
+
+
+def _in_words(name: str, by: float) -> str:
+    if name == nuisance.TIME_SHIFT:
+        sooner = "earlier" if by > 0.0 else "later"
+        return f"the motion {engineering(abs(by), 's')} {sooner}"
+    return f"{_WORDS[name]} × {by:.2f}"
 
 
 def judged(
@@ -112,11 +126,26 @@ def judged(
             there = float((one.values + best.problem.origins)[best.index[name]])
         if there is None or not ends[0] <= there <= ends[1]:
             return "weak", say("why", "contested", way=one.words, there=there, unit=unit)
-    # The law errs in an impact, and the contradiction may be the reason.
+    # The law errs in an impact, and the contradiction or a doubtful force may be the reason.
     held = best.problem.kept and best.problem.objective.drive == "impact"
-    if state[0] == "determined" and held and settled:
-        return "weak", say("why", "contested_held")
+    if state[0] == "determined" and held:
+        test = best.problem.measurement
+        force, zero = test.outliers.get("stress"), test.zeros.get("stress", 0.0)
+        clipped = force is not None and force.clipped_at is not None
+        peak = 0.0 if test.stress is None else float(test.stress.max())
+        if settled or clipped or zero > DOUBTFUL * peak:
+            return "weak", say("why", "contested_held", settled=settled, clipped=clipped)
     return state
+
+
+def _earlier(test: Measurement, late: float) -> tuple[Measurement, float]:
+    """Return the test with its motion earlier by `late` s, and the change of its zero, m."""
+    assert test.time is not None
+    assert test.displacement is not None
+    moved = later(test.time, test.displacement, -late)
+    contact = 0.0 if test.rise is None else test.rise[0]
+    more = np.interp(contact, test.time, moved - test.displacement)
+    return replace(test, displacement=moved), float(more)
 
 
 def _refitted(best: BestPoint, way: Way, starts: int = 0) -> Array | None:
@@ -131,6 +160,12 @@ def _refitted(best: BestPoint, way: Way, starts: int = 0) -> Array | None:
     of_stress = [unit_of(name).startswith("Pa") for name in problem.names]
     values[of_stress] *= stresses  # a good start, exact along a given motion
     for name, by in way.items():
+        if name == nuisance.TIME_SHIFT:
+            test, more = _earlier(test, by)
+            if (zero := params.get("displacement_zero")) is not None:
+                zero.set(value=zero.value + more, min=zero.min + more, max=zero.max + more)
+                values[problem.index["displacement_zero"]] += more
+            continue
         test = changed(test, name, by - 1.0)
         if name in params:
             one, place = params[name], best.index[name]

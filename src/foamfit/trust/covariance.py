@@ -93,6 +93,9 @@ class Block:
     room: Array | None = None  # (k, 2): distances to the lower and upper limits
     # (k,): change of its parameters by one standard error of a quantity that the fit takes as exact
     given: Array | None = None
+    # (n, q): change of the residual by one standard error of each parameter held where the record
+    # shows it
+    shifts: Array | None = None
 
     @cached_property
     def axes(self) -> tuple[Array, Array]:
@@ -250,6 +253,9 @@ class Uncertainty:
                 moved = moved if self.curvatures is None else self.curvatures[t] @ moved
                 pull = self.root @ self._bread @ left.T @ moved
                 out = out + np.outer(pull, pull)
+            if block.shifts is not None:
+                pulls = self.root @ self._bread @ left.T @ (block.axes[0].T @ block.shifts)
+                out = out + pulls @ pulls.T
         out[self.lost, :] = out[:, self.lost] = np.nan
         return out
 

@@ -105,9 +105,7 @@ def _with_other_zeros(best: BestPoint) -> Array:
 
     To first order, within the limits of the parameters.
     """
-    kept = best.problem.kept
-    columns = best.problem.slopes(best.values, tuple(kept)) * [one.sigma for one in kept.values()]
-    moves = best.sizes[:, None] * (np.linalg.pinv(best.scaled, rcond=1e-10) @ columns)
+    moves = best.sizes[:, None] * (np.linalg.pinv(best.scaled, rcond=1e-10) @ best.shifts)
     sides = np.concatenate([moves, -moves], axis=1).T
     return np.asarray(np.clip(best.values[best.places] + sides, *best.box))
 
