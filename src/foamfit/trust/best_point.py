@@ -147,7 +147,7 @@ class BestPoint:
         at_rest = any(prior.name == zero for prior in self.problem.objective.priors)
         if {zero, CONTACT_TIME} <= out.keys() and not at_rest:
             out[zero] = out[zero] + out.pop(CONTACT_TIME)
-        return np.array([*out.values()]).T
+        return np.reshape([*out.values()], (-1, self.residual.size)).T
 
     def gradient(self, places: NDArray[np.intp], step: Array) -> Array:
         """Return half the gradient of the cost after a step of the parameters at `places`.
