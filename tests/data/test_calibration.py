@@ -14,6 +14,7 @@ from conftest import DATA, EXPERIMENTS, needs_data
 from foamfit.cli import main
 from foamfit.data.calibration import contradictions
 from foamfit.data.csv_file import read_test
+from foamfit.fitting.curves import choose_drive
 
 sys.path.insert(0, str(EXPERIMENTS / "recovery"))
 import rig
@@ -155,14 +156,43 @@ def test_a_clipped_force_contradicts_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("late", [0.02, 0.05])
-def test_a_force_that_lags_is_no_wrong_scale(late: float, tmp_path: Path) -> None:
+def test_a_force_that_lags_is_a_delay_and_no_wrong_scale(late: float, tmp_path: Path) -> None:
     for seed in (1, 2, 3):
         record = rig.impact(rig.Impact(), seed)
-        shifted = np.interp(
-            record.time - late * record.course.end, record.time, record.channels["force"]
-        )
+        lag = late * record.course.end
+        shifted = np.interp(record.time - lag, record.time, record.channels["force"])
         lagging = replace(record, channels=record.channels | {"force": shifted})
-        assert quantities(rig.write(lagging, tmp_path)) == []
+        test = read_test(rig.write(lagging, tmp_path))
+        (one,) = contradictions(test)
+        assert one.quantity == "time_shift"
+        assert one.ratio == pytest.approx(-lag, abs=one.limit)
+        assert choose_drive(test) == "impact"
+
+
+def test_a_striker_that_falls_before_contact_has_the_velocity_at_contact(tmp_path: Path) -> None:
+    """Its mean velocity over a long flight is 1 % less."""
+    record = rig.impact(rig.Impact(gravity=True), 20006)
+    test = read_test(rig.write(record, tmp_path))
+    speed, error = test.flight
+    assert abs(speed - record.rig.velocity) < 4.0 * error < 0.005 * speed
+    assert contradictions(test) == ()
+    assert not any("given as" in note for note in test.notes)
+
+
+@pytest.mark.parametrize("share", [0.05, -0.03])
+def test_a_linear_drift_of_the_force_is_taken_off(share: float, tmp_path: Path) -> None:
+    for seed in (1, 2, 3):
+        record = rig.impact(rig.Impact(before=0.4), seed)
+        force, lasts = record.channels["force"], record.course.end
+        drift = share * np.ptp(force) * (record.time - record.time[0]) / lasts
+        drifting = replace(record, channels=record.channels | {"force": force + drift})
+        still, straight = (read_test(rig.write(one, tmp_path)) for one in (record, drifting))
+        assert any("this line is taken off" in note for note in straight.notes)
+        assert not any("this line is taken off" in note for note in still.notes)
+        assert contradictions(straight) == ()
+        at = np.interp(straight.time, still.time, still.stress)
+        off = np.abs(np.mean(straight.stress - at))
+        assert off < 0.1 * abs(share) * np.ptp(still.stress)
 
 
 def test_check_says_what_contradicts_and_the_line_that_settles_it(tmp_path: Path) -> None:

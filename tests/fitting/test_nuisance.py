@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import AREA, HEIGHT, synthetic_impact
+from conftest import AREA, EXPERIMENTS, HEIGHT, synthetic_impact
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.curves import default_weights
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import fix_and_vary, make_params
+from foamfit.fitting.search import Tracker
 from foamfit.one_model import Found, Options, identify
+from foamfit.settle import keep_to_record
 from foamfit.springs.model import Model
+
+sys.path.insert(0, str(EXPERIMENTS / "recovery"))
+import rig
 
 SPRING = ff.MicroscaleSpring(
     k0=5.5e5, kc=4e5, eps_star=0.3, sigma_plus=1.1e5, spread_plus=0.4, sigma_minus=7e4,
@@ -244,3 +250,24 @@ def test_the_derivative_by_the_zero_of_a_driving_motion_is_that_of_differences(t
     found, wanted = slopes["stress_strain"][1], (sides[1] - sides[0]) / (2.0 * step)
     assert (strain < 0.07).any()
     assert np.linalg.norm(found - wanted) < 1e-3 * np.linalg.norm(wanted)
+
+
+def test_a_minimum_that_the_search_missed_is_no_error_of_the_law(tmp_path):
+    """With contact and zeros held, the descents reach it; then they are free again."""
+    record = rig.impact(rig.Impact(law="microscale", samples=400, before=0.3), 2)
+    test = ff.read_test(rig.write(record, tmp_path))
+    problem = Options(drive="impact").problem(test, "microscale", None)
+    right = problem.vector()
+    for name, value in record.truth.items():
+        if name.startswith("s1_"):
+            right[problem.index[name]] = value
+    wrong = right.copy()
+    wrong[problem.index["s1_k0"]] *= 3.0
+    tracker = Tracker(problem.objective)
+    tracker.consider(wrong)
+    tracker.ends = [right]
+    found, freed = keep_to_record(problem, tracker, ())
+    assert freed is None
+    assert not found.kept
+    assert "contact_time" in found.free()
+    assert tracker.best_cost < 1.1 * found.objective.n_data

@@ -101,7 +101,7 @@ def settle(
         again = _refitted(best, way, starts=STARTS * (impact and not stopped)) if way else plain
         moved = None if again is None or plain is None else best.values + again - plain
         words = listed(_in_words(name, by) for name, by in way.items()) if way else ""
-        out += [Settled(words, moved)] if way else []
+        out += [Settled(words, moved)] if way or moved is not None else []
     return tuple(out)
 
 
@@ -126,10 +126,9 @@ def judged(
             there = float((one.values + best.problem.origins)[best.index[name]])
         if there is None or not ends[0] <= there <= ends[1]:
             return "weak", say("why", "contested", way=one.words, there=there, unit=unit)
-    # The law errs in an impact, and the contradiction or a doubtful force may be the reason.
-    held = best.problem.kept and best.problem.objective.drive == "impact"
-    if state[0] == "determined" and held:
-        test = best.problem.measurement
+    # The law errs, and the contradiction, or a doubtful force in an impact, may be the reason.
+    impact, test = best.problem.objective.drive == "impact", best.problem.measurement
+    if state[0] == "determined" and (best.problem.kept if impact else settled and best.misfits):
         force, zero = test.outliers.get("stress"), test.zeros.get("stress", 0.0)
         clipped = force is not None and force.clipped_at is not None
         peak = 0.0 if test.stress is None else float(test.stress.max())

@@ -254,7 +254,7 @@ class Uncertainty:
                 pull = self.root @ self._bread @ left.T @ moved
                 out = out + np.outer(pull, pull)
             if block.shifts is not None:
-                # Far from the best point the curvature of a cost with kinks is unknown: JᵀJ is used.
+                # So far away the curvature of a cost with kinks is unknown, and JᵀJ is used.
                 pulls = self.root @ left.T @ (block.axes[0].T @ block.shifts)
                 out = out + pulls @ pulls.T
         out[self.lost, :] = out[:, self.lost] = np.nan
