@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Collection
+from copy import copy
 from dataclasses import replace
 
 import lmfit
@@ -156,12 +157,15 @@ def sampled(problem: Problem) -> Problem:
 def follow_samples(problem: Problem, tracker: Tracker) -> Problem:
     """Follow the samples of a driving motion, if its smooth curve is followed 5 % worse.
 
-    The curve may be smoother than the motion.
+    The curve may be smoother than the motion. Where its residual is noise, it is not: on a steep
+    branch the samples would add their own noise to the strain.
     """
     smooth, ends = problem.objective, tracker.ends
     if tracker.best_values is None or smooth.drive != "displacement" or smooth.motion is None:
         return problem
     values, cost = tracker.best_values, tracker.best_cost
+    if not errs(BestPoint(problem, values)):
+        return problem
     rough = sampled(problem)
     trial = Tracker(rough.objective, tracker.deadline, ends=[values])
     try:
@@ -196,11 +200,18 @@ def weigh_motion(problem: Problem, tracker: Tracker) -> None:
 
 
 def back_to_plain(problem: Problem, tracker: Tracker) -> None:
-    """Return to plain least squares if the best point follows the record more than 5 % worse."""
+    """Return to plain least squares if the best point follows the record more than 5 % worse.
+
+    Where both residuals are noise, the weighed one is right.
+    """
     objective = problem.objective
     if tracker.plain is None or objective.weighing is None or tracker.best_values is None:
         return
     values, cost = tracker.plain
     residual = objective.plain(tracker.best_values)
-    if float(residual @ residual) > WORSE**2 * cost:
+    if float(residual @ residual) <= WORSE**2 * cost:
+        return
+    unweighed = copy(objective)
+    unweighed.weighing = None
+    if errs(BestPoint(replace(problem, objective=unweighed), tracker.best_values)):
         objective.weighing, tracker.best_values, tracker.best_cost = None, values, cost

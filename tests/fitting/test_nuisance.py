@@ -271,3 +271,13 @@ def test_a_minimum_that_the_search_missed_is_no_error_of_the_law(tmp_path):
     assert not found.kept
     assert "contact_time" in found.free()
     assert tracker.best_cost < 1.1 * found.objective.n_data
+
+
+def test_a_steep_branch_is_weighed_by_the_noise_of_the_motion(tmp_path):
+    """Plain least squares follows this record 5 % closer, and misses the start of branch c."""
+    record = rig.slow(rig.Slow("bistable", noise=1e-3), 4001)
+    test = ff.read_test(rig.write(record, tmp_path))
+    result = ff.fit(test, model="bistable", intervals="local", seed=0)
+    for name in ("s1_kc", "s1_eps_c"):
+        low, high = result.parameters[name].ci95
+        assert low < record.truth[name] < high
