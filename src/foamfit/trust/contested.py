@@ -89,16 +89,18 @@ def settle(
     """Repeat the fit for each way to settle the contradictions in `found`.
 
     With a wrong striker an impact may be fitted best far from the right springs, so these are
-    searched for, unless the search of the fit was `stopped`.
+    searched for, unless the search of the fit was `stopped`, or the law errs and nothing is
+    determined anyway.
     """
     if not found or not best.names:
         return ()
     test, impact = best.problem.measurement, best.problem.objective.drive == "impact"
+    far = impact and not stopped and not best.problem.kept
     plain, out = _refitted(best, {}), list[Settled]()  # a joint fit is not the best of one test
     for way in ways(found, braked=test.braked):
         # A given motion needs no striker.
         way = {name: by for name, by in way.items() if impact or name not in nuisance.STRIKER}
-        again = _refitted(best, way, starts=STARTS * (impact and not stopped)) if way else plain
+        again = _refitted(best, way, starts=STARTS * far) if way else plain
         moved = None if again is None or plain is None else best.values + again - plain
         words = listed(_in_words(name, by) for name, by in way.items()) if way else ""
         out += [Settled(words, moved)] if way or moved is not None else []
