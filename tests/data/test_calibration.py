@@ -218,7 +218,7 @@ REAL = {
         '[specimen]\nheight = "20 mm"\narea = "400 mm^2"\n'
         '[striker]\nmass = "1 kg"\nvelocity = "1.0 m/s"\n'
         '[columns]\nforce = { column = "specific_force_N_per_kg", unit = "N" }\n',
-        ['velocity = "1.166 m/s"'],
+        ['velocity = "1.16 m/s"'],
     ),
 }
 

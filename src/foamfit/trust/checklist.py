@@ -266,17 +266,14 @@ def _of_test(
     small = [note for note in test.notes if CONTRADICTED in note]
     doubts = [note for note in test.notes if note.startswith(ASKED) and note not in small]
     told: dict[bool, list[str]] = {True: [], False: []}
-    clocks = [one for one in balance.contradictions if one.quantity == "time_shift"]
-    for one in contradictions:
-        if one.quantity == "time_shift":
-            continue  # see `_time_shift`
+    for one in (one for one in contradictions if one.quantity != "time_shift"):
         told[one.quantity == "force_scale"].append(
             say("contradiction", "said", one=one, drive=drive)
         )
     settled = len(contradictions) < len(balance.contradictions)
     ratio, absorbed = balance.impulse_ratio, balance.absorbed_over_striker
-    unsaid = drive == "impact" and len(balance.contradictions) == len(clocks)
-    wrong = told[False] or (small if unsaid else [])
+    said = any(one.quantity != "time_shift" for one in balance.contradictions)
+    wrong = told[False] or (small if drive == "impact" and not said else [])
     known = ratio is not None or test.flight is not None
     yield _check("velocity", False if wrong else True if known else None, warnings=wrong)
     known = ratio is not None and not settled
@@ -306,15 +303,12 @@ def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
 
 
 def _time_shift(
-    best: BestPoint,
-    estimates: Estimates,
-    with_error: Sequence[str],
-    contradictions: Sequence[Contradiction],
+    best: BestPoint, estimates: Estimates, with_error: Sequence[str], found: Sequence[Contradiction]
 ) -> Check:
     test, objective = best.problem.measurement, best.problem.objective
     force = test.outliers.get("stress")
-    clocks = [one for one in contradictions if one.quantity == "time_shift"]
-    contradicted = len(contradictions) > len(clocks) and objective.drive == "impact"
+    clocks = [one for one in found if one.quantity == "time_shift"]
+    contradicted = len(found) > len(clocks) and objective.drive == "impact"
     clipped = force is not None and force.clipped_at is not None
     facts: dict[str, Any] = {"held": False, "clipped": clipped, "shift": None}
     facts["contradicted"] = contradicted
