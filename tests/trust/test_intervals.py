@@ -94,6 +94,7 @@ class Bench:
 
     objective: Curve
     low: float = -100.0
+    kept: Any = field(default_factory=dict)  # nothing is held
     index: Any = field(default_factory=lambda: {"a": 0, "b": 1})
 
     @property
