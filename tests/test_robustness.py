@@ -136,7 +136,7 @@ def test_a_shift_between_force_and_motion_is_warned_of_and_fitted(late):
     plain = ff.fit(test, starts=2, intervals="local")
     word = "late" if late > 0 else "early"
     (warning,) = [w for w in plain.warnings if "--time-shift" in w]
-    assert f"{word} by" in warning
+    assert f"{word} against the force by" in warning
     result = ff.fit(test, time_shift=True, starts=2, intervals="local")
     item = result.parameters["time_shift"]
     assert item.unit == "s"
