@@ -16,7 +16,6 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 
 if TYPE_CHECKING:
-    from foamfit.springs.kernels import Row
     from foamfit.springs.laws.record import Law
 
 FLOAT = np.dtype(np.float64)
@@ -107,16 +106,16 @@ class Spring(ABC):
         """The record of its law."""
 
     @cached_property
-    def row(self) -> Row:
+    def row(self) -> Array:
         """The row of the spring for the kernels, without relaxation."""
         return self.solver_row(0)
 
-    def solver_row(self, room: int) -> Row:
+    def solver_row(self, room: int) -> Array:
         """Return the row with `room` relaxation terms."""
-        from foamfit.springs.laws import followed
+        from foamfit.springs.compiled import solver_row
 
         terms = self.relaxation if room else ()
-        row = followed.solver_row(self.law, np.array(self.values), terms, room)
+        row = solver_row(self.law, np.array(self.values), terms, room)
         assert row is not None  # checked when the spring was made
         return row
 

@@ -20,7 +20,6 @@ from foamfit.springs.laws.shared import (
     COMPARED_K0,
     K0,
     KC,
-    functions_of,
     steeper,
 )
 from foamfit.springs.loop import Loop
@@ -328,9 +327,9 @@ def _law(*options: str) -> Law:
         word="microscale" if options else "",
         title="microscale spring",
         params=(*_PARAMS[:2], replace(_PARAMS[2], coordinate=beyond), *_PARAMS[3:], *extra),
-        places={"stiffening": 8, "softening": 9, "weakening": 10} if options else {},
+        places={"stiffening": 7, "softening": 8, "weakening": 9} if options else {},
         numbered=BRANCH_NAMES,
-        functions=functions_of(kind),
+        functions="microscale",
         branches=_BRANCHES | again,
         spring=make,
         searched=(

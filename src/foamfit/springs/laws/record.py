@@ -145,7 +145,7 @@ class Law:
     kind: str  #: name in models: "bistable", "linear+bistable"
     #: parameters in the order of `Functions.fill`, without dashpot, relaxation terms and height
     params: tuple[Param, ...]
-    functions: Functions | Callable[[], Functions]  #: or a callable that returns them
+    functions: Functions | str  #: or the name of a built-in law
     columns: int = 0  #: length of a row; by default one number per parameter
     states: int = OWN  #: length of a state; by default strain, stress and branch
     #: branches in the order of their numbers, the first at rest: name and description
@@ -225,14 +225,10 @@ class Law:
             raise InputError(f"law '{self.kind}' is not known yet: register it first")
         return self.spring(*values, **({"relaxation": relaxation} if self.hysteretic else {}))
 
-    def loaded_functions(self) -> Functions:
-        """The functions of the law."""
-        return self.functions if isinstance(self.functions, Functions) else self.functions()
-
-    @cached_property
+    @property
     def is_viscous(self) -> bool:
-        """Whether the stress depends on time."""
-        return self.loaded_functions().viscous is not None
+        """Whether the stress depends on the strain rate."""
+        return isinstance(self.functions, Functions) and self.functions.viscous is not None
 
     def assembled(self, chosen: Callable[[Param], float]) -> Array:
         """Return parameters from a choice for each: its position between its ends, or its value."""
