@@ -120,7 +120,7 @@ def room(sizes: tuple[int, ...], internals: int) -> tuple[int, int]:
     n += n * p
     wide_n = (n + 3) // 4 * 4
     floats = count * wide + 2 * groups + DRIVES + (2 * count + 1 + 4 * count + groups + 3 + count) * p
-    floats += SCALES + internals + RUN + 28 * wide_n + 2 + terms * (TABLE + 1 + p) + 3 * p + 8
+    floats += SCALES + internals + count + RUN + 28 * wide_n + 2 + terms * (TABLE + 1 + p) + 3 * p + 8
     return floats, WORDS + count * NUMBERS + count + 1 + p + n
 
 
@@ -137,7 +137,7 @@ def place_state(c, kinds, numbers):  # type: ignore[no-untyped-def]
             n, eta = past(numbers, i * NUMBERS), c.springs[i * c.width + ETA]
             n[EPS_AT] = n[X_AT] = -1
             if several and eta > 0.0:
-                n[EPS_AT], kinds[at], at = at, OF_EPS, at + 1
+                n[EPS_AT], kinds[at], at, more = at, more, at + 1, more + 1
             n[Z_AT] = at
             for _ in range(c.terms):
                 kinds[at], at = OF_SIGMA, at + 1
@@ -152,7 +152,7 @@ def place_state(c, kinds, numbers):  # type: ignore[no-untyped-def]
         while i < c.ends[g]:
             n = past(numbers, i * NUMBERS)
             if several and n[EPS_AT] < 0:
-                n[EPS_AT], kinds[at], at = at, OF_EPS, at + 1
+                n[EPS_AT], kinds[at], at, more = at, more, at + 1, more + 1
             if n[KIND] == BY_STRESS:
                 n[X_AT], kinds[at], at = at, OF_SIGMA, at + 1
             i += 1
@@ -183,7 +183,7 @@ def own_directions(c, own, owned):  # type: ignore[no-untyped-def]
 
 
 @inner
-def lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, values, ints, floats):  # type: ignore[no-untyped-def]
+def lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, solved, ints, floats):  # type: ignore[no-untyped-def]
     """Lay out a run; return chain and work."""
     count, groups, p, terms, wide = sizes[COUNT], sizes[GROUPS], sizes[P], sizes[TERMS], sizes[WIDE]
     top, row = sizes[TOP], sizes[ROW_OF]
@@ -228,11 +228,11 @@ def lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, values, i
     c = Links(
         springs, per_mass, drive, carried, own, held, part, common, strain, numbers, start(ends),
         start(directions), owned, words, sizes[RESULTS_OF], row, wide, count, groups, nodes, p,
-        none, none, terms, top, none, none,
+        none, none, terms, top, solved, none,
     )  # fmt: skip
     own_directions(c, own, owned)
     carries, base = place_state(c, kinds, numbers)
-    more = SCALES
+    more = SCALES + count
     for i in range(count):
         more += numbers[i * NUMBERS + INTERNALS]
     for k in range(more):
@@ -246,7 +246,7 @@ def lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, values, i
     c = Links(
         springs, per_mass, drive, carried, own, held, part, common, strain, numbers, start(ends),
         start(directions), owned, words, sizes[RESULTS_OF], row, wide, count, groups, nodes, p,
-        base, carries, terms, top, none, none,
+        base, carries, terms, top, solved, none,
     )  # fmt: skip
     pack(c)
     line = past(stage, 16 * w)
@@ -439,6 +439,37 @@ def log_switch(c, m, i, left, log):  # type: ignore[no-untyped-def]
 
 
 @inner
+def mend(c, y):  # type: ignore[no-untyped-def]
+    """Bring what is integrated besides the state back to it: one step of Newton's method.
+
+    So the stress of a BY_STRESS law stays that of its strain, and springs without a dashpot in one
+    group keep one stress.
+    """
+    for g in range(c.groups):
+        i0, soft, mean, count = c.ends[g - 1] if g > 0 else c.none, 0.0, 0.0, 0
+        for i in range(i0, c.ends[g]):
+            s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+            if n[KIND] == BY_STRESS:
+                change = s[c.results + MISS] * s[c.results + SLOPE]
+                y[n[X_AT]] -= change
+                s[TOTAL] -= s[GAIN] * change
+            if s[ETA] == 0.0 and n[EPS_AT] >= 0 and s[TANGENT] > 0.0:
+                compliance = s[HEIGHT] / (s[GAIN] * s[TANGENT])
+                soft, mean, count = soft + compliance, mean + compliance * s[TOTAL], count + 1
+            elif s[ETA] == 0.0:
+                count -= c.count  # a flat branch takes the rest
+        if count < 2:
+            continue
+        for i in range(i0, c.ends[g]):
+            s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+            if s[ETA] == 0.0:
+                longer = (mean / soft - s[TOTAL]) / (s[GAIN] * s[TANGENT])
+                y[n[EPS_AT]] += longer
+                if n[KIND] == BY_STRESS:
+                    y[n[X_AT]] += longer * s[TANGENT]
+
+
+@inner
 def pass_event(c, m, n, want, share, who, kind, log):  # type: ignore[no-untyped-def]
     """Move to an event within the step; return dS/dt at the end of contact, or change the branch."""
     r, y = m.run, m.y
@@ -452,6 +483,8 @@ def pass_event(c, m, n, want, share, who, kind, log):  # type: ignore[no-untyped
         y[k] = m.state[k]
     r[NOW] += share * dt
     r[GROW] = min(r[GROW], 1.0)
+    rates(c, y, m.stage, want, r[NOW] - r[BEGUN])
+    mend(c, y)
     rates(c, y, m.stage, want, r[NOW] - r[BEGUN])
     if kind == RELEASE:
         return slope
@@ -581,37 +614,6 @@ def write_inside(c, m, n, t, reached, want, out):  # type: ignore[no-untyped-def
 
 
 @inner
-def mend(c, y):  # type: ignore[no-untyped-def]
-    """Bring what is integrated besides the state back to it: one step of Newton's method.
-
-    So the stress of a BY_STRESS law stays that of its strain, and springs without a dashpot in one
-    group keep one stress.
-    """
-    for g in range(c.groups):
-        i0, soft, mean, count = c.ends[g - 1] if g > 0 else c.none, 0.0, 0.0, 0
-        for i in range(i0, c.ends[g]):
-            s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-            if n[KIND] == BY_STRESS:
-                change = s[c.results + MISS] * s[c.results + SLOPE]
-                y[n[X_AT]] -= change
-                s[TOTAL] -= s[GAIN] * change
-            if s[ETA] == 0.0 and n[EPS_AT] >= 0 and s[TANGENT] > 0.0:
-                compliance = s[HEIGHT] / (s[GAIN] * s[TANGENT])
-                soft, mean, count = soft + compliance, mean + compliance * s[TOTAL], count + 1
-            elif s[ETA] == 0.0:
-                count -= c.count  # a flat branch takes the rest
-        if count < 2:
-            continue
-        for i in range(i0, c.ends[g]):
-            s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-            if s[ETA] == 0.0:
-                longer = (mean / soft - s[TOTAL]) / (s[GAIN] * s[TANGENT])
-                y[n[EPS_AT]] += longer
-                if n[KIND] == BY_STRESS:
-                    y[n[X_AT]] += longer * s[TANGENT]
-
-
-@inner
 def finish_step(c, m, struck):  # type: ignore[no-untyped-def]
     """Advance to the end of a step."""
     r = m.run
@@ -638,7 +640,7 @@ def integrate(  # type: ignore[no-untyped-def]
     `out` (1 + p, 1 + nodes, n) becomes base stress and displacements, and their derivatives, `log`
     the switches; `ints` and `floats` are overwritten.
     """
-    c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, values, ints, floats)
+    c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, 0, ints, floats)
     r, want, tol, most, speed = m.run, int(c.p > 0), reals[TOL], reals[MOST], reals[SPEED]
     struck, n = speed > 0.0, c.base + c.carries * c.p
     for k in range(RUN):
@@ -727,7 +729,7 @@ def balance(  # type: ignore[no-untyped-def]
 
     `strains` (springs, n) and `history` become strains and branches.
     """
-    c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, values, ints, floats)
+    c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, 1, ints, floats)
     begin(c)
     want, y, before, p, reach = int(c.p > 0), m.y, 0.0, c.p, past(c.common, 2 * c.p)
     for i in range(c.count):
@@ -771,7 +773,7 @@ def follow(  # type: ignore[no-untyped-def]
     floats, seeds,
 ):  # fmt: skip
     """Follow one spring, without its dashpot, along strains; see `along`."""
-    c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, strain, ints, floats)
+    c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, 1, ints, floats)
     begin(c)
     y = past(m.run, RUN)
     work = past(y, c.terms * (1 + c.p))
