@@ -89,6 +89,7 @@ class Work(NamedTuple):
     kinds: Any  #: of the components, integers
     scales: Any  #: of the kinds
     run: Any  #: numbers that change, see `runs`
+    degree: int  #: of the dense output if it is a polynomial of an implicit step, else 0
 
 
 @inner
@@ -174,6 +175,13 @@ def make_dense(c, m, n, dt, at, tol, want):  # type: ignore[no-untyped-def]
 def dense(m, n, x, out):  # type: ignore[no-untyped-def]
     """Fill the state at the share x of the step."""
     z, line, wide = 1.0 - x, m.line, m.wide
+    if m.degree:
+        for i in range(n):
+            value = 0.0
+            for q in range(m.degree - 1, -1, -1):
+                value = (value + line[q * wide + i]) * x
+            out[i] = m.y[i] + value
+        return
     for i in range(n):
         value = line[4 * wide + i] + z * (line[5 * wide + i] + x * line[6 * wide + i])
         value = line[2 * wide + i] + z * (line[3 * wide + i] + x * value)

@@ -20,12 +20,25 @@ without mass, it is S of the last group; an onsite damper then moves the top wit
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 from llvmlite import ir
 from numba import cfunc, types
 from numba.extending import intrinsic
 
+from foamfit.solve.equilibrium import (
+    EPS_AT,
+    INTERNALS,
+    KIND,
+    NUMBERS,
+    PARAMETERS,
+    X_AT,
+    Z_AT,
+    put,
+    root,
+    strain_at,
+)
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled.contract import (
     BEGIN,
@@ -40,15 +53,17 @@ from foamfit.springs.compiled.contract import (
     GAIN,
     HEIGHT,
     INTERNAL,
-    MISS,
     OF_HELD,
     OF_LAW,
     OF_PARAMETER,
+    OFFSET,
     OF_STRESS,
     PER_HEIGHT,
     RATE,
     RELAX,
     SETTLE,
+    SIGMA_HIGH,
+    SIGMA_LOW,
     SLOPE,
     STRESS as TOTAL,
     SWITCH,
@@ -68,10 +83,6 @@ from foamfit.springs.compiled.contract import (
 )
 from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
-# Integers of a spring: the addresses of its law, kind, number of parameters and of internal
-# variables; and the places of strain, internal variables and relaxation terms in the state (-1:
-# none).
-KIND, PARAMETERS, INTERNALS, EPS_AT, X_AT, Z_AT, NUMBERS = 5, 6, 7, 8, 9, 10, 12
 # Kinds of components of the state, which share a scale: displacement, velocity, strain, stress;
 # each internal variable has its own.
 OF_W, OF_V, OF_EPS, OF_SIGMA, SCALES = range(5)
@@ -243,6 +254,8 @@ def follow_group(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
     last = g == c.groups - 1
     push = c.drive[VALUE] + c.drive[VALUE_RATE] * at
     weight, total, loose, flat = 0.0, rate, -1, -1
+    if c.solved:
+        solve_loose(c, g, i0, i1, reach, push, y)
     for i in range(i0, i1):
         s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
         eps = y[n[EPS_AT]] if s[ETA] > 0.0 or not c.solved else s[EPS]
@@ -267,10 +280,47 @@ def follow_group(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
         rate += c.drive[TOP_SPEED]
     share_rate(c, i0, i1, common, rate, loose, flat, last and c.top == STRESS)
     for i in range(i0, i1):
-        f[c.numbers[i * NUMBERS + EPS_AT]] = c.springs[i * c.width + RATE]
+        s = past(c.springs, i * c.width)
+        if s[ETA] > 0.0 or not c.solved:
+            f[c.numbers[i * NUMBERS + EPS_AT]] = s[RATE]
         move_inside(c, i, f)
     c.carried[g] = common
     return common
+
+
+@inner
+def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
+    """Fill the strains of the springs without a dashpot on their branches."""
+    flat, rest, some, common = -1, reach, False, c.carried[g]
+    for i in range(i0, i1):
+        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+        s[OFFSET] = 0.0
+        for k in range(c.terms):
+            s[OFFSET] += s[RELAX + 2 * k] * y[n[Z_AT] + k]
+        if s[ETA] > 0.0:
+            rest -= s[HEIGHT] * y[n[EPS_AT]]
+            continue
+        some = True
+        if s[SIGMA_LOW] == s[SIGMA_HIGH]:
+            flat = i
+    if not some:
+        return
+    if g == c.groups - 1 and c.top == STRESS:
+        common = push
+    elif flat >= 0:
+        s = past(c.springs, flat * c.width)
+        common = s[GAIN] * s[SIGMA_HIGH] + s[OFFSET]
+    else:
+        root(c, i0, i1, rest, common, -math.inf, math.inf, 1)
+        return
+    for i in range(i0, i1):
+        s = past(c.springs, i * c.width)
+        if s[ETA] == 0.0 and i != flat:
+            put(c, i, strain_at(c, i, common), common)
+            rest -= s[HEIGHT] * s[EPS]
+    if flat >= 0 and not (g == c.groups - 1 and c.top == STRESS):
+        s = past(c.springs, flat * c.width)
+        s[EPS] = rest / s[HEIGHT]
 
 
 @inner

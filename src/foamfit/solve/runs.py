@@ -25,6 +25,33 @@ from foamfit.solve.explicit import (
     suspicious,
     take,
 )
+from foamfit.solve.implicit import (
+    BEFORE,
+    BEGUN,
+    BRIEF,
+    DAMPED,
+    DOUBTFUL,
+    FAILED,
+    GROW,
+    HORIZON,
+    LARGEST,
+    LAST,
+    LOGGED,
+    NOW,
+    PIECE,
+    PLAIN,
+    POINTS,
+    PRESSED,
+    RUN,
+    SAMPLE,
+    SAMPLED,
+    SHORT,
+    STEP,
+    TAKEN,
+    Systems,
+    implicit_step,
+    order_state,
+)
 from foamfit.solve.links import PACE as PACED
 from foamfit.solve.links import (
     CHANGE_AT,
@@ -103,16 +130,7 @@ LAW = 8
 # Numbers of a run.
 DRAGS, SPEED, TOL, MOST, PACE, REALS = range(6)
 # Results of a run.
-OUTCOME, ENDED, STEPS, SWITCHES, ENDINGS = range(5)
-# Numbers that change during a run: time, begin of the piece, step, end of the piece, steps, growth
-# of the next step, largest stress, whether the base stress has risen, last error, next sample,
-# number of the piece, switches.
-NOW, BEGUN, STEP, HORIZON, TAKEN, GROW, LARGEST, PRESSED, LAST, SAMPLE, PIECE, LOGGED, RUN = range(13)
-PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
-
-
-
-
+OUTCOME, ENDED, STEPS, SWITCHES, UNRESOLVED, ENDINGS = range(6)
 def room(sizes: tuple[int, ...], internals: int) -> tuple[int, int]:
     """Return the numbers of floats and integers that a run needs, at most."""
     count, groups, p, terms, _, _, _, _, wide, _, _ = sizes
@@ -151,6 +169,9 @@ def place_state(c, kinds, numbers):  # type: ignore[no-untyped-def]
         several = c.ends[g] - i > 1 or (g == c.groups - 1 and (c.top == STRESS or c.top == VISCOUS))
         while i < c.ends[g]:
             n = past(numbers, i * NUMBERS)
+            if c.solved:
+                i += 1
+                continue
             if several and n[EPS_AT] < 0:
                 n[EPS_AT], kinds[at], at, more = at, more, at + 1, more + 1
             if n[KIND] == BY_STRESS:
@@ -252,7 +273,7 @@ def lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, solved, i
     line = past(stage, 16 * w)
     m = Work(
         stage, w, line, past(line, 7 * w), past(line, 8 * w), past(line, 9 * w), past(line, 10 * w),
-        past(line, 11 * w), past(stage, 13 * w), kinds, scales, run,
+        past(line, 11 * w), past(stage, 13 * w), kinds, scales, run, POINTS * solved,
     )  # fmt: skip
     return c, m
 
@@ -362,7 +383,7 @@ def approach(c, t, speed, gravity, out):  # type: ignore[no-untyped-def]
 
 
 @inner
-def one_step(c, m, n, want, tol, upto, most):  # type: ignore[no-untyped-def]
+def one_step(c, m, n, want, tol, upto, most, work):  # type: ignore[no-untyped-def]
     """Take one step, shorter ones until it is accurate; return how it ended.
 
     `upto` is the time of the next sample inside the piece. A step that may contain a switch or
@@ -445,7 +466,7 @@ def mend(c, y):  # type: ignore[no-untyped-def]
     So the stress of a BY_STRESS law stays that of its strain, and springs without a dashpot in one
     group keep one stress.
     """
-    for g in range(c.groups):
+    for g in range(c.none if not c.solved else c.groups, c.groups):
         i0, soft, mean, count = c.ends[g - 1] if g > 0 else c.none, 0.0, 0.0, 0
         for i in range(i0, c.ends[g]):
             s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
@@ -542,7 +563,7 @@ def start_at_rest(c, m, t, values, rows):  # type: ignore[no-untyped-def]
         s[TANGENT], s[TOTAL] = s[c.results + SLOPE], s[c.results + OF_LAW]
         if n[EPS_AT] >= 0:
             y[n[EPS_AT]] = s[EPS]
-        if n[KIND] == BY_STRESS:
+        if n[KIND] == BY_STRESS and n[X_AT] >= 0:
             y[n[X_AT]] = s[X]
         for k in range(c.terms):
             y[n[Z_AT] + k] = -s[TOTAL]
@@ -630,17 +651,9 @@ def finish_step(c, m, struck):  # type: ignore[no-untyped-def]
         m.scales[kind] = max(m.scales[kind], abs(m.y[k]))
 
 
-@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
-def integrate(  # type: ignore[no-untyped-def]
-    sizes, laws, ends, directions, rows, heights, mass, reals, values, t, out, log, ints, floats,
-    scales, endings,
-):  # fmt: skip
-    """Integrate a chain over sample times; fill `endings`.
-
-    `out` (1 + p, 1 + nodes, n) becomes base stress and displacements, and their derivatives, `log`
-    the switches; `ints` and `floats` are overwritten.
-    """
-    c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, 0, ints, floats)
+@inner
+def loop(step, c, m, work, mass, reals, values, t, rows, out, log, scales, brief, endings):  # type: ignore[no-untyped-def]
+    """Take steps until the run ends."""
     r, want, tol, most, speed = m.run, int(c.p > 0), reals[TOL], reals[MOST], reals[SPEED]
     struck, n = speed > 0.0, c.base + c.carries * c.p
     for k in range(RUN):
@@ -648,7 +661,7 @@ def integrate(  # type: ignore[no-untyped-def]
     for k in range(SCALES):
         m.scales[k] = scales[k]
     begin(c)
-    gravity = 0.0
+    gravity, r[BRIEF] = 0.0, brief
     if struck:
         m.y[2 * c.nodes - 1] = speed
         gravity = values[0] / mass[c.groups - 1]
@@ -677,7 +690,7 @@ def integrate(  # type: ignore[no-untyped-def]
         keep_values(c)
         r[STEP] = min(r[STEP], r[HORIZON] - r[NOW])
         upto = t[int(r[SAMPLE])] if struck else math.inf
-        how = one_step(c, m, n, want, tol, upto, most)
+        how = step(c, m, n, want, tol, upto, most, work)
         if how == FAILED or r[TAKEN] >= most or c.drive[FLAT] > 0.0:
             outcome = TOO_MANY_STEPS if r[TAKEN] >= most else STEP_UNDERFLOW
             if how == FAILED and not abs(m.new[0]) < math.inf:
@@ -718,6 +731,50 @@ def integrate(  # type: ignore[no-untyped-def]
             r[HORIZON] = math.nextafter(r[NOW], math.inf)
         r[STEP] = dt
         fresh_scales(c, m)
+
+
+@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
+def integrate(  # type: ignore[no-untyped-def]
+    sizes, laws, ends, directions, rows, heights, mass, reals, values, t, out, log, ints, floats,
+    scales, endings,
+):  # fmt: skip
+    """Integrate a chain over sample times by explicit steps; fill `endings`.
+
+    `out` (1 + p, 1 + nodes, n) becomes base stress and displacements, and their derivatives, `log`
+    the switches; `ints` and `floats` are overwritten.
+    """
+    c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, 0, ints, floats)
+    loop(one_step, c, m, c, mass, reals, values, t, rows, out, log, scales, 0.0, endings)
+
+
+@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
+def integrate_stiff(  # type: ignore[no-untyped-def]
+    sizes, laws, ends, directions, rows, heights, mass, reals, values, t, out, log, ints, floats,
+    scales, endings, brief, complexes, jacobian, integers,
+):  # fmt: skip
+    """Do the same by implicit steps.
+
+    `brief` is the length of a short step, s; the last three arrays are overwritten.
+    """
+    c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, 1, ints, floats)
+    places = past(start(integers), 3 * c.carries)
+    groups_of = past(places, c.carries)
+    n, reach = order_state(c, places, groups_of)
+    systems = past(start(complexes), 3 * n)
+    alive = past(start(jacobian), n * (2 * reach + 1))
+    for k in range(2 * c.groups + 2):
+        alive[k] = 0.0
+    worst = past(alive, 2 * c.groups)
+    work = Systems(
+        systems, start(complexes), start(jacobian), start(integers), places, groups_of, reach,
+        alive, worst,
+    )  # fmt: skip
+    loop(implicit_step, c, m, work, mass, reals, values, t, rows, out, log, scales, brief, endings)
+    motion, stress = m.scales[OF_W], m.run[LARGEST]
+    lost = m.run[DAMPED]
+    if worst[0] > 0.0:
+        lost += max(worst[0] / motion if motion > 0.0 else 0.0, worst[1] / stress)
+    endings[UNRESOLVED] = lost
 
 
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import math
 
+from foamfit.solve.equilibrium import NUMBERS, elongation_at, put, root, strain_at
 from foamfit.solve.links import (
-    KIND,
-    NUMBERS,
     change_branch,
     derive_group,
     evaluate,
 )
 from foamfit.springs.compiled.contract import (
-    BY_STRESS,
     EPS,
     HEIGHT,
     HIGH,
@@ -27,35 +25,15 @@ from foamfit.springs.compiled.contract import (
     SIGMA_HIGH,
     SIGMA_LOW,
     SLOPE,
-    SOFT,
-    STRAIN,
     STRESS as TOTAL,
     TANGENT,
     TURNS,
-    X,
     call_number,
     inner,
     past,
 )
 
 MOST_SWITCHES = 100_000  # of all springs between two samples
-LEAST = 1e-6  # strain to whose rounding error elongations are always resolved
-
-
-@inner
-def put(c, i, eps, sigma):  # type: ignore[no-untyped-def]
-    """Bring a spring to a strain and stress of its branch."""
-    s = past(c.springs, i * c.width)
-    s[EPS] = eps
-    if c.numbers[i * NUMBERS + KIND] == BY_STRESS:
-        s[X] = sigma
-
-
-@inner
-def strain_at(c, i, sigma):  # type: ignore[no-untyped-def]
-    """Return the strain of a spring at a stress on its branch; fill SOFT."""
-    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-    return call_number(n[STRAIN], past(s, c.row), s, sigma)
 
 
 @inner
@@ -100,19 +78,6 @@ def elongation(c, i0, i1):  # type: ignore[no-untyped-def]
 
 
 @inner
-def elongation_at(c, i0, i1, sigma):  # type: ignore[no-untyped-def]
-    """Return elongation, compliance, and size of the terms at a stress on the branches."""
-    total = compliance = size = 0.0
-    for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        eps = strain_at(c, i, sigma)
-        total += s[HEIGHT] * eps
-        compliance += s[HEIGHT] * s[SOFT]
-        size += s[HEIGHT] * max(abs(eps), LEAST)
-    return total, compliance, size
-
-
-@inner
 def _yield_flat(c, i0, i1, rest, y):  # type: ignore[no-untyped-def]
     """Let springs on flat branches take an elongation, from the base up; return what is left.
 
@@ -130,49 +95,6 @@ def _yield_flat(c, i0, i1, rest, y):  # type: ignore[no-untyped-def]
         change_branch(c, i, int(up), y)
         return rest, True
     return rest, False
-
-
-@inner
-def _split_jump(c, i0, i1, target, low, high):  # type: ignore[no-untyped-def]
-    """Distribute an elongation inside a jump between two stresses from the base up."""
-    rest = target - elongation_at(c, i0, i1, low)[0]
-    for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        upper, eps = strain_at(c, i, high), strain_at(c, i, low)
-        gain = min(max(rest / s[HEIGHT], 0.0), upper - eps)
-        put(c, i, eps + gain, 0.5 * (low + high))
-        rest -= s[HEIGHT] * gain
-    return 0.5 * (low + high)
-
-
-@inner
-def _root(c, i0, i1, target, sigma, limit):  # type: ignore[no-untyped-def]
-    """Return the stress between two stresses at which springs reach an elongation; fill strains.
-
-    Newton's method inside a bracket, which every third trial halves.
-    """
-    low, high = min(sigma, limit), max(sigma, limit)
-    for trial in range(400):
-        total, compliance, size = elongation_at(c, i0, i1, sigma)
-        miss = total - target
-        if abs(miss) <= 2e-15 * (size + abs(target)):
-            break
-        if miss > 0.0:
-            high = min(high, sigma)
-        else:
-            low = max(low, sigma)
-        new = sigma - miss / compliance
-        if not low < new < high or (trial >= 8 and trial % 3 == 0):
-            if low > -math.inf and high < math.inf:
-                new = 0.5 * (low + high)
-            elif not low < new < high:
-                new = sigma + (2.0 if miss < 0.0 else -2.0) * max(abs(sigma), abs(miss / compliance))
-            if new in (low, high):  # neighbouring floating-point numbers
-                return _split_jump(c, i0, i1, target, low, high)
-        sigma = new
-    for i in range(i0, i1):
-        put(c, i, strain_at(c, i, sigma), sigma)
-    return sigma
 
 
 @inner
@@ -200,7 +122,7 @@ def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
             limit = min(limit, s[SIGMA_HIGH]) if up else max(limit, s[SIGMA_LOW])
         limit = max(limit, common) if up else min(limit, common)
         if abs(limit) < math.inf:
-            beyond = target - elongation_at(c, i0, i1, limit)[0]
+            beyond = target - elongation_at(c, i0, i1, limit, c.none)[0]
             if (beyond > 0.0) if up else (beyond < 0.0):
                 common = limit
                 for i in range(i0, i1):
@@ -210,7 +132,7 @@ def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
                     if (s[SIGMA_HIGH] <= limit) if up else (s[SIGMA_LOW] >= limit):
                         change_branch(c, i, int(up), y)
                 continue
-        return _root(c, i0, i1, target, common, limit)
+        return root(c, i0, i1, target, common, min(common, limit), max(common, limit), c.none)
     return common
 
 

@@ -46,9 +46,9 @@ from numba.extending import intrinsic
 BRANCH, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH, TURNS, HELD, OWN, MEMORY = 0, 1, 2, 3, 4, 5, 6, 8, 48
 # Values: strain and its rate, stress T with relaxation but without dashpot, the part of dT/dt
 # without dε/dt, strain and rate at the start of a step, height, dashpot, 1 + Σ g, 1/height, dε/dσ,
-# dσ/dε along the path of the internal variables.
-EPS, RATE, STRESS, DRIFT, OLD_EPS, OLD_RATE, HEIGHT, ETA, GAIN, PER_HEIGHT, SOFT, TANGENT = range(
-    MEMORY, MEMORY + 12
+# dσ/dε along the path of the internal variables, Σ g z.
+EPS, RATE, STRESS, DRIFT, OLD_EPS, OLD_RATE, HEIGHT, ETA, GAIN, PER_HEIGHT, SOFT, TANGENT, OFFSET = (
+    range(MEMORY, MEMORY + 13)
 )
 X, MOST_INTERNAL = 64, 32  # internal variables
 RELAX, MOST_TERMS = 96, 10  # g and τ of relaxation terms
