@@ -44,7 +44,7 @@ _values, _vectors = np.linalg.eig(_INVERSE)
 _kept = [int(np.argmin(np.abs(_values.imag)))] + [
     int(k) for k in np.argsort(_values.imag) if _values[k].imag > 1e-9
 ]
-EIGEN = np.ascontiguousarray(_values[_kept])  # one of each pair
+EIGEN = np.array(_values[_kept])  # one of each pair
 SYSTEMS = len(_kept)
 TO_BASIS = np.ascontiguousarray(np.linalg.inv(_vectors)[_kept])
 FROM_BASIS = np.ascontiguousarray(_vectors[:, _kept] * np.where(np.abs(EIGEN.imag) > 1e-9, 2.0, 1.0))
@@ -68,6 +68,9 @@ PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
 SHORT = 5e-4  # length of a short step, as a share of the duration
 FOLLOW_LIMIT = 600  # number of short steps in a row that are taken
 TURNS_OF_NEWTON = 12
+# Newton's method ends at changes of ENOUGH over the tolerance, of derivatives at ENOUGH/OF_TANGENTS: as
+# they obey linear equations, the next change is smaller by the error of the matrices.
+ENOUGH, OF_TANGENTS = 1e-3, 1e3
 
 
 class Systems(NamedTuple):
@@ -82,6 +85,7 @@ class Systems(NamedTuple):
     reach: int
     alive: Any  #: vibrations, see `remember`, (groups, 2)
     worst: Any  #: the largest motion and stress at a sample
+    largest: Any  #: values of the derivatives, over the scales, (p,)
 
 
 # ---------------------------------------------------------------- banded systems
@@ -203,7 +207,7 @@ def prepare(n, reach, h, work):  # type: ignore[no-untyped-def]
 def _improve(c, m, n, reach, h, column, tol, work):  # type: ignore[no-untyped-def]
     """Take one step of Newton's method for the state (column 0) or a derivative; return its size.
 
-    Sizes are relative to the scales, for derivatives also to their largest component.
+    Sizes are relative to the scales, for derivatives also to the largest value so far.
     """
     wide, base, p = m.wide, c.base, c.p
     rates_at, moves = past(m.stage, wide), past(m.stage, (POINTS + 1) * wide)
@@ -220,7 +224,7 @@ def _improve(c, m, n, reach, h, column, tol, work):  # type: ignore[no-untyped-d
     size = most = 0.0
     for k in range(n):
         one, place = (k if column == 0 else base + k * p + column - 1), work.places[k]
-        scale = max(m.scales[m.kinds[k]], abs(m.y[k]))
+        scale = max(m.scales[m.kinds[k]], max(abs(m.y[k]), abs(m.y[k] + moves[(POINTS - 1) * wide + k])))
         per = 1.0 / scale if scale > 0.0 else 0.0
         for i in range(POINTS):
             change = 0.0
@@ -231,7 +235,9 @@ def _improve(c, m, n, reach, h, column, tol, work):  # type: ignore[no-untyped-d
             most = max(most, abs(m.y[one] + moves[i * wide + one]) * per)
     if column == 0:
         return size / tol
-    return size / (most * tol) if most > 0.0 else 0.0
+    largest = past(work.largest, column - 1)
+    largest[0] = most = max(most, largest[0])
+    return OF_TANGENTS * size / most if most > 0.0 else 0.0
 
 
 @inner
@@ -247,10 +253,10 @@ def _collocate(c, m, n, reach, h, at, tol, want, work):  # type: ignore[no-untyp
             rates(c, m.state, past(m.stage, (1 + i) * wide), want, at + NODES[i] * h)
         size = _improve(c, m, n, reach, h, 0, tol, work)
         for column in range(1, 1 + c.p):
-            size = max(size, 1e-2 * _improve(c, m, n, reach, h, column, tol, work))
+            size = max(size, _improve(c, m, n, reach, h, column, tol, work))
         if not size < math.inf:
             return False
-        if size <= 1e-3 or (turn > 1 and size > 0.3 * before and size <= 0.03):
+        if size <= ENOUGH or (turn > 1 and size > 0.3 * before and size <= 0.03):
             return True
         if turn > 2 and size > 2.0 * before:
             return False
@@ -270,7 +276,7 @@ def _error(c, m, n, reach, h, tol, work):  # type: ignore[no-untyped-def]
     substitute(work.systems, n, reach, work.pivots, x)
     size = 0.0
     for k in range(n):
-        scale = max(m.scales[m.kinds[k]], abs(m.y[k]))
+        scale = max(m.scales[m.kinds[k]], max(abs(m.y[k]), abs(m.y[k] + m.stage[2 * POINTS * wide + k])))
         if scale > 0.0:
             size = max(size, abs(x[work.places[k]].real) / scale)
     return size / tol

@@ -145,7 +145,7 @@ def room(sizes: tuple[int, ...], internals: int) -> tuple[int, int]:
 @inner
 def place_state(c, kinds, numbers):  # type: ignore[no-untyped-def]
     """Give every component of the state its place; return the numbers of components."""
-    at, more = 2 * c.nodes, SCALES + c.none
+    at, more = 2 * c.nodes, SCALES + c.count
     for k in range(at):
         kinds[k] = OF_V if k % 2 else OF_W
     i = c.none
@@ -155,7 +155,7 @@ def place_state(c, kinds, numbers):  # type: ignore[no-untyped-def]
             n, eta = past(numbers, i * NUMBERS), c.springs[i * c.width + ETA]
             n[EPS_AT] = n[X_AT] = -1
             if several and eta > 0.0:
-                n[EPS_AT], kinds[at], at, more = at, more, at + 1, more + 1
+                n[EPS_AT], kinds[at], at = at, SCALES + i, at + 1
             n[Z_AT] = at
             for _ in range(c.terms):
                 kinds[at], at = OF_SIGMA, at + 1
@@ -173,7 +173,7 @@ def place_state(c, kinds, numbers):  # type: ignore[no-untyped-def]
                 i += 1
                 continue
             if several and n[EPS_AT] < 0:
-                n[EPS_AT], kinds[at], at, more = at, more, at + 1, more + 1
+                n[EPS_AT], kinds[at], at = at, SCALES + i, at + 1
             if n[KIND] == BY_STRESS:
                 n[X_AT], kinds[at], at = at, OF_SIGMA, at + 1
             i += 1
@@ -548,6 +548,8 @@ def start_at_rest(c, m, t, values, rows):  # type: ignore[no-untyped-def]
     first = c.drive[VALUE]
     if c.top == FREE or c.top == VISCOUS:
         return
+    for i in range(i0, i1):
+        c.springs[i * c.width + GAIN] = 1.0  # relaxation terms carry nothing yet
     if c.top == STRESS:
         for i in range(i0, i1):
             if c.springs[i * c.width + ETA] == 0.0:
@@ -569,6 +571,9 @@ def start_at_rest(c, m, t, values, rows):  # type: ignore[no-untyped-def]
             y[n[Z_AT] + k] = -s[TOTAL]
     if c.p > 0:
         derive_start(c, m, i0, i1, first, rows)
+    for i in range(i0, i1):
+        for k in range(c.terms):
+            c.springs[i * c.width + GAIN] += rows[i, 1 + 2 * k]
 
 
 @inner
@@ -577,7 +582,7 @@ def derive_start(c, m, i0, i1, common, rows):  # type: ignore[no-untyped-def]
     y, p = m.y, c.p
     for i in range(i0, i1):
         s = past(c.springs, i * c.width)
-        s[ETA], s[GAIN] = 0.0 if c.top == MOTION else s[ETA], 1.0
+        s[ETA] = 0.0 if c.top == MOTION else s[ETA]
         for k in range(c.terms):
             s[RELAX + 2 * k] = 0.0
     c.carried[c.groups - 1] = common
@@ -587,7 +592,6 @@ def derive_start(c, m, i0, i1, common, rows):  # type: ignore[no-untyped-def]
         s[ETA] = rows[i, 0]
         for k in range(c.terms):
             s[RELAX + 2 * k] = rows[i, 1 + 2 * k]
-            s[GAIN] += rows[i, 1 + 2 * k]
         slope = s[c.results + SLOPE]
         for j in range(p):
             strain, part = c.strain[i * p + j], c.part[i * p + j]
@@ -660,6 +664,8 @@ def loop(step, c, m, work, mass, reals, values, t, rows, out, log, scales, brief
         r[k] = 0.0
     for k in range(SCALES):
         m.scales[k] = scales[k]
+    for i in range(c.count):  # of the strain of each spring
+        m.scales[SCALES + i] = scales[OF_EPS]
     begin(c)
     gravity, r[BRIEF] = 0.0, brief
     if struck:
@@ -762,12 +768,12 @@ def integrate_stiff(  # type: ignore[no-untyped-def]
     n, reach = order_state(c, places, groups_of)
     systems = past(start(complexes), 3 * n)
     alive = past(start(jacobian), n * (2 * reach + 1))
-    for k in range(2 * c.groups + 2):
+    for k in range(2 * c.groups + 2 + c.p):
         alive[k] = 0.0
     worst = past(alive, 2 * c.groups)
     work = Systems(
         systems, start(complexes), start(jacobian), start(integers), places, groups_of, reach,
-        alive, worst,
+        alive, worst, past(worst, 2),
     )  # fmt: skip
     loop(implicit_step, c, m, work, mass, reals, values, t, rows, out, log, scales, brief, endings)
     motion, stress = m.scales[OF_W], m.run[LARGEST]
