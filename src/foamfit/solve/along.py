@@ -205,7 +205,7 @@ def go_to(c, eps, between, m, seed, y, tol, weight):  # type: ignore[no-untyped-
 
 
 @inner
-def follow_motion(c, strain, t, tol, seeds, m, y, out, branches):  # type: ignore[no-untyped-def]
+def follow_motion(c, strain, t, tol, seeds, m, y, out, branches, slopes):  # type: ignore[no-untyped-def]
     """Follow the spring along strains from rest; fill stress, derivatives and branches."""
     s, n, lasts, weight = past(c.springs, c.none), strain.size, t[-1] - t[0], 0.0
     for k in range(c.terms):
@@ -228,7 +228,7 @@ def follow_motion(c, strain, t, tol, seeds, m, y, out, branches):  # type: ignor
         else:
             go_to(c, strain[j], t[j] - t[j - 1], m, seed, y, tol, weight)
         sum_up(c, y, j, out)
-        branches[j] = int(s[BRANCH])
+        branches[j], slopes[j] = int(s[BRANCH]), s[c.results + SLOPE]
         if not m[0] < math.inf:
             for k in range(j, n):
                 out[0, 0, k], branches[k] = math.inf, int(s[BRANCH])

@@ -832,12 +832,12 @@ def balance(  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 def follow(  # type: ignore[no-untyped-def]
-    sizes, laws, ends, directions, rows, heights, mass, reals, strain, t, out, branches, ints,
-    floats, seeds,
+    sizes, laws, ends, directions, rows, heights, mass, reals, strain, t, out, branches, slopes,
+    ints, floats, seeds,
 ):  # fmt: skip
     """Follow one spring, without its dashpot, along strains; see `along`."""
     c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, 1, ints, floats)
     begin(c)
     y = past(m.run, RUN)
     work = past(y, c.terms * (1 + c.p))
-    follow_motion(c, strain, t, reals[TOL], start(seeds), work, y, out, branches)
+    follow_motion(c, strain, t, reals[TOL], start(seeds), work, y, out, branches, slopes)

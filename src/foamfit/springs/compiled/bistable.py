@@ -164,6 +164,8 @@ COMPILED = Compiled(
     7,
     0,
     (begin.address, evaluate.address, switch.address, settle.address, strain.address),
+    (TABLE + A * WIDE, TABLE + C * WIDE, TABLE + D * WIDE),
+    TABLE + C * WIDE + 1,
 )
 
 
@@ -232,5 +234,5 @@ _LINEAR = (
     begin_linear.address, evaluate_linear.address, switch_linear.address, settle.address,
     strain_linear.address,
 )  # fmt: skip
-LINEAR = Compiled(fill_linear, EXPLICIT, 2, 1, 0, _LINEAR)
-UNILATERAL = Compiled(fill_unilateral, EXPLICIT, 2, 1, 0, _LINEAR)
+LINEAR = Compiled(fill_linear, EXPLICIT, 2, 1, 0, _LINEAR, (0,))
+UNILATERAL = Compiled(fill_unilateral, EXPLICIT, 2, 1, 0, _LINEAR, (0,))

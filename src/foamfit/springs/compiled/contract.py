@@ -83,6 +83,9 @@ class Compiled(NamedTuple):
     derivatives: int  #: number of parameters, by which `evaluate` gives derivatives
     internal: int  #: number of internal variables
     addresses: tuple[int, int, int, int, int]  #: begin, evaluate, switch, settle, strain
+    #: columns of the row with slopes dσ/dε (Pa) of branches at zero stress, that at rest first
+    slopes: tuple[int, ...] = ()
+    pole: int = -1  #: column of the row with ε_*, if the strain stays below 1 + ε_*
 
 
 BEGIN, EVALUATE, SWITCH, SETTLE, STRAIN = range(5)

@@ -558,4 +558,6 @@ COMPILED = Compiled(
     PARAMETERS,
     1,
     (begin.address, evaluate.address, switch.address, settle.address, strain.address),
+    (K0, KC),
+    STAR,
 )
