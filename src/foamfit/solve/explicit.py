@@ -11,39 +11,27 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from llvmlite import ir
+from numba import cfunc, types
+from numba.extending import intrinsic
 from scipy.integrate._ivp import dop853_coefficients as pair
 
-from foamfit.solve.links import (
-    EPS_AT,
-    INTERNALS,
-    KIND,
-    NUMBERS,
-    OF_EPS,
-    OF_SIGMA,
-    OF_V,
-    OF_W,
-    VALUE,
-    VALUE_RATE,
-    X_AT,
-    Z_AT,
-    change_branch,
-    rates,
-)
-from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
+from foamfit.solve.links import rates, unpack
 from foamfit.springs.compiled.contract import (
-    BRANCH,
     EPS,
-    EXPLICIT,
-    HEIGHT,
     HIGH,
-    INTERNAL,
     LOW,
     OLD_EPS,
     OLD_RATE,
+    OPTIONS,
     RATE,
     STRESS as TOTAL,
     TURNS,
+    address,
+    floats_at,
+    inlined,
     inner,
+    integers_at,
     past,
 )
 
@@ -68,6 +56,14 @@ WEIGHT = np.concatenate(
 )  # fmt: skip
 TIMES = pair.C[:ALL_STAGES]
 
+# Numbers that change during a run: time, begin of the piece, step, end of the piece, steps, growth
+# of the next step, largest stress, whether the base stress has risen, last error, next sample,
+# number of the piece, switches; of implicit steps: length of the one before, least length that the
+# error can enforce, length of a short step, short steps in a row, size of all vibrations that were
+# damped out, and of those in the last steps.
+NOW, BEGUN, STEP, HORIZON, TAKEN, GROW, LARGEST, PRESSED, LAST, SAMPLE, PIECE, LOGGED = range(12)
+BEFORE, FLOOR, BRIEF, IN_ROW, DAMPED, DAMPING, RUN = range(12, 19)
+PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
 LAST_TERM = 1e-3  # share of the last term of the dense output that counts as its error
 RISEN = 1e-9  # base stress over the largest stress above which its return to zero ends the contact
 # Kinds of events: a branch ends at its upper or lower strain, a spring turns, contact ends.
@@ -75,10 +71,9 @@ TOP_END, LOW_END, TURN, RELEASE = range(4)
 
 
 class Work(NamedTuple):
-    """Arrays of a run: pointers."""
+    """Arrays of a run: pointers. `pack_work` keeps it in memory for other functions."""
 
     stage: Any  #: rates at the stages
-    wide: int  #: their width
     line: Any  #: the dense output
     y: Any  #: the state
     new: Any  #: at the end of the step
@@ -86,10 +81,35 @@ class Work(NamedTuple):
     f: Any  #: rates between
     nil: Any  #: zeros
     errors: Any
-    kinds: Any  #: of the components, integers
     scales: Any  #: of the kinds
-    run: Any  #: numbers that change, see `runs`
+    run: Any  #: numbers that change, see above
+    kinds: Any  #: of the components, integers
+    words: Any  #: this, in memory
+    wide: int  #: width of a row of stages
     degree: int  #: of the dense output if it is a polynomial of an implicit step, else 0
+
+
+@inlined
+def pack_work(m):  # type: ignore[no-untyped-def]
+    """Keep the arrays of a run in its `words`."""
+    w = m.words
+    w[0], w[1], w[2], w[3] = address(m.stage), address(m.line), address(m.y), address(m.new)
+    w[4], w[5], w[6], w[7] = address(m.state), address(m.f), address(m.nil), address(m.errors)
+    w[8], w[9], w[10], w[11] = address(m.scales), address(m.run), address(m.kinds), address(w)
+    w[12], w[13] = m.wide, m.degree
+
+
+@inlined
+def unpack_work(w):  # type: ignore[no-untyped-def]
+    """Return the arrays of a run from its words."""
+    return Work(
+        floats_at(w[0]), floats_at(w[1]), floats_at(w[2]), floats_at(w[3]), floats_at(w[4]),
+        floats_at(w[5]), floats_at(w[6]), floats_at(w[7]), floats_at(w[8]), floats_at(w[9]),
+        integers_at(w[10]), w, w[12], w[13],
+    )  # fmt: skip
+
+
+WORK_WORDS = len(Work._fields)
 
 
 @inner
@@ -294,3 +314,67 @@ def keep_values(c):  # type: ignore[no-untyped-def]
         s[OLD_EPS], s[OLD_RATE] = s[EPS], s[RATE]
         largest = max(largest, abs(s[TOTAL]))
     return largest
+
+
+# ---------------------------------------------------------------- one step
+
+
+_F, _I, _IP = types.float64, types.int64, types.CPointer(types.int64)
+#: words of chain and work, whether with derivatives, tolerance, time of the next sample, bound on
+#: steps, and words of the systems of implicit steps
+STEPPING = _I(_IP, _IP, _I, _F, _F, _F, _IP)
+
+
+@cfunc(STEPPING, **OPTIONS, cache=True)
+def _step(words, of_work, want, tol, upto, most, of_systems):  # type: ignore[no-untyped-def]
+    """Take one step, shorter ones until it is accurate; return how it ended.
+
+    `upto` is the time of the next sample inside the piece. A step that may contain a switch or
+    contains a sample has its dense output.
+    """
+    c, m = unpack(words), unpack_work(of_work)
+    r, again, n = m.run, False, c.base + c.carries * c.p
+    while True:
+        dt, at = r[STEP], r[NOW] - r[BEGUN]
+        if r[NOW] + dt == r[NOW] or not dt > 0.0:
+            return FAILED
+        take(c, m, n, dt, at, want)
+        r[TAKEN] += 1.0
+        error = error_of(c, m, dt, tol)
+        if not error <= 1.0:
+            again = True
+            r[STEP] = dt * (max(0.2, 0.9 * error**-0.125) if error < math.inf else 0.2)
+            if r[TAKEN] > most:
+                return FAILED
+            continue
+        grow = 6.0
+        if error > 1e-8:
+            grow = min(6.0, max(0.3, 0.9 * error**-0.115 * r[LAST] ** 0.02))
+        r[GROW] = min(grow, 1.0) if again else grow
+        doubtful = suspicious(c, dt, r[PRESSED] > 0.0)
+        if not doubtful and upto > r[NOW] + dt:
+            r[LAST] = max(error, 1e-4)
+            return PLAIN
+        size = make_dense(c, m, n, dt, at, tol, want)
+        if size > 1.0 and dt > 1e-12 * abs(r[HORIZON] - r[BEGUN]):
+            again = True
+            r[STEP] = dt * max(0.3, 0.9 * size**-0.143)
+            continue
+        r[LAST] = max(error, 1e-4)
+        if size > 0.0:
+            r[GROW] = min(r[GROW], 0.9 * size**-0.143)
+        return DOUBTFUL if doubtful else SAMPLED
+
+
+EXPLICIT_STEP = _step.address
+
+
+@intrinsic
+def take_step(typing, where, words, of_work, want, tol, upto, most, of_systems):  # type: ignore[no-untyped-def]
+    """Take one step by the function at an address; return how it ended."""
+
+    def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        kind = ir.FunctionType(ir.IntType(64), [value.type for value in args[1:]])
+        return builder.call(builder.inttoptr(args[0], kind.as_pointer()), args[1:])
+
+    return _I(_I, _IP, _IP, _I, _F, _F, _F, _IP), emit

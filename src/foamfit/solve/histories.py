@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.solve import cache, links, runs
+from foamfit.solve import cache, explicit, links, runs
 from foamfit.solve.scene import MOTION, STRESS
 from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import INTERNAL, RESULTS, results_of
 from foamfit.springs.spring import Spring
 
-_ONE = np.ones(1)
+_ONE, _NO_SYSTEMS = np.ones(1), np.zeros(4, np.int64)
 _END = np.array([1])
 TOL = 1e-12  # of a law with internal variables
 _NONE = np.empty((0, 2), np.int64)
@@ -27,12 +27,13 @@ def _packed(spring: Spring, history: Array, top: int) -> tuple[list[Any], Any]:
     row[0] = 0.0  # no dashpot
     place, results = RESULTS, results_of(law.derivatives, law.internal)
     at = place + results
-    sizes = 1, 1, 0, 0, top, 1, place, at, at + law.columns, links.RATES, links.CHANGE
+    sizes = 1, 1, 0, 0, top, 1, place, at, at + law.columns, links.RATES
+    sizes += links.CHANGE, explicit.EXPLICIT_STEP, 0
     floats, integers = runs.room(sizes, law.internal)
     time, out = np.arange(history.size, dtype=float), np.empty((1, 2, history.size))
     packed = [
         np.array(sizes), np.array([(*law.addresses, law.kind, law.derivatives, law.internal)]),
-        _END, _NONE, row[None, :], _ONE, _ONE, np.array((0.0, 0.0, TOL, 1e9, 0.0)), history, time,
+        _END, _NONE, row[None, :], _ONE, _ONE, np.array((0.0, 0.0, TOL, 1e9, 0.0, 0.0)), history, time,
         out, np.empty(integers, np.int64), np.empty(floats),
     ]  # fmt: skip
     return packed, law
@@ -55,7 +56,7 @@ def _integrated(packed: list[Any], branches: NDArray[np.int64]) -> tuple[Array, 
     values, time, out = packed[8:11]
     log, endings = np.empty((4 * values.size + 64, 5)), np.zeros(runs.ENDINGS)
     rate, most = np.abs(np.diff(values)).max(initial=0.0), np.abs(values).max()
-    runs.integrate(*packed[:11], log, *packed[11:], np.array((most, rate, most, 0.0)), endings)
+    runs.integrate(*packed[:11], log, *packed[11:], np.array((most, rate, most, 0.0)), endings, _NO_SYSTEMS)
     branches[:] = 0
     for at, _, _, entered, _ in log[: int(endings[runs.SWITCHES])].tolist():
         branches[int(np.searchsorted(time, at)) :] = int(entered)
@@ -79,7 +80,7 @@ def _strain_of_internal(packed: list[Any]) -> Array:
     stress, _, out = packed[8:11]
     log, endings = np.empty((0, 5)), np.zeros(runs.ENDINGS)
     scales = np.array((1e-3, 0.0, 1e-3, np.abs(stress).max()))
-    runs.integrate(*packed[:11], log, *packed[11:], scales, endings)
+    runs.integrate(*packed[:11], log, *packed[11:], scales, endings, _NO_SYSTEMS)
     if endings[runs.OUTCOME]:
         out[0, 1, :] = np.nan
     return np.asarray(out[0, 1])

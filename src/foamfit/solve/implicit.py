@@ -16,12 +16,45 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import cfunc
 
 from foamfit.solve.equilibrium import EPS_AT, INTERNALS, KIND, NUMBERS, X_AT, Z_AT
-from foamfit.solve.explicit import STAGES, suspicious
-from foamfit.solve.links import DRAGGED, rates
+from foamfit.solve.explicit import (
+    BEFORE,
+    BEGUN,
+    BRIEF,
+    DAMPED,
+    DAMPING,
+    DOUBTFUL,
+    FAILED,
+    FLOOR,
+    GROW,
+    HORIZON,
+    IN_ROW,
+    NOW,
+    PRESSED,
+    SAMPLED,
+    STAGES,
+    STEP,
+    STEPPING,
+    TAKEN,
+    suspicious,
+    unpack_work,
+)
+from foamfit.solve.links import DRAGGED, rates, unpack
 from foamfit.solve.scene import FREE, STRESS, VISCOUS
-from foamfit.springs.compiled.contract import ETA, GAIN, HEIGHT, INTERNAL, TANGENT, inner, past
+from foamfit.springs.compiled.contract import (
+    ETA,
+    GAIN,
+    HEIGHT,
+    INTERNAL,
+    OPTIONS,
+    TANGENT,
+    complexes_at,
+    floats_at,
+    inner,
+    past,
+)
 
 POINTS = 5
 
@@ -57,15 +90,6 @@ _moments = 1.0 / np.arange(1, POINTS + 1) - np.where(np.arange(POINTS) == 0, _ga
 _weights = np.linalg.solve((NODES[:, None] ** np.arange(POINTS)).T, _moments)
 OF_ERROR = (_weights - _A[-1]) @ _INVERSE / _gamma
 
-# Numbers that change during a run: time, begin of the piece, step, end of the piece, steps, growth
-# of the next step, largest stress, whether the base stress has risen, last error, next sample,
-# number of the piece, switches; of implicit steps: length of the one before, least length that the
-# error can enforce, length of a short step, short steps in a row, size of all vibrations that were
-# damped out, and of those in the last steps.
-NOW, BEGUN, STEP, HORIZON, TAKEN, GROW, LARGEST, PRESSED, LAST, SAMPLE, PIECE, LOGGED = range(12)
-BEFORE, FLOOR, BRIEF, IN_ROW, DAMPED, DAMPING, RUN = range(12, 19)
-PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
-SHORT = 5e-4  # length of a short step, as a share of the duration
 FOLLOW_LIMIT = 600  # number of short steps in a row that are taken
 TURNS_OF_NEWTON = 12
 # Newton's method ends at changes of ENOUGH over the tolerance, of derivatives at ENOUGH/OF_TANGENTS: as
@@ -82,7 +106,7 @@ class Systems(NamedTuple):
     pivots: Any  #: SYSTEMS of n integers
     places: Any  #: of the components in the systems
     groups_of: Any  #: groups of the components
-    reach: int
+    reach: int  #: see `order_state`
     alive: Any  #: vibrations, see `remember`, (groups, 2)
     worst: Any  #: the largest motion and stress at a sample
     largest: Any  #: values of the derivatives, over the scales, (p,)
@@ -415,8 +439,30 @@ def _allowed(c, m, h, excess, tol, rounded):  # type: ignore[no-untyped-def]
 
 
 @inner
-def implicit_step(c, m, n, want, tol, upto, most, work):  # type: ignore[no-untyped-def]
+def systems_of(c, words):  # type: ignore[no-untyped-def]
+    """Return the systems of a run; their words contain 3 addresses, reach, and integers.
+
+    At the first step, which finds a reach of zero, the components are ordered.
+    """
+    n = c.carries
+    pivots = past(words, 4)
+    places, groups_of = past(pivots, SYSTEMS * n), past(pivots, (SYSTEMS + 1) * n)
+    if words[3] == 0:
+        words[3] = order_state(c, places, groups_of)[1]
+    reach = words[3]
+    jacobian, alive = floats_at(words[1]), floats_at(words[2])
+    worst, right = past(alive, 2 * c.groups), complexes_at(words[0])
+    return Systems(
+        past(right, SYSTEMS * n), right, jacobian, pivots, places, groups_of, reach, alive, worst,
+        past(worst, 2),
+    )  # fmt: skip
+
+
+@cfunc(STEPPING, **OPTIONS, cache=True)
+def _step(words, of_work, want, tol, upto, most, of_systems):  # type: ignore[no-untyped-def]
     """Take one implicit step, shorter ones until it is accurate; return how it ended."""
+    c, m = unpack(words), unpack_work(of_work)
+    work = systems_of(c, of_systems)
     r, at, reach = m.run, m.run[NOW] - m.run[BEGUN], work.reach
     linearise(c, m, at, c.carries, reach, work, work.jacobian)
     first, first_error = r[STEP], math.inf
@@ -443,3 +489,6 @@ def implicit_step(c, m, n, want, tol, upto, most, work):  # type: ignore[no-unty
     remember(c, m, h, max(upto - r[NOW], 0.0) if upto < math.inf else h, work.alive, work.worst)
     r[BEFORE] = h
     return DOUBTFUL if suspicious(c, h, r[PRESSED] > 0.0) else SAMPLED
+
+
+IMPLICIT_STEP = _step.address

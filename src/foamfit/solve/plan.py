@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve import cache, links, rates, runs
+from foamfit.solve import cache, explicit, links, rates, runs
 from foamfit.solve import scene as scenes
-from foamfit.solve.implicit import SHORT
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
 from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
@@ -37,12 +36,13 @@ MOST_SAMPLED = 10_000_000  # in total
 # Error of a step over the requested error.
 ALONE, IN_SERIES, OF_MASSES = 0.1, 1e-2, 1e-3
 OF_IMPLICIT = 1e-1
+SHORT = 5e-4  # length of a short implicit step, as a share of the duration, for a truncation of 3e-8
 LEAST_TOL = 2e-14
 LOGGED = 1024  # switches in the log of a first run; with more it is repeated
 AT_MOST = 1e-9  # error of an elongation over the height
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
-_NOTHING = np.zeros(1)
+_NOTHING, _NO_SYSTEMS = np.zeros(1), np.zeros(4, np.int64)
 
 
 class Laws(NamedTuple):
@@ -129,9 +129,10 @@ class Plan(NamedTuple):
         row = RESULTS + self.laws.results
         width = row + rows.shape[1] - 1 - 2 * terms
         sizes = (
-            count, groups, p, terms, self.top, nodes, RESULTS, row, width, links.RATES, links.CHANGE
+            count, groups, p, terms, self.top, nodes, RESULTS, row, width, links.RATES,
+            links.CHANGE, explicit.EXPLICIT_STEP, 0,
         )  # fmt: skip
-        reals = np.array((drag, self.speed, tol, most, 1.0))
+        reals = np.array((drag, self.speed, tol, most, 1.0, 0.0))
         return [
             np.array(sizes), self.laws.table, self.ends, directions, rows, heights, self.mass, reals,
             self.values, self.time, np.empty((1 + p, 1 + nodes, self.time.size)),
@@ -180,23 +181,25 @@ class Plan(NamedTuple):
         packed = self._packed(rows, heights, drag, tol, most, directions, nodes)
         log, endings = np.empty((logged, 5)), np.zeros(runs.ENDINGS)
         scales = self._scales(rows, heights)
+        lost = 0.0
         if not stiff:
             cache.announce(runs.integrate, "the solver")
-            runs.integrate(*packed, log, *self._room(packed), scales, endings)
+            runs.integrate(*packed, log, *self._room(packed), scales, endings, _NO_SYSTEMS)
             failed = int(endings[runs.OUTCOME])
             stiff = self.implicit is None and failed in (
                 scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW
             )  # fmt: skip
         method = EXPLICIT_STEPS
         if stiff:
-            method = RADAU
-            packed[7][2:4] = max(OF_IMPLICIT * self.margin * rtol, LEAST_TOL), self.max_steps
-            cache.announce(runs.integrate_stiff, "the solver of stiff scenes")
-            runs.integrate_stiff(
-                *packed, log, *self._room(packed), scales, endings, self._brief(rows, heights, drag, tol),
-                *self._systems(heights, len(directions)),
-            )  # fmt: skip
-        return self._motion(packed[-1], method, endings, log, rows)
+            from foamfit.solve import implicit
+
+            method, tol = RADAU, max(OF_IMPLICIT * self.margin * rtol, LEAST_TOL)
+            packed[0][runs.STEP_OF : runs.STEP_OF + 2] = implicit.IMPLICIT_STEP, implicit.POINTS
+            packed[7][2:4], packed[7][5] = (tol, self.max_steps), self._brief(rows, heights, drag, tol)
+            *kept, words = self._systems(heights, len(directions))
+            runs.integrate(*packed, log, *self._room(packed), scales, endings, words)
+            lost = _lost(kept[2][2 * len(self.ends) :], endings)
+        return self._motion(packed[-1], method, endings, log, rows, lost)
 
     def _brief(self, rows: Array, heights: Array, drag: float, tol: float) -> float:
         """Return the length of a short implicit step, s."""
@@ -207,21 +210,24 @@ class Plan(NamedTuple):
             duration = min(duration, 5.0 * lasts)
         return SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0)
 
-    def _systems(self, heights: Array, p: int) -> tuple[Any, Array, NDArray[np.int64]]:
-        """Return the arrays of implicit steps."""
+    def _systems(self, heights: Array, p: int) -> tuple[Any, Array, Array, NDArray[np.int64]]:
+        """Return the arrays of implicit steps, and their words."""
         inside = [0, *self.ends.tolist()]
         each = [one.internal for one in self.laws.made]
         sizes = [
             2 + sum(1 + self.terms + each[i] for i in range(first, last))
             for first, last in zip(inside, inside[1:], strict=False)
         ]
-        n = sum(sizes)
+        n, groups = sum(sizes), len(sizes)
         reach = max(one + other for one, other in zip(sizes, [0, *sizes], strict=False)) - 1
         complexes = np.empty(3 * n * (3 * reach + 2), np.complex128)
-        return complexes, np.empty(n * (2 * reach + 1) + 2 * len(sizes) + 2 + p), np.empty(5 * n, int)
+        jacobian, alive = np.empty(n * (2 * reach + 1)), np.zeros(2 * groups + 2 + p)
+        words = np.zeros(4 + 5 * n, np.int64)
+        words[:3] = [one.ctypes.data for one in (complexes, jacobian, alive)]
+        return complexes, jacobian, alive, words
 
     def _motion(
-        self, out: Array, method: str, endings: Array, log: Array, rows: Array
+        self, out: Array, method: str, endings: Array, log: Array, rows: Array, lost: float
     ) -> Motion:
         """Return the result of a run as a Motion; raise SimulationError if it failed."""
         outcome, time, steps, switches = endings[:4].tolist()
@@ -235,7 +241,6 @@ class Plan(NamedTuple):
             log = log[: int(switches)] if switches <= len(log) else np.empty((int(switches), 5))
         else:
             log = NO_SWITCHES
-        lost = float(endings[runs.UNRESOLVED])
         return Motion(out[0, 1:], out[0, 0], time, log, int(steps), method, slopes, lost)
 
     # ------------------------------------------------------------------ without integration
@@ -312,6 +317,15 @@ class Plan(NamedTuple):
         gain = 1.0 + rows[:, 1 : 1 + 2 * self.terms : 2].sum(axis=1)
         chain = gain * first, gain * steep, rows[:, 0], heights, self.ends, self.mass, drag, self.top
         return rates.fastest_rates(*chain, self.speed > 0.0, self._duration)
+
+
+def _lost(worst: Array, endings: Array) -> float:
+    """Return the size of the vibrations that implicit steps damped out, relative to the ranges."""
+    motion, stress = float(endings[runs.FARTHEST]), float(endings[runs.STRONGEST])
+    lost = float(endings[runs.DAMPED_OUT])
+    if worst[0] > 0.0:
+        lost += max(worst[0] / motion if motion > 0.0 else 0.0, worst[1] / stress)
+    return lost
 
 
 def seeds(strain: Array, moved: bool) -> Array:

@@ -8,25 +8,6 @@ from numba import njit
 
 from foamfit.solve.along import TABLE, follow_motion
 from foamfit.solve.explicit import (
-    ALL_STAGES,
-    LOW_END,
-    RELEASE,
-    RISEN,
-    STAGES,
-    TOP_END,
-    TURN,
-    Work,
-    dense,
-    error_of,
-    first_event,
-    keep_values,
-    look,
-    make_dense,
-    suspicious,
-    take,
-)
-from foamfit.solve.implicit import (
-    BEFORE,
     BEGUN,
     BRIEF,
     DAMPED,
@@ -40,17 +21,24 @@ from foamfit.solve.implicit import (
     NOW,
     PIECE,
     PLAIN,
-    POINTS,
     PRESSED,
+    RELEASE,
+    RISEN,
     RUN,
     SAMPLE,
-    SAMPLED,
-    SHORT,
+    STAGES,
     STEP,
     TAKEN,
-    Systems,
-    implicit_step,
-    order_state,
+    TOP_END,
+    TURN,
+    WORK_WORDS,
+    Work,
+    dense,
+    first_event,
+    keep_values,
+    look,
+    pack_work,
+    take_step,
 )
 from foamfit.solve.links import PACE as PACED
 from foamfit.solve.links import (
@@ -125,21 +113,21 @@ from foamfit.springs.compiled.contract import (
 from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
 
 # Integers of a run, then for each spring: addresses of its law, kind, parameters, internals.
-COUNT, GROUPS, P, TERMS, TOP, NODES_OUT, RESULTS_OF, ROW_OF, WIDE, RATES_OF, CHANGE_OF, SIZES = range(12)
+COUNT, GROUPS, P, TERMS, TOP, NODES_OUT, RESULTS_OF, ROW_OF, WIDE, RATES_OF, CHANGE_OF, STEP_OF, DEGREE_OF, SIZES = range(14)
 LAW = 8
 # Numbers of a run.
-DRAGS, SPEED, TOL, MOST, PACE, REALS = range(6)
+DRAGS, SPEED, TOL, MOST, PACE, BRIEFLY, REALS = range(7)
 # Results of a run.
-OUTCOME, ENDED, STEPS, SWITCHES, UNRESOLVED, ENDINGS = range(6)
+OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, ENDINGS = range(8)
 def room(sizes: tuple[int, ...], internals: int) -> tuple[int, int]:
     """Return the numbers of floats and integers that a run needs, at most."""
-    count, groups, p, terms, _, _, _, _, wide, _, _ = sizes
+    count, groups, p, terms, _, _, _, _, wide, *_ = sizes
     n = 2 * groups + count * (1 + terms) + internals
     n += n * p
     wide_n = (n + 3) // 4 * 4
     floats = count * wide + 2 * groups + DRIVES + (2 * count + 1 + 4 * count + groups + 3 + count) * p
     floats += SCALES + internals + count + RUN + 28 * wide_n + 2 + terms * (TABLE + 1 + p) + 3 * p + 8
-    return floats, WORDS + count * NUMBERS + count + 1 + p + n
+    return floats, WORDS + WORK_WORDS + count * NUMBERS + count + 1 + p + n
 
 
 @inner
@@ -211,7 +199,8 @@ def lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, solved, i
     nodes = groups if top == FREE or top == VISCOUS else groups - 1
     words = start(ints)
     words[RATES_AT], words[CHANGE_AT] = sizes[RATES_OF], sizes[CHANGE_OF]
-    numbers = past(words, WORDS)
+    of_work = past(words, WORDS)
+    numbers = past(of_work, WORK_WORDS)
     owned = past(numbers, count * NUMBERS)
     kinds = past(owned, count + 1 + p)
     springs = start(floats)
@@ -272,9 +261,10 @@ def lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, solved, i
     pack(c)
     line = past(stage, 16 * w)
     m = Work(
-        stage, w, line, past(line, 7 * w), past(line, 8 * w), past(line, 9 * w), past(line, 10 * w),
-        past(line, 11 * w), past(stage, 13 * w), kinds, scales, run, POINTS * solved,
+        stage, line, past(line, 7 * w), past(line, 8 * w), past(line, 9 * w), past(line, 10 * w),
+        past(line, 11 * w), past(stage, 13 * w), scales, run, kinds, of_work, w, sizes[DEGREE_OF],
     )  # fmt: skip
+    pack_work(m)
     return c, m
 
 
@@ -380,46 +370,6 @@ def approach(c, t, speed, gravity, out):  # type: ignore[no-untyped-def]
 
 
 # ---------------------------------------------------------------- the loop over time
-
-
-@inner
-def one_step(c, m, n, want, tol, upto, most, work):  # type: ignore[no-untyped-def]
-    """Take one step, shorter ones until it is accurate; return how it ended.
-
-    `upto` is the time of the next sample inside the piece. A step that may contain a switch or
-    contains a sample has its dense output.
-    """
-    r, again = m.run, False
-    while True:
-        dt, at = r[STEP], r[NOW] - r[BEGUN]
-        if r[NOW] + dt == r[NOW] or not dt > 0.0:
-            return FAILED
-        take(c, m, n, dt, at, want)
-        r[TAKEN] += 1.0
-        error = error_of(c, m, dt, tol)
-        if not error <= 1.0:
-            again = True
-            r[STEP] = dt * (max(0.2, 0.9 * error**-0.125) if error < math.inf else 0.2)
-            if r[TAKEN] > most:
-                return FAILED
-            continue
-        grow = 6.0
-        if error > 1e-8:
-            grow = min(6.0, max(0.3, 0.9 * error**-0.115 * r[LAST] ** 0.02))
-        r[GROW] = min(grow, 1.0) if again else grow
-        doubtful = suspicious(c, dt, r[PRESSED] > 0.0)
-        if not doubtful and upto > r[NOW] + dt:
-            r[LAST] = max(error, 1e-4)
-            return PLAIN
-        size = make_dense(c, m, n, dt, at, tol, want)
-        if size > 1.0 and dt > 1e-12 * abs(r[HORIZON] - r[BEGUN]):
-            again = True
-            r[STEP] = dt * max(0.3, 0.9 * size**-0.143)
-            continue
-        r[LAST] = max(error, 1e-4)
-        if size > 0.0:
-            r[GROW] = min(r[GROW], 0.9 * size**-0.143)
-        return DOUBTFUL if doubtful else SAMPLED
 
 
 @inner
@@ -532,6 +482,7 @@ def fresh_scales(c, m):  # type: ignore[no-untyped-def]
 def ended(out, outcome, m):  # type: ignore[no-untyped-def]
     """Write the results of a run."""
     out[OUTCOME], out[STEPS], out[SWITCHES] = outcome, m.run[TAKEN], m.run[LOGGED]
+    out[STRONGEST], out[FARTHEST], out[DAMPED_OUT] = m.run[LARGEST], m.scales[OF_W], m.run[DAMPED]
     if outcome != DONE:
         out[ENDED] = m.run[NOW]
 
@@ -655,11 +606,20 @@ def finish_step(c, m, struck):  # type: ignore[no-untyped-def]
         m.scales[kind] = max(m.scales[kind], abs(m.y[k]))
 
 
-@inner
-def loop(step, c, m, work, mass, reals, values, t, rows, out, log, scales, brief, endings):  # type: ignore[no-untyped-def]
-    """Take steps until the run ends."""
+@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
+def integrate(  # type: ignore[no-untyped-def]
+    sizes, laws, ends, directions, rows, heights, mass, reals, values, t, out, log, ints, floats,
+    scales, endings, systems,
+):  # fmt: skip
+    """Integrate a chain over sample times; fill `endings`.
+
+    `out` (1 + p, 1 + nodes, n) becomes base stress and displacements, and their derivatives, `log`
+    the switches; `ints` and `floats` are overwritten. `systems` are the words of implicit steps.
+    """
+    solved = int(sizes[DEGREE_OF] > 0)
+    c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, solved, ints, floats)
     r, want, tol, most, speed = m.run, int(c.p > 0), reals[TOL], reals[MOST], reals[SPEED]
-    struck, n = speed > 0.0, c.base + c.carries * c.p
+    struck, n, step = speed > 0.0, c.base + c.carries * c.p, sizes[STEP_OF]
     for k in range(RUN):
         r[k] = 0.0
     for k in range(SCALES):
@@ -667,7 +627,7 @@ def loop(step, c, m, work, mass, reals, values, t, rows, out, log, scales, brief
     for i in range(c.count):  # of the strain of each spring
         m.scales[SCALES + i] = scales[OF_EPS]
     begin(c)
-    gravity, r[BRIEF] = 0.0, brief
+    gravity, r[BRIEF] = 0.0, reals[BRIEFLY]
     if struck:
         m.y[2 * c.nodes - 1] = speed
         gravity = values[0] / mass[c.groups - 1]
@@ -696,7 +656,7 @@ def loop(step, c, m, work, mass, reals, values, t, rows, out, log, scales, brief
         keep_values(c)
         r[STEP] = min(r[STEP], r[HORIZON] - r[NOW])
         upto = t[int(r[SAMPLE])] if struck else math.inf
-        how = step(c, m, n, want, tol, upto, most, work)
+        how = take_step(step, c.words, m.words, want, tol, upto, most, start(systems))
         if how == FAILED or r[TAKEN] >= most or c.drive[FLAT] > 0.0:
             outcome = TOO_MANY_STEPS if r[TAKEN] >= most else STEP_UNDERFLOW
             if how == FAILED and not abs(m.new[0]) < math.inf:
@@ -737,50 +697,6 @@ def loop(step, c, m, work, mass, reals, values, t, rows, out, log, scales, brief
             r[HORIZON] = math.nextafter(r[NOW], math.inf)
         r[STEP] = dt
         fresh_scales(c, m)
-
-
-@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
-def integrate(  # type: ignore[no-untyped-def]
-    sizes, laws, ends, directions, rows, heights, mass, reals, values, t, out, log, ints, floats,
-    scales, endings,
-):  # fmt: skip
-    """Integrate a chain over sample times by explicit steps; fill `endings`.
-
-    `out` (1 + p, 1 + nodes, n) becomes base stress and displacements, and their derivatives, `log`
-    the switches; `ints` and `floats` are overwritten.
-    """
-    c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, 0, ints, floats)
-    loop(one_step, c, m, c, mass, reals, values, t, rows, out, log, scales, 0.0, endings)
-
-
-@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
-def integrate_stiff(  # type: ignore[no-untyped-def]
-    sizes, laws, ends, directions, rows, heights, mass, reals, values, t, out, log, ints, floats,
-    scales, endings, brief, complexes, jacobian, integers,
-):  # fmt: skip
-    """Do the same by implicit steps.
-
-    `brief` is the length of a short step, s; the last three arrays are overwritten.
-    """
-    c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, 1, ints, floats)
-    places = past(start(integers), 3 * c.carries)
-    groups_of = past(places, c.carries)
-    n, reach = order_state(c, places, groups_of)
-    systems = past(start(complexes), 3 * n)
-    alive = past(start(jacobian), n * (2 * reach + 1))
-    for k in range(2 * c.groups + 2 + c.p):
-        alive[k] = 0.0
-    worst = past(alive, 2 * c.groups)
-    work = Systems(
-        systems, start(complexes), start(jacobian), start(integers), places, groups_of, reach,
-        alive, worst, past(worst, 2),
-    )  # fmt: skip
-    loop(implicit_step, c, m, work, mass, reals, values, t, rows, out, log, scales, brief, endings)
-    motion, stress = m.scales[OF_W], m.run[LARGEST]
-    lost = m.run[DAMPED]
-    if worst[0] > 0.0:
-        lost += max(worst[0] / motion if motion > 0.0 else 0.0, worst[1] / stress)
-    endings[UNRESOLVED] = lost
 
 
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)

@@ -138,7 +138,9 @@ def _pointer(kind, width):  # type: ignore[no-untyped-def]
     return at
 
 
+_COMPLEX = ir.LiteralStructType([ir.DoubleType(), ir.DoubleType()])
 floats_at, integers_at = _pointer(_F, ir.DoubleType()), _pointer(_I, ir.IntType(64))
+complexes_at = _pointer(types.complex128, _COMPLEX)
 
 
 def _call(builder, values):  # type: ignore[no-untyped-def]
