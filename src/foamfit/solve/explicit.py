@@ -83,6 +83,7 @@ class Work(NamedTuple):
     errors: Any
     scales: Any  #: of the kinds
     run: Any  #: numbers that change, see above
+    batch: Any  #: samples that are computed together
     kinds: Any  #: of the components, integers
     words: Any  #: this, in memory
     wide: int  #: width of a row of stages
@@ -95,8 +96,8 @@ def pack_work(m):  # type: ignore[no-untyped-def]
     w = m.words
     w[0], w[1], w[2], w[3] = address(m.stage), address(m.line), address(m.y), address(m.new)
     w[4], w[5], w[6], w[7] = address(m.state), address(m.f), address(m.nil), address(m.errors)
-    w[8], w[9], w[10], w[11] = address(m.scales), address(m.run), address(m.kinds), address(w)
-    w[12], w[13] = m.wide, m.degree
+    w[8], w[9], w[10], w[11] = address(m.scales), address(m.run), address(m.batch), address(m.kinds)
+    w[12], w[13], w[14] = address(w), m.wide, m.degree
 
 
 @inlined
@@ -105,7 +106,7 @@ def unpack_work(w):  # type: ignore[no-untyped-def]
     return Work(
         floats_at(w[0]), floats_at(w[1]), floats_at(w[2]), floats_at(w[3]), floats_at(w[4]),
         floats_at(w[5]), floats_at(w[6]), floats_at(w[7]), floats_at(w[8]), floats_at(w[9]),
-        integers_at(w[10]), w, w[12], w[13],
+        floats_at(w[10]), integers_at(w[11]), w, w[13], w[14],
     )  # fmt: skip
 
 

@@ -86,9 +86,12 @@ from foamfit.solve.scene import (
 from foamfit.solve.static import bring, derive_here, elongation, push_to, strain_to
 from foamfit.springs.compiled.contract import (
     BRANCH,
+    BY,
+    BY_HELD,
     BY_STRESS,
     EPS,
     ETA,
+    EVALUATE,
     EXPLICIT,
     GAIN,
     HEIGHT,
@@ -105,16 +108,18 @@ from foamfit.springs.compiled.contract import (
     TANGENT,
     TURNS,
     X,
+    call_evaluate,
     inner,
     past,
     results_of,
     start,
 )
-from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
+from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
 # Integers of a run, then for each spring: addresses of its law, kind, parameters, internals.
 COUNT, GROUPS, P, TERMS, TOP, NODES_OUT, RESULTS_OF, ROW_OF, WIDE, RATES_OF, CHANGE_OF, STEP_OF, DEGREE_OF, SIZES = range(14)
 LAW = 8
+BATCH, MOST_OWN = 64, 10  # samples that are computed together; parameters of a built-in law
 # Numbers of a run.
 DRAGS, SPEED, TOL, MOST, PACE, BRIEFLY, REALS = range(7)
 # Results of a run.
@@ -126,7 +131,7 @@ def room(sizes: tuple[int, ...], internals: int) -> tuple[int, int]:
     n += n * p
     wide_n = (n + 3) // 4 * 4
     floats = count * wide + 2 * groups + DRIVES + (2 * count + 1 + 4 * count + groups + 3 + count) * p
-    floats += SCALES + internals + count + RUN + 28 * wide_n + 2 + terms * (TABLE + 1 + p) + 3 * p + 8
+    floats += SCALES + internals + count + RUN + 28 * wide_n + BATCH * (6 + BY + MOST_OWN) + 2 + terms * (TABLE + 1 + p) + 3 * p + 8
     return floats, WORDS + WORK_WORDS + count * NUMBERS + count + 1 + p + n
 
 
@@ -262,7 +267,8 @@ def lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, solved, i
     line = past(stage, 16 * w)
     m = Work(
         stage, line, past(line, 7 * w), past(line, 8 * w), past(line, 9 * w), past(line, 10 * w),
-        past(line, 11 * w), past(stage, 13 * w), scales, run, kinds, of_work, w, sizes[DEGREE_OF],
+        past(line, 11 * w), past(stage, 13 * w), scales, run, past(line, 12 * w), kinds, of_work,
+        w, sizes[DEGREE_OF],
     )  # fmt: skip
     pack_work(m)
     return c, m
@@ -578,10 +584,104 @@ def next_piece(c, m, t, values, want, out):  # type: ignore[no-untyped-def]
 
 
 @inner
+def polynomial(m, i, shares, n, out):  # type: ignore[no-untyped-def]
+    """Fill component i of the state at n shares of an explicit step."""
+    line, wide = m.line, m.wide
+    a, b, c, d = line[i], line[wide + i], line[2 * wide + i], line[3 * wide + i]
+    e, g, h, first = line[4 * wide + i], line[5 * wide + i], line[6 * wide + i], m.y[i]
+    for k in range(n):
+        x = shares[k]
+        z = 1.0 - x
+        out[k] = first + x * (a + z * (b + x * (c + z * (d + x * (e + z * (g + x * h))))))
+
+
+@inner
+def write_batch(c, m, t, at, n, out):  # type: ignore[no-untyped-def]
+    """Write n samples from `at` on: base stress of one spring, which is alone, and the top."""
+    s, own, p, top = past(c.springs, c.none), past(c.numbers, c.none), c.p, 2 * c.groups - 2
+    shares = m.batch
+    eps, x, work = past(shares, BATCH), past(shares, 2 * BATCH), past(shares, 3 * BATCH)
+    w, v, found = past(shares, 4 * BATCH), past(shares, 5 * BATCH), past(shares, 6 * BATCH)
+    per, eta, gain, dt, now = s[PER_HEIGHT], s[ETA], s[GAIN], m.run[STEP], m.run[NOW]
+    for k in range(n):
+        shares[k] = (t[at + k] - now) / dt
+    polynomial(m, c.none, shares, n, w)
+    polynomial(m, c.none + 1, shares, n, v)
+    for k in range(n):
+        eps[k] = w[k] * per
+    if own[X_AT] >= 0:
+        polynomial(m, own[X_AT], shares, n, x)
+    call_evaluate(own[EVALUATE], past(s, c.row), s, eps, x, n, int(p > 0), found)
+    sigma = past(found, OF_LAW * n)
+    for k in range(n):
+        out[0, 0, at + k] = gain * sigma[k] + eta * per * v[k]
+    for q in range(c.terms):
+        polynomial(m, own[Z_AT] + q, shares, n, work)
+        for k in range(n):
+            out[0, 0, at + k] += s[RELAX + 2 * q] * work[k]
+    if top > 0:
+        polynomial(m, top, shares, n, work)
+    for k in range(n):
+        out[0, 1, at + k] = work[k] if top > 0 else w[k]
+    for j in range(p):
+        write_slope(c, m, j, at, n, out)
+
+
+@inner
+def write_slope(c, m, j, at, n, out):  # type: ignore[no-untyped-def]
+    """Write derivative j of the samples of `write_batch`."""
+    s, own, p, top = past(c.springs, c.none), past(c.numbers, c.none), c.p, 2 * c.groups - 2
+    shares = m.batch
+    eps, work, v = past(shares, BATCH), past(shares, 3 * BATCH), past(shares, 5 * BATCH)
+    found = past(shares, 6 * BATCH)
+    slope, sigma = past(found, SLOPE * n), past(found, OF_LAW * n)
+    per, eta, gain, what = s[PER_HEIGHT], s[ETA], s[GAIN], c.directions[2 * j + 1]
+    mine, of_height, of_eta = c.directions[2 * j] == 0, c.own[j], c.own[p + j]
+    polynomial(m, c.base + j, shares, n, work)
+    for k in range(n):
+        out[1 + j, 1, at + k] = work[k]
+        out[1 + j, 0, at + k] = gain * slope[k] * per * (work[k] - of_height * eps[k])
+    if mine and 0 <= what < OWN_ETA:
+        by = past(found, (BY + what) * n)
+        for k in range(n):
+            out[1 + j, 0, at + k] += gain * by[k]
+    if own[KIND] == BY_STRESS:
+        held, ever, by = gain * c.held[j], gain * c.held[p + j], past(found, BY_HELD * n)
+        for k in range(n):
+            out[1 + j, 0, at + k] += held * by[k] + ever * by[n + k]
+    if eta > 0.0 or of_eta > 0.0:
+        polynomial(m, c.none + 1, shares, n, v)
+        polynomial(m, c.base + p + j, shares, n, work)
+        for k in range(n):
+            more = of_eta * v[k] + eta * (work[k] - of_height * per * v[k])
+            out[1 + j, 0, at + k] += per * more
+    for q in range(c.terms):
+        polynomial(m, c.base + (own[Z_AT] + q) * p + j, shares, n, work)
+        for k in range(n):
+            out[1 + j, 0, at + k] += s[RELAX + 2 * q] * work[k]
+        if mine and what == OWN_RELAXATION + 2 * q:
+            polynomial(m, own[Z_AT] + q, shares, n, work)
+            for k in range(n):
+                out[1 + j, 0, at + k] += sigma[k] + work[k]
+    if top > 0:
+        polynomial(m, c.base + top * p + j, shares, n, work)
+        for k in range(n):
+            out[1 + j, 1, at + k] = work[k]
+
+
+@inner
 def write_inside(c, m, n, t, reached, want, out):  # type: ignore[no-untyped-def]
     """Write the samples of an impact up to a time inside the step."""
     r = m.run
     k = int(r[SAMPLE])
+    quick = out.shape[1] == 2 and c.ends[0] == 1 and c.top == FREE and m.degree == 0
+    if quick and c.numbers[KIND] != INTERNAL:
+        while k < t.size and t[k] <= reached:
+            last = k + 1
+            while last < t.size and last - k < BATCH and t[last] <= reached:
+                last += 1
+            write_batch(c, m, t, k, last - k, out)
+            k = last
     while k < t.size and t[k] <= reached:
         dense(m, n, (t[k] - r[NOW]) / r[STEP], m.state)
         write(c, m.state, m.f, t[k] - r[BEGUN], k, want, out)
