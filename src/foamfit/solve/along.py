@@ -195,7 +195,7 @@ def go_to(c, eps, between, m, seed, y, tol, weight):  # type: ignore[no-untyped-
         if not m[0] < math.inf:
             return
         left = max(left - share, 0.0)
-        pace = 2.0 * share if share < 1.0 else 1.0
+        pace = 1.0 if whole else 2.0 * share
         if leaving and whole:
             change_branch(c, c.none, int(up), y)
             bring_to(c, s[EPS])
