@@ -56,7 +56,8 @@ WEIGHT = np.concatenate(
 )  # fmt: skip
 TIMES = pair.C[:ALL_STAGES]
 
-# Numbers that change during a run: time, begin of the piece, step, end of the piece, steps, growth
+# Numbers that change during a run: time since the piece began, time at which it begins, step,
+# length of the piece, steps, growth
 # of the next step, largest stress, whether the base stress has risen, last error, next sample,
 # number of the piece, switches; of implicit steps: length of the one before, least length that the
 # error can enforce, length of a short step, short steps in a row, size of all vibrations that were
@@ -336,7 +337,7 @@ def _step(words, of_work, want, tol, upto, most, of_systems):  # type: ignore[no
     c, m = unpack(words), unpack_work(of_work)
     r, again, n = m.run, False, c.base + c.carries * c.p
     while True:
-        dt, at = r[STEP], r[NOW] - r[BEGUN]
+        dt, at = r[STEP], r[NOW]
         if r[NOW] + dt == r[NOW] or not dt > 0.0:
             return FAILED
         take(c, m, n, dt, at, want)
@@ -357,7 +358,7 @@ def _step(words, of_work, want, tol, upto, most, of_systems):  # type: ignore[no
             r[LAST] = max(error, 1e-4)
             return PLAIN
         size = make_dense(c, m, n, dt, at, tol, want)
-        if size > 1.0 and dt > 1e-12 * abs(r[HORIZON] - r[BEGUN]):
+        if size > 1.0 and dt > 1e-12 * abs(r[HORIZON]):
             again = True
             r[STEP] = dt * max(0.3, 0.9 * size**-0.143)
             continue

@@ -463,7 +463,7 @@ def _step(words, of_work, want, tol, upto, most, of_systems):  # type: ignore[no
     """Take one implicit step, shorter ones until it is accurate; return how it ended."""
     c, m = unpack(words), unpack_work(of_work)
     work = systems_of(c, of_systems)
-    r, at, reach = m.run, m.run[NOW] - m.run[BEGUN], work.reach
+    r, at, reach = m.run, m.run[NOW], work.reach
     linearise(c, m, at, c.carries, reach, work, work.jacobian)
     first, first_error = r[STEP], math.inf
     while True:

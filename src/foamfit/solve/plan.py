@@ -24,7 +24,8 @@ from foamfit.springs.spring import as_samples
 Directions = NDArray[np.int64]
 
 FIRST_ORDER, SECOND_ORDER = "first order", "second order"
-EXPLICIT_STEPS, RADAU = "Dormand-Prince", "Radau IIA"
+EXPLICIT_STEPS, RADAU, AGGREGATE = "Dormand-Prince", "Radau IIA", "aggregate"
+LEAST_AGGREGATE, AS_ONE = 9, 1e-4  # springs that an impact treats as one; error over rtol and springs
 MAX_STEPS = 2_000_000
 # Implicit steps replace explicit ones above these limits.
 MOST_RELAXATION = 3e3  # relaxation times in the duration of the scene
@@ -179,6 +180,8 @@ class Plan(NamedTuple):
         tol = max((OF_IMPLICIT if stiff else 1.0) * self.margin * rtol, LEAST_TOL)
         most = self.max_explicit if self.implicit is None and not stiff else self.max_steps
         packed = self._packed(rows, heights, drag, tol, most, directions, nodes)
+        if not stiff and not len(directions) and (found := self._as_one(rows, heights, rtol, packed)):
+            return found
         log, endings = np.empty((logged, 5)), np.zeros(runs.ENDINGS)
         scales = self._scales(rows, heights)
         lost = 0.0
@@ -200,6 +203,26 @@ class Plan(NamedTuple):
             runs.integrate(*packed, log, *self._room(packed), scales, endings, words)
             lost = _lost(kept[2][2 * len(self.ends) :], endings)
         return self._motion(packed[-1], method, endings, log, rows, lost)
+
+    def _as_one(
+        self, rows: Array, heights: Array, rtol: float, packed: list[Any]
+    ) -> Motion | None:
+        """Treat many springs under one stress as one spring in an impact, if that is possible."""
+        many = len(heights) >= LEAST_AGGREGATE and len(self.ends) == 1 and self.speed > 0.0
+        if not many or self.values[0] != 0.0:
+            return None
+        from foamfit.solve.many import integrate_aggregate, shapes_of
+
+        shapes, out = shapes_of(self, rows), packed[-1]
+        if shapes is None:
+            return None
+        cache.announce(integrate_aggregate, "the solver of many springs")
+        log = np.empty((4 * len(rows) + 64, 5))
+        numbers = np.array((self.mass[0], packed[7][0], self.speed, AS_ONE * rtol / len(rows)))
+        given = shapes, heights, numbers, self.time, self.max_steps, out[0], log, np.zeros(2, int)
+        outcome, end, steps, switches = integrate_aggregate(*given)
+        endings = np.array((outcome, end, steps, switches), dtype=float)
+        return self._motion(out, AGGREGATE, endings, log, rows, 0.0)
 
     def _brief(self, rows: Array, heights: Array, drag: float, tol: float) -> float:
         """Return the length of a short implicit step, s."""

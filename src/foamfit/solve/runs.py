@@ -398,10 +398,10 @@ def first_step(c, tol):  # type: ignore[no-untyped-def]
 def begin_piece(c, m, k, t, values):  # type: ignore[no-untyped-def]
     """Prescribe the drive between samples k and k + 1."""
     r, drive = m.run, c.drive
-    r[BEGUN], drive[VALUE], drive[VALUE_RATE] = t[k], values[k], 0.0
-    r[HORIZON] = t[k]
+    r[NOW], r[BEGUN], drive[VALUE], drive[VALUE_RATE] = 0.0, t[k], values[k], 0.0
+    r[HORIZON] = 0.0
     if k + 1 < t.size:
-        r[HORIZON] = t[k + 1]
+        r[HORIZON] = t[k + 1] - t[k]
         drive[VALUE_RATE] = (values[k + 1] - values[k]) / (t[k + 1] - t[k])
 
 
@@ -410,7 +410,7 @@ def log_switch(c, m, i, left, log):  # type: ignore[no-untyped-def]
     """Log a change of branch, if there is room."""
     s, at = past(c.springs, i * c.width), int(m.run[LOGGED])
     if at < log.shape[0]:
-        log[at, 0], log[at, 1], log[at, 2] = m.run[NOW], i, left
+        log[at, 0], log[at, 1], log[at, 2] = m.run[BEGUN] + m.run[NOW], i, left
         log[at, 3], log[at, 4] = s[BRANCH], s[EPS]
     m.run[LOGGED] += 1.0
 
@@ -450,7 +450,7 @@ def mend(c, y):  # type: ignore[no-untyped-def]
 def pass_event(c, m, n, want, share, who, kind, log):  # type: ignore[no-untyped-def]
     """Move to an event within the step; return dS/dt at the end of contact, or change the branch."""
     r, y = m.run, m.y
-    dt, at, slope = r[STEP], r[NOW] - r[BEGUN], 0.0
+    dt, at, slope = r[STEP], r[NOW], 0.0
     if kind == RELEASE:
         after = look(c, m, dt, at, share + 1e-3, c.none, RELEASE + c.none)
         before = look(c, m, dt, at, share - 1e-3, c.none, RELEASE + c.none)
@@ -460,9 +460,9 @@ def pass_event(c, m, n, want, share, who, kind, log):  # type: ignore[no-untyped
         y[k] = m.state[k]
     r[NOW] += share * dt
     r[GROW] = min(r[GROW], 1.0)
-    rates(c, y, m.stage, want, r[NOW] - r[BEGUN])
+    rates(c, y, m.stage, want, r[NOW])
     mend(c, y)
-    rates(c, y, m.stage, want, r[NOW] - r[BEGUN])
+    rates(c, y, m.stage, want, r[NOW])
     if kind == RELEASE:
         return slope
     s = past(c.springs, who * c.width)
@@ -470,7 +470,7 @@ def pass_event(c, m, n, want, share, who, kind, log):  # type: ignore[no-untyped
     left, steep = s[BRANCH], s[TANGENT]
     change_branch(c, who, up, y)
     log_switch(c, m, who, left, log)
-    rates(c, y, m.stage, want, r[NOW] - r[BEGUN])
+    rates(c, y, m.stage, want, r[NOW])
     if steep > 0.0 and s[TANGENT] > 0.0:
         r[GROW] *= min(max(math.sqrt(steep / s[TANGENT]), 0.2), 2.0)
     return slope
@@ -490,7 +490,7 @@ def ended(out, outcome, m):  # type: ignore[no-untyped-def]
     out[OUTCOME], out[STEPS], out[SWITCHES] = outcome, m.run[TAKEN], m.run[LOGGED]
     out[STRONGEST], out[FARTHEST], out[DAMPED_OUT] = m.run[LARGEST], m.scales[OF_W], m.run[DAMPED]
     if outcome != DONE:
-        out[ENDED] = m.run[NOW]
+        out[ENDED] = m.run[BEGUN] + m.run[NOW]
 
 
 @inner
@@ -572,7 +572,7 @@ def blend(c, m, t, k, want, out):  # type: ignore[no-untyped-def]
 def next_piece(c, m, t, values, want, out):  # type: ignore[no-untyped-def]
     """Write the sample at the end of a piece, and begin the next; return whether it was the last."""
     r, k = m.run, int(m.run[PIECE]) + 1
-    write(c, m.y, m.f, r[NOW] - r[BEGUN], k, want, out)
+    write(c, m.y, m.f, r[NOW], k, want, out)
     r[PIECE] = k
     if k == t.size - 1:
         return True
@@ -684,7 +684,7 @@ def write_inside(c, m, n, t, reached, want, out):  # type: ignore[no-untyped-def
             k = last
     while k < t.size and t[k] <= reached:
         dense(m, n, (t[k] - r[NOW]) / r[STEP], m.state)
-        write(c, m.state, m.f, t[k] - r[BEGUN], k, want, out)
+        write(c, m.state, m.f, t[k], k, want, out)
         k += 1
     r[SAMPLE] = k
 
@@ -735,7 +735,6 @@ def integrate(  # type: ignore[no-untyped-def]
         r[SAMPLE] = approach(c, t, speed, gravity, out)
     else:
         start_at_rest(c, m, t, values, rows)
-        r[NOW] = t[0]
     rates(c, m.y, m.stage, want, 0.0)
     r[STEP], r[LAST], r[GROW] = r[HORIZON] - r[NOW], 1e-4, 1.0
     if struck:
@@ -765,7 +764,7 @@ def integrate(  # type: ignore[no-untyped-def]
             return
         share, who, kind = 1.0, -1, -1
         if how == DOUBTFUL:
-            dt, at = r[STEP], r[NOW] - r[BEGUN]
+            dt, at = r[STEP], r[NOW]
             share, who, kind = first_event(c, m, dt, at, r[PRESSED] > 0.0)
         if struck and how != PLAIN:
             whole = who < 0 and r[NOW] + r[STEP] >= r[HORIZON]
@@ -784,7 +783,7 @@ def integrate(  # type: ignore[no-untyped-def]
             keep_values(c)
         else:
             if how != PLAIN:
-                rates(c, m.new, m.f, c.none, r[NOW] + r[STEP] - r[BEGUN])
+                rates(c, m.new, m.f, c.none, r[NOW] + r[STEP])
             finish_step(c, m, struck)
             stalled = 0
         dt = r[STEP] * r[GROW]

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve.plan import (
+    AGGREGATE,
     CLOSED_FORM,
     MOST_WORK,
     NO_DIRECTIONS,
@@ -53,8 +54,8 @@ class Response:
     #: time at which the base stress of an impact returned to zero, s; None if it did not
     contact_end: float | None
     solver: str  #: "closed form", "first order" or "second order": the simplest that suffices
-    #: "closed form", "Dormand-Prince" (explicit steps) or "Radau IIA" (implicit steps, where light
-    #: masses or dashpots make the scene stiff; they damp unresolved vibrations)
+    #: "closed form", "Dormand-Prince" (explicit steps), "aggregate" (explicit steps of many springs
+    #: under one stress) or "Radau IIA" (implicit steps, where light masses or dashpots make the scene stiff; they damp unresolved vibrations)
     method: str
     #: time (s), spring (0 at the base), branch left, branch entered, and strain, (m, 5)
     switches: Array
@@ -153,9 +154,9 @@ def _resolve_vibrations(
 
 
 def _is_long(scene: Plan, motion: Motion, few: int) -> bool:
-    """Whether a motion took many steps or switches."""
+    """Whether a motion took many steps or switches (the steps of an aggregate are switches)."""
     vibrates = len(scene.ends) > 1 and len(motion.switches) > FEW_SWITCHES
-    return motion.steps > few or vibrates
+    return (motion.steps > few or vibrates) and motion.method != AGGREGATE
 
 
 def _hard(scene: Plan, arrays: ChainArrays) -> bool:
