@@ -131,7 +131,7 @@ def main() -> None:
     jobs = [("impact", name, seed) for seed in seeds for name in CLASSES]
     rows = run(run_test, jobs, options.raw, options.jobs)
     print(studies.shown(table_of(rows)))
-    for row in rows[rows["far"] == True].itertuples():  # noqa: E712 - of objects
+    for row in rows[rows["far"].fillna(False).astype(bool)].itertuples():
         found = f"{row.value:.3g} ({row.low:.3g} to {row.high:.3g}), true {row.truth:.3g}"
         print(f"{rows.loc[row.Index, 'class']}, test {row.test}: {row.parameter} = {found}")
     for name, error in rows.loc[rows["error"].notna(), ["class", "error"]].to_numpy():

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.measurement import GRAVITY, INTEGRATED, Entry, Measurement
+from foamfit.data.measurement import GRAVITY, INTEGRATED, Entry, Measurement, is_clipped
 from foamfit.data.noise import residual_time, with_noise
 from foamfit.text import engineering, rounded
 
@@ -142,7 +142,8 @@ def _of_delay(test: Measurement, delay: Shown | None) -> Iterator[Contradiction]
     limit = max(LATE * math.hypot(delay[1], stated), float(np.median(np.diff(test.time))))
     if abs(late) > limit:
         says = f"the motion is {'late' if late > 0.0 else 'early'} against the force by "
-        says += f"{engineering(abs(late), 's')} ± {engineering(delay[1], 's')}"
+        error = float(f"{delay[1]:.2g}")
+        says += f"{engineering(abs(late), 's')} ± {engineering(error, 's')}"
         yield Contradiction("time_shift", late, limit, says, ())
 
 
@@ -154,9 +155,7 @@ def balance(test: Measurement) -> Balance:
     if not (striker.mass and striker.velocity) or test.motion == INTEGRATED:
         return Balance()
     integrated = "displacement" in test.derived  # from the acceleration, with the stated velocity
-    force = test.outliers.get("stress")
-    clipped = force is not None and force.clipped_at is not None
-    if clipped or (test.braked and integrated) or float(stress.max()) <= 0.0:
+    if is_clipped(test) or (test.braked and integrated) or float(stress.max()) <= 0.0:
         return Balance(test.flight)
     fitted = _fitted(with_noise(test), striker.mass, w, stress, time)
     if fitted is None:

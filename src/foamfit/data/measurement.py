@@ -396,3 +396,9 @@ class Measurement(Samples):
     def channels(self) -> dict[str, Array]:
         """Return the available ones of stress, displacement, acceleration, interior motions."""
         return self.curves("acceleration")
+
+
+def is_clipped(test: Measurement) -> bool:
+    """Return whether the force of a test is clipped."""
+    force = test.outliers.get("stress")
+    return force is not None and force.clipped_at is not None

@@ -77,8 +77,10 @@ def condition(
     used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record), turn=0)
     if impact:
         start = contact.start_of_impact(first, levels)
-        record = first = zeros.without_drift(first, start, levels)
-        start = contact.start_of_impact(first, levels)
+        straight = zeros.without_drift(first, start, levels)
+        if straight is not first:
+            record = first = straight
+            start = contact.start_of_impact(first, levels)
         if first.stress[start.first :].max() == 0.0:
             raise _never_positive(first.stress)
         start = replace(start, gauge=zeros.gauge_before(first, start, levels, given))

@@ -12,7 +12,7 @@ from scipy.ndimage import convolve1d
 
 from foamfit.arrays import Array
 from foamfit.data.calibration import contradictions
-from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel
+from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel, is_clipped
 from foamfit.data.motion import SmoothMotion, follow
 from foamfit.errors import InputError
 from foamfit.solve.scene import Motion
@@ -78,8 +78,7 @@ def check_drive(measurement: Measurement, drive: str) -> None:
     }
     if missing := [what for what, there in needed.items() if not there]:
         raise InputError(f"{measurement.name}: the {drive} drive needs {' and '.join(missing)}")
-    force = measurement.outliers.get("stress")
-    if drive == "stress" and force is not None and force.clipped_at is not None:
+    if drive == "stress" and is_clipped(measurement):
         raise InputError(
             f"{measurement.name}: the force is clipped, so it cannot drive the specimen; choose "
             "the displacement or the impact drive"

@@ -15,7 +15,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.calibration import Contradiction
 from foamfit.data.energy import EnergyAudit
-from foamfit.data.measurement import ASKED, INTEGRATED
+from foamfit.data.measurement import ASKED, INTEGRATED, is_clipped
 from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import InputError
 from foamfit.fitting.branches import covered, visited
@@ -306,22 +306,20 @@ def _time_shift(
     best: BestPoint, estimates: Estimates, with_error: Sequence[str], found: Sequence[Contradiction]
 ) -> Check:
     test, objective = best.problem.measurement, best.problem.objective
-    force = test.outliers.get("stress")
     clocks = [one for one in found if one.quantity == "time_shift"]
     contradicted = len(found) > len(clocks) and objective.drive == "impact"
-    clipped = force is not None and force.clipped_at is not None
-    facts: dict[str, Any] = {"held": False, "clipped": clipped, "shift": None}
+    facts: dict[str, Any] = {"held": False, "clipped": is_clipped(test), "shift": None}
     facts["contradicted"] = contradicted
     if objective.time_shift:
         shift = estimates.get("time_shift")
         facts |= {"held": shift is None or not shift.vary, "shift": shift and shift.value}
         return _check("time_shift", None if facts["held"] else True, **facts)
-    for one in clocks:
-        warning = say("contradiction", "said", one=one, drive=objective.drive)
-        return _check("time_shift", False, warnings=[warning], late=one.ratio, **facts)
+    if clocks:
+        warning = say("contradiction", "said", one=clocks[0], drive=objective.drive)
+        return _check("time_shift", False, warnings=[warning], late=clocks[0].ratio, **facts)
     with suppress(InputError):
         check_time_shift(test, objective.drive)
-        if not clipped and not contradicted:
+        if not (facts["clipped"] or contradicted):
             late = _shift_hint(best, with_error) or 0.0
             return _check("time_shift", late == 0.0, late=late, **facts)
     return _check("time_shift", None, **facts)
@@ -331,8 +329,9 @@ def _shift_hint(best: BestPoint, with_error: Sequence[str]) -> float | None:
     """Return the delay (s) of the motion channel if the test shows it clearly, else None.
 
     The delay is estimated by one linear step from the residuals, and accepted above a quarter of
-    the sampling interval. Where a large shift has spoilt the fit, the striker's equation of motion
-    gives it. The test must have both channels in time; see `fitting.curves.check_time_shift`.
+    the sampling interval. A large one contradicts the striker's equation of motion; see
+    `data.calibration`. The test must have both channels in time; see
+    `fitting.curves.check_time_shift`.
     """
     objective, simulated = best.problem.objective, best.simulated
     gap = float(np.median(np.diff(objective.time)))
@@ -341,9 +340,7 @@ def _shift_hint(best: BestPoint, with_error: Sequence[str]) -> float | None:
         objective.compare(replace(simulated, curves=curves), best.values) for curves in shifted
     )
     shift = _one_step(best, with_error, (late - early) / gap, gap)
-    if shift is not None and abs(shift) > 0.25 * gap:
-        return shift
-    return _shift_of_motion(best)
+    return shift if shift is not None and abs(shift) > 0.25 * gap else None
 
 
 def _one_step(
@@ -363,36 +360,3 @@ def _one_step(
         return None
     spread = covariance(jacobian, left, problem.objective.sizes, sizes)
     return float(move[-1]) if abs(move[-1]) > 4.0 * spread.stderr[-1] else None
-
-
-def _shift_of_motion(best: BestPoint) -> float | None:
-    """Return the delay (s) of the motion if the striker's equation of motion shows it clearly.
-
-    With m w'' = -F, the force integrated twice gives the motion up to scale and zero. The delay is
-    accepted if it exceeds the sampling interval and lowers the sum of squares to a tenth, or to
-    half if the rest is at the noise.
-    """
-    problem = best.problem
-    test, striker = problem.measurement, problem.measurement.striker
-    time, stress, motion = test.time, test.stress, test.displacement
-    if problem.objective.drive != "impact" or time is None or stress is None or motion is None:
-        return None
-    assert striker is not None
-    velocity = float(best.values[best.index["velocity"]])
-    dt = np.diff(time, prepend=min(time[0], 0.0))
-    slowed = np.cumsum(dt * (stress - 0.5 * np.diff(stress, prepend=0.0)))
-    braked = np.cumsum(dt * (slowed - 0.5 * np.diff(slowed, prepend=0.0)))
-    shifts = np.linspace(-0.1, 0.1, 401) * float(time[-1])
-    left = []
-    for late in shifts:
-        when = time - late
-        columns = np.column_stack([np.interp(when, time, braked), np.ones(time.size)])
-        fall = 0.5 * (striker.gravity or 0.0) * when
-        free = motion - (velocity + fall) * when
-        left.append(float(np.linalg.lstsq(columns, free, rcond=None)[1].sum()))
-    place, none = int(np.argmin(left)), left[shifts.size // 2]
-    floor = 4.0 * problem.objective.noise("displacement_time").sigma ** 2 * time.size
-    inside, least = 0 < place < shifts.size - 1, left[place]
-    clear = inside and least < (0.5 if least < floor else 0.1) * none
-    gap = float(np.median(np.diff(time)))
-    return float(shifts[place]) if clear and abs(shifts[place]) > gap else None

@@ -13,7 +13,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.calibration import Contradiction
-from foamfit.data.measurement import Measurement
+from foamfit.data.measurement import Measurement, is_clipped
 from foamfit.fitting import nuisance
 from foamfit.fitting.curves import later
 from foamfit.fitting.search import Tracker, descend, search
@@ -131,8 +131,7 @@ def judged(
     # The law errs, and the contradiction, or a doubtful force in an impact, may be the reason.
     impact, test = best.problem.objective.drive == "impact", best.problem.measurement
     if state[0] == "determined" and (best.problem.kept if impact else settled and best.misfits):
-        force, zero = test.outliers.get("stress"), test.zeros.get("stress", 0.0)
-        clipped = force is not None and force.clipped_at is not None
+        clipped, zero = is_clipped(test), test.zeros.get("stress", 0.0)
         peak = 0.0 if test.stress is None else float(test.stress.max())
         if settled or clipped or zero > DOUBTFUL * peak:
             return "weak", say("why", "contested_held", settled=settled, clipped=clipped)
