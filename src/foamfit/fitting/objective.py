@@ -36,7 +36,7 @@ from foamfit.fitting.curves import (
     without_tension,
 )
 from foamfit.fitting.weighing import Weighing
-from foamfit.solve.plan import AnyPlan, Motion
+from foamfit.solve.plan import Plan, Motion
 from foamfit.solve.plan import plan as make_plan
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.model import Model
@@ -171,7 +171,7 @@ class Objective:
         return moved_at(self._clock, self.time, self.measurement.displacement, self.motion)
 
     @cached_property
-    def _along(self) -> dict[bool, AnyPlan]:
+    def _along(self) -> dict[bool, Plan]:
         """Scenes of the springs along the measured motion; empty without a motion."""
         is_measured = self.measurement.displacement is not None
         return self._scenes(DisplacementDrive(self._moved)) if is_measured else {}
@@ -257,7 +257,7 @@ class Objective:
             return StressDrive(driving_stress(self.stress, self.model))
         return DisplacementDrive(self._moved)
 
-    def _scenes(self, loading: Drive) -> dict[bool, AnyPlan]:
+    def _scenes(self, loading: Drive) -> dict[bool, Plan]:
         """Prepare scenes without and with dashpots; they do not depend on the spring parameters.
 
         Interior masses are included in impacts only; along a prescribed motion the springs are in
@@ -422,7 +422,7 @@ class Objective:
         wanted = np.append(wanted, [(0, MOVED)], axis=0) if moved else wanted
         at = dict(zip(self.nuisance, nuisance.tolist(), strict=True))
 
-        def run(plan: AnyPlan, everything: bool) -> Motion:
+        def run(plan: Plan, everything: bool) -> Motion:
             return plan.run(
                 rows, heights, self.rtol, drag=drag, everything=everything, directions=wanted
             )
@@ -468,7 +468,7 @@ class Objective:
         """Whether the measured motion drives the springs."""
         return self.drive == "displacement"
 
-    def _placed(self, plan: AnyPlan, at: dict[str, float]) -> AnyPlan:
+    def _placed(self, plan: Plan, at: dict[str, float]) -> Plan:
         """Return the plan with contact time, striker and zero of the driving motion applied."""
         zero = at.get("displacement_zero", 0.0)
         if self._driven and (zero != 0.0 or self.measurement.contact != "file"):
@@ -482,7 +482,7 @@ class Objective:
             time=time, speed=at[nuisances.VELOCITY], mass=mass, values=weight / plan.mass[-1]
         )
 
-    def _followed(self, plan: AnyPlan, at: dict[str, float]) -> AnyPlan:
+    def _followed(self, plan: Plan, at: dict[str, float]) -> Plan:
         """Return the plan along the measured motion of an impact, zero without contact."""
         if self.drive != "impact":
             return plan

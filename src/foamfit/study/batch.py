@@ -343,8 +343,7 @@ def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator
         yield given
         return
     if not cache.compiled():
-        _LOG.warning("foamfit: compiling the solver, once after installation")
-        with precompile.side_by_side() as finish:
+        with precompile.at_first_use() as finish:
             finish()
     count = min(jobs or cores(), max(len(made.tests), 1))
     try:
