@@ -31,7 +31,7 @@ def admissible(p):
 
 
 def stress(p, x, strain, branch):
-    """Return the stress of curve, spring and exponentials; x are their stresses less the curve."""
+    """Return the stress of curve, spring and exponentials; elastic + x[j] are their strains."""
     elastic, a = curve(strain, p[0], p[1], p[2], p[3])[0], p[5]
     sine = near(math.sin(math.pi * a.real), math.pi * math.cos(math.pi * a.real), a)
     strength, ratio = p[4] * sine / math.pi * SLOWEST**a, RATIO**a
