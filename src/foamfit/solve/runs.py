@@ -119,7 +119,7 @@ from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 # Integers of a run, then for each spring: addresses of its law, kind, parameters, internals.
 COUNT, GROUPS, P, TERMS, TOP, NODES_OUT, RESULTS_OF, ROW_OF, WIDE, RATES_OF, CHANGE_OF, STEP_OF, DEGREE_OF, SIZES = range(14)
 LAW = 8
-BATCH, MOST_OWN = 64, 10  # samples that are computed together; parameters of a built-in law
+BATCH, MOST_OWN = 64, 10  # samples that are computed together, of a law with so many parameters
 # Numbers of a run.
 DRAGS, SPEED, TOL, MOST, PACE, BRIEFLY, REALS = range(7)
 # Results of a run.
@@ -675,7 +675,7 @@ def write_inside(c, m, n, t, reached, want, out):  # type: ignore[no-untyped-def
     r = m.run
     k = int(r[SAMPLE])
     quick = out.shape[1] == 2 and c.ends[0] == 1 and c.top == FREE and m.degree == 0
-    if quick and c.numbers[KIND] != INTERNAL:
+    if quick and c.numbers[KIND] != INTERNAL and c.numbers[PARAMETERS] <= MOST_OWN:
         while k < t.size and t[k] <= reached:
             last = k + 1
             while last < t.size and last - k < BATCH and t[last] <= reached:
