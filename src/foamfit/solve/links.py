@@ -7,6 +7,10 @@ INTERNAL law. The derivatives by parameter of all these follow. The rest of the 
 them on a branch, but is integrated as well, which costs less than to solve for it: strains of
 springs without a dashpot, and the stress of BY_STRESS laws. Its derivatives are computed.
 
+The derivatives δx of internal variables need those of the strain rate. Where no state contains the
+strain these are unknown, and u = δx - A δε is integrated instead, the derivatives at fixed strain:
+du/dt = dε/dt (A_x u + A_p) + δB - A_x B δε.
+
 Springs without mass between them form a group, which carries one stress S:
 
 - one spring between two nodes: its strain follows from the nodes;
@@ -29,6 +33,7 @@ from numba.extending import intrinsic
 
 from foamfit.solve.equilibrium import (
     EPS_AT,
+    FIXED,
     INTERNALS,
     KIND,
     NUMBERS,
@@ -65,6 +70,7 @@ from foamfit.springs.compiled.contract import (
     SIGMA_HIGH,
     SIGMA_LOW,
     SLOPE,
+    STEEP,
     STRESS as TOTAL,
     SWITCH,
     TANGENT,
@@ -301,6 +307,9 @@ def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
             rest -= s[HEIGHT] * y[n[EPS_AT]]
             continue
         some = True
+        if n[KIND] == INTERNAL:
+            for k in range(n[INTERNALS]):
+                s[X + k] = y[n[X_AT] + k]
         if s[SIGMA_LOW] == s[SIGMA_HIGH]:
             flat = i
     if not some:
@@ -365,6 +374,7 @@ def derive_spring(c, i, y):  # type: ignore[no-untyped-def]
     s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
     part, total = past(c.part, i * p), past(c.part, (c.count + i) * p)
     out = past(s, c.results)
+    s[STEEP] = s[TANGENT] if n[FIXED] else out[SLOPE]
     for j in range(p):
         part[j] = 0.0
     if n[KIND] == BY_STRESS:
@@ -395,7 +405,7 @@ def derive_spring(c, i, y):  # type: ignore[no-untyped-def]
 def derive_inside(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
     """Fill the rates of the derivatives of relaxation terms and of internal variables.
 
-    `quicker` are the derivatives of the strain rate, for INTERNAL laws.
+    `quicker` are the derivatives of the strain rate, for INTERNAL laws; not read if they are unknown.
     """
     s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
     part, strain, out = past(c.part, i * p), past(c.strain, i * p), past(s, c.results)
@@ -403,7 +413,7 @@ def derive_inside(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
         at, per = c.base + (n[Z_AT] + k) * p, 1.0 / s[RELAX + 2 * k + 1]
         more, of_tau = (y[n[Z_AT] + k] + out[OF_LAW]) * per * per, OWN_RELAXATION + 2 * k + 1
         for j in range(p):
-            f[at + j] = -per * (y[at + j] + out[SLOPE] * strain[j] + part[j])
+            f[at + j] = -per * (y[at + j] + s[STEEP] * strain[j] + part[j])
             if c.directions[2 * j] == i and c.directions[2 * j + 1] == of_tau:
                 f[at + j] += more
     if n[KIND] != INTERNAL:
@@ -413,9 +423,16 @@ def derive_inside(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
     by = past(values, size)
     for k in range(x):
         a, b, rate = 2 + k, 2 + x + k, s[RATE]
-        at = c.base + (n[X_AT] + k) * p
+        at, by_strain = c.base + (n[X_AT] + k) * p, c.drive[PACE] * by[b]
+        if n[FIXED]:
+            for m in range(x):
+                column = past(by, (2 + m) * size)
+                change = column[b] * values[2 + m] - column[a] * values[2 + x + m]
+                by_strain += c.drive[PACE] * change
+        else:
+            by_strain += rate * by[a]
         for j in range(p):
-            f[at + j] = values[a] * quicker[j] + (rate * by[a] + c.drive[PACE] * by[b]) * strain[j]
+            f[at + j] = by_strain * strain[j] + (0.0 if n[FIXED] else values[a] * quicker[j])
         for m in range(x):
             column, d_x = past(by, (2 + m) * size), past(y, c.base + (n[X_AT] + m) * p)
             for j in range(p):
@@ -476,7 +493,7 @@ def derive_group(c, g, y, f):  # type: ignore[no-untyped-def]
     derive_spring(c, i0, y)
     s, own, strain = past(c.springs, i0 * c.width), past(c.own, 2 * i0 * p), past(c.strain, i0 * p)
     per, eta, total = s[PER_HEIGHT], s[ETA], past(c.part, (c.count + i0) * p)
-    slope, eps, faster = s[c.results + SLOPE] * s[GAIN], s[EPS], s[RATE]
+    slope, eps, faster = s[STEEP] * s[GAIN], s[EPS], s[RATE]
     for j in range(p):
         strain[j] = (reach[j] - eps * own[j]) * per
         rate[j] = (rate[j] - faster * own[j]) * per
@@ -497,10 +514,10 @@ def derive_several(c, g, i0, i1, y, f, reach, rate, out):  # type: ignore[no-unt
             weight += s[HEIGHT] / s[ETA]
             continue
         loose = i
-        if s[c.results + SLOPE] == 0.0:
+        if s[TANGENT] == 0.0:
             flat = i
         else:
-            soft += s[HEIGHT] / (s[GAIN] * s[c.results + SLOPE])
+            soft += s[HEIGHT] / (s[GAIN] * s[TANGENT])
     for i in range(i0, i1):  # of damped springs `total` becomes the whole derivative
         derive_spring(c, i, y)
         s, own, total = (
@@ -508,7 +525,7 @@ def derive_several(c, g, i0, i1, y, f, reach, rate, out):  # type: ignore[no-unt
             past(c.own, 2 * i * p),
             past(c.part, (c.count + i) * p),
         )
-        slope, at, share = s[GAIN] * s[c.results + SLOPE], c.numbers[i * NUMBERS + EPS_AT], 0.0
+        slope, at, share = s[GAIN] * s[STEEP], c.numbers[i * NUMBERS + EPS_AT], 0.0
         if s[ETA] > 0.0:
             share = s[HEIGHT] / s[ETA]
             for j in range(p):
@@ -577,7 +594,7 @@ def derive_share(c, i, y, f, is_flat, reach, out):  # type: ignore[no-untyped-de
         for j in range(p):
             strain[j] = reach[j] / s[HEIGHT]
     else:
-        slope = s[GAIN] * s[c.results + SLOPE]
+        slope = s[GAIN] * s[STEEP]
         for j in range(p):
             strain[j] = (out[j] - total[j]) / slope
     derive_inside(c, i, y, f, past(f, mine) if s[ETA] > 0.0 else strain)
@@ -649,27 +666,51 @@ def rates_of(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
 
 @inner
 def leave_inside(c, i, up, y):  # type: ignore[no-untyped-def]
-    """Change the branch of a spring of an INTERNAL law, whose internal variables may jump."""
+    """Change the branch of a spring of an INTERNAL law, whose internal variables may jump.
+
+    Their rates may jump too, so that the delay of the instant of the change counts.
+    """
     s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
     x = n[INTERNALS]
     changes = past(s, c.results + BY + n[PARAMETERS] + 2 + 2 * x)  # instead of derivatives
     call_switch(n[SWITCH], past(s, c.row), s, up, changes)
     for k in range(x):
         y[n[X_AT] + k] = s[X + k]
-    wide = 1 + x + n[PARAMETERS]
-    out = past(changes, x * wide)
+    if p == 0:
+        return
+    wide, first = 1 + x + n[PARAMETERS], past(s, c.results + BY + n[PARAMETERS] + 2)  # A, then B
+    end, out, late = past(changes, x * wide), past(changes, (x + 1) * wide), 0.0
+    faster = s[RATE] * (1.0 - end[0])  # of the strain past the end
+    for k in range(x):
+        faster -= end[1 + k] * (s[RATE] * first[k] + c.drive[PACE] * first[x + k])
+    delays = past(c.common, (c.groups + 1) * p)
     for j in range(p):
+        strain = c.strain[i * p + j]
         own = c.directions[2 * j + 1] if c.directions[2 * j] == i else OWN_ETA
-        for k in range(x):
-            by = past(changes, k * wide)
-            value = by[0] * c.strain[i * p + j]
+        for k in range(x + 1):  # of the end, then of the internal variables at the instant
+            by = end if k == 0 else past(changes, (k - 1) * wide)
+            value = by[0] * (strain + s[RATE] * late if k > 0 else strain)
             for m in range(x):
-                value += by[1 + m] * y[c.base + (n[X_AT] + m) * p + j]
+                d_x = y[c.base + (n[X_AT] + m) * p + j] + (first[m] * strain if n[FIXED] else 0.0)
+                if k > 0:
+                    d_x += (s[RATE] * first[m] + c.drive[PACE] * first[x + m]) * late
+                value += by[1 + m] * d_x
             if own < OWN_ETA:
                 value += by[1 + x + own]
-            out[k] = value
+            if k == 0:
+                late = (value - strain) / faster if faster != 0.0 else 0.0
+            else:
+                out[k - 1] = value
+        delays[j] = late
         for k in range(x):
             y[c.base + (n[X_AT] + k) * p + j] = out[k]
+    evaluate(c, i, c.none)  # on the next branch
+    for j in range(p):
+        strain = c.strain[i * p + j] if n[FIXED] else 0.0
+        for k in range(x):
+            moved = first[k] * (strain + s[RATE] * delays[j])
+            moved += c.drive[PACE] * first[x + k] * delays[j]
+            y[c.base + (n[X_AT] + k) * p + j] -= moved
 
 
 @cfunc(types.void(_IP, _I, _I, _P), **OPTIONS, cache=True)

@@ -46,6 +46,7 @@ from foamfit.solve.links import (
     DRAGGED,
     DRIVES,
     EPS_AT,
+    FIXED,
     FLAT,
     INTERNALS,
     KIND,
@@ -147,6 +148,7 @@ def place_state(c, kinds, numbers):  # type: ignore[no-untyped-def]
         while i < c.ends[g]:
             n, eta = past(numbers, i * NUMBERS), c.springs[i * c.width + ETA]
             n[EPS_AT] = n[X_AT] = -1
+            n[FIXED] = int(several and eta == 0.0)
             if several and eta > 0.0:
                 n[EPS_AT], kinds[at], at = at, SCALES + i, at + 1
             n[Z_AT] = at
@@ -444,6 +446,9 @@ def mend(c, y):  # type: ignore[no-untyped-def]
                 y[n[EPS_AT]] += longer
                 if n[KIND] == BY_STRESS:
                     y[n[X_AT]] += longer * s[TANGENT]
+                elif n[KIND] == INTERNAL:
+                    for k in range(n[INTERNALS]):
+                        y[n[X_AT] + k] += longer * s[c.results + BY + n[PARAMETERS] + 2 + k]
 
 
 @inner
