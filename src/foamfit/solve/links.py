@@ -182,9 +182,9 @@ def follow_spring(c, i, eps, y, f, want):  # type: ignore[no-untyped-def]
         for k in range(n[INTERNALS]):
             s[X + k] = y[n[X_AT] + k]
     s[EPS] = eps
-    evaluate(c, i, want if kind != INTERNAL or want else 2 * int(n[EPS_AT] >= 0))
+    evaluate(c, i, want if kind != INTERNAL or want else 2 * n[FIXED])
     sigma, tangent, drift = out[OF_LAW], out[SLOPE], 0.0
-    if kind == INTERNAL and (want or n[EPS_AT] >= 0):
+    if kind == INTERNAL and (want or n[FIXED]):
         x, values = n[INTERNALS], past(out, BY + n[PARAMETERS])
         size = 2 + 2 * x
         for k in range(x):
