@@ -105,6 +105,7 @@ from foamfit.springs.compiled.contract import (
     RELAX,
     RESULTS,
     SLOPE,
+    STEEP,
     STRESS as TOTAL,
     TANGENT,
     TURNS,
@@ -125,6 +126,9 @@ BATCH, MOST_OWN = 64, 10  # samples that are computed together, of a law with so
 DRAGS, SPEED, TOL, MOST, PACE, BRIEFLY, REALS = range(7)
 # Results of a run.
 OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, ENDINGS = range(8)
+RAMP = 1e-9  # time of a ramp to the first sample over the duration
+
+
 def room(sizes: tuple[int, ...], internals: int) -> tuple[int, int]:
     """Return the numbers of floats and integers that a run needs, at most."""
     count, groups, p, terms, _, _, _, _, wide, *_ = sizes
@@ -539,6 +543,71 @@ def start_at_rest(c, m, t, values, rows):  # type: ignore[no-untyped-def]
 
 
 @inner
+def starts_on_ramp(c, values):  # type: ignore[no-untyped-def]
+    """Whether internal variables change up to the first sample of a drive."""
+    if values[0] == 0.0 or not (c.top == MOTION or c.top == STRESS):
+        return False
+    for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
+        if c.numbers[i * NUMBERS + KIND] == INTERNAL:
+            return True
+    return False
+
+
+@inner
+def begin_ramp(c, m, t, values):  # type: ignore[no-untyped-def]
+    """Begin a ramp to the first sample of a drive, while time stands still.
+
+    Nodes rest. Relaxation terms and dashpots carry nothing; under a prescribed stress dashpots are
+    rigid.
+    """
+    r, drive = m.run, c.drive
+    brief = RAMP * (t[t.size - 1] - t[0]) if t.size > 1 else RAMP
+    r[NOW], r[BEGUN], r[HORIZON], r[PIECE] = 0.0, t[0] - brief, brief, -1.0
+    drive[VALUE], drive[VALUE_RATE], drive[PACED] = 0.0, values[0] / brief, 0.0
+    for g in range(c.groups):
+        c.per_mass[g] = 0.0
+    for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
+        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+        if s[ETA] > 0.0:
+            s[ETA] = 0.0 if c.top == MOTION else math.inf
+            n[FIXED] = int(c.top == MOTION and n[EPS_AT] >= 0)
+        s[GAIN] = 1.0
+        for k in range(c.terms):
+            s[RELAX + 2 * k] = 0.0
+
+
+@inner
+def end_ramp(c, m, rows, mass, pace):  # type: ignore[no-untyped-def]
+    """Let time pass again: relaxation terms begin at zero, and dashpots at the present strain."""
+    y, p, i0 = m.y, c.p, (c.ends[c.groups - 2] if c.groups > 1 else c.none)
+    rates(c, y, m.stage, int(p > 0), m.run[NOW])
+    c.drive[PACED], m.run[GROW] = pace, 1.0
+    for g in range(c.groups):
+        c.per_mass[g] = 1.0 / mass[g]
+    for i in range(i0, c.count):
+        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+        for k in range(c.terms):
+            s[RELAX + 2 * k] = rows[i, 1 + 2 * k]
+            s[GAIN] += rows[i, 1 + 2 * k]
+            y[n[Z_AT] + k] = -s[c.results + OF_LAW]
+            for j in range(p):
+                by = s[STEEP] * c.strain[i * p + j] + c.part[i * p + j]
+                y[c.base + (n[Z_AT] + k) * p + j] = -by
+        if rows[i, 0] == 0.0:
+            continue
+        s[ETA] = rows[i, 0]
+        if n[EPS_AT] >= 0 and c.top == MOTION:
+            y[n[EPS_AT]] = s[EPS]
+            for j in range(p):
+                y[c.base + n[EPS_AT] * p + j] = c.strain[i * p + j]
+        if n[FIXED]:
+            first, n[FIXED] = past(s, c.results + BY + n[PARAMETERS] + 2), 0
+            for k in range(n[INTERNALS] if n[KIND] == INTERNAL else c.none):
+                for j in range(p):
+                    y[c.base + (n[X_AT] + k) * p + j] += first[k] * c.strain[i * p + j]
+
+
+@inner
 def derive_start(c, m, i0, i1, common, rows):  # type: ignore[no-untyped-def]
     """Fill the derivatives of the state at rest, where terms carry nothing, nor dashpots."""
     y, p = m.y, c.p
@@ -577,13 +646,16 @@ def blend(c, m, t, k, want, out):  # type: ignore[no-untyped-def]
 def next_piece(c, m, t, values, want, out):  # type: ignore[no-untyped-def]
     """Write the sample at the end of a piece, and begin the next; return whether it was the last."""
     r, k = m.run, int(m.run[PIECE]) + 1
-    write(c, m.y, m.f, r[NOW], k, want, out)
     r[PIECE] = k
+    if k == 0:  # after a ramp, with the rate of the first piece
+        begin_piece(c, m, k, t, values)
+    write(c, m.y, m.f, r[NOW], k, want, out)
     if k == t.size - 1:
         return True
-    begin_piece(c, m, k, t, values)
+    if k > 0:
+        begin_piece(c, m, k, t, values)
     rates(c, m.y, m.stage, want, 0.0)
-    if c.top == MOTION and c.groups == 1:
+    if c.top == MOTION and c.groups == 1 and k > 0:
         blend(c, m, t, k, want, out)
     return False
 
@@ -724,7 +796,7 @@ def integrate(  # type: ignore[no-untyped-def]
     solved = int(sizes[DEGREE_OF] > 0)
     c, m = lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, solved, ints, floats)
     r, want, tol, most, speed = m.run, int(c.p > 0), reals[TOL], reals[MOST], reals[SPEED]
-    struck, n, step = speed > 0.0, c.base + c.carries * c.p, sizes[STEP_OF]
+    ramps, struck, n, step = False, speed > 0.0, c.base + c.carries * c.p, sizes[STEP_OF]
     for k in range(RUN):
         r[k] = 0.0
     for k in range(SCALES):
@@ -739,16 +811,20 @@ def integrate(  # type: ignore[no-untyped-def]
         c.drive[VALUE], r[HORIZON] = values[0], t[t.size - 1]
         r[SAMPLE] = approach(c, t, speed, gravity, out)
     else:
-        start_at_rest(c, m, t, values, rows)
+        ramps = starts_on_ramp(c, values)
+        if ramps:
+            begin_ramp(c, m, t, values)
+        else:
+            start_at_rest(c, m, t, values, rows)
     rates(c, m.y, m.stage, want, 0.0)
     r[STEP], r[LAST], r[GROW] = r[HORIZON] - r[NOW], 1e-4, 1.0
     if struck:
         r[STEP] = min(r[STEP], first_step(c, tol))
-    elif t.size == 1:
+    elif t.size == 1 and not ramps:
         write(c, m.y, m.f, 0.0, c.none, want, out)
         ended(endings, DONE, m)
         return
-    else:
+    elif not ramps:
         write(c, m.y, m.f, 0.0, c.none, want, out)
     fresh_scales(c, m)
     stalled = 0
@@ -793,6 +869,8 @@ def integrate(  # type: ignore[no-untyped-def]
             stalled = 0
         dt = r[STEP] * r[GROW]
         if not struck and r[NOW] >= r[HORIZON]:
+            if ramps and r[PIECE] < 0.0:
+                end_ramp(c, m, rows, mass, reals[PACE])
             if next_piece(c, m, t, values, want, out):
                 endings[ENDED] = math.nan
                 ended(endings, DONE, m)
