@@ -238,7 +238,7 @@ def lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, solved, i
         for k in range(1 + 2 * terms, rows.shape[1]):
             s[row + k - 1 - 2 * terms] = rows[i, k]
     for g in range(groups):
-        per_mass[g] = 1.0 / mass[g]
+        per_mass[g], carried[g] = 1.0 / mass[g], 0.0  # the first guess of a stress
     for k in range(DRIVES):
         drive[k] = 0.0
     for k in range((4 * count) * p):
