@@ -129,7 +129,7 @@ def order_state(c, places, groups_of):  # type: ignore[no-untyped-def]
                 places[2 * g + k], groups_of[2 * g + k], at = at, g, at + 1
         for i in range(c.ends[g - 1] if g > 0 else c.none, c.ends[g]):
             n = past(c.numbers, i * NUMBERS)
-            if n[EPS_AT] >= 0 and c.springs[i * c.width + ETA] > 0.0:
+            if n[EPS_AT] >= 0:
                 places[n[EPS_AT]], groups_of[n[EPS_AT]], at = at, g, at + 1
             inside = n[INTERNALS] if n[KIND] == INTERNAL else c.none
             for k in range(c.terms + inside):
