@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -93,10 +94,13 @@ def slope_along(spring: Spring, strain: Array) -> Array:
     if law.kind != INTERNAL:
         runs.follow(*packed[:11], branches, slopes, *packed[11:], np.zeros((strain.size, 2)))
         return slopes
-    # Differences over the last thousandth of the way to each sample.
-    step = 1e-3 * np.diff(strain, prepend=0.0)
-    still = step == 0.0
-    step[still] = 1e-9
-    ways = (strain[:, None] - step[:, None] * np.array((2.0, 1.0, 0.0))).ravel()
+    # Differences over the last thousandth of the way to each sample; a sample without a way has the
+    # slope of the one before it.
+    moves = np.diff(strain, prepend=math.nan) != 0.0
+    moved = strain[moves]
+    step = 1e-3 * np.diff(moved, prepend=0.0)
+    step[step == 0.0] = 1e-9  # the first
+    ways = (moved[:, None] - step[:, None] * np.array((2.0, 1.0, 0.0))).ravel()
     stress = stress_along(spring, ways)[0].reshape(-1, 3)
-    return np.asarray((stress[:, 0] - 4.0 * stress[:, 1] + 3.0 * stress[:, 2]) / (2.0 * step))
+    found = (stress[:, 0] - 4.0 * stress[:, 1] + 3.0 * stress[:, 2]) / (2.0 * step)
+    return np.asarray(found[np.cumsum(moves) - 1])
