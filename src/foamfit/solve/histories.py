@@ -60,7 +60,7 @@ def _integrated(packed: list[Any], branches: NDArray[np.int64]) -> tuple[Array, 
     runs.integrate(*packed[:11], log, *packed[11:], np.array((most, rate, most, 0.0)), endings, _NO_SYSTEMS)
     branches[:] = 0
     for at, _, _, entered, _ in log[: int(endings[runs.SWITCHES])].tolist():
-        branches[int(np.searchsorted(time, at)) :] = int(entered)
+        branches[int(np.searchsorted(time, at, "right")) :] = int(entered)
     if endings[runs.OUTCOME]:
         out[0, 0, int(np.searchsorted(time, endings[runs.ENDED])) :] = np.inf
     return out[0, 0], branches
