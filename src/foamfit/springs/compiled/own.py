@@ -14,7 +14,9 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from llvmlite import ir
 from numba import carray, cfunc, njit, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from foamfit.arrays import Array
@@ -79,12 +81,19 @@ FURTHEST, TRIALS = 1e12, 200  # largest strain, and trials, in the search for a 
 
 @intrinsic
 def call_formulas(typing, where, point, branch, what, out):  # type: ignore[no-untyped-def]
-    """Call the function of a law."""
-    from llvmlite import ir
+    """Call the function of a law, by numba's own convention.
+
+    An exception, such as that of a division by zero, is not raised: the results keep what they were
+    before.
+    """
 
     def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        kind = ir.FunctionType(ir.IntType(64), [value.type for value in args[1:]])
-        return builder.call(builder.inttoptr(args[0], kind.as_pointer()), args[1:])
+        long, told = ir.IntType(64), ir.IntType(8).as_pointer()
+        result = cgutils.alloca_once_value(builder, ir.Constant(long, 0))
+        given = [result, cgutils.alloca_once(builder, told), *args[1:]]
+        kind = ir.FunctionType(ir.IntType(32), [value.type for value in given])
+        builder.call(builder.inttoptr(args[0], kind.as_pointer()), given)
+        return builder.load(result)
 
     return _I(_I, _CP, _I, _I, _CP), emit
 
@@ -348,8 +357,6 @@ def _tuple_at(count: int) -> Any:
     @intrinsic
     def load(typing, pointer):  # type: ignore[no-untyped-def]
         def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
-            from llvmlite import ir
-
             at = [builder.gep(args[0], [ir.Constant(ir.IntType(64), k)]) for k in range(count)]
             return context.make_tuple(builder, kind, [builder.load(one) for one in at])
 
@@ -365,11 +372,12 @@ def _formulas(given: Functions, count: int, inside: int) -> Any:
     ends, change = _inside(given.ends, _nothing), _inside(given.switch, _same)
     load = _tuple_at(count)
 
-    @cfunc(_FORMULAS, **OPTIONS)
+    @njit(_FORMULAS, **OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
     def formulas(point, branch, what, out):  # type: ignore[no-untyped-def]
         p, x = load(past(point, 2 + inside)), carray(past(point, 2), (inside,))
         strain = point[0]
         if what == VALUES:
+            out[0] = complex(math.nan, 0.0)  # of a formula that divides by zero
             out[0], out[1] = stress(p, x, strain, branch), viscous(p, x, strain, point[1], branch)
             one, two = carray(past(out, 2), (inside,)), carray(past(out, 2 + inside), (inside,))
             for k in range(2 * inside):
@@ -392,7 +400,9 @@ def compile_law(law: Law) -> Compiled:
     simple = inside == 0 and given.viscous is None
     kind, bounded = EXPLICIT if simple else INTERNAL, float(given.ends is not None)
     formulas = _formulas(given, count, inside)
-    where, begin_any = float(formulas.address), _begin.address  # below 2^53
+    made = formulas.overloads[_FORMULAS.args]
+    where = float(made.library.get_pointer_to_function(made.fndesc.llvm_func_name))  # below 2^53
+    begin_any = _begin.address
 
     @cfunc(_F(_P, _P), **OPTIONS)
     def begin(row, s):  # type: ignore[no-untyped-def]

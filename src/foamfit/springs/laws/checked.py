@@ -15,6 +15,7 @@ from foamfit.solve.histories import stress_along
 from foamfit.springs.compiled import row_of
 from foamfit.springs.compiled.contract import MOST_INTERNAL
 from foamfit.springs.laws.record import ADMISSIBLE, COMMON, Functions, Law, Param
+from foamfit.springs.spring import LawSpring
 
 SCALES = {"one": 1.0, "strain": 0.5, "stress": 1e6, "slope": 2e6, "damping": 1e3, "duration": 1e-3}
 _UP = np.linspace(0.0, 0.5, 101)
@@ -124,7 +125,7 @@ def _trial(law: Law) -> str | None:
     try:
         if row_of(law, values) is None:
             return f"admissible refuses its own start values ({shown}); give others"
-        stress, branches = stress_along(law.make([*values, 0.0], ()), TRIED)
+        stress, branches = stress_along(LawSpring(law, [*values, 0.0]), TRIED)
     except Exception as error:  # any error of the compiler in a user's function
         return f"its functions cannot be compiled or run ({type(error).__name__}: {_told(error)})"
     if not np.all(np.isfinite(stress)):
