@@ -58,6 +58,8 @@ from foamfit.springs.compiled.contract import (
     GAIN,
     HEIGHT,
     INTERNAL,
+    LOSS,
+    LOSSY,
     OF_HELD,
     OF_LAW,
     OF_PARAMETER,
@@ -74,6 +76,7 @@ from foamfit.springs.compiled.contract import (
     STRESS as TOTAL,
     SWITCH,
     TANGENT,
+    TINY,
     OPTIONS,
     X,
     address,
@@ -222,6 +225,84 @@ def viscous(c, i):  # type: ignore[no-untyped-def]
 
 
 @inner
+def take_rate(c, i, common, want):  # type: ignore[no-untyped-def]
+    """Fill the strain rate of a damped spring under the stress of its group.
+
+    If V depends on the rate, by Newton's method in logarithms inside a bracket: it takes one step for
+    a power of the rate.
+    """
+    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+    force, s[LOSS] = common - s[TOTAL], s[ETA]
+    if s[LOSSY] == 0.0 or c.drive[PACE] == 0.0:
+        s[RATE] = force / s[ETA]
+        return
+    sign, rate, low, high = 1.0 if force > 0.0 else -1.0, abs(s[RATE]), 0.0, math.inf
+    values = past(s, c.results + BY + n[PARAMETERS])
+    rate = rate if rate > 0.0 else 1.0
+    for _ in range(200):
+        s[RATE] = sign * rate if force != 0.0 else 0.0
+        evaluate(c, i, want if want else 2)
+        value = sign * (values[1] + s[ETA] * s[RATE])
+        s[LOSS] = s[ETA] + values[2 * (2 + 2 * n[INTERNALS]) + 1]
+        if force == 0.0:
+            s[LOSS] = s[LOSS] if s[LOSS] > TINY else math.inf
+            return
+        low, high = (low, rate) if value >= abs(force) else (rate, high)
+        new = -1.0
+        if value > 0.0 and s[LOSS] > 0.0:
+            new = rate * (abs(force) / value) ** (value / (s[LOSS] * rate))
+        if abs(new - rate) <= 4e-16 * rate:
+            return
+        if not low < new < high:
+            new = math.sqrt(low * high) if low > 0.0 else 1e-3 * high
+            if high == math.inf:
+                new = 1e3 * low
+        if new == low or new == high or not new > 1e-200:
+            return
+        rate = new
+
+
+@inner
+def has_loss(c, i0, i1):  # type: ignore[no-untyped-def]
+    """Whether a stress V in a group depends on the strain rate."""
+    for i in range(i0, i1):
+        if past(c.springs, i * c.width)[LOSSY] > 0.0 and c.drive[PACE] > 0.0:
+            return True
+    return False
+
+
+@inner
+def common_of(c, i0, i1, rate, push, drag, common):  # type: ignore[no-untyped-def]
+    """Return the stress under which damped springs, one of which has V, reach a rate together.
+
+    With drag > 0 their top moves with the velocity (push - common)/drag too.
+    """
+    low, high = -math.inf, math.inf
+    for _ in range(200):
+        miss, soft = -rate, 0.0
+        if drag > 0.0:
+            miss, soft = miss - (push - common) / drag, 1.0 / drag
+        for i in range(i0, i1):
+            s = past(c.springs, i * c.width)
+            take_rate(c, i, common, c.none)
+            miss += s[HEIGHT] * s[RATE]
+            soft += s[HEIGHT] / s[LOSS]
+        low, high = (low, common) if miss > 0.0 else (common, high)
+        new = common - miss / soft if soft > 0.0 else math.nan
+        if miss == 0.0 or abs(new - common) <= 4e-16 * abs(common):
+            break
+        if not low < new < high:
+            if low > -math.inf and high < math.inf:
+                new = 0.5 * (low + high)
+            else:
+                new = common + (1.0 if miss < 0.0 else -1.0) * max(abs(common), 1.0)
+            if new == low or new == high:
+                break
+        common = new
+    return common
+
+
+@inner
 def span_of(c, g, y, at):  # type: ignore[no-untyped-def]
     """Return elongation and its rate of a group, as far as its nodes tell."""
     last = g == c.groups - 1
@@ -279,12 +360,15 @@ def follow_group(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
         if last and c.top == VISCOUS:
             weight, total = weight + 1.0 / c.drive[DRAGGED], total + push / c.drive[DRAGGED]
         common = total / weight
+        if has_loss(c, i0, i1):
+            drag = c.drive[DRAGGED] if last and c.top == VISCOUS else 0.0
+            common = common_of(c, i0, i1, rate, push, drag, c.carried[g])
     else:
         common = past(c.springs, (loose if flat < 0 else flat) * c.width)[TOTAL]
     if last and c.top == VISCOUS:
         c.drive[TOP_SPEED] = (push - common) / c.drive[DRAGGED]
         rate += c.drive[TOP_SPEED]
-    share_rate(c, i0, i1, common, rate, loose, flat, last and c.top == STRESS)
+    share_rate(c, i0, i1, common, rate, loose, flat, last and c.top == STRESS, want)
     for i in range(i0, i1):
         s = past(c.springs, i * c.width)
         if s[ETA] > 0.0 or not c.solved:
@@ -333,13 +417,13 @@ def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
 
 
 @inner
-def share_rate(c, i0, i1, common, rate, loose, flat, pushed):  # type: ignore[no-untyped-def]
+def share_rate(c, i0, i1, common, rate, loose, flat, pushed, want):  # type: ignore[no-untyped-def]
     """Fill the strain rates of a group of several springs; `pushed`: its stress is prescribed."""
     soft, rest, climb = 0.0, rate, c.drive[VALUE_RATE]
     for i in range(i0, i1):
         s = past(c.springs, i * c.width)
         if s[ETA] > 0.0:
-            s[RATE] = (common - s[TOTAL]) / s[ETA]
+            take_rate(c, i, common, want)
             rest -= s[HEIGHT] * s[RATE]
         elif flat < 0:
             compliance = s[HEIGHT] / (s[GAIN] * s[TANGENT])
@@ -507,11 +591,11 @@ def derive_group(c, g, y, f):  # type: ignore[no-untyped-def]
 def derive_several(c, g, i0, i1, y, f, reach, rate, out):  # type: ignore[no-untyped-def]
     """Do the same for a group of several springs, or under a massless top."""
     p, loose, soft, weight, flat = c.p, -1, 0.0, 0.0, -1
-    last, common = g == c.groups - 1, c.carried[g]
+    last = g == c.groups - 1
     for i in range(i0, i1):
         s = past(c.springs, i * c.width)
         if s[ETA] > 0.0:
-            weight += s[HEIGHT] / s[ETA]
+            weight += s[HEIGHT] / s[LOSS]
             continue
         loose = i
         if s[TANGENT] == 0.0:
@@ -527,15 +611,18 @@ def derive_several(c, g, i0, i1, y, f, reach, rate, out):  # type: ignore[no-unt
         )
         slope, at, share = s[GAIN] * s[STEEP], c.numbers[i * NUMBERS + EPS_AT], 0.0
         if s[ETA] > 0.0:
-            share = s[HEIGHT] / s[ETA]
+            share = s[HEIGHT] / s[LOSS]
             for j in range(p):
-                total[j] += slope * y[c.base + at * p + j]
+                c.strain[i * p + j] = y[c.base + at * p + j]
+                total[j] += slope * c.strain[i * p + j]
+            if s[LOSSY] > 0.0:  # at the present rate
+                derive_viscous(c, i, y, past(c.common, c.groups * p), total)
         else:
             for j in range(p):
                 total[j] += own[p + j] * s[RATE]
             if flat < 0:
                 share = s[HEIGHT] / slope
-        over = (s[TOTAL] - common) / s[ETA] if loose < 0 else 0.0
+        over = -s[RATE] if loose < 0 else 0.0
         for j in range(p):
             if loose < 0:
                 rate[j] += share * total[j] + over * (own[j] - share * own[p + j])
@@ -589,7 +676,7 @@ def derive_share(c, i, y, f, is_flat, reach, out):  # type: ignore[no-untyped-de
     if s[ETA] > 0.0:
         for j in range(p):
             strain[j] = y[mine + j]
-            f[mine + j] = (out[j] - total[j] - s[RATE] * own[p + j]) / s[ETA]
+            f[mine + j] = (out[j] - total[j] - s[RATE] * own[p + j]) / s[LOSS]
     elif is_flat:
         for j in range(p):
             strain[j] = reach[j] / s[HEIGHT]

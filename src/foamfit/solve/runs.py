@@ -97,6 +97,7 @@ from foamfit.springs.compiled.contract import (
     GAIN,
     HEIGHT,
     INTERNAL,
+    LOSS,
     MISS,
     OF_LAW,
     OPTIONS,
@@ -232,6 +233,7 @@ def lay_out(sizes, laws, ends, directions, rows, heights, mass, reals, solved, i
         for k in range(row):
             s[k] = 0.0
         s[HEIGHT], s[PER_HEIGHT], s[ETA], s[GAIN] = heights[i], 1.0 / heights[i], rows[i, 0], 1.0
+        s[LOSS] = s[ETA]
         for k in range(terms):
             s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = rows[i, 1 + 2 * k], rows[i, 2 + 2 * k]
             s[GAIN] += rows[i, 1 + 2 * k]

@@ -29,8 +29,8 @@ from foamfit.springs.compiled.contract import (
     EXPLICIT,
     HIGH,
     INTERNAL,
+    LOSSY,
     LOW,
-    MEMORY,
     MISS,
     OF_LAW,
     OPTIONS,
@@ -68,8 +68,8 @@ STEP = 1e-40  # imaginary step
 # on the next branch, whose number it returns.
 VALUES, ENDS, DOWN, UP = range(4)
 # What a spring of a registered law keeps in memory: the address of its function, kind, numbers of
-# parameters and of internal variables, and whether its branches end.
-FORMULAS, KIND, COUNT, INSIDE, BOUNDED = range(OWN, OWN + 5)
+# parameters and of internal variables, whether its branches end, and whether V depends on the rate.
+FORMULAS, KIND, COUNT, INSIDE, BOUNDED, DAMPS = range(OWN, OWN + 6)
 _F, _I, _P = types.float64, types.int64, types.CPointer(types.float64)
 _CP = types.CPointer(types.complex128)
 _FORMULAS = _I(_CP, _I, _I, _CP)
@@ -164,6 +164,7 @@ def enter(row, s):  # type: ignore[no-untyped-def]
 @beginning
 def _begin(row, s):  # type: ignore[no-untyped-def]
     s[EPS] = s[BRANCH] = s[RATE] = 0.0
+    s[LOSSY] = s[DAMPS]
     for k in range(int(s[INSIDE])):
         s[X + k] = 0.0
     enter(row, s)
@@ -199,7 +200,11 @@ def evaluate_internal(row, s, eps, x, n, want, out):  # type: ignore[no-untyped-
     for j in range(n):
         point, found = gather(row, s, eps[j], x, n, j)
         for q in range(2 + inside + count):
-            if q > 0 and (want == 0 or (want == 2 and (q == 1 or q >= 2 + inside))):
+            if q > 0 and (want == 0 or (want == 2 and q >= 2 + inside)):
+                continue
+            if q == 1 and s[DAMPS] == 0.0:
+                for f in range(size):
+                    out[(at + 2 * size + f) * n + j] = 0.0
                 continue
             kept = point[q]
             point[q] = complex(kept.real, STEP)
@@ -399,6 +404,7 @@ def compile_law(law: Law) -> Compiled:
     count, inside = len(law.params), law.internal
     simple = inside == 0 and given.viscous is None
     kind, bounded = EXPLICIT if simple else INTERNAL, float(given.ends is not None)
+    damps = float(given.viscous is not None)
     formulas = _formulas(given, count, inside)
     made = formulas.overloads[_FORMULAS.args]
     where = float(made.library.get_pointer_to_function(made.fndesc.llvm_func_name))  # below 2^53
@@ -406,7 +412,8 @@ def compile_law(law: Law) -> Compiled:
 
     @cfunc(_F(_P, _P), **OPTIONS)
     def begin(row, s):  # type: ignore[no-untyped-def]
-        s[FORMULAS], s[KIND], s[COUNT], s[INSIDE], s[BOUNDED] = where, kind, count, inside, bounded
+        s[FORMULAS], s[KIND], s[COUNT], s[INSIDE] = where, kind, count, inside
+        s[BOUNDED], s[DAMPS] = bounded, damps
         call_begin(begin_any, row, s)
         return 0.0
 
@@ -417,7 +424,7 @@ def compile_law(law: Law) -> Compiled:
     # parameters, slope at rest, then room for complex numbers
     columns = count + 1 + 2 * (2 + inside + count + max(3, 2 + 2 * inside))
     fill = _fill(given.admissible, count, addresses, RESULTS + results_of(count, inside))
-    return Compiled(fill, kind, columns, count, inside, addresses, (count,))
+    return Compiled(fill, kind, columns, count, inside, addresses, (count,), -1, damps > 0.0)
 
 
 def _fill(
