@@ -9,13 +9,13 @@ import foamfit as ff
 
 def stress(p, x, strain, branch):
     """σ, Pa."""
-    k, alpha, limit, n = p
+    k, alpha, _, _ = p
     return alpha * k * strain + (1.0 - alpha) * k * x[0]
 
 
 def along(p, x, strain, branch, out):
     """dz/dε."""
-    k, alpha, limit, n = p
+    _, _, limit, n = p
     grown = x[0] / limit if branch == 0 else -x[0] / limit
     out[0] = 1.0 - grown**n if grown.real > 0.0 else 1.0
 

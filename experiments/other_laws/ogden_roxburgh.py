@@ -2,9 +2,9 @@
 
     σ = η σ_0(ε),   η = 1 - (1/r) erf((W_m - W_0(ε)) / m)
 
-σ_0 and W_0 are stress and energy of the Ogden curve (`ogden.py`), W_m is W_0 at the largest strain so
-far. On the loading curve η = 1; unloading and reloading below the largest
-strain follow the same softer path. r >= 1 and m > 0 (J/m³).
+σ_0 and W_0 are stress and energy of the Ogden curve (`ogden.py`), W_m is W_0 at the largest strain
+so far. On the loading curve η = 1; unloading and reloading below the largest strain follow the same
+softer path. r >= 1 and m > 0 (J/m³).
 
 Ogden & Roxburgh 1999, Proc. R. Soc. A 455, 2861, equation (51).
 """

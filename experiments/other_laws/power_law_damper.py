@@ -29,7 +29,7 @@ def admissible(p):
 
 def stress(p, x, strain, branch):
     """Return the stress of the paper's spring (eqs. 2 and 3)."""
-    k0, kc, dsigma, eps_a, eps_c, plus, minus, c, n = p
+    k0, kc, dsigma, eps_a, eps_c, plus, minus = p[:7]
     sigma_a = k0 * eps_a / (1.0 - eps_a)
     sigma_c = sigma_a + dsigma
     if branch == D:
@@ -42,10 +42,8 @@ def stress(p, x, strain, branch):
 
 def ends(p, x, strain, branch, out):
     """Fill the ends of the branch (eqs. 4 and 5)."""
-    k0, kc, dsigma, eps_a, eps_c, plus, minus, c, n = p
-    points = points_of(
-        k0.real, kc.real, dsigma.real, eps_a.real, eps_c.real, plus.real, minus.real
-    )
+    k0, kc, dsigma, eps_a, eps_c, plus, minus = p[:7]
+    points = points_of(k0.real, kc.real, dsigma.real, eps_a.real, eps_c.real, plus.real, minus.real)
     if branch != A:
         out[0] = eps_a if branch == D else eps_c if branch == C else points[3]
     if branch != C:

@@ -7,6 +7,7 @@ import functools
 import math
 import pickle
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -189,7 +190,7 @@ def test_a_registered_copy_agrees_with_the_built_in_law(
 def test_a_registered_copy_follows_histories_to_rounding() -> None:
     one = ff.BistableSpring(*SEVEN)
     ways = (0.0, 0.3, 0.1, 0.36, 0.0, 0.2)
-    strain = np.concatenate([np.linspace(*way, 41) for way in zip(ways, ways[1:], strict=False)])
+    strain = np.concatenate([np.linspace(*way, 41) for way in pairwise(ways)])
     stress = one.stress(strain)
     for internal in (0, 1):
         other = copy_of(one, internal)

@@ -73,9 +73,8 @@ FORMULAS, KIND, COUNT, INSIDE, BOUNDED, DAMPS = range(OWN, OWN + 6)
 _F, _I, _P = types.float64, types.int64, types.CPointer(types.float64)
 _CP = types.CPointer(types.complex128)
 _FORMULAS = _I(_CP, _I, _I, _CP)
-_WITHIN: dict[str, Any] = {
-    **OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False
-}  # fmt: skip
+_ALONE: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_WITHIN: dict[str, Any] = {**_ALONE, "_nrt": False}
 FURTHEST, TRIALS = 1e12, 200  # largest strain, and trials, in the search for a strain
 
 
@@ -377,7 +376,7 @@ def _formulas(given: Functions, count: int, inside: int) -> Any:
     ends, change = _inside(given.ends, _nothing), _inside(given.switch, _same)
     load = _tuple_at(count)
 
-    @njit(_FORMULAS, **OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    @njit(_FORMULAS, **_ALONE)
     def formulas(point, branch, what, out):  # type: ignore[no-untyped-def]
         p, x = load(past(point, 2 + inside)), carray(past(point, 2), (inside,))
         strain = point[0]
@@ -417,7 +416,7 @@ def compile_law(law: Law) -> Compiled:
         call_begin(begin_any, row, s)
         return 0.0
 
-    addresses = (
+    addresses: Any = (
         begin.address, _evaluate.address, _switch.address, _settle.address, _strain.address
     )  # fmt: skip
     kept.append((formulas, begin))  # the addresses stay valid
