@@ -76,7 +76,6 @@ from foamfit.springs.compiled.contract import (
     STRESS as TOTAL,
     SWITCH,
     TANGENT,
-    TINY,
     OPTIONS,
     X,
     address,
@@ -224,6 +223,9 @@ def viscous(c, i):  # type: ignore[no-untyped-def]
     return c.drive[PACE] * s[c.results + BY + n[PARAMETERS] + 1] if n[KIND] == INTERNAL else 0.0
 
 
+LEAST_RATE = 1e-25  # smaller strain rates are zero, 1/s
+
+
 @inner
 def take_rate(c, i, common, want):  # type: ignore[no-untyped-def]
     """Fill the strain rate of a damped spring under the stress of its group.
@@ -244,8 +246,8 @@ def take_rate(c, i, common, want):  # type: ignore[no-untyped-def]
         evaluate(c, i, want if want else 2)
         value = sign * (values[1] + s[ETA] * s[RATE])
         s[LOSS] = s[ETA] + values[2 * (2 + 2 * n[INTERNALS]) + 1]
-        if force == 0.0:
-            s[LOSS] = s[LOSS] if s[LOSS] > TINY else math.inf
+        if force == 0.0:  # at rest, where the derivative of a power is infinite or zero
+            s[LOSS] = math.inf
             return
         low, high = (low, rate) if value >= abs(force) else (rate, high)
         new = -1.0
@@ -257,9 +259,11 @@ def take_rate(c, i, common, want):  # type: ignore[no-untyped-def]
             new = math.sqrt(low * high) if low > 0.0 else 1e-3 * high
             if high == math.inf:
                 new = 1e3 * low
-        if new == low or new == high or not new > 1e-200:
+        if new == low or new == high:
             return
         rate = new
+        if not rate > LEAST_RATE:
+            force = 0.0
 
 
 @inner
@@ -653,7 +657,7 @@ def derive_common(c, last, loose, flat, soft, weight, reach, rate, out):  # type
             for j in range(p):
                 rate[j] -= of_drag[j] * c.drive[TOP_SPEED] / c.drive[DRAGGED]
         for j in range(p):
-            out[j] = rate[j] / weight
+            out[j] = rate[j] / weight if weight > 0.0 else 0.0  # all at rest
     elif flat < 0:
         for j in range(p):
             out[j] = reach[j] / soft
