@@ -91,8 +91,8 @@ def error_of(c, dt, tol):  # type: ignore[no-untyped-def]
         size = max(scales[kinds[i]], max(abs(y[i]), abs(new[i])))
         if size > 0.0:
             scale = 1.0 / (tol * size)
-            five += (errors[i] * scale) ** 2
-            three += (errors[wide + i] * scale) ** 2
+            one, other = errors[i] * scale, errors[wide + i] * scale
+            five, three = five + one * one, three + other * other
     if five == 0.0:
         return 0.0
     return five / math.sqrt(c.base * (five + 0.01 * three))

@@ -203,7 +203,7 @@ def derive_group(c, g, y, f):  # type: ignore[no-untyped-def]
         else:
             for j in range(p):
                 total[j] += own[p + j] * s[RATE]
-            if flat < 0:
+            if slope > 0.0:
                 share = s[HEIGHT] / slope
         over = (s[TOTAL] - common) / s[ETA] if loose < 0 else 0.0
         for j in range(p):
@@ -266,7 +266,7 @@ def derive_share(c, i, y, f, is_flat, reach, out):  # type: ignore[no-untyped-de
     else:
         slope = s[GAIN] * s[c.results + SLOPE]
         for j in range(p):
-            strain[j] = (out[j] - total[j]) / slope
+            strain[j] = (out[j] - total[j]) / slope if slope > 0.0 else 0.0
     derive_inside(c, i, y, f, past(f, mine) if s[ETA] > 0.0 else strain)
 
 

@@ -29,6 +29,7 @@ from foamfit.solve.run import (
     DAMPED,
     EPS_AT,
     FLAT,
+    GRAVITY,
     GROW,
     HORIZON,
     KIND,
@@ -84,6 +85,7 @@ SPEED, TOL, MOST, BRIEFLY, LEAST, REALS = 2, 3, 4, 5, 6, 10
 # Results of a run.
 OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, STRESS_LOST = range(9)
 ENDINGS = 9
+SWITCHED, RELEASED, STALLED = 1, 2, 3  # what happened in a step
 _I = types.int64
 
 
@@ -209,8 +211,8 @@ def _fresh_scales(c):  # type: ignore[no-untyped-def]
 
 @inner
 def _begin(c, reals, mass):  # type: ignore[no-untyped-def]
-    """Set scales and, for an impact, the striker; return its acceleration by gravity."""
-    r, top, gravity = c.now, c.groups - 1, 0.0
+    """Set scales and, for an impact, the striker."""
+    r, top = c.now, c.groups - 1
     for k in range(SCALES):
         c.scales[k] = reals[LEAST + k]
     for i in range(c.count):  # of the strain of each spring
@@ -218,17 +220,16 @@ def _begin(c, reals, mass):  # type: ignore[no-untyped-def]
     r[BRIEF], r[LAST], r[GROW] = reals[BRIEFLY], 1e-4, 1.0
     if reals[SPEED] > 0.0:
         c.y[2 * top + 1] = reals[SPEED]
-        gravity = c.values[0] / mass[top]
-        c.drive[VALUE], r[HORIZON] = c.values[0], c.time[c.samples - 1]
-        r[SAMPLE] = approach(c, reals[SPEED], gravity)
-    return gravity
+        c.drive[VALUE], c.drive[GRAVITY] = c.values[0], c.values[0] / mass[top]
+        r[HORIZON] = c.time[c.samples - 1]
+        approach(c, reals[SPEED])
 
 
 @inner
-def _advance(c, how, struck, want, gravity):  # type: ignore[no-untyped-def]
+def _advance(c, how, struck, want):  # type: ignore[no-untyped-def]
     """Go to the first event in the step or to its end, and write its samples.
 
-    Return 1 if there was an event, 2 if it is the end of contact, which ends the run.
+    Return what happened: nothing, an event, the end of contact, or an event without any progress.
     """
     r, share, who, kind = c.now, 1.0, -1, -1
     if how == DOUBTFUL:
@@ -244,9 +245,9 @@ def _advance(c, how, struck, want, gravity):  # type: ignore[no-untyped-def]
     moved = share * r[STEP] > 1e-15 * abs(r[NOW])
     slope = _pass_event(c, want, share, who, kind)
     if kind == RELEASE:
-        fly(c, gravity, slope)
-        return c.none + 2
-    return c.none + 1 if moved else c.none + 3
+        fly(c, slope)
+        return RELEASED + c.none
+    return (SWITCHED if moved else STALLED) + c.none
 
 
 @inner
@@ -261,35 +262,6 @@ def _failure(c, how, most):  # type: ignore[no-untyped-def]
     return c.none + (STEP_UNDERFLOW if how == FAILED else DONE)
 
 
-@inner
-def _run(c, struck, want, tol, most, gravity):  # type: ignore[no-untyped-def]
-    """Take steps until the last sample; return the outcome, and the time at which contact ended."""
-    r, stalled = c.now, 0
-    while True:
-        if struck and int(r[SAMPLE]) == c.samples:
-            return c.none + DONE, math.nan
-        keep_values(c)
-        r[STEP] = min(r[STEP], r[HORIZON] - r[NOW])
-        upto = c.time[int(r[SAMPLE])] if struck else math.inf
-        how = take_step(c, want, tol, upto, most)
-        outcome = _failure(c, how, most)
-        if outcome != DONE:
-            return outcome, r[BEGUN] + r[NOW]
-        event = _advance(c, how, struck, want, gravity)
-        if event == 2:
-            return c.none + DONE, r[NOW]
-        stalled = stalled + 1 if event == 3 else 0
-        if stalled > 4 * c.count + 8:
-            return c.none + STEP_UNDERFLOW, r[BEGUN] + r[NOW]
-        dt = r[STEP] * r[GROW]
-        if r[NOW] >= r[HORIZON] and struck:
-            r[HORIZON] = math.nextafter(r[NOW], math.inf)
-        elif r[NOW] >= r[HORIZON] and drive(c, c.none, want):
-            return c.none + DONE, math.nan
-        r[STEP] = dt
-        _fresh_scales(c)
-
-
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 def integrate(  # type: ignore[no-untyped-def]
     template, ints, floats, rows, heights, mass, reals, values, time, out, log, endings
@@ -301,17 +273,36 @@ def integrate(  # type: ignore[no-untyped-def]
     """
     c = begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals)
     r, want, struck = c.now, int(c.p > 0), reals[SPEED] > 0.0
-    gravity, done = _begin(c, reals, mass), 0
+    tol, most, stalled, done = reals[TOL], reals[MOST], 0, 0
+    _begin(c, reals, mass)
     if struck:
         rates(c, c.y, c.stage, want, 0.0)
-        r[STEP] = min(r[HORIZON], _first_step(c, reals[TOL]))
+        r[STEP] = min(r[HORIZON], _first_step(c, tol))
     else:
         done = drive(c, 1, want)
         r[STEP] = r[HORIZON]
-    _fresh_scales(c)
-    endings[OUTCOME], endings[ENDED] = DONE, math.nan
-    if not done:
-        endings[OUTCOME], endings[ENDED] = _run(c, struck, want, reals[TOL], reals[MOST], gravity)
+    outcome, ended = DONE, math.nan
+    while not (done or (struck and int(r[SAMPLE]) == c.samples)):
+        _fresh_scales(c)
+        keep_values(c)
+        r[STEP] = min(r[STEP], r[HORIZON] - r[NOW])
+        upto = c.time[int(r[SAMPLE])] if struck else math.inf
+        how = take_step(c, want, tol, upto, most)
+        outcome = _failure(c, how, most)
+        event = _advance(c, how, struck, want) if outcome == DONE else c.none
+        stalled = stalled + 1 if event == STALLED else 0
+        if stalled > 4 * c.count + 8:
+            outcome = STEP_UNDERFLOW
+        if outcome != DONE or event == RELEASED:
+            ended = r[BEGUN] + r[NOW]
+            break
+        dt = r[STEP] * r[GROW]
+        if r[NOW] >= r[HORIZON] and struck:
+            r[HORIZON] = math.nextafter(r[NOW], math.inf)
+        elif r[NOW] >= r[HORIZON]:
+            done = drive(c, c.none, want)
+        r[STEP] = dt
+    endings[OUTCOME], endings[ENDED] = outcome, ended
     endings[STEPS], endings[SWITCHES] = r[TAKEN], r[LOGGED]
     endings[STRONGEST], endings[FARTHEST], endings[DAMPED_OUT] = r[LARGEST], c.scales[OF_W], r[DAMPED]
     endings[MOTION_LOST], endings[STRESS_LOST] = c.worst[0], c.worst[1]

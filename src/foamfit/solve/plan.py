@@ -41,7 +41,7 @@ MOST_SAMPLED = 10_000_000  # in total
 ALONE, IN_SERIES, OF_MASSES = 0.1, 1e-2, 1e-3
 OF_IMPLICIT = 1e-1
 SHORT = 5e-4  # length of a short implicit step, as a share of the duration, for a truncation of 3e-8
-LEAST_TOL = 2e-14
+LEAST_TOL = 5e-13
 # Outcomes of explicit steps after which implicit ones are tried.
 _STIFF = scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW
 LOGGED = 1024  # switches in the log of a first run; with more it is repeated

@@ -13,6 +13,7 @@ from foamfit.solve.events import dense
 from foamfit.solve.motion import rates_of
 from foamfit.solve.run import (
     BATCH,
+    GRAVITY,
     KIND,
     NOW,
     NUMBERS,
@@ -50,6 +51,7 @@ from foamfit.springs.compiled.contract import (
 )  # fmt: skip
 from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 
+INSIDE, FLIGHT, APPROACH = -1, -2, -3  # instead of the number of a sample
 _F, _I, _P, _IP = types.float64, types.int64, types.CPointer(types.float64), types.CPointer(types.int64)
 
 
@@ -215,58 +217,29 @@ def _write_inside(c, reached, want):  # type: ignore[no-untyped-def]
     r[SAMPLE] = k
 
 
-@cfunc(types.void(_IP, _P, _F, _I, _I), **OPTIONS, cache=True)
-def _samples(words, y, at, k, want):  # type: ignore[no-untyped-def]
-    """Write sample k from a state or, if k is negative, those of the step up to the time `at`."""
-    c = unpack(words)
-    if k < 0:
-        _write_inside(c, at, want)
-    else:
-        _write(c, y, at, k, want)
-
-
-WRITE = _samples.address
-
-
-@intrinsic
-def _call_samples(typing, where, c, y, at, k, want):  # type: ignore[no-untyped-def]
-    return types.void(_I, RECORD, _P, _F, _I, _I), by_address
-
-
-@inlined
-def write(c, y, at, k, want):  # type: ignore[no-untyped-def]
-    """Write sample k from a state at a time since the piece began."""
-    _call_samples(c.write_at, c, y, at, k, want)
-
-
-@inlined
-def write_inside(c, reached, want):  # type: ignore[no-untyped-def]
-    """Write the samples of an impact up to a time inside the step."""
-    _call_samples(c.write_at, c, c.y, reached, -1, want)
-
-
 # ---------------------------------------------------------------- without contact
 
 
 @inner
-def approach(c, speed, gravity):  # type: ignore[no-untyped-def]
-    """Write the samples before contact, when only the striker moves; return their number."""
-    done, motion, t = c.none, row_of(c, c.none, c.shown - 1), c.time
+def _approach(c, speed):  # type: ignore[no-untyped-def]
+    """Write the samples before contact, when only the striker moves."""
+    done, motion, t, gravity = c.none, row_of(c, c.none, c.shown - 1), c.time, c.drive[GRAVITY]
     while done < c.samples and t[done] < 0.0:
         for row in range((1 + c.p) * c.shown):
             c.out[row * c.samples + done] = 0.0
         motion[done] = (speed + 0.5 * gravity * t[done]) * t[done]
         done += 1
-    return done
+    c.now[SAMPLE] = done
 
 
 @inner
-def fly(c, gravity, slope):  # type: ignore[no-untyped-def]
+def _fly(c, slope):  # type: ignore[no-untyped-def]
     """Write the samples after the end of contact; `slope` is dS/dt there.
 
     The chain moves with the striker. Derivatives include the shift of the end of contact.
     """
     p, y, now, t, top = c.p, c.y, c.now[NOW], c.time, c.groups - 1
+    gravity = c.drive[GRAVITY]
     speed, pull, first = y[2 * top + 1], c.stage[2 * top + 1], int(c.now[SAMPLE])
     for j in range(1 + p):
         stress = row_of(c, j, c.none)
@@ -294,3 +267,52 @@ def fly(c, gravity, slope):  # type: ignore[no-untyped-def]
                 at, motion = reach[j] + (quick - speed) * late, row_of(c, 1 + j, node)
                 for k in range(first, c.samples):
                     motion[k] = at + dv * (t[k] - now)
+
+
+# ---------------------------------------------------------------- called by address
+
+
+@cfunc(types.void(_IP, _P, _F, _I, _I), **OPTIONS, cache=True)
+def _samples(words, y, at, k, want):  # type: ignore[no-untyped-def]
+    """Write sample k from a state at a time, or do one of the tasks below zero."""
+    c = unpack(words)
+    if k == INSIDE:
+        _write_inside(c, at, want)
+    elif k == FLIGHT:
+        _fly(c, at)
+    elif k == APPROACH:
+        _approach(c, at)
+    else:
+        _write(c, y, at, k, want)
+
+
+WRITE = _samples.address
+
+
+@intrinsic
+def _call_samples(typing, where, c, y, at, k, want):  # type: ignore[no-untyped-def]
+    return types.void(_I, RECORD, _P, _F, _I, _I), by_address
+
+
+@inlined
+def write(c, y, at, k, want):  # type: ignore[no-untyped-def]
+    """Write sample k from a state at a time since the piece began."""
+    _call_samples(c.write_at, c, y, at, k, want)
+
+
+@inlined
+def approach(c, speed):  # type: ignore[no-untyped-def]
+    """Write the samples before contact, when only the striker moves."""
+    _call_samples(c.write_at, c, c.y, speed, APPROACH, 0)
+
+
+@inlined
+def fly(c, slope):  # type: ignore[no-untyped-def]
+    """Write the samples after the end of contact; `slope` is dS/dt there."""
+    _call_samples(c.write_at, c, c.y, slope, FLIGHT, 0)
+
+
+@inlined
+def write_inside(c, reached, want):  # type: ignore[no-untyped-def]
+    """Write the samples of an impact up to a time inside the step."""
+    _call_samples(c.write_at, c, c.y, reached, INSIDE, want)
