@@ -49,8 +49,9 @@ from foamfit.springs.compiled.contract import (
 from foamfit.springs.parameters import OWN_ETA
 
 RISEN = 1e-9  # base stress over the largest stress above which its return to zero ends the contact
-# Kinds of events: a branch ends at its upper or lower strain, a spring turns, contact ends.
-TOP_END, LOW_END, TURN, RELEASE = range(4)
+# Kinds of events: a branch ends at its upper or lower strain, a spring turns, contact ends. Then a
+# greatest and a least strain.
+TOP_END, LOW_END, TURN, RELEASE, TOP_TURN, LOW_TURN = range(6)
 PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
 _F, _I, _P, _IP = types.float64, types.int64, types.CPointer(types.float64), types.CPointer(types.int64)
 #: record, whether with derivatives, tolerance, time of the next sample, bound on steps
@@ -142,8 +143,8 @@ def _excess(c, i, kind):  # type: ignore[no-untyped-def]
     s = past(c.springs, i * c.width)
     if kind == RELEASE:
         return -c.carried[0]
-    if kind == TURN:
-        return -s[TURNS] * s[RATE]
+    if kind >= TURN:
+        return -s[RATE] * (s[TURNS] if kind == TURN else 1.0 if kind == TOP_TURN else -1.0)
     return s[EPS] - s[HIGH] if kind == TOP_END else s[LOW] - s[EPS]
 
 
@@ -168,59 +169,67 @@ def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
         value = _excess(c, i, kind)
         if kind < TURN and abs(value) < 1e-15:
             return middle
-        if value > 0.0:
+        if value >= 0.0:
             f_low *= 0.5 if side == 1 else 1.0
             high, f_high, side = middle, value, 1
         else:
             f_high *= 0.5 if side == -1 else 1.0
             low, f_low, side = middle, value, -1
-    return high
+    return low if middle <= low else high
 
 
 @inner
-def _any_past(c, who, what):  # type: ignore[no-untyped-def]
-    """Return spring and kind of an event that has happened, other than one; -1 if there is none."""
-    if c.now[PRESSED] > 0.0 and what != RELEASE and c.carried[0] <= 0.0:
-        return c.none, RELEASE + c.none
+def _earliest(c, before, share):  # type: ignore[no-untyped-def]
+    """Return the first of the events in (before, share] whose effect is seen at the end."""
+    found, who, what = share, -1 + c.none, -1 + c.none
+    look(c, found)
+    if c.now[PRESSED] > 0.0 and c.carried[0] <= 0.0:
+        found, who, what = _locate(c, before, found, c.none, RELEASE + c.none), c.none, RELEASE + c.none
+        look(c, found)
     for i in range(c.count):
         for kind in range(RELEASE):
-            if not (i == who and kind == what) and _excess(c, i, kind) > 0.0:
-                return i, kind
-    return -1 + c.none, -1 + c.none
+            if _excess(c, i, kind) > 0.0:
+                there = _locate(c, before, found, i, kind)
+                if who < 0 or there < found:
+                    found, who, what = there, i, kind
+                look(c, found)
+    if who >= 0 and what != RELEASE and c.now[PRESSED] > 0.0:  # the contact ends as well
+        look(c, min(found + 1e-9, 1.0))
+        what = RELEASE + c.none if c.carried[0] <= 0.0 else what
+    return found, who, what
 
 
 @inner
 def first_event(c):  # type: ignore[no-untyped-def]
     """Return share, spring and kind of the first event in a step; spring -1 if there is none.
 
-    A quarter at a time, in case a spring goes past an end and returns. What has happened before an
-    event that was found is earlier, so it is found next.
+    A spring may go past the end of its branch and return within the step. So the strains are also
+    judged at their extrema.
     """
-    pieces, before = 1, 0.0
+    nobody, before, pieces = -1 + c.none, 0.0, 1
     look(c, 1.0)
     for i in range(c.count):
-        s = past(c.springs, i * c.width)
-        if s[OLD_RATE] * s[RATE] <= 0.0:  # otherwise one look at the end tells
+        if c.springs[i * c.width + OLD_RATE] * c.springs[i * c.width + RATE] <= 0.0:
             pieces = 4
     for piece in range(1, pieces + 1):
-        found, who, what = piece / pieces, -1 + c.none, -1 + c.none
-        look(c, found)
-        for _ in range(4 * c.count + 4):
-            i, kind = _any_past(c, who, what)
-            if i < 0:
-                break
-            there = _locate(c, before, found, i, kind)
-            if who >= 0 and not there < found:
-                break
-            found, who, what = there, i, kind
-            look(c, found)
+        share = piece / pieces
+        found, who, what = _earliest(c, before, share)
         if who >= 0:
-            if what != RELEASE and c.now[PRESSED] > 0.0:
-                look(c, min(found + 1e-9, 1.0))
-                what = RELEASE + c.none if c.carried[0] <= 0.0 else what
             return found, who, what
-        before = found
-    return 1.0, -1 + c.none, -1 + c.none
+        for i in range(c.count if pieces > 1 else 0):
+            s = past(c.springs, i * c.width)
+            look(c, share)
+            if s[OLD_RATE] * s[RATE] < 0.0:
+                turn = _locate(c, before, share, i, TOP_TURN if s[RATE] < 0.0 else LOW_TURN)
+                found, who, what = _earliest(c, before, turn)
+                if who >= 0:
+                    return found, who, what
+        look(c, share)
+        for i in range(c.count):
+            s = past(c.springs, i * c.width)
+            s[OLD_RATE] = s[RATE]
+        before = share
+    return 1.0, nobody, nobody
 
 
 @inner

@@ -187,7 +187,7 @@ def _improve(c, h, column, tol):  # type: ignore[no-untyped-def]
                 value += TO_BASIS[e, i] * (rate - EIGEN[e] * (move / h))
             x[c.places[k]] = value
         substitute(past(c.systems, e * n * (3 * reach + 1)), n, reach, past(c.pivots, e * n), x)
-    size = most = 0.0
+    size, most, finite = 0.0, 0.0, True
     for k in range(n):
         one, place = (k if column == 0 else base + k * p + column - 1), c.places[k]
         scale = max(c.scales[c.kinds[k]], max(abs(c.y[k]), abs(c.y[k] + moves[(POINTS - 1) * wide + k])))
@@ -197,8 +197,10 @@ def _improve(c, h, column, tol):  # type: ignore[no-untyped-def]
             for e in range(SYSTEMS):
                 change += (FROM_BASIS[i, e] * c.right[e * n + place]).real
             moves[i * wide + one] += change
-            size = max(size, abs(change) * per)
+            size, finite = max(size, abs(change) * per), finite and abs(change) < math.inf
             most = max(most, abs(c.y[one] + moves[i * wide + one]) * per)
+    if not finite:  # max leaves NaN out
+        return math.inf
     if column == 0:
         return size / tol
     largest = past(c.largest, column - 1)
@@ -208,17 +210,41 @@ def _improve(c, h, column, tol):  # type: ignore[no-untyped-def]
 
 @inner
 def _collocate(c, h, at, tol, want):  # type: ignore[no-untyped-def]
-    """Solve one step by Newton's method from the guess in its increments; false if it fails."""
-    wide, before = c.wide, math.inf
+    """Solve one step by Newton's method from the guess in its increments; false if it fails.
+
+    The state is solved first, and from the same values of the springs whether derivatives are
+    wanted or not, so that it does not depend on them.
+    """
+    if not _solve(c, h, at, tol, c.none, c.none + 1):
+        return False
+    if not want:
+        return True
+    size, groups = c.count * c.width, c.groups
+    for k in range(size):
+        c.kept[k] = c.springs[k]
+    for g in range(groups):
+        c.kept[size + g] = c.carried[g]
+    solved = _solve(c, h, at, tol, c.none + 1, 1 + c.p)
+    for k in range(size):
+        c.springs[k] = c.kept[k]
+    for g in range(groups):
+        c.carried[g] = c.kept[size + g]
+    return solved
+
+
+@inner
+def _solve(c, h, at, tol, first, last):  # type: ignore[no-untyped-def]
+    """Solve for the state (column 0) or for the derivatives (columns from 1 on)."""
+    wide, before, y, state = c.wide, math.inf, c.y, c.state
     total = c.base + c.carries * c.p
     moves = past(c.stage, (POINTS + 1) * wide)
     for turn in range(TURNS_OF_NEWTON):
         for i in range(POINTS):
             for k in range(total):
-                c.state[k] = c.y[k] + moves[i * wide + k]
-            rates(c, c.state, past(c.stage, (1 + i) * wide), want, at + NODES[i] * h)
-        size = _improve(c, h, 0, tol)
-        for column in range(1, 1 + c.p):
+                state[k] = y[k] + moves[i * wide + k]
+            rates(c, state, past(c.stage, (1 + i) * wide), first, at + NODES[i] * h)
+        size = 0.0
+        for column in range(first, last):
             size = max(size, _improve(c, h, column, tol))
         if not size < math.inf:
             return False

@@ -201,7 +201,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
         "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
         "batch": BATCH * (6 + BY + MOST_OWN) + 3 * p + MOST_TERMS * (9 + p),
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
-        "largest": p if size else 0, "systems": 2 * SYSTEMS * size * (3 * reach + 1),
+        "largest": p if size else 0, "kept": count * width + groups if size and p else 0, "systems": 2 * SYSTEMS * size * (3 * reach + 1),
         "right": 2 * SYSTEMS * size,
     }  # fmt: skip
     arrays = (

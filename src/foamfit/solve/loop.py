@@ -68,6 +68,7 @@ from foamfit.springs.compiled.contract import (
     HEIGHT,
     MISS,
     OPTIONS,
+    RATE,
     SLOPE,
     STRESS as TOTAL,
     TANGENT,
@@ -158,6 +159,32 @@ def _log(c, i, left):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _switch(c, i, up, want):  # type: ignore[no-untyped-def]
+    """Change the branch of a spring now."""
+    s, r = past(c.springs, i * c.width), c.now
+    left, steep = s[BRANCH], s[TANGENT]
+    change_branch(c, i, up, c.y)
+    _log(c, i, left)
+    rates(c, c.y, c.stage, want, r[NOW])
+    if steep > 0.0 and s[TANGENT] > 0.0:
+        r[GROW] *= min(max(math.sqrt(steep / s[TANGENT]), 0.2), 2.0)
+
+
+@inner
+def _turn(c, want):  # type: ignore[no-untyped-def]
+    """Let springs turn whose rate has changed its sign by a jump of the prescribed rate."""
+    for _ in range(4 * c.count):
+        turned = False
+        for i in range(c.count):
+            s = past(c.springs, i * c.width)
+            if s[TURNS] * s[RATE] < 0.0:
+                _switch(c, i, int(s[TURNS] < 0.0), want)
+                turned = True
+        if not turned:
+            return
+
+
+@inner
 def _pass_event(c, want, share, who, kind):  # type: ignore[no-untyped-def]
     """Move to an event within the step; return dS/dt at the end of contact, or change the branch."""
     r, y, n, slope = c.now, c.y, c.base + c.carries * c.p, 0.0
@@ -176,14 +203,8 @@ def _pass_event(c, want, share, who, kind):  # type: ignore[no-untyped-def]
     rates(c, y, c.stage, want, r[NOW])
     if kind == RELEASE:
         return slope
-    s = past(c.springs, who * c.width)
-    up = int(s[TURNS] < 0.0) if kind == TURN else int(kind == TOP_END)
-    left, steep = s[BRANCH], s[TANGENT]
-    change_branch(c, who, up, y)
-    _log(c, who, left)
-    rates(c, y, c.stage, want, r[NOW])
-    if steep > 0.0 and s[TANGENT] > 0.0:
-        r[GROW] *= min(max(math.sqrt(steep / s[TANGENT]), 0.2), 2.0)
+    turns = c.springs[who * c.width + TURNS]
+    _switch(c, who, int(turns < 0.0) if kind == TURN else int(kind == TOP_END), want)
     return slope
 
 
@@ -301,6 +322,7 @@ def integrate(  # type: ignore[no-untyped-def]
             r[HORIZON] = math.nextafter(r[NOW], math.inf)
         elif r[NOW] >= r[HORIZON]:
             done = drive(c, c.none, want)
+            _turn(c, want)
         r[STEP] = dt
     endings[OUTCOME], endings[ENDED] = outcome, ended
     endings[STEPS], endings[SWITCHES] = r[TAKEN], r[LOGGED]

@@ -33,15 +33,17 @@ MAX_STEPS = 2_000_000
 # Implicit steps replace explicit ones above these limits.
 MOST_RELAXATION = 3e3  # relaxation times in the duration of the scene
 MOST_VIBRATION = 1e5  # radians of the fastest vibration in the duration
+FASTEST = 1e10  # radians above which a step that shrinks to nothing is said to be too fast
 MOST_EXPLICIT_WORK = 300_000  # steps times springs
 # Bounds on steps times springs of any solver keep runs to seconds.
 MOST_WORK = 1_500_000  # in addition to the samples of a drive
 MOST_SAMPLED = 10_000_000  # in total
 # Error of a step over the requested error.
-ALONE, IN_SERIES, OF_MASSES = 0.1, 1e-2, 1e-3
+ALONE, IN_SERIES, OF_MASSES = 2e-3, 2e-3, 1e-3
 OF_IMPLICIT = 1e-1
 SHORT = 5e-4  # length of a short implicit step, as a share of the duration, for a truncation of 3e-8
-LEAST_TOL = 5e-13
+# Least error of a step; of vibrating masses, whose steps would not exceed rounding errors below it.
+LEAST_TOL, LEAST_OF_MASSES = 2e-14, 5e-13
 # Outcomes of explicit steps after which implicit ones are tried.
 _STIFF = scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW
 LOGGED = 1024  # switches in the log of a first run; with more it is repeated
@@ -169,20 +171,25 @@ class Plan(NamedTuple):
         out = np.empty((1 + len(directions), 1 + shown, self.time.size))
         if not stiff and not len(directions) and (found := self._as_one(rows, heights, rtol, drag, out)):
             return found
-        log, endings, tol = np.empty((logged, 5)), np.empty(loop.ENDINGS), self.margin * rtol
+        log, endings = np.empty((logged, 5)), np.empty(loop.ENDINGS)
+        least = LEAST_TOL if self.margin != OF_MASSES else LEAST_OF_MASSES
+        tol = max(self.margin * rtol, least)
         scales = self._scales(rows, heights)
         given = rows, heights, directions, out, log, endings
         if not stiff:
             most = self.max_explicit if self.implicit is None else self.max_steps
-            reals = np.array((drag, 1.0, self.speed, max(tol, LEAST_TOL), most, 0.0, *scales))
+            reals = np.array((drag, 1.0, self.speed, tol, most, 0.0, *scales))
             self._integrate(*given, reals)
             stiff = self.implicit is None and int(endings[loop.OUTCOME]) in _STIFF
             if not stiff:
                 return self._motion(out, EXPLICIT_STEPS, endings, log, rows, 0.0)
-        tol = max(OF_IMPLICIT * tol, LEAST_TOL)
+        tol = max(OF_IMPLICIT * self.margin * rtol, LEAST_TOL)
         brief = self._brief(rows, heights, drag, tol)
         reals = np.array((drag, 1.0, self.speed, tol, self.max_steps, brief, *scales))
         self._integrate(*given, reals, POINTS)
+        if endings[loop.OUTCOME] == scenes.STEP_UNDERFLOW:
+            fastest = max(self.fastest_rates(rows, heights, drag))
+            endings[loop.OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
         return self._motion(out, RADAU, endings, log, rows, _lost(endings))
 
     def _integrate(

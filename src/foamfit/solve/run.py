@@ -44,12 +44,13 @@ from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
 # rates at the stages of a step; its dense output; the state, that at the end of a step, and one
 # between with its rates; zeros; errors; samples that are computed together. Those of implicit
 # steps: Jacobian, n rows of 2 reach + 1; vibrations, see `implicit.remember`, and the largest
-# motion and stress at a sample; values of the derivatives over the scales; factored systems,
+# motion and stress at a sample; values of the derivatives over the scales; a copy of `springs` and
+# `carried`; factored systems,
 # complex, SYSTEMS of n rows of 3 reach + 1, and their right sides.
 FLOATS = (
     "springs", "per_mass", "drive", "carried", "own", "held", "part", "common", "strain", "scales",
     "now", "stage", "line", "y", "new", "state", "f", "nil", "errors", "batch",
-    "jacobian", "alive", "worst", "largest", "systems", "right",
+    "jacobian", "alive", "worst", "largest", "kept", "systems", "right",
 )  # fmt: skip
 # Arrays of integers: rows of NUMBERS of the springs; one past the last spring of each group;
 # directions of the derivatives, (p, 2); where the directions of each spring begin and end, and
