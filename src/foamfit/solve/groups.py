@@ -64,7 +64,7 @@ def _follow(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
     reach, rate = span_of(c, g, y, at)
     last = g == c.groups - 1
     push = c.drive[VALUE] + c.drive[VALUE_RATE] * at
-    weight, total, loose, flat = 0.0, rate, -1, -1
+    weight, total, pull, loose, flat = 0.0, rate, -rate, -1, -1
     if c.solved:
         solve_loose(c, g, i0, i1, reach, push, y)
     for i in range(i0, i1):
@@ -74,21 +74,24 @@ def _follow(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
         if eta > 0.0:
             weight += h / eta
             total += h / eta * stress
+            pull += h / eta * (push - stress)
         else:
             loose = i
             if s[TANGENT] == 0.0:
                 flat = i
     if last and c.top == STRESS:
         common = push
-    elif loose < 0:
-        if last and c.top == VISCOUS:
-            weight, total = weight + 1.0 / c.drive[DRAGGED], total + push / c.drive[DRAGGED]
-        common = total / weight
-    else:
+    elif loose >= 0:
         common = past(c.springs, (loose if flat < 0 else flat) * c.width)[TOTAL]
+    elif last and c.top == VISCOUS:  # without the difference of S and push, which may be tiny
+        common = push - c.drive[DRAGGED] * pull / (c.drive[DRAGGED] * weight + 1.0)
+    else:
+        common = total / weight
     if last and c.top == VISCOUS:
-        c.drive[TOP_SPEED] = (push - common) / c.drive[DRAGGED]
-        rate += c.drive[TOP_SPEED]
+        drag = c.drive[DRAGGED]
+        speed = (push - common) / drag if loose >= 0 else pull / (drag * weight + 1.0)
+        c.drive[TOP_SPEED] = speed
+        rate += speed
     share_rate(c, i0, i1, common, rate, loose, flat, last and c.top == STRESS)
     for i in range(i0, i1):
         s = past(c.springs, i * c.width)
@@ -219,8 +222,8 @@ def derive_group(c, g, y, f):  # type: ignore[no-untyped-def]
     if last and c.top == VISCOUS:
         per, of_drag, top = 1.0 / c.drive[DRAGGED], past(c.own, 2 * c.count * p), c.base + 2 * g * p
         for j in range(p):
-            f[top + j] = -per * (out[j] + of_drag[j] * c.drive[TOP_SPEED])
-            f[top + p + j] = 0.0
+            here = -per * (out[j] + of_drag[j] * c.drive[TOP_SPEED])
+            f[top + j], f[top + p + j] = rate[j] if loose < 0 else here, 0.0
 
 
 @inner
@@ -230,11 +233,12 @@ def derive_common(c, last, loose, flat, soft, weight, reach, rate, out):  # type
     if last and c.top == STRESS:
         for j in range(p):
             out[j] = 0.0
+    elif loose < 0 and last and c.top == VISCOUS:
+        drag, speed = c.drive[DRAGGED], c.drive[TOP_SPEED]
+        for j in range(p):  # `rate` becomes that of the velocity of the top
+            rate[j] = -(rate[j] + of_drag[j] * speed * weight) / (drag * weight + 1.0)
+            out[j] = -drag * rate[j] - of_drag[j] * speed
     elif loose < 0:
-        if last and c.top == VISCOUS:
-            weight += 1.0 / c.drive[DRAGGED]
-            for j in range(p):
-                rate[j] -= of_drag[j] * c.drive[TOP_SPEED] / c.drive[DRAGGED]
         for j in range(p):
             out[j] = rate[j] / weight
     elif flat < 0:

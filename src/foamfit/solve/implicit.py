@@ -29,6 +29,8 @@ from foamfit.solve.run import (
     HORIZON,
     IN_ROW,
     NOW,
+    OF_V,
+    OF_W,
     POINTS,
     STEP,
     STEPPED,
@@ -74,7 +76,7 @@ FOLLOW_LIMIT = 600  # number of short steps in a row that are taken
 TURNS_OF_NEWTON = 12
 # Newton's method ends at changes of ENOUGH over the tolerance, of derivatives at ENOUGH/OF_TANGENTS: as
 # they obey linear equations, the next change is smaller by the error of the matrices.
-ENOUGH, OF_TANGENTS = 1e-3, 1e3
+ENOUGH, OF_TANGENTS = 1e-3, 1e6
 
 
 # ---------------------------------------------------------------- banded systems
@@ -127,6 +129,14 @@ def substitute(a, n, reach, pivots, x):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _scale(c, k):  # type: ignore[no-untyped-def]
+    """Return the scale of a component; that of a node is shared, as fast vibrations are not resolved."""
+    if k < 2 * c.nodes:
+        return c.scales[OF_V if k % 2 else OF_W]
+    return c.scales[c.kinds[k]]
+
+
+@inner
 def linearise(c, at):  # type: ignore[no-untyped-def]
     """Fill the derivatives of the rates by the state, by differences, in bands of 2 reach + 1."""
     places, groups_of, n, reach, jacobian = c.places, c.groups_of, c.carries, c.reach, c.jacobian
@@ -135,7 +145,7 @@ def linearise(c, at):  # type: ignore[no-untyped-def]
         jacobian[k] = 0.0
     rates(c, y, f0, c.none, at)
     for one in range(n):
-        step = 1e-8 * max(abs(y[one]), c.scales[c.kinds[one]])
+        step = 1e-8 * max(abs(y[one]), _scale(c, one))
         if step == 0.0:
             step = 1e-12
         kept = y[one]
@@ -190,7 +200,7 @@ def _improve(c, h, column, tol):  # type: ignore[no-untyped-def]
     size, most, finite = 0.0, 0.0, True
     for k in range(n):
         one, place = (k if column == 0 else base + k * p + column - 1), c.places[k]
-        scale = max(c.scales[c.kinds[k]], max(abs(c.y[k]), abs(c.y[k] + moves[(POINTS - 1) * wide + k])))
+        scale = max(_scale(c, k), max(abs(c.y[k]), abs(c.y[k] + moves[(POINTS - 1) * wide + k])))
         per = 1.0 / scale if scale > 0.0 else 0.0
         for i in range(POINTS):
             change = 0.0
@@ -258,7 +268,11 @@ def _solve(c, h, at, tol, first, last):  # type: ignore[no-untyped-def]
 
 @inner
 def _error(c, h, tol):  # type: ignore[no-untyped-def]
-    """Return the error of a step over the tolerance."""
+    """Return the error of a step over the tolerance.
+
+    Velocities are left out: they are not sampled, and those of vibrations that are damped out would
+    only shorten the steps.
+    """
     x, wide, n, reach = c.right, c.wide, c.carries, c.reach
     for k in range(n):
         value = c.stage[k]
@@ -268,7 +282,9 @@ def _error(c, h, tol):  # type: ignore[no-untyped-def]
     substitute(c.systems, n, reach, c.pivots, x)
     size = 0.0
     for k in range(n):
-        scale = max(c.scales[c.kinds[k]], max(abs(c.y[k]), abs(c.y[k] + c.stage[2 * POINTS * wide + k])))
+        if k < 2 * c.nodes and k % 2:
+            continue
+        scale = max(_scale(c, k), max(abs(c.y[k]), abs(c.y[k] + c.stage[2 * POINTS * wide + k])))
         if scale > 0.0:
             size = max(size, abs(x[c.places[k]].real) / scale)
     return size / tol

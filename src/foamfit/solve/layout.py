@@ -20,8 +20,6 @@ from foamfit.solve.run import (
     MOST_OWN,
     NUMBERS,
     OF_SIGMA,
-    OF_V,
-    OF_W,
     RUN,
     SCALES,
     STAGES,
@@ -73,7 +71,8 @@ def _groups(shape: Shape) -> list[range]:
 def place_state(shape: Shape, numbers: NDArray[np.int64], nodes: int) -> tuple[list[int], int]:
     """Give every component its place; return the kinds, and how many have derivatives."""
     damped = np.frombuffer(shape.damped, bool)
-    kinds, more, count = [OF_W, OF_V] * nodes, SCALES + len(shape.laws), len(shape.laws)
+    more, count = SCALES + len(shape.laws) + 2 * nodes, len(shape.laws)
+    kinds = list(range(more - 2 * nodes, more))
     several = [False] * count
     for g, springs in enumerate(_groups(shape)):
         alone = len(springs) == 1 and not (
@@ -196,7 +195,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     lengths = {
         "springs": count * width, "per_mass": groups, "drive": DRIVES, "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
-        "common": (groups + 3) * p, "strain": count * p, "scales": SCALES + count + internals,
+        "common": (groups + 3) * p, "strain": count * p, "scales": SCALES + count + 2 * nodes + internals,
         "now": RUN, "stage": STAGES * wide, "line": LINE * wide, "y": wide, "new": wide,
         "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
         "batch": BATCH * (6 + BY + MOST_OWN) + 3 * p + MOST_TERMS * (9 + p),

@@ -39,6 +39,7 @@ from foamfit.solve.run import (
     NOW,
     NUMBERS,
     OF_EPS,
+    OF_V,
     OF_W,
     PRESSED,
     RECORD,
@@ -86,6 +87,7 @@ SPEED, TOL, MOST, BRIEFLY, LEAST, REALS = 2, 3, 4, 5, 6, 10
 # Results of a run.
 OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, STRESS_LOST = range(9)
 ENDINGS = 9
+LEAST_SHARE = 1e-6  # of the largest scale of nodes, see `_fresh_scales`
 SWITCHED, RELEASED, STALLED = 1, 2, 3  # what happened in a step
 _I = types.int64
 
@@ -223,11 +225,21 @@ def _finish_step(c, struck):  # type: ignore[no-untyped-def]
 
 @inner
 def _fresh_scales(c):  # type: ignore[no-untyped-def]
-    """Let the scales of the error cover what the next step may reach."""
+    """Let the scales of the error cover what the next step may reach.
+
+    A dashpot under a mass that hardly moves makes the base stress of its velocity, so each node has
+    a scale of its own, down to LEAST_SHARE of the largest.
+    """
     y, rate, scales, kinds, part = c.y, c.stage, c.scales, c.kinds, 0.1 * c.now[STEP]
     for k in range(c.base):
         kind = kinds[k]
         scales[kind] = max(scales[kind], max(abs(y[k]), part * abs(rate[k])))
+    for k in range(2 * c.nodes):
+        shared = OF_V if k % 2 else OF_W
+        scales[shared] = max(scales[shared], scales[kinds[k]])
+    for k in range(2 * c.nodes):
+        shared = OF_V if k % 2 else OF_W
+        scales[kinds[k]] = max(scales[kinds[k]], LEAST_SHARE * scales[shared])
 
 
 @inner

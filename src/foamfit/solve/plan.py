@@ -34,9 +34,9 @@ MAX_STEPS = 2_000_000
 MOST_RELAXATION = 3e3  # relaxation times in the duration of the scene
 MOST_VIBRATION = 1e5  # radians of the fastest vibration in the duration
 FASTEST = 1e10  # radians above which a step that shrinks to nothing is said to be too fast
-MOST_EXPLICIT_WORK = 300_000  # steps times springs
+MOST_EXPLICIT_WORK = 1_200_000  # steps times springs
 # Bounds on steps times springs of any solver keep runs to seconds.
-MOST_WORK = 1_500_000  # in addition to the samples of a drive
+MOST_WORK = 6_000_000  # in addition to the samples of a drive
 MOST_SAMPLED = 10_000_000  # in total
 # Error of a step over the requested error.
 ALONE, IN_SERIES, OF_MASSES = 2e-3, 2e-3, 1e-3
@@ -172,29 +172,45 @@ class Plan(NamedTuple):
         if not stiff and not len(directions) and (found := self._as_one(rows, heights, rtol, drag, out)):
             return found
         log, endings = np.empty((logged, 5)), np.empty(loop.ENDINGS)
-        least = LEAST_TOL if self.margin != OF_MASSES else LEAST_OF_MASSES
-        tol = max(self.margin * rtol, least)
-        scales = self._scales(rows, heights)
         given = rows, heights, directions, out, log, endings
-        if not stiff:
-            most = self.max_explicit if self.implicit is None else self.max_steps
-            reals = np.array((drag, 1.0, self.speed, tol, most, 0.0, *scales))
-            self._integrate(*given, reals)
-            stiff = self.implicit is None and int(endings[loop.OUTCOME]) in _STIFF
-            if not stiff:
-                return self._motion(out, EXPLICIT_STEPS, endings, log, rows, 0.0)
-        tol = max(OF_IMPLICIT * self.margin * rtol, LEAST_TOL)
-        brief = self._brief(rows, heights, drag, tol)
-        reals = np.array((drag, 1.0, self.speed, tol, self.max_steps, brief, *scales))
-        self._integrate(*given, reals, POINTS)
-        if endings[loop.OUTCOME] == scenes.STEP_UNDERFLOW:
-            fastest = max(self.fastest_rates(rows, heights, drag))
-            endings[loop.OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
-        return self._motion(out, RADAU, endings, log, rows, _lost(endings))
+        for degree in self._methods(stiff):
+            reals = self._reals(rows, heights, rtol, drag, degree)
+            self._integrate(*given, reals, degree)
+            if endings[loop.OUTCOME] not in _STIFF:
+                break
+        fastest = max(self.fastest_rates(rows, heights, drag))
+        if endings[loop.OUTCOME] == scenes.STEP_UNDERFLOW and fastest > FASTEST:
+            endings[loop.OUTCOME] = scenes.TOO_FAST
+        lost = _lost(endings) if degree else 0.0
+        return self._motion(out, RADAU if degree else EXPLICIT_STEPS, endings, log, rows, lost)
+
+    def _methods(self, stiff: bool) -> tuple[int, ...]:
+        """Return the degrees of the methods to try: 0 for explicit steps.
+
+        Where explicit steps may take as many as all, implicit ones are not tried after them.
+        """
+        if self.implicit is not None:
+            return (POINTS,) if self.implicit else (0,)
+        if stiff:
+            return POINTS, 0
+        return (0, POINTS) if self.max_explicit < self.max_steps else (0,)
+
+    def _reals(self, rows: Array, heights: Array, rtol: float, drag: float, degree: int) -> Array:
+        """Return the numbers that the loop over time is given; see `loop`."""
+        least = LEAST_TOL if self.margin != OF_MASSES else LEAST_OF_MASSES
+        tol, most, brief = max(self.margin * rtol, least), self.max_steps, 0.0
+        if degree:
+            tol = max(OF_IMPLICIT * self.margin * rtol, 2.0 * least)
+            most = self.max_steps // 4  # each takes longer
+            brief = self._brief(rows, heights, drag, tol)
+        elif self.implicit is None:
+            most = self.max_explicit
+        scales = self._scales(rows, heights)
+        return np.array((drag, 1.0, self.speed, tol, most, brief, *scales))
 
     def _integrate(
         self, rows: Array, heights: Array, directions: Directions, out: Array, log: Array,
-        endings: Array, reals: Array, degree: int = 0,
+        endings: Array, reals: Array, degree: int,
     ) -> None:  # fmt: skip
         """Run the loop over time, with implicit steps if `degree` is that of their polynomial."""
         cache.announce(loop.integrate, "the solver")

@@ -82,8 +82,9 @@ _FLOATS_END, _INTEGERS_END = len(FLOATS), len(FLOATS) + len(INTEGERS)
 # variables; and the places of strain, internal variables and relaxation terms in the state (-1:
 # none).
 KIND, PARAMETERS, INTERNALS, EPS_AT, X_AT, Z_AT, NUMBERS = 5, 6, 7, 8, 9, 10, 12
-# Kinds of components of the state, which share a scale: displacement, velocity, strain, stress; the
-# strain of each spring and each internal variable have their own.
+# Kinds of components of the state, which share a scale: displacement, velocity, strain, stress.
+# Then follow the strain of each spring, displacement and velocity of each node, and each internal
+# variable, which have scales of their own.
 OF_W, OF_V, OF_EPS, OF_SIGMA, SCALES = range(5)
 # The drive now: stress or displacement at the start of the piece and its rate; velocity of a
 # viscous top; 1 if a stress acts on a flat branch; onsite damping of the top, Pa s/m; 0 if time
