@@ -52,9 +52,13 @@ from foamfit.springs.compiled.contract import (
     SLOPE,
     STRESS as TOTAL,
     TANGENT,
+    TURNS,
     inner,
     past,
 )  # fmt: skip
+
+STANDS, MOVES = 1e-12, 1e-9  # relative rates that are nothing but rounding, and more than that
+SNAPPING = (0, 2, 3)  # parameters of a bistable law on which the stress at A1 depends
 
 
 @inner
@@ -274,6 +278,29 @@ def derive_share(c, i, y, f, is_flat, reach, out):  # type: ignore[no-untyped-de
     derive_inside(c, i, y, f, past(f, mine) if s[ETA] > 0.0 else strain)
 
 
+@inner
+def _mark_one_sided(c, g):  # type: ignore[no-untyped-def]
+    """Mark the derivatives that differ from above and below.
+
+    A snapping spring that stands still continues for one sign of the change of a parameter and is
+    held for the other; of several springs on flat branches, the sign decides which moves first.
+    """
+    p, flat, common = c.p, 0, past(c.common, g * c.p)
+    first, last = (c.ends[g - 1] if g > 0 else 0), c.ends[g]
+    for i in range(first, last):
+        s = past(c.springs, i * c.width)
+        flat += int(s[SIGMA_LOW] == s[SIGMA_HIGH] and s[ETA] == 0.0)
+    for i in range(first, last):
+        s, total = past(c.springs, i * c.width), past(c.part, (c.count + i) * p)
+        stands = s[TURNS] != 0.0 and abs(s[RATE]) * s[ETA] < STANDS * abs(c.carried[g])
+        for j in range(p):
+            if stands and abs(common[j] - total[j]) > MOVES * max(abs(common[j]), abs(total[j])):
+                c.sided[j] = 1.0
+            mine = flat > 1 and c.directions[2 * j] == i and s[SIGMA_LOW] == s[SIGMA_HIGH]
+            if mine and s[ETA] == 0.0 and c.directions[2 * j + 1] in SNAPPING:
+                c.sided[j] = 1.0
+
+
 @cfunc(GROUP, **OPTIONS, cache=True)
 def _group(words, g, y, f, want, at):  # type: ignore[no-untyped-def]
     """Fill the values of the springs of a group and their part of the rates `f`; return S."""
@@ -282,6 +309,7 @@ def _group(words, g, y, f, want, at):  # type: ignore[no-untyped-def]
         _follow(c, g, y, f, want, at)
     if want:
         derive_group(c, g, y, f)
+        _mark_one_sided(c, g)
     return c.carried[g]
 
 

@@ -267,11 +267,17 @@ def _solve(c, h, at, tol, first, last):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _is_free(c, g):  # type: ignore[no-untyped-def]
+    """Whether no dashpot acts below or above a node."""
+    return stiffness_of(c, g, True) == 0.0 and stiffness_of(c, g + 1, True) == 0.0
+
+
+@inner
 def _error(c, h, tol):  # type: ignore[no-untyped-def]
     """Return the error of a step over the tolerance.
 
-    Velocities are left out: they are not sampled, and those of vibrations that are damped out would
-    only shorten the steps.
+    Velocities of nodes without a dashpot are left out: no stress depends on them, and those of
+    vibrations that are damped out would only shorten the steps.
     """
     x, wide, n, reach = c.right, c.wide, c.carries, c.reach
     for k in range(n):
@@ -282,7 +288,7 @@ def _error(c, h, tol):  # type: ignore[no-untyped-def]
     substitute(c.systems, n, reach, c.pivots, x)
     size = 0.0
     for k in range(n):
-        if k < 2 * c.nodes and k % 2:
+        if k < 2 * c.nodes and k % 2 and _is_free(c, k // 2):
             continue
         scale = max(_scale(c, k), max(abs(c.y[k]), abs(c.y[k] + c.stage[2 * POINTS * wide + k])))
         if scale > 0.0:

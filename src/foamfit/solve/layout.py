@@ -196,7 +196,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
         "springs": count * width, "per_mass": groups, "drive": DRIVES, "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
         "common": (groups + 3) * p, "strain": count * p, "scales": SCALES + count + 2 * nodes + internals,
-        "now": RUN, "stage": STAGES * wide, "line": LINE * wide, "y": wide, "new": wide,
+        "now": RUN, "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide, "new": wide,
         "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
         "batch": BATCH * (6 + BY + MOST_OWN) + 3 * p + MOST_TERMS * (9 + p),
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,

@@ -84,7 +84,7 @@ from foamfit.springs.compiled.contract import (
 # bound on steps, length of a short implicit step, least scales of displacement, velocity, strain
 # and stress.
 SPEED, TOL, MOST, BRIEFLY, LEAST, REALS = 2, 3, 4, 5, 6, 10
-# Results of a run.
+# Results of a run; after them, for each derivative, whether it is one-sided.
 OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, STRESS_LOST = range(9)
 ENDINGS = 9
 LEAST_SHARE = 1e-6  # of the largest scale of nodes, see `_fresh_scales`
@@ -340,3 +340,5 @@ def integrate(  # type: ignore[no-untyped-def]
     endings[STEPS], endings[SWITCHES] = r[TAKEN], r[LOGGED]
     endings[STRONGEST], endings[FARTHEST], endings[DAMPED_OUT] = r[LARGEST], c.scales[OF_W], r[DAMPED]
     endings[MOTION_LOST], endings[STRESS_LOST] = c.worst[0], c.worst[1]
+    for j in range(c.p):
+        endings[ENDINGS + j] = c.sided[j]

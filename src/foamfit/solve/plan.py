@@ -34,16 +34,16 @@ MAX_STEPS = 2_000_000
 MOST_RELAXATION = 3e3  # relaxation times in the duration of the scene
 MOST_VIBRATION = 1e5  # radians of the fastest vibration in the duration
 FASTEST = 1e10  # radians above which a step that shrinks to nothing is said to be too fast
-MOST_EXPLICIT_WORK = 1_200_000  # steps times springs
+MOST_EXPLICIT_WORK, MOST_IMPLICIT_WORK = 1_200_000, 1_500_000  # steps times springs
 # Bounds on steps times springs of any solver keep runs to seconds.
 MOST_WORK = 6_000_000  # in addition to the samples of a drive
 MOST_SAMPLED = 10_000_000  # in total
 # Error of a step over the requested error.
-ALONE, IN_SERIES, OF_MASSES = 2e-3, 2e-3, 1e-3
+ALONE, IN_SERIES, OF_MASSES = 1e-3, 2e-3, 1e-3
 OF_IMPLICIT = 1e-1
 SHORT = 5e-4  # length of a short implicit step, as a share of the duration, for a truncation of 3e-8
 # Least error of a step; of vibrating masses, whose steps would not exceed rounding errors below it.
-LEAST_TOL, LEAST_OF_MASSES = 2e-14, 5e-13
+LEAST_TOL, LEAST_OF_MASSES, LEAST_VIBRATING = 2e-14, 5e-13, 5e-12  # the last of implicit steps
 # Outcomes of explicit steps after which implicit ones are tried.
 _STIFF = scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW
 LOGGED = 1024  # switches in the log of a first run; with more it is repeated
@@ -171,7 +171,7 @@ class Plan(NamedTuple):
         out = np.empty((1 + len(directions), 1 + shown, self.time.size))
         if not stiff and not len(directions) and (found := self._as_one(rows, heights, rtol, drag, out)):
             return found
-        log, endings = np.empty((logged, 5)), np.empty(loop.ENDINGS)
+        log, endings = np.empty((logged, 5)), np.empty(loop.ENDINGS + len(directions))
         given = rows, heights, directions, out, log, endings
         for degree in self._methods(stiff):
             reals = self._reals(rows, heights, rtol, drag, degree)
@@ -197,11 +197,12 @@ class Plan(NamedTuple):
 
     def _reals(self, rows: Array, heights: Array, rtol: float, drag: float, degree: int) -> Array:
         """Return the numbers that the loop over time is given; see `loop`."""
-        least = LEAST_TOL if self.margin != OF_MASSES else LEAST_OF_MASSES
+        least = LEAST_OF_MASSES if len(self.ends) > 1 else LEAST_TOL
         tol, most, brief = max(self.margin * rtol, least), self.max_steps, 0.0
         if degree:
-            tol = max(OF_IMPLICIT * self.margin * rtol, 2.0 * least)
-            most = self.max_steps // 4  # each takes longer
+            damped = bool(rows[:, 0].any())
+            tol = max(OF_IMPLICIT * self.margin * rtol, LEAST_TOL if damped else LEAST_VIBRATING)
+            most = min(most, MOST_IMPLICIT_WORK // len(heights))
             brief = self._brief(rows, heights, drag, tol)
         elif self.implicit is None:
             most = self.max_explicit
@@ -257,7 +258,7 @@ class Plan(NamedTuple):
         if not finite:
             outcome = int(outcome) if outcome != scenes.DONE else scenes.NOT_FINITE
             raise scenes.failure(outcome, self.top, self.values, loose, steps=int(steps), time=time)
-        slopes = Slopes(out[1:, 1:], out[1:, 0]) if len(out) > 1 else None
+        slopes = Slopes(out[1:, 1:], out[1:, 0], endings[loop.ENDINGS :]) if len(out) > 1 else None
         if len(log):
             log = log[: int(switches)] if switches <= len(log) else np.empty((int(switches), 5))
         else:
