@@ -88,6 +88,7 @@ class Plan(NamedTuple):
     margin: float  #: error of a step over the requested error
     max_steps: int
     max_explicit: int  #: explicit steps before implicit ones are tried
+    least: float = LEAST_VIBRATING  #: least error of an implicit step of undamped springs
     implicit: bool | None = None  #: whether steps are implicit; None: only in stiff scenes
 
     @property
@@ -201,7 +202,7 @@ class Plan(NamedTuple):
         tol, most, brief = max(self.margin * rtol, least), self.max_steps, 0.0
         if degree:
             damped = bool(rows[:, 0].any())
-            tol = max(OF_IMPLICIT * self.margin * rtol, LEAST_TOL if damped else LEAST_VIBRATING)
+            tol = max(OF_IMPLICIT * self.margin * rtol, LEAST_TOL if damped else self.least)
             most = min(most, MOST_IMPLICIT_WORK // len(heights))
             brief = self._brief(rows, heights, drag, tol)
         elif self.implicit is None:

@@ -15,6 +15,7 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.solve.plan import (
     AGGREGATE,
     CLOSED_FORM,
+    LEAST_TOL,
     MOST_WORK,
     NO_DIRECTIONS,
     RADAU,
@@ -112,7 +113,7 @@ def _verified(
         if rtol * factor < 1e-14:
             break
         try:
-            finer = run(scene, rtol * factor)
+            finer = run(scene._replace(least=LEAST_TOL), rtol * factor)
         except SimulationError:
             if scene.implicit is False:  # the last resort, see `_resolve_vibrations`
                 raise SimulationError(_UNRESOLVED.format(size=lost)) from None
