@@ -183,7 +183,7 @@ def test_a_motion_is_as_exact_as_asked_for(name: str) -> None:
         got = ff.simulate(given, drive, TIME, rtol)
         assert difference(pressed, got.base_stress) < rtol
         assert max(map(difference, moved, got.displacement)) < rtol
-        assert got.method == "Taylor series"
+        assert got.method == "Dormand-Prince"
         if not np.isnan(end):
             assert got.contact_end == pytest.approx(end, rel=rtol)
 
