@@ -178,14 +178,17 @@ def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _any_past(c, who, what):  # type: ignore[no-untyped-def]
-    """Return spring and kind of an event that has happened, other than one; -1 if there is none."""
-    if c.now[PRESSED] > 0.0 and what != RELEASE and c.carried[0] <= 0.0:
+def _any_past(c, who, what, begin):  # type: ignore[no-untyped-def]
+    """Return spring and kind of an event that has happened, other than one; -1 if there is none.
+
+    Candidates are numbered: the end of contact, then those of each spring; `begin` is the first.
+    """
+    if begin == 0 and c.now[PRESSED] > 0.0 and what != RELEASE and c.carried[0] <= 0.0:
         return c.none, RELEASE + c.none
-    for i in range(c.count):
-        for kind in range(RELEASE):
-            if not (i == who and kind == what) and _excess(c, i, kind) > 0.0:
-                return i, kind
+    for number in range(max(begin - 1, 0), RELEASE * c.count):
+        i, kind = number // RELEASE, number % RELEASE
+        if not (i == who and kind == what) and _excess(c, i, kind) > 0.0:
+            return i, kind
     return -1 + c.none, -1 + c.none
 
 
@@ -203,16 +206,17 @@ def first_event(c):  # type: ignore[no-untyped-def]
         if s[OLD_RATE] * s[RATE] <= 0.0:  # otherwise one look at the end tells
             pieces = 4
     for piece in range(1, pieces + 1):
-        found, who, what = piece / pieces, -1 + c.none, -1 + c.none
+        found, who, what, begin = piece / pieces, -1 + c.none, -1 + c.none, c.none
         look(c, found)
-        for _ in range(4 * c.count + 4):
-            i, kind = _any_past(c, who, what)
+        for _ in range(8 * c.count + 8):
+            i, kind = _any_past(c, who, what, begin)
             if i < 0:
                 break
             there = _locate(c, before, found, i, kind)
-            if who >= 0 and not there < found:
-                break
-            found, who, what = there, i, kind
+            if who >= 0 and not there < found:  # together with it, but others may be earlier
+                begin = 1 if kind == RELEASE else 2 + RELEASE * i + kind
+            else:
+                found, who, what, begin = there, i, kind, c.none
             look(c, found)
         if who >= 0:
             if what != RELEASE and c.now[PRESSED] > 0.0:
