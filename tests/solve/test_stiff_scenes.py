@@ -361,6 +361,16 @@ def test_energy_of_an_undamped_impact(name: str, speed: float) -> None:
     assert total == pytest.approx(energy["brought"][-1], rel=1e-6)
 
 
+@pytest.mark.parametrize("implicit", [True, False])
+def test_a_switch_shortly_before_the_end_of_contact_is_found(implicit: bool) -> None:
+    """Whatever the steps: a gap at the base opens in the same step as a spring leaves branch c."""
+    want, blow = case("foam-2", "impact")
+    for rtol in np.geomspace(1e-4, 1e-10, 25):
+        got = run(CHAINS["foam-2"], blow, rtol, implicit)
+        assert got.switches[:, 1:4].tolist() == [[1, 0, 1], [1, 1, 2], [1, 2, 3]]
+        assert got.contact_end == pytest.approx(want.contact_end, rel=100.0 * rtol)
+
+
 def test_samples_do_not_change_the_motion() -> None:
     scene = struck("foam-2", 1e-2)
     every = run(*scene, 1e-8)
