@@ -196,6 +196,8 @@ def _improve(c, h, column, tol):  # type: ignore[no-untyped-def]
             change = 0.0
             for e in range(SYSTEMS):
                 change += (FROM_BASIS[i, e] * c.right[e * n + place]).real
+            if not abs(change) < math.inf:  # `max` would pass over what is not a number
+                return math.inf
             moves[i * wide + one] += change
             size = max(size, abs(change) * per)
             most = max(most, abs(c.y[one] + moves[i * wide + one]) * per)
@@ -243,8 +245,11 @@ def _error(c, h, tol):  # type: ignore[no-untyped-def]
     size = 0.0
     for k in range(n):
         scale = max(c.scales[c.kinds[k]], max(abs(c.y[k]), abs(c.y[k] + c.stage[2 * POINTS * wide + k])))
+        error = abs(x[c.places[k]].real)
+        if not error < math.inf:
+            return math.inf
         if scale > 0.0:
-            size = max(size, abs(x[c.places[k]].real) / scale)
+            size = max(size, error / scale)
     return size / tol
 
 
