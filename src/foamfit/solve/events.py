@@ -48,6 +48,7 @@ from foamfit.springs.compiled.contract import (
 )  # fmt: skip
 from foamfit.springs.parameters import OWN_ETA
 
+ROUNDED = 1e-12  # strain past an end that rounding explains, of a spring that moves away from it
 RISEN = 1e-9  # base stress over the largest stress above which its return to zero ends the contact
 # Kinds of events: a branch ends at its upper or lower strain, a spring turns, contact ends.
 TOP_END, LOW_END, TURN, RELEASE = range(4)
@@ -187,7 +188,9 @@ def _any_past(c, who, what, begin):  # type: ignore[no-untyped-def]
         return c.none, RELEASE + c.none
     for number in range(max(begin - 1, 0), RELEASE * c.count):
         i, kind = number // RELEASE, number % RELEASE
-        if not (i == who and kind == what) and _excess(c, i, kind) > 0.0:
+        s, over = past(c.springs, i * c.width), _excess(c, i, kind)
+        leaves = kind < TURN and over < ROUNDED and (s[RATE] < 0.0) == (kind == TOP_END)
+        if over > 0.0 and not leaves and not (i == who and kind == what):
             return i, kind
     return -1 + c.none, -1 + c.none
 
