@@ -395,7 +395,7 @@ def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
     first, first_error = r[STEP], math.inf
     while True:
         h = r[STEP]
-        if r[NOW] + h == r[NOW] or not h > 0.0 or r[TAKEN] > most:
+        if r[NOW] + h == r[NOW] or not h > 0.0 or r[TAKEN] >= most:
             return FAILED
         r[TAKEN] += 1.0
         _guess(c, h, r[BEFORE])
