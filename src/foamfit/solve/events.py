@@ -48,6 +48,7 @@ from foamfit.springs.compiled.contract import (
 )  # fmt: skip
 from foamfit.springs.parameters import OWN_ETA
 
+ROUNDED = 1e-12  # strain past an end that rounding explains, of a spring that moves away from it
 RISEN = 1e-9  # base stress over the largest stress above which its return to zero ends the contact
 # Kinds of events: a branch ends at its upper or lower strain, a spring turns, contact ends. Then a
 # greatest and a least strain.
@@ -149,6 +150,14 @@ def _excess(c, i, kind):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _happened(c, i, kind):  # type: ignore[no-untyped-def]
+    """Whether a spring is past an end or has turned, and not by rounding while it moves away."""
+    over, rate = _excess(c, i, kind), c.springs[i * c.width + RATE]
+    leaves = kind < TURN and over < ROUNDED and (rate < 0.0) == (kind == TOP_END)
+    return over > 0.0 and not leaves
+
+
+@inner
 def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
     """Return where an excess becomes positive between two shares, by Illinois' method."""
     look(c, low)
@@ -188,7 +197,7 @@ def _earliest(c, before, share):  # type: ignore[no-untyped-def]
         look(c, found)
     for i in range(c.count):
         for kind in range(RELEASE):
-            if _excess(c, i, kind) > 0.0:
+            if _happened(c, i, kind):
                 there = _locate(c, before, found, i, kind)
                 if who < 0 or there < found:
                     found, who, what = there, i, kind

@@ -141,7 +141,7 @@ def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
         if not error <= 1.0:
             again = True
             r[STEP] = dt * (max(0.2, 0.9 * error**-0.125) if error < math.inf else 0.2)
-            if r[TAKEN] > most:
+            if r[TAKEN] >= most:
                 return FAILED
             continue
         grow = 6.0

@@ -108,7 +108,8 @@ def _follow(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
 @inner
 def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
     """Fill the strains of the springs without a dashpot on their branches."""
-    flat, rest, some, common = -1, reach, False, c.carried[g]
+    flat, rest, some = -1, reach, False
+    common = c.carried[g] if abs(c.carried[g]) < math.inf else 0.0  # after a trial that failed
     for i in range(i0, i1):
         s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
         s[OFFSET] = 0.0

@@ -197,7 +197,7 @@ def _improve(c, h, column, tol):  # type: ignore[no-untyped-def]
                 value += TO_BASIS[e, i] * (rate - EIGEN[e] * (move / h))
             x[c.places[k]] = value
         substitute(past(c.systems, e * n * (3 * reach + 1)), n, reach, past(c.pivots, e * n), x)
-    size, most, finite = 0.0, 0.0, True
+    size = most = 0.0
     for k in range(n):
         one, place = (k if column == 0 else base + k * p + column - 1), c.places[k]
         scale = max(_scale(c, k), max(abs(c.y[k]), abs(c.y[k] + moves[(POINTS - 1) * wide + k])))
@@ -206,11 +206,11 @@ def _improve(c, h, column, tol):  # type: ignore[no-untyped-def]
             change = 0.0
             for e in range(SYSTEMS):
                 change += (FROM_BASIS[i, e] * c.right[e * n + place]).real
+            if not abs(change) < math.inf:  # `max` would pass over what is not a number
+                return math.inf
             moves[i * wide + one] += change
-            size, finite = max(size, abs(change) * per), finite and abs(change) < math.inf
+            size = max(size, abs(change) * per)
             most = max(most, abs(c.y[one] + moves[i * wide + one]) * per)
-    if not finite:  # max leaves NaN out
-        return math.inf
     if column == 0:
         return size / tol
     largest = past(c.largest, column - 1)
@@ -291,8 +291,11 @@ def _error(c, h, tol):  # type: ignore[no-untyped-def]
         if k < 2 * c.nodes and k % 2 and _is_free(c, k // 2):
             continue
         scale = max(_scale(c, k), max(abs(c.y[k]), abs(c.y[k] + c.stage[2 * POINTS * wide + k])))
+        error = abs(x[c.places[k]].real)
+        if not error < math.inf:
+            return math.inf
         if scale > 0.0:
-            size = max(size, abs(x[c.places[k]].real) / scale)
+            size = max(size, error / scale)
     return size / tol
 
 
@@ -438,7 +441,7 @@ def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
     first, first_error = r[STEP], math.inf
     while True:
         h = r[STEP]
-        if r[NOW] + h == r[NOW] or not h > 0.0 or r[TAKEN] > most:
+        if r[NOW] + h == r[NOW] or not h > 0.0 or r[TAKEN] >= most:
             return FAILED
         r[TAKEN] += 1.0
         _guess(c, h, r[BEFORE])

@@ -254,7 +254,7 @@ def _begin(c, reals, mass):  # type: ignore[no-untyped-def]
     if reals[SPEED] > 0.0:
         c.y[2 * top + 1] = reals[SPEED]
         c.drive[VALUE], c.drive[GRAVITY] = c.values[0], c.values[0] / mass[top]
-        r[HORIZON] = c.time[c.samples - 1]
+        r[HORIZON] = max(c.time[c.samples - 1], 1e-300)  # a sample at contact needs a step
         approach(c, reals[SPEED])
 
 

@@ -255,7 +255,7 @@ class Plan(NamedTuple):
         """Return the result of a run as a Motion; raise SimulationError if it failed."""
         outcome, time, steps, switches = endings[:4].tolist()
         loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
-        finite = outcome == scenes.DONE and math.isfinite(float(out[0].sum()))
+        finite = outcome == scenes.DONE and bool(np.isfinite(out[0]).all())
         if not finite:
             outcome = int(outcome) if outcome != scenes.DONE else scenes.NOT_FINITE
             raise scenes.failure(outcome, self.top, self.values, loose, steps=int(steps), time=time)
@@ -293,7 +293,7 @@ class Plan(NamedTuple):
                 *_memory(layout), rows, heights, self.mass, reals, self.values, self.time, out,
                 _NO_LOG, strain, branches,
             )  # fmt: skip
-        fine = math.isfinite(float(out[0].sum()))
+        fine = bool(np.isfinite(out[0]).all())
         if fine and self.top == scenes.MOTION and not alone:
             miss = np.abs(out[0, -1] - self.values).max()
             fine = miss <= AT_MOST * (self.height + np.abs(self.values).max())
