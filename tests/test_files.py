@@ -410,7 +410,7 @@ def test_the_process_that_compiles_is_ended_too(monkeypatch: pytest.MonkeyPatch)
 
     This must also work while we wait for that process to end.
     """
-    from foamfit.solve import precompile
+    from foamfit.solve import cache, precompile
 
     begun: list[subprocess.Popen[bytes]] = []
     real = subprocess.Popen
@@ -422,11 +422,20 @@ def test_the_process_that_compiles_is_ended_too(monkeypatch: pytest.MonkeyPatch)
         return process
 
     monkeypatch.setattr(subprocess, "Popen", other)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(cache, "compiled", lambda *_: False)
+    monkeypatch.setattr(precompile, "run", lambda *_: None)
+
+    def compiles() -> None:
+        with precompile.at_first_use(announce=list) as finish:
+            signal.setitimer(signal.ITIMER_REAL, 0.1)
+            finish()
+
     before = signal.signal(signal.SIGALRM, signal.default_int_handler)
     began = time.monotonic()
     try:
-        with pytest.raises(KeyboardInterrupt), precompile.side_by_side():
-            signal.setitimer(signal.ITIMER_REAL, 0.1)
+        with pytest.raises(KeyboardInterrupt):
+            compiles()
     finally:
         signal.signal(signal.SIGALRM, before)
     assert begun[0].wait() == -signal.SIGTERM

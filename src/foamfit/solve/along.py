@@ -10,7 +10,12 @@ from __future__ import annotations
 
 import math
 
-from foamfit.solve.links import KIND, NUMBERS, PARAMETERS, change_branch, evaluate
+from numba import njit
+
+from foamfit.solve.events import change_branch
+from foamfit.solve.motion import evaluate
+from foamfit.solve.run import KIND, NUMBERS, begin_run
+from foamfit.solve.samples import row_of
 from foamfit.springs.compiled.contract import (
     BRANCH,
     BY,
@@ -20,6 +25,7 @@ from foamfit.springs.compiled.contract import (
     HIGH,
     LOW,
     OF_LAW,
+    OPTIONS,
     PER_HEIGHT,
     RELAX,
     SETTLE,
@@ -29,6 +35,7 @@ from foamfit.springs.compiled.contract import (
     call_number,
     inner,
     past,
+    start,
 )
 from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
@@ -39,7 +46,7 @@ LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the mi
 @inner
 def bring_to(c, eps):  # type: ignore[no-untyped-def]
     """Bring the spring to a strain on its branch; return the stress."""
-    s, n = past(c.springs, c.none), past(c.numbers, c.none)
+    s, n = c.springs, c.numbers
     call_number(n[SETTLE], past(s, c.row), s, eps)
     evaluate(c, c.none, int(c.p > 0))
     return s[c.results + OF_LAW]
@@ -48,7 +55,7 @@ def bring_to(c, eps):  # type: ignore[no-untyped-def]
 @inner
 def derive(c, seed, y):  # type: ignore[no-untyped-def]
     """Fill the derivatives of the stress now in `part`, and those of the strain."""
-    s, n, p = past(c.springs, c.none), past(c.numbers, c.none), c.p
+    s, n, p = c.springs, c.numbers, c.p
     out, held, part, strain = past(s, c.results), c.held, c.part, c.strain
     for j in range(p):
         own = c.directions[2 * j + 1]
@@ -88,7 +95,7 @@ def relax(c, h, tables, y, first, low, high, last, bump, d_first, d_middle):  # 
     The stress goes from `first` to `last` with the slopes `low` and `high` at the ends, and `bump`
     times 16 r² (1-r)². y contains the terms, then their derivatives.
     """
-    s, p = past(c.springs, c.none), c.p
+    s, p = c.springs, c.p
     rise = last - first
     square, cube = 3.0 * rise - 2.0 * low - high, low + high - 2.0 * rise
     square, cube, fourth = square + 16.0 * bump, cube - 32.0 * bump, 16.0 * bump
@@ -110,21 +117,21 @@ def relax(c, h, tables, y, first, low, high, last, bump, d_first, d_middle):  # 
 
 
 @inner
-def sum_up(c, y, j, out):  # type: ignore[no-untyped-def]
+def sum_up(c, y, j):  # type: ignore[no-untyped-def]
     """Write stress and derivatives of a sample, with all terms."""
-    s, p = past(c.springs, c.none), c.p
+    s, p = c.springs, c.p
     sigma = s[c.results + OF_LAW]
     total = sigma
     for q in range(p):
-        out[1 + q, 0, j] = c.common[q]
-    for k in range(c.terms):
-        g = s[RELAX + 2 * k]
-        total += g * (sigma + y[k])
-        for q in range(p):
-            out[1 + q, 0, j] += g * (c.common[q] + y[c.terms + k * p + q])
+        slope = c.common[q]
+        for k in range(c.terms):
+            slope += s[RELAX + 2 * k] * (c.common[q] + y[c.terms + k * p + q])
             if c.directions[2 * q + 1] == OWN_RELAXATION + 2 * k:
-                out[1 + q, 0, j] += sigma + y[k]
-    out[0, 0, j] = total
+                slope += sigma + y[k]
+        row_of(c, 1 + q, c.none)[j] = slope
+    for k in range(c.terms):
+        total += s[RELAX + 2 * k] * (sigma + y[k])
+    row_of(c, c.none, c.none)[j] = total
 
 
 @inner
@@ -133,7 +140,7 @@ def step_to(c, part, h, m, seed, y, tol, weight):  # type: ignore[no-untyped-def
 
     m: largest stress, tables, and room for the derivatives at the start and in the middle.
     """
-    s, p = past(c.springs, c.none), c.p
+    s, p = c.springs, c.p
     tables, d_first, d_middle = past(m, 2), past(m, 2 + c.terms * TABLE), past(m, 2 + c.terms * TABLE + p)
     out = past(s, c.results)
     origin, first, slope, x = s[EPS], out[OF_LAW], out[SLOPE], s[X]
@@ -170,7 +177,7 @@ def step_to(c, part, h, m, seed, y, tol, weight):  # type: ignore[no-untyped-def
 @inner
 def go_to(c, eps, between, m, seed, y, tol, weight):  # type: ignore[no-untyped-def]
     """Go to the strain of the next sample, `between` later, from branch to branch."""
-    s, begun, left, pace = past(c.springs, c.none), past(c.springs, c.none)[EPS], 1.0, 1.0
+    s, begun, left, pace = c.springs, c.springs[EPS], 1.0, 1.0
     while left > 0.0 or s[EPS] != eps:
         up = eps > s[EPS]
         if s[EPS] != eps and s[TURNS] * (1.0 if up else -1.0) < 0.0:
@@ -205,29 +212,41 @@ def go_to(c, eps, between, m, seed, y, tol, weight):  # type: ignore[no-untyped-
 
 
 @inner
-def follow_motion(c, strain, t, tol, seeds, m, y, out, branches, slopes):  # type: ignore[no-untyped-def]
-    """Follow the spring along strains from rest; fill stress, derivatives and branches."""
-    s, n, lasts, weight = past(c.springs, c.none), strain.size, t[-1] - t[0], 0.0
+def _first(c, eps, m, seed, y, tol, weight):  # type: ignore[no-untyped-def]
+    """Go to the strain of the first sample, where relaxation terms carry nothing."""
+    go_to(c, eps, 0.0, m, seed, y, tol, weight)
+    for k in range(c.terms):
+        y[k] = -c.springs[c.results + OF_LAW]
+        for q in range(c.p):
+            y[c.terms + k * c.p + q] = -c.common[q]
+
+
+@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
+def follow(  # type: ignore[no-untyped-def]
+    template, ints, floats, rows, heights, mass, reals, strains, time, out, log, seeds, branches,
+    slopes,
+):  # fmt: skip
+    """Follow one spring, without its dashpot, along strains from rest.
+
+    `branches` and `slopes` become those of the samples; `seeds` (n, 2) are derivatives of a shift
+    of the motion, see `plan.seeds`.
+    """
+    c = begin_run(template, ints, floats, time, strains, out, log, rows, heights, mass, reals)
+    s, t, tol, n, weight, m = c.springs, c.time, reals[3], c.samples, 0.0, c.batch
+    y = past(m, 2 + c.terms * TABLE + 2 * c.p)
+    lasts = t[n - 1] - t[0]
     for k in range(c.terms):
         weight += s[RELAX + 2 * k] * min(1.0, lasts / s[RELAX + 2 * k + 1])
         m[2 + k * TABLE + OF_STEP] = -1.0
-    m[0] = 0.0
     bring_to(c, 0.0)
-    derive(c, past(seeds, c.none), y)
+    derive(c, start(seeds), y)
     for j in range(n):
-        seed = past(seeds, 2 * j)
+        seed, eps = past(start(seeds), 2 * j), c.values[j]
         if j == 0:
-            terms_of = c.terms * (1 + c.p)
-            for k in range(terms_of):
-                y[k] = 0.0
-            go_to(c, strain[j], 0.0, m, seed, y, tol, weight)
-            for k in range(c.terms):  # q = 0 at the first sample
-                y[k] = -s[c.results + OF_LAW]
-                for q in range(c.p):
-                    y[c.terms + k * c.p + q] = -c.common[q]
+            _first(c, eps, m, seed, y, tol, weight)
         else:
-            go_to(c, strain[j], t[j] - t[j - 1], m, seed, y, tol, weight)
-        sum_up(c, y, j, out)
+            go_to(c, eps, t[j] - t[j - 1], m, seed, y, tol, weight)
+        sum_up(c, y, j)
         branches[j], slopes[j] = int(s[BRANCH]), s[c.results + SLOPE]
         if not m[0] < math.inf:
             for k in range(j, n):

@@ -16,10 +16,10 @@ FOLDERS = ("springs", "solve")  # subfolders with compiled loops
 
 def _caches() -> set[Path]:
     """Return numba's cache folders of this package, one for each folder with compiled loops."""
-    from foamfit.solve import runs
+    from foamfit.solve import loop
     from foamfit.springs.compiled import bistable
 
-    loops: tuple[Any, ...] = (runs.integrate, bistable.fill)
+    loops: tuple[Any, ...] = (loop.integrate, bistable.fill)
     return {Path(loop.stats.cache_path or ".") for loop in loops}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from foamfit.solve.run import KIND, NUMBERS
 from foamfit.springs.compiled.contract import (
     BY_STRESS,
     EPS,
@@ -19,11 +20,6 @@ from foamfit.springs.compiled.contract import (
     past,
 )
 
-# Integers of a spring: the addresses of its law, kind, number of parameters and of internal
-# variables; and the places of strain, internal variables and relaxation terms in the state (-1:
-# none); and whether
-# the derivatives of its internal variables are those at a fixed strain.
-KIND, PARAMETERS, INTERNALS, EPS_AT, X_AT, Z_AT, FIXED, NUMBERS = 5, 6, 7, 8, 9, 10, 11, 12
 LEAST = 1e-6  # strain to whose rounding error elongations are always resolved
 
 

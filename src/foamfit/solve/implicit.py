@@ -13,51 +13,33 @@ steps then grow up to a floor regardless of their error, and the vibration is da
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
-
 import numpy as np
 from numba import cfunc
 
-from foamfit.solve.equilibrium import EPS_AT, INTERNALS, KIND, NUMBERS, X_AT, Z_AT
-from foamfit.solve.explicit import (
+from foamfit.solve.events import DOUBTFUL, FAILED, SAMPLED, STEPPING, suspicious
+from foamfit.solve.motion import rates
+from foamfit.solve.run import (
     BEFORE,
-    BEGUN,
     BRIEF,
     DAMPED,
     DAMPING,
-    DOUBTFUL,
-    FAILED,
+    DRAGGED,
     FLOOR,
     GROW,
     HORIZON,
     IN_ROW,
     NOW,
-    PRESSED,
-    SAMPLED,
-    STAGES,
+    OF_V,
+    OF_W,
+    POINTS,
     STEP,
-    STEPPING,
+    STEPPED,
+    SYSTEMS,
     TAKEN,
-    suspicious,
-    unpack_work,
+    unpack,
 )
-from foamfit.solve.links import DRAGGED, rates, unpack
 from foamfit.solve.scene import FREE, STRESS, VISCOUS
-from foamfit.springs.compiled.contract import (
-    ETA,
-    GAIN,
-    HEIGHT,
-    INTERNAL,
-    OPTIONS,
-    TANGENT,
-    complexes_at,
-    floats_at,
-    inner,
-    past,
-)
-
-POINTS = 5
-
+from foamfit.springs.compiled.contract import ETA, GAIN, HEIGHT, OPTIONS, TANGENT, inner, past
 
 def _radau() -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes c and the matrix A of the method."""
@@ -78,7 +60,7 @@ _kept = [int(np.argmin(np.abs(_values.imag)))] + [
     int(k) for k in np.argsort(_values.imag) if _values[k].imag > 1e-9
 ]
 EIGEN = np.array(_values[_kept])  # one of each pair
-SYSTEMS = len(_kept)
+assert len(_kept) == SYSTEMS
 TO_BASIS = np.ascontiguousarray(np.linalg.inv(_vectors)[_kept])
 FROM_BASIS = np.ascontiguousarray(_vectors[:, _kept] * np.where(np.abs(EIGEN.imag) > 1e-9, 2.0, 1.0))
 # Coefficients 1 … 5 of the polynomial over the step [0, 1], from increments at the points.
@@ -94,49 +76,10 @@ FOLLOW_LIMIT = 600  # number of short steps in a row that are taken
 TURNS_OF_NEWTON = 12
 # Newton's method ends at changes of ENOUGH over the tolerance, of derivatives at ENOUGH/OF_TANGENTS: as
 # they obey linear equations, the next change is smaller by the error of the matrices.
-ENOUGH, OF_TANGENTS = 1e-3, 1e3
-
-
-class Systems(NamedTuple):
-    """The linear systems of a step: pointers."""
-
-    systems: Any  #: factored, complex, SYSTEMS of n rows of 3 reach + 1
-    right: Any  #: their right sides, complex, SYSTEMS of n
-    jacobian: Any  #: n rows of 2 reach + 1
-    pivots: Any  #: SYSTEMS of n integers
-    places: Any  #: of the components in the systems
-    groups_of: Any  #: groups of the components
-    reach: int  #: see `order_state`
-    alive: Any  #: vibrations, see `remember`, (groups, 2)
-    worst: Any  #: the largest motion and stress at a sample
-    largest: Any  #: values of the derivatives, over the scales, (p,)
+ENOUGH, OF_TANGENTS = 1e-3, 1e6
 
 
 # ---------------------------------------------------------------- banded systems
-
-
-@inner
-def order_state(c, places, groups_of):  # type: ignore[no-untyped-def]
-    """Order the components by groups: fill place and group of each; return size and reach.
-
-    Components couple with those of the neighbouring groups: at places closer than the reach.
-    """
-    at, most, before = c.none, c.none, c.none
-    for g in range(c.groups):
-        first = at
-        if g < c.nodes:
-            for k in range(2):
-                places[2 * g + k], groups_of[2 * g + k], at = at, g, at + 1
-        for i in range(c.ends[g - 1] if g > 0 else c.none, c.ends[g]):
-            n = past(c.numbers, i * NUMBERS)
-            if n[EPS_AT] >= 0:
-                places[n[EPS_AT]], groups_of[n[EPS_AT]], at = at, g, at + 1
-            inside = n[INTERNALS] if n[KIND] == INTERNAL else c.none
-            for k in range(c.terms + inside):
-                one = n[Z_AT] + k if k < c.terms else n[X_AT] + k - c.terms
-                places[one], groups_of[one], at = at, g, at + 1
-        most, before = max(most, at - first + before), at - first
-    return at, most - 1
 
 
 @inner
@@ -186,15 +129,23 @@ def substitute(a, n, reach, pivots, x):  # type: ignore[no-untyped-def]
 
 
 @inner
-def linearise(c, m, at, n, reach, work, jacobian):  # type: ignore[no-untyped-def]
+def _scale(c, k):  # type: ignore[no-untyped-def]
+    """Return the scale of a component; that of a node is shared, as fast vibrations are not resolved."""
+    if k < 2 * c.nodes:
+        return c.scales[OF_V if k % 2 else OF_W]
+    return c.scales[c.kinds[k]]
+
+
+@inner
+def linearise(c, at):  # type: ignore[no-untyped-def]
     """Fill the derivatives of the rates by the state, by differences, in bands of 2 reach + 1."""
-    places, groups_of = work.places, work.groups_of
-    y, f0, f1, wide = m.y, m.f, m.state, 2 * reach + 1
+    places, groups_of, n, reach, jacobian = c.places, c.groups_of, c.carries, c.reach, c.jacobian
+    y, f0, f1, wide = c.y, c.f, c.state, 2 * reach + 1
     for k in range(n * wide):
         jacobian[k] = 0.0
     rates(c, y, f0, c.none, at)
     for one in range(n):
-        step = 1e-8 * max(abs(y[one]), m.scales[m.kinds[one]])
+        step = 1e-8 * max(abs(y[one]), _scale(c, one))
         if step == 0.0:
             step = 1e-12
         kept = y[one]
@@ -210,14 +161,15 @@ def linearise(c, m, at, n, reach, work, jacobian):  # type: ignore[no-untyped-de
 
 
 @inner
-def prepare(n, reach, h, work):  # type: ignore[no-untyped-def]
+def prepare(c, h):  # type: ignore[no-untyped-def]
     """Factor the systems of a step of length h; false if one is singular."""
+    n, reach, jacobian = c.carries, c.reach, c.jacobian
     wide, narrow = 3 * reach + 1, 2 * reach + 1
     for e in range(SYSTEMS):
-        a, pivots = past(work.systems, e * n * wide), past(work.pivots, e * n)
+        a, pivots = past(c.systems, e * n * wide), past(c.pivots, e * n)
         for i in range(n):
             for j in range(wide):
-                a[i * wide + j] = complex(-work.jacobian[i * narrow + j], 0.0) if j < narrow else 0j
+                a[i * wide + j] = complex(-jacobian[i * narrow + j], 0.0) if j < narrow else 0j
             a[i * wide + reach] += EIGEN[e] / h
         if not factor(a, n, reach, pivots):
             return False
@@ -228,56 +180,82 @@ def prepare(n, reach, h, work):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _improve(c, m, n, reach, h, column, tol, work):  # type: ignore[no-untyped-def]
+def _improve(c, h, column, tol):  # type: ignore[no-untyped-def]
     """Take one step of Newton's method for the state (column 0) or a derivative; return its size.
 
     Sizes are relative to the scales, for derivatives also to the largest value so far.
     """
-    wide, base, p = m.wide, c.base, c.p
-    rates_at, moves = past(m.stage, wide), past(m.stage, (POINTS + 1) * wide)
+    wide, base, p, n, reach = c.wide, c.base, c.p, c.carries, c.reach
+    rates_at, moves = past(c.stage, wide), past(c.stage, (POINTS + 1) * wide)
     for e in range(SYSTEMS):
-        x = past(work.right, e * n)
+        x = past(c.right, e * n)
         for k in range(n):
             one = k if column == 0 else base + k * p + column - 1
             value = 0j
             for i in range(POINTS):
                 rate, move = rates_at[i * wide + one], moves[i * wide + one]
                 value += TO_BASIS[e, i] * (rate - EIGEN[e] * (move / h))
-            x[work.places[k]] = value
-        substitute(past(work.systems, e * n * (3 * reach + 1)), n, reach, past(work.pivots, e * n), x)
+            x[c.places[k]] = value
+        substitute(past(c.systems, e * n * (3 * reach + 1)), n, reach, past(c.pivots, e * n), x)
     size = most = 0.0
     for k in range(n):
-        one, place = (k if column == 0 else base + k * p + column - 1), work.places[k]
-        scale = max(m.scales[m.kinds[k]], max(abs(m.y[k]), abs(m.y[k] + moves[(POINTS - 1) * wide + k])))
+        one, place = (k if column == 0 else base + k * p + column - 1), c.places[k]
+        scale = max(_scale(c, k), max(abs(c.y[k]), abs(c.y[k] + moves[(POINTS - 1) * wide + k])))
         per = 1.0 / scale if scale > 0.0 else 0.0
         for i in range(POINTS):
             change = 0.0
             for e in range(SYSTEMS):
-                change += (FROM_BASIS[i, e] * work.right[e * n + place]).real
+                change += (FROM_BASIS[i, e] * c.right[e * n + place]).real
+            if not abs(change) < math.inf:  # `max` would pass over what is not a number
+                return math.inf
             moves[i * wide + one] += change
             size = max(size, abs(change) * per)
-            most = max(most, abs(m.y[one] + moves[i * wide + one]) * per)
+            most = max(most, abs(c.y[one] + moves[i * wide + one]) * per)
     if column == 0:
         return size / tol
-    largest = past(work.largest, column - 1)
+    largest = past(c.largest, column - 1)
     largest[0] = most = max(most, largest[0])
     return OF_TANGENTS * size / most if most > 0.0 else 0.0
 
 
 @inner
-def _collocate(c, m, n, reach, h, at, tol, want, work):  # type: ignore[no-untyped-def]
-    """Solve one step by Newton's method from the guess in its increments; false if it fails."""
-    wide, before = m.wide, math.inf
+def _collocate(c, h, at, tol, want):  # type: ignore[no-untyped-def]
+    """Solve one step by Newton's method from the guess in its increments; false if it fails.
+
+    The state is solved first, and from the same values of the springs whether derivatives are
+    wanted or not, so that it does not depend on them.
+    """
+    if not _solve(c, h, at, tol, c.none, c.none + 1):
+        return False
+    if not want:
+        return True
+    size, groups = c.count * c.width, c.groups
+    for k in range(size):
+        c.kept[k] = c.springs[k]
+    for g in range(groups):
+        c.kept[size + g] = c.carried[g]
+    solved = _solve(c, h, at, tol, c.none + 1, 1 + c.p)
+    for k in range(size):
+        c.springs[k] = c.kept[k]
+    for g in range(groups):
+        c.carried[g] = c.kept[size + g]
+    return solved
+
+
+@inner
+def _solve(c, h, at, tol, first, last):  # type: ignore[no-untyped-def]
+    """Solve for the state (column 0) or for the derivatives (columns from 1 on)."""
+    wide, before, y, state = c.wide, math.inf, c.y, c.state
     total = c.base + c.carries * c.p
-    moves = past(m.stage, (POINTS + 1) * wide)
+    moves = past(c.stage, (POINTS + 1) * wide)
     for turn in range(TURNS_OF_NEWTON):
         for i in range(POINTS):
             for k in range(total):
-                m.state[k] = m.y[k] + moves[i * wide + k]
-            rates(c, m.state, past(m.stage, (1 + i) * wide), want, at + NODES[i] * h)
-        size = _improve(c, m, n, reach, h, 0, tol, work)
-        for column in range(1, 1 + c.p):
-            size = max(size, _improve(c, m, n, reach, h, column, tol, work))
+                state[k] = y[k] + moves[i * wide + k]
+            rates(c, state, past(c.stage, (1 + i) * wide), first, at + NODES[i] * h)
+        size = 0.0
+        for column in range(first, last):
+            size = max(size, _improve(c, h, column, tol))
         if not size < math.inf:
             return False
         if size <= ENOUGH or (turn > 1 and size > 0.3 * before and size <= 0.03):
@@ -289,54 +267,69 @@ def _collocate(c, m, n, reach, h, at, tol, want, work):  # type: ignore[no-untyp
 
 
 @inner
-def _error(c, m, n, reach, h, tol, work):  # type: ignore[no-untyped-def]
-    """Return the error of a step over the tolerance."""
-    x, wide = work.right, m.wide
+def _is_free(c, g):  # type: ignore[no-untyped-def]
+    """Whether no dashpot acts below or above a node."""
+    return stiffness_of(c, g, True) == 0.0 and stiffness_of(c, g + 1, True) == 0.0
+
+
+@inner
+def _error(c, h, tol):  # type: ignore[no-untyped-def]
+    """Return the error of a step over the tolerance.
+
+    Velocities of nodes without a dashpot are left out: no stress depends on them, and those of
+    vibrations that are damped out would only shorten the steps.
+    """
+    x, wide, n, reach = c.right, c.wide, c.carries, c.reach
     for k in range(n):
-        value = m.stage[k]
+        value = c.stage[k]
         for i in range(POINTS):
-            value += OF_ERROR[i] * m.stage[(POINTS + 1 + i) * wide + k] / h
-        x[work.places[k]] = complex(value, 0.0)
-    substitute(work.systems, n, reach, work.pivots, x)
+            value += OF_ERROR[i] * c.stage[(POINTS + 1 + i) * wide + k] / h
+        x[c.places[k]] = complex(value, 0.0)
+    substitute(c.systems, n, reach, c.pivots, x)
     size = 0.0
     for k in range(n):
-        scale = max(m.scales[m.kinds[k]], max(abs(m.y[k]), abs(m.y[k] + m.stage[2 * POINTS * wide + k])))
+        if k < 2 * c.nodes and k % 2 and _is_free(c, k // 2):
+            continue
+        scale = max(_scale(c, k), max(abs(c.y[k]), abs(c.y[k] + c.stage[2 * POINTS * wide + k])))
+        error = abs(x[c.places[k]].real)
+        if not error < math.inf:
+            return math.inf
         if scale > 0.0:
-            size = max(size, abs(x[work.places[k]].real) / scale)
+            size = max(size, error / scale)
     return size / tol
 
 
 @inner
-def _finish(c, m, h, at, want):  # type: ignore[no-untyped-def]
+def _finish(c, h, at, want):  # type: ignore[no-untyped-def]
     """Fill the polynomial of a step, and state and rates at its end."""
-    wide, total = m.wide, c.base + c.carries * c.p
+    wide, total = c.wide, c.base + c.carries * c.p
     for q in range(POINTS):
         for k in range(total):
             value = 0.0
             for i in range(POINTS):
-                value += COEFFICIENTS[q, i] * m.stage[(POINTS + 1 + i) * wide + k]
-            m.line[q * wide + k] = value
+                value += COEFFICIENTS[q, i] * c.stage[(POINTS + 1 + i) * wide + k]
+            c.line[q * wide + k] = value
     for k in range(total):
-        m.new[k] = m.y[k] + m.stage[2 * POINTS * wide + k]
-    rates(c, m.new, past(m.stage, STAGES * wide), want, at + h)
+        c.new[k] = c.y[k] + c.stage[2 * POINTS * wide + k]
+    rates(c, c.new, past(c.stage, STEPPED * wide), want, at + h)
 
 
 @inner
-def _guess(c, m, h, last):  # type: ignore[no-untyped-def]
+def _guess(c, h, last):  # type: ignore[no-untyped-def]
     """Extrapolate the polynomial of the step before, of length `last` (0: none)."""
-    wide, total = m.wide, c.base + c.carries * c.p
+    wide, total = c.wide, c.base + c.carries * c.p
     for i in range(POINTS):
-        move = past(m.stage, (POINTS + 1 + i) * wide)
+        move = past(c.stage, (POINTS + 1 + i) * wide)
         if not 0.0 < h <= 2.0 * last:
             for k in range(total):
-                move[k] = NODES[i] * h * m.stage[k] if last < 0.0 else 0.0
+                move[k] = NODES[i] * h * c.stage[k] if last < 0.0 else 0.0
             continue
         x = 1.0 + NODES[i] * h / last
         for k in range(total):
             value = whole = 0.0
             for q in range(POINTS - 1, -1, -1):
-                value = (value + m.line[q * wide + k]) * x
-                whole += m.line[q * wide + k]
+                value = (value + c.line[q * wide + k]) * x
+                whole += c.line[q * wide + k]
             move[k] = value - whole
 
 
@@ -368,7 +361,7 @@ def is_unresolved(c, span):  # type: ignore[no-untyped-def]
 
 
 @inner
-def remember(c, m, span, wait, alive, worst):  # type: ignore[no-untyped-def]
+def remember(c, span, wait):  # type: ignore[no-untyped-def]
     """Add the vibrations that a step was too long to resolve to those the response lacks.
 
     A mass whose velocity differs by δv from the initial velocity of the step's polynomial then
@@ -379,6 +372,7 @@ def remember(c, m, span, wait, alive, worst):  # type: ignore[no-untyped-def]
     first sample that may show it.
     """
     motion = stress = 0.0
+    alive, worst = c.alive, c.worst
     row = math.sin(0.5 * math.pi / max(c.nodes, 2))
     for g in range(c.nodes):
         below, above = stiffness_of(c, g, False), stiffness_of(c, g + 1, False)
@@ -390,7 +384,7 @@ def remember(c, m, span, wait, alive, worst):  # type: ignore[no-untyped-def]
             continue
         started = 0.0
         if own * span > 2.0 and fade < own:
-            started = abs(m.line[2 * g] - span * m.y[2 * g + 1]) / span / root
+            started = abs(c.line[2 * g] - span * c.y[2 * g + 1]) / span / root
             slow = fade * min(max(2.0 * row * row, 4.0 / (own * span) ** 2), 1.0)
             lasting = alive[2 * g] > 1e-3 * started
             alive[2 * g + 1] = min(slow, alive[2 * g + 1]) if lasting else slow
@@ -407,12 +401,12 @@ def remember(c, m, span, wait, alive, worst):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _allowed(c, m, h, excess, tol, rounded):  # type: ignore[no-untyped-def]
+def _allowed(c, h, excess, tol, rounded):  # type: ignore[no-untyped-def]
     """Return the length to use for a step with this error over the tolerance: h to accept it.
 
     An excessive error is accepted if rounding dominates it or if no shorter step is resolved.
     """
-    r = m.run
+    r = c.now
     if not excess < math.inf:
         return 0.3 * h
     factor, floor = 0.9 * max(excess, 1e-12) ** (-1.0 / 6.0), max(r[FLOOR], 1e-15 * abs(r[NOW]))
@@ -438,57 +432,36 @@ def _allowed(c, m, h, excess, tol, rounded):  # type: ignore[no-untyped-def]
     return h
 
 
-@inner
-def systems_of(c, words):  # type: ignore[no-untyped-def]
-    """Return the systems of a run; their words contain 3 addresses, reach, and integers.
-
-    At the first step, which finds a reach of zero, the components are ordered.
-    """
-    n = c.carries
-    pivots = past(words, 4)
-    places, groups_of = past(pivots, SYSTEMS * n), past(pivots, (SYSTEMS + 1) * n)
-    if words[3] == 0:
-        words[3] = order_state(c, places, groups_of)[1]
-    reach = words[3]
-    jacobian, alive = floats_at(words[1]), floats_at(words[2])
-    worst, right = past(alive, 2 * c.groups), complexes_at(words[0])
-    return Systems(
-        past(right, SYSTEMS * n), right, jacobian, pivots, places, groups_of, reach, alive, worst,
-        past(worst, 2),
-    )  # fmt: skip
-
-
 @cfunc(STEPPING, **OPTIONS, cache=True)
-def _step(words, of_work, want, tol, upto, most, of_systems):  # type: ignore[no-untyped-def]
+def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
     """Take one implicit step, shorter ones until it is accurate; return how it ended."""
-    c, m = unpack(words), unpack_work(of_work)
-    work = systems_of(c, of_systems)
-    r, at, reach = m.run, m.run[NOW], work.reach
-    linearise(c, m, at, c.carries, reach, work, work.jacobian)
+    c = unpack(words)
+    r, at = c.now, c.now[NOW]
+    linearise(c, at)
     first, first_error = r[STEP], math.inf
     while True:
         h = r[STEP]
-        if r[NOW] + h == r[NOW] or not h > 0.0 or r[TAKEN] > most:
+        if r[NOW] + h == r[NOW] or not h > 0.0 or r[TAKEN] >= most:
             return FAILED
         r[TAKEN] += 1.0
-        _guess(c, m, h, r[BEFORE])
-        solved = prepare(c.carries, reach, h, work)
-        if not (solved and _collocate(c, m, c.carries, reach, h, at, tol, want, work)):
+        _guess(c, h, r[BEFORE])
+        solved = prepare(c, h)
+        if not (solved and _collocate(c, h, at, tol, want)):
             r[STEP], r[BEFORE] = 0.3 * h, 0.0
             continue
-        excess = _error(c, m, c.carries, reach, h, tol, work)
+        excess = _error(c, h, tol)
         if first_error == math.inf:
             first, first_error = h, excess
         rounded = h <= 1e-6 * first and excess > 0.3 * first_error
-        allowed = _allowed(c, m, h, excess, tol, rounded)
+        allowed = _allowed(c, h, excess, tol, rounded)
         if allowed < h:
             r[STEP] = allowed
             continue
         break
-    _finish(c, m, h, at, want)
-    remember(c, m, h, max(upto - r[NOW], 0.0) if upto < math.inf else h, work.alive, work.worst)
+    _finish(c, h, at, want)
+    remember(c, h, max(upto - r[NOW], 0.0) if upto < math.inf else h)
     r[BEFORE] = h
-    return DOUBTFUL if suspicious(c, h, r[PRESSED] > 0.0) else SAMPLED
+    return DOUBTFUL if suspicious(c, h) else SAMPLED
 
 
 IMPLICIT_STEP = _step.address

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve import cache, explicit, links, rates, runs
+from foamfit.solve import along, cache, loop, rates, static
 from foamfit.solve import scene as scenes
+from foamfit.solve.layout import Layout, Shape, lay_out
+from foamfit.solve.run import POINTS
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
 from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
+from foamfit.springs.laws.record import Law
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled
-from foamfit.springs.compiled.contract import INTERNAL, RESULTS, TINY, Compiled, results_of
+from foamfit.springs.compiled.contract import INTERNAL, Compiled
 from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT
 from foamfit.springs.spring import as_samples
 
@@ -30,38 +33,37 @@ MAX_STEPS = 2_000_000
 # Implicit steps replace explicit ones above these limits.
 MOST_RELAXATION = 3e3  # relaxation times in the duration of the scene
 MOST_VIBRATION = 1e5  # radians of the fastest vibration in the duration
-MOST_EXPLICIT_WORK = 300_000  # steps times springs
+FASTEST = 1e10  # radians above which a step that shrinks to nothing is said to be too fast
+MOST_EXPLICIT_WORK, MOST_IMPLICIT_WORK = 1_200_000, 1_500_000  # steps times springs
 # Bounds on steps times springs of any solver keep runs to seconds.
-MOST_WORK = 1_500_000  # in addition to the samples of a drive
+MOST_WORK = 6_000_000  # in addition to the samples of a drive
 MOST_SAMPLED = 10_000_000  # in total
 # Error of a step over the requested error.
-ALONE, IN_SERIES, OF_MASSES = 0.1, 1e-2, 1e-3
+ALONE, IN_SERIES, OF_MASSES = 1e-3, 2e-3, 1e-3
 OF_IMPLICIT = 1e-1
 SHORT = 5e-4  # length of a short implicit step, as a share of the duration, for a truncation of 3e-8
-LEAST_TOL = 2e-14
+# Least error of a step; of vibrating masses, whose steps would not exceed rounding errors below it.
+LEAST_TOL, LEAST_OF_MASSES, LEAST_VIBRATING = 2e-14, 5e-13, 5e-12  # the last of implicit steps
+# Outcomes of explicit steps after which implicit ones are tried.
+_STIFF = scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW
 LOGGED = 1024  # switches in the log of a first run; with more it is repeated
 AT_MOST = 1e-9  # error of an elongation over the height
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
-_NOTHING, _NO_SYSTEMS = np.zeros(1), np.zeros(4, np.int64)
+_NOTHING, _NO_LOG = np.zeros(1), np.empty((0, 5))
 
 
 class Laws(NamedTuple):
     """The laws of a chain as the solver takes them."""
 
-    table: NDArray[np.int64]  #: addresses, kind, parameters and internal variables, (springs, 8)
+    records: tuple[Law, ...]
     made: tuple[Compiled, ...]
-    results: int  #: numbers that a law returns at most
-    internals: int
     loose: tuple[int, ...]  #: numbers of the unilateral springs
 
 
 def _laws(chain: Chain) -> Laws:
-    made = tuple(compiled(law) for law in chain.laws)
-    table = np.array([(*one.addresses, one.kind, one.derivatives, one.internal) for one in made])
-    results = max(results_of(one.derivatives, one.internal) for one in made)
     loose = tuple(i + 1 for i, law in enumerate(chain.laws) if law.kind == "unilateral")
-    return Laws(table, made, results, sum(one.internal for one in made), loose)
+    return Laws(chain.laws, tuple(compiled(law) for law in chain.laws), loose)
 
 
 class Plan(NamedTuple):
@@ -74,7 +76,7 @@ class Plan(NamedTuple):
     laws: Laws
     terms: int  #: number of relaxation terms in a row
     height: float  #: H, m
-    ends: NDArray[np.int64]  #: one past the last spring of each group, (groups,)
+    ends: tuple[int, ...]  #: one past the last spring of each group
     mass: Array  #: areal masses of the nodes, m/A, kg/m², (groups,)
     drag: float  #: onsite damping of the top, η_site/H, Pa·s/m
     top: int  #: FREE, VISCOUS, STRESS or MOTION
@@ -86,6 +88,7 @@ class Plan(NamedTuple):
     margin: float  #: error of a step over the requested error
     max_steps: int
     max_explicit: int  #: explicit steps before implicit ones are tried
+    least: float = LEAST_VIBRATING  #: least error of an implicit step of undamped springs
     implicit: bool | None = None  #: whether steps are implicit; None: only in stiff scenes
 
     @property
@@ -121,28 +124,17 @@ class Plan(NamedTuple):
 
     # ------------------------------------------------------------------ arrays of the solver
 
-    def _packed(
-        self, rows: Array, heights: Array, drag: float, tol: float, most: int,
-        directions: Directions, nodes: int,
-    ) -> list[Any]:  # fmt: skip
-        """Return the arguments that all compiled runs have in common, `out` last."""
-        count, groups, p, terms = len(heights), len(self.ends), len(directions), self.terms
-        row = RESULTS + self.laws.results
-        width = row + rows.shape[1] - 1 - 2 * terms
-        sizes = (
-            count, groups, p, terms, self.top, nodes, RESULTS, row, width, links.RATES,
-            links.CHANGE, explicit.EXPLICIT_STEP, 0,
+    def _layout(
+        self, rows: Array, directions: Directions, degree: int = 0, integrated: bool = True
+    ) -> Layout:
+        """Return where everything of a run lies."""
+        damped = (rows[:, 0] > 0.0).tobytes()
+        solved = degree > 0 or not integrated
+        shape = Shape(
+            self.laws.records, self.terms, self.ends, self.top, damped, directions.tobytes(),
+            self.speed > 0.0, degree, solved,
         )  # fmt: skip
-        reals = np.array((drag, self.speed, tol, most, 1.0, 0.0))
-        return [
-            np.array(sizes), self.laws.table, self.ends, directions, rows, heights, self.mass, reals,
-            self.values, self.time, np.empty((1 + p, 1 + nodes, self.time.size)),
-        ]  # fmt: skip
-
-    def _room(self, packed: list[Any]) -> tuple[NDArray[np.int64], Array]:
-        """Return the integers and floats of a run."""
-        floats, integers = runs.room(tuple(packed[0].tolist()), self.laws.internals)
-        return np.empty(integers, np.int64), np.empty(floats)
+        return lay_out(shape, integrated)
 
     def slopes_of(self, rows: Array) -> tuple[Array, Array]:
         """Return the slopes dσ/dε (Pa) of the springs at rest, and the steepest at zero stress."""
@@ -176,36 +168,60 @@ class Plan(NamedTuple):
         if self.implicit is None and (drag or len(self.ends) > 1 or rows[:, 0].any()):
             vibrates, relaxes = self.fastest_rates(rows, heights, drag)
             stiff = vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION
-        nodes = len(heights) if everything else 1
-        tol = max((OF_IMPLICIT if stiff else 1.0) * self.margin * rtol, LEAST_TOL)
-        most = self.max_explicit if self.implicit is None and not stiff else self.max_steps
-        packed = self._packed(rows, heights, drag, tol, most, directions, nodes)
-        if not stiff and not len(directions) and (found := self._as_one(rows, heights, rtol, packed)):
+        shown = len(heights) if everything else 1
+        out = np.empty((1 + len(directions), 1 + shown, self.time.size))
+        if not stiff and not len(directions) and (found := self._as_one(rows, heights, rtol, drag, out)):
             return found
-        log, endings = np.empty((logged, 5)), np.zeros(runs.ENDINGS)
-        scales = self._scales(rows, heights)
-        lost = 0.0
-        if not stiff:
-            cache.announce(runs.integrate, "the solver")
-            runs.integrate(*packed, log, *self._room(packed), scales, endings, _NO_SYSTEMS)
-            failed = int(endings[runs.OUTCOME])
-            stiff = self.implicit is None and failed in (
-                scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW
-            )  # fmt: skip
-        method = EXPLICIT_STEPS
-        if stiff:
-            from foamfit.solve import implicit
+        log, endings = np.empty((logged, 5)), np.empty(loop.ENDINGS + len(directions))
+        given = rows, heights, directions, out, log, endings
+        for degree in self._methods(stiff):
+            reals = self._reals(rows, heights, rtol, drag, degree)
+            self._integrate(*given, reals, degree)
+            if endings[loop.OUTCOME] not in _STIFF:
+                break
+        fastest = max(self.fastest_rates(rows, heights, drag))
+        if endings[loop.OUTCOME] == scenes.STEP_UNDERFLOW and fastest > FASTEST:
+            endings[loop.OUTCOME] = scenes.TOO_FAST
+        lost = _lost(endings) if degree else 0.0
+        return self._motion(out, RADAU if degree else EXPLICIT_STEPS, endings, log, rows, lost)
 
-            method, tol = RADAU, max(OF_IMPLICIT * self.margin * rtol, LEAST_TOL)
-            packed[0][runs.STEP_OF : runs.STEP_OF + 2] = implicit.IMPLICIT_STEP, implicit.POINTS
-            packed[7][2:4], packed[7][5] = (tol, self.max_steps), self._brief(rows, heights, drag, tol)
-            *kept, words = self._systems(heights, len(directions))
-            runs.integrate(*packed, log, *self._room(packed), scales, endings, words)
-            lost = _lost(kept[2][2 * len(self.ends) :], endings)
-        return self._motion(packed[-1], method, endings, log, rows, lost)
+    def _methods(self, stiff: bool) -> tuple[int, ...]:
+        """Return the degrees of the methods to try: 0 for explicit steps.
+
+        Where explicit steps may take as many as all, implicit ones are not tried after them.
+        """
+        if self.implicit is not None:
+            return (POINTS,) if self.implicit else (0,)
+        if stiff:
+            return POINTS, 0
+        return (0, POINTS) if self.max_explicit < self.max_steps else (0,)
+
+    def _reals(self, rows: Array, heights: Array, rtol: float, drag: float, degree: int) -> Array:
+        """Return the numbers that the loop over time is given; see `loop`."""
+        least = LEAST_OF_MASSES if len(self.ends) > 1 else LEAST_TOL
+        tol, most, brief = max(self.margin * rtol, least), self.max_steps, 0.0
+        if degree:
+            damped = bool(rows[:, 0].any())
+            tol = max(OF_IMPLICIT * self.margin * rtol, LEAST_TOL if damped else self.least)
+            most = min(most, MOST_IMPLICIT_WORK // len(heights))
+            brief = self._brief(rows, heights, drag, tol)
+        elif self.implicit is None:
+            most = self.max_explicit
+        scales = self._scales(rows, heights)
+        return np.array((drag, 1.0, self.speed, tol, most, brief, *scales))
+
+    def _integrate(
+        self, rows: Array, heights: Array, directions: Directions, out: Array, log: Array,
+        endings: Array, reals: Array, degree: int,
+    ) -> None:  # fmt: skip
+        """Run the loop over time, with implicit steps if `degree` is that of their polynomial."""
+        cache.announce(loop.integrate, "the solver")
+        layout = self._layout(rows, directions, degree)
+        drive = self.mass, reals, self.values, self.time
+        loop.integrate(*_memory(layout), rows, heights, *drive, out, log, endings)
 
     def _as_one(
-        self, rows: Array, heights: Array, rtol: float, packed: list[Any]
+        self, rows: Array, heights: Array, rtol: float, drag: float, out: Array
     ) -> Motion | None:
         """Treat many springs under one stress as one spring in an impact, if that is possible."""
         many = len(heights) >= LEAST_AGGREGATE and len(self.ends) == 1 and self.speed > 0.0
@@ -213,12 +229,12 @@ class Plan(NamedTuple):
             return None
         from foamfit.solve.many import integrate_aggregate, shapes_of
 
-        shapes, out = shapes_of(self, rows), packed[-1]
+        shapes = shapes_of(self, rows)
         if shapes is None:
             return None
         cache.announce(integrate_aggregate, "the solver of many springs")
         log = np.empty((4 * len(rows) + 64, 5))
-        numbers = np.array((self.mass[0], packed[7][0], self.speed, AS_ONE * rtol / len(rows)))
+        numbers = np.array((self.mass[0], drag, self.speed, AS_ONE * rtol / len(rows)))
         given = shapes, heights, numbers, self.time, self.max_steps, out[0], log, np.zeros(2, int)
         outcome, end, steps, switches = integrate_aggregate(*given)
         endings = np.array((outcome, end, steps, switches), dtype=float)
@@ -233,33 +249,17 @@ class Plan(NamedTuple):
             duration = min(duration, 5.0 * lasts)
         return SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0)
 
-    def _systems(self, heights: Array, p: int) -> tuple[Any, Array, Array, NDArray[np.int64]]:
-        """Return the arrays of implicit steps, and their words."""
-        inside = [0, *self.ends.tolist()]
-        each = [one.internal for one in self.laws.made]
-        sizes = [
-            2 + sum(1 + self.terms + each[i] for i in range(first, last))
-            for first, last in zip(inside, inside[1:], strict=False)
-        ]
-        n, groups = sum(sizes), len(sizes)
-        reach = max(one + other for one, other in zip(sizes, [0, *sizes], strict=False)) - 1
-        complexes = np.empty(3 * n * (3 * reach + 2), np.complex128)
-        jacobian, alive = np.empty(n * (2 * reach + 1)), np.zeros(2 * groups + 2 + p)
-        words = np.zeros(4 + 5 * n, np.int64)
-        words[:3] = [one.ctypes.data for one in (complexes, jacobian, alive)]
-        return complexes, jacobian, alive, words
-
     def _motion(
         self, out: Array, method: str, endings: Array, log: Array, rows: Array, lost: float
     ) -> Motion:
         """Return the result of a run as a Motion; raise SimulationError if it failed."""
         outcome, time, steps, switches = endings[:4].tolist()
         loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
-        finite = outcome == scenes.DONE and math.isfinite(float(out[0].sum()))
+        finite = outcome == scenes.DONE and bool(np.isfinite(out[0]).all())
         if not finite:
             outcome = int(outcome) if outcome != scenes.DONE else scenes.NOT_FINITE
             raise scenes.failure(outcome, self.top, self.values, loose, steps=int(steps), time=time)
-        slopes = Slopes(out[1:, 1:], out[1:, 0]) if len(out) > 1 else None
+        slopes = Slopes(out[1:, 1:], out[1:, 0], endings[loop.ENDINGS :]) if len(out) > 1 else None
         if len(log):
             log = log[: int(switches)] if switches <= len(log) else np.empty((int(switches), 5))
         else:
@@ -274,21 +274,26 @@ class Plan(NamedTuple):
         """Solve springs in static equilibrium under one stress, or one spring in known motion."""
         count, wanted, n = len(heights), len(directions) > 0, self.time.size
         alone = self.top == scenes.MOTION and count == 1
-        packed = self._packed(
-            rows, heights, 0.0, rtol, 0, directions, count if everything else 1
-        )  # fmt: skip
-        out, branches = packed[-1], np.empty((count, n), np.int64)
+        shown = count if everything else 1
+        out, branches = np.empty((1 + len(directions), 1 + shown, n)), np.empty((count, n), np.int64)
+        reals = np.array((0.0, 1.0, 0.0, rtol))
+        layout = self._layout(rows, directions, integrated=False)
         if alone:
             strain = (self.values / heights)[None, :]
-            packed[8] = strain[0]
             moved = bool((directions[:, 1] == MOVED).any())
-            runs.follow(*packed, branches[0], np.empty(n), *self._room(packed), seeds(strain[0], moved))
+            along.follow(
+                *_memory(layout), rows, heights, self.mass, reals, strain[0], self.time, out, _NO_LOG,
+                seeds(strain[0], moved), branches[0], np.empty(n),
+            )  # fmt: skip
             out[0, 1], out[1:, 1] = self.values, 0.0
             self._add_dashpot(out, strain[0], rows[0, 0], heights, directions)
         else:
-            strain, endings = np.empty((count, n)), np.zeros(runs.ENDINGS)
-            runs.balance(*packed, branches, *self._room(packed), strain, endings)
-        fine = math.isfinite(float(out[0].sum()))
+            strain = np.empty((count, n))
+            static.balance(
+                *_memory(layout), rows, heights, self.mass, reals, self.values, self.time, out,
+                _NO_LOG, strain, branches,
+            )  # fmt: skip
+        fine = bool(np.isfinite(out[0]).all())
         if fine and self.top == scenes.MOTION and not alone:
             miss = np.abs(out[0, -1] - self.values).max()
             fine = miss <= AT_MOST * (self.height + np.abs(self.values).max())
@@ -338,17 +343,22 @@ class Plan(NamedTuple):
         """Return the radians of vibration and relaxation that explicit steps would cover."""
         first, steep = self.slopes_of(rows)
         gain = 1.0 + rows[:, 1 : 1 + 2 * self.terms : 2].sum(axis=1)
-        eta = np.where(rows[:, 0] > TINY, rows[:, 0], 0.0)
-        chain = gain * first, gain * steep, eta, heights, self.ends, self.mass, drag, self.top
+        chain = gain * first, gain * steep, rows[:, 0], heights, np.array(self.ends), self.mass, drag, self.top
         return rates.fastest_rates(*chain, self.speed > 0.0, self._duration)
 
 
-def _lost(worst: Array, endings: Array) -> float:
+def _memory(layout: Layout) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Return the words of a run, and memory for its integers and floats."""
+    return layout.words, np.empty_like(layout.words), np.zeros(layout.floats)
+
+
+def _lost(endings: Array) -> float:
     """Return the size of the vibrations that implicit steps damped out, relative to the ranges."""
-    motion, stress = float(endings[runs.FARTHEST]), float(endings[runs.STRONGEST])
-    lost = float(endings[runs.DAMPED_OUT])
-    if worst[0] > 0.0:
-        lost += max(worst[0] / motion if motion > 0.0 else 0.0, worst[1] / stress)
+    lost, moved = float(endings[loop.DAMPED_OUT]), float(endings[loop.FARTHEST])
+    motion, stress = endings[loop.MOTION_LOST : loop.STRESS_LOST + 1].tolist()
+    if motion > 0.0:
+        share = motion / moved if moved > 0.0 else 0.0
+        lost += max(share, stress / float(endings[loop.STRONGEST]))
     return lost
 
 
@@ -423,10 +433,10 @@ def plan(
         elif above == 0.0:
             top = scenes.VISCOUS if chain.site_damping > 0.0 else scenes.STRESS
     arrays, count, laws = chain.arrays, len(chain.springs), _laws(chain)
-    ends, masses = arrays.top, np.array([above / chain.area])
+    ends, masses = (count,), np.array([above / chain.area])
     if arrays.heavy:
         inside = np.flatnonzero(arrays.masses[:-1] > 0.0)
-        ends = np.append(inside + 1, ends)
+        ends = (*(inside + 1).tolist(), count)
         masses = np.append(arrays.masses[inside] / chain.area, masses)
     internal = any(one.kind == INTERNAL for one in laws.made)
     alone = top == scenes.MOTION and count == 1

@@ -55,7 +55,12 @@ def at_first_use(
     (announce or (lambda: cache.warn("the solver")))()
     other = None
     if (os.cpu_count() or 1) > 1:
-        other = subprocess.Popen([sys.executable, "-c", CALL.format(LOOPS[1])])
+        path = (str(cache.PACKAGE.parent), os.environ.get("PYTHONPATH", ""))
+        other = subprocess.Popen(
+            [sys.executable, "-c", CALL.format(LOOPS[1])],
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path))},
+            process_group=0,  # Ctrl-C must reach only the process that starts this one
+        )
     done = False
 
     def finish() -> None:

@@ -12,13 +12,15 @@ from foamfit.arrays import Array
 # Top of the chain: with a mass, with an onsite damper only, under known stress, in known motion.
 FREE, VISCOUS, STRESS, MOTION = range(4)
 # Outcomes of a run.
-DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE = range(5)
+DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE, TOO_FAST = range(6)
 _FAILURES = {
     TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
     "too fast to be followed (a light mass or a heavy dashpot)",
     STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s, where the scene "
     "changes faster than numbers can resolve (a strain at the end of its branch, a very light "
     "mass, or many springs on a flat branch)",
+    TOO_FAST: "something in the scene is too fast to be followed (a light mass, or a dashpot that is "
+    "very light beside a stiff spring)",
     FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
     "that nothing slows; give the top a mass or the spring a dashpot",
     NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "

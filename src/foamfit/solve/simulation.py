@@ -15,6 +15,7 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.solve.plan import (
     AGGREGATE,
     CLOSED_FORM,
+    LEAST_TOL,
     MOST_WORK,
     NO_DIRECTIONS,
     RADAU,
@@ -112,11 +113,13 @@ def _verified(
         if rtol * factor < 1e-14:
             break
         try:
-            finer = run(scene, rtol * factor)
+            finer = run(scene._replace(least=LEAST_TOL), rtol * factor)
         except SimulationError:
             if scene.implicit is False:  # the last resort, see `_resolve_vibrations`
                 raise SimulationError(_UNRESOLVED.format(size=lost)) from None
-            raise
+            if miss == math.inf:
+                raise
+            break
         miss = max(
             difference(finer.displacement, motion.displacement),
             difference(finer.base_stress, motion.base_stress),
@@ -155,7 +158,8 @@ def _resolve_vibrations(
 
 def _is_long(scene: Plan, motion: Motion, few: int) -> bool:
     """Whether a motion took many steps or switches (the steps of an aggregate are switches)."""
-    vibrates = len(scene.ends) > 1 and len(motion.switches) > FEW_SWITCHES
+    bounces = len(scene.ends) > 1 or scene.speed == 0.0
+    vibrates = bounces and scene.solver == SECOND_ORDER and len(motion.switches) > FEW_SWITCHES
     return (motion.steps > few or vibrates) and motion.method != AGGREGATE
 
 

@@ -9,17 +9,21 @@ from __future__ import annotations
 
 import math
 
-from foamfit.solve.equilibrium import NUMBERS, elongation_at, put, root, strain_at
-from foamfit.solve.links import (
-    change_branch,
-    derive_group,
-    evaluate,
-)
+from numba import njit
+
+from foamfit.solve.equilibrium import elongation_at, put, root, strain_at
+from foamfit.solve.events import change_branch
+from foamfit.solve.motion import ONLY_DERIVATIVES, evaluate, rates_of
+from foamfit.solve.run import NUMBERS, begin_run
+from foamfit.solve.samples import row_of
+from foamfit.solve.scene import STRESS
 from foamfit.springs.compiled.contract import (
+    BRANCH,
     EPS,
     HEIGHT,
     HIGH,
     LOW,
+    OPTIONS,
     OF_LAW,
     SETTLE,
     SIGMA_HIGH,
@@ -137,11 +141,58 @@ def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
 
 
 @inner
-def derive_here(c, g, common, y, f):  # type: ignore[no-untyped-def]
-    """Fill the derivatives of a group in equilibrium."""
-    for i in range(c.ends[g - 1] if g > 0 else 0, c.ends[g]):
-        s = past(c.springs, i * c.width)
-        evaluate(c, i, 1)
-        s[TANGENT], s[TOTAL] = s[c.results + SLOPE], s[c.results + OF_LAW]
-    c.carried[g] = common
-    derive_group(c, g, y, f)
+def _bring_all(c, k, before):  # type: ignore[no-untyped-def]
+    """Bring the chain to sample k of its drive, from a common stress; return that stress."""
+    now = c.values[k]
+    if c.top == STRESS:
+        for i in range(c.count):
+            push_to(c, i, now, before, c.y)
+    else:
+        now = bring(c, c.none, c.count, now, before, c.y)
+    return now
+
+
+@inner
+def _write(c, k, now):  # type: ignore[no-untyped-def]
+    """Write sample k: the common stress, displacements, and their derivatives."""
+    p, place, reach = c.p, 0.0, past(c.common, 3 * c.p)  # with one group, the last of the rows
+    if p > 0:
+        for i in range(c.count):
+            s = past(c.springs, i * c.width)
+            evaluate(c, i, 1 + c.none)
+            s[TANGENT], s[TOTAL] = s[c.results + SLOPE], s[c.results + OF_LAW]
+        c.carried[0] = now
+        rates_of(c, c.none, c.y, c.f, ONLY_DERIVATIVES, 0.0)
+    row_of(c, c.none, c.none)[k] = now
+    for j in range(p):
+        row_of(c, 1 + j, c.none)[k], reach[j] = c.common[j], 0.0
+    for i in range(c.count):
+        s, strain, own = past(c.springs, i * c.width), past(c.strain, i * p), past(c.own, 2 * i * p)
+        place += s[HEIGHT] * s[EPS]
+        for j in range(p):
+            reach[j] += s[HEIGHT] * strain[j] + s[EPS] * own[j]
+        if c.shown > 2 or i == c.count - 1:
+            node = 1 + i if c.shown > 2 else c.shown - 1
+            row_of(c, c.none, node)[k] = place
+            for j in range(p):
+                row_of(c, 1 + j, node)[k] = reach[j]
+
+
+@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
+def balance(  # type: ignore[no-untyped-def]
+    template, ints, floats, rows, heights, mass, reals, values, time, out, log, strains, history
+):  # fmt: skip
+    """Follow undamped, massless springs in series along a motion or stress of the top.
+
+    `strains` (springs, n) and `history` become strains and branches.
+    """
+    c = begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals)
+    before = 0.0
+    for i in range(c.count):
+        evaluate(c, i, int(c.p > 0))
+    for k in range(c.samples):
+        before = _bring_all(c, k, before)
+        _write(c, k, before)
+        for i in range(c.count):
+            s = past(c.springs, i * c.width)
+            strains[i, k], history[i, k] = s[EPS], int(s[BRANCH])

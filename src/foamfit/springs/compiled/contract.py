@@ -149,33 +149,34 @@ floats_at, integers_at = _pointer(_F, ir.DoubleType()), _pointer(_I, ir.IntType(
 complexes_at = _pointer(types.complex128, _COMPLEX)
 
 
-def _call(builder, values):  # type: ignore[no-untyped-def]
-    """Call the function at an address, the first value, with the others."""
-    address, *given = values
-    kind = ir.FunctionType(ir.DoubleType(), [value.type for value in given])
-    return builder.call(builder.inttoptr(address, kind.as_pointer()), given)
+def by_address(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    """Call the function at an address, the first argument, with the others."""
+    returned = signature.return_type
+    result = ir.VoidType() if returned == types.void else context.get_value_type(returned)
+    kind = ir.FunctionType(result, [value.type for value in args[1:]])
+    found = builder.call(builder.inttoptr(args[0], kind.as_pointer()), args[1:])
+    return context.get_dummy_value() if returned == types.void else found
 
 
 @intrinsic
-def call_begin(typing, address, row, s):  # type: ignore[no-untyped-def]
+def call_begin(typing, where, row, s):  # type: ignore[no-untyped-def]
     """Call `begin` of a law."""
-    return _F(_I, _P, _P), lambda context, builder, signature, args: _call(builder, args)
+    return _F(_I, _P, _P), by_address
 
 
 @intrinsic
-def call_evaluate(typing, address, row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
+def call_evaluate(typing, where, row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
     """Call `evaluate` of a law."""
-    kind = _F(_I, _P, _P, _P, _P, _I, _I, _P)
-    return kind, lambda context, builder, signature, args: _call(builder, args)
+    return _F(_I, _P, _P, _P, _P, _I, _I, _P), by_address
 
 
 @intrinsic
-def call_switch(typing, address, row, s, up, out):  # type: ignore[no-untyped-def]
+def call_switch(typing, where, row, s, up, out):  # type: ignore[no-untyped-def]
     """Call `switch` of a law."""
-    return _F(_I, _P, _P, _I, _P), lambda context, builder, signature, args: _call(builder, args)
+    return _F(_I, _P, _P, _I, _P), by_address
 
 
 @intrinsic
-def call_number(typing, address, row, s, number):  # type: ignore[no-untyped-def]
+def call_number(typing, where, row, s, number):  # type: ignore[no-untyped-def]
     """Call `settle` or `strain` of a law."""
-    return _F(_I, _P, _P, _F), lambda context, builder, signature, args: _call(builder, args)
+    return _F(_I, _P, _P, _F), by_address

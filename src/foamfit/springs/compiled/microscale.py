@@ -188,12 +188,11 @@ def mixture(row, branch, p, rest, never, sigma):  # type: ignore[no-untyped-def]
 def at_stress(row, s, sigma):  # type: ignore[no-untyped-def]
     """Return the strain at a stress on the branch; fill dε/dσ and d²ε/dσ²."""
     branch = int(s[BRANCH])
-    if not moves(branch):
-        strain, slope, bend, _, _ = mixture(row, branch, s[SNAPPED], s[REST], s[NEVER], sigma)
+    if not moves(branch) or not sigma > 0.0:  # where none has snapped, branches are continued
+        p, rest = (0.0, 1.0) if moves(branch) else (s[SNAPPED], s[REST])
+        strain, slope, bend, _, _ = mixture(row, branch, p, rest, s[NEVER], sigma)
         s[FLEXIBILITY], s[CURVATURE] = slope, bend
         return strain
-    if not sigma > 0.0:
-        return -math.inf
     place, scale = line(row, branch)
     rank = (math.log(sigma) - place) / scale
     p, rest = shares(rank)
@@ -510,10 +509,13 @@ def evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
         weight = density(s[RANK])
     for j in range(count):
         sigma = x[j]
-        if moving:
+        if moving and sigma > 0.0:
             rank = (math.log(sigma) - place) * wide
             p, rest = shares(rank)
             weight, pace = density(rank), wide / sigma
+        elif moving:  # continued
+            rank = p = weight = pace = 0.0
+            rest = 1.0
         two = 1.0 / (kc + sigma)
         fresh, worn = rest, 0.0
         if mixed:
