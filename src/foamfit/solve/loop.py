@@ -32,6 +32,7 @@ from foamfit.solve.run import (
     GRAVITY,
     GROW,
     HORIZON,
+    INTERNALS,
     KIND,
     LARGEST,
     LAST,
@@ -41,6 +42,7 @@ from foamfit.solve.run import (
     OF_EPS,
     OF_V,
     OF_W,
+    PARAMETERS,
     PRESSED,
     RECORD,
     SAMPLE,
@@ -62,11 +64,13 @@ from foamfit.solve.scene import (
 )
 from foamfit.springs.compiled.contract import (
     BRANCH,
+    BY,
     BY_STRESS,
     EPS,
     ETA,
     GAIN,
     HEIGHT,
+    INTERNAL,
     MISS,
     OPTIONS,
     RATE,
@@ -148,6 +152,9 @@ def _mend(c, y):  # type: ignore[no-untyped-def]
                 y[n[EPS_AT]] += longer
                 if n[KIND] == BY_STRESS:
                     y[n[X_AT]] += longer * s[TANGENT]
+                elif n[KIND] == INTERNAL:
+                    for k in range(n[INTERNALS]):
+                        y[n[X_AT] + k] += longer * s[c.results + BY + n[PARAMETERS] + 2 + k]
 
 
 @inner
