@@ -10,13 +10,16 @@ from numba.extending import intrinsic
 
 from foamfit.solve.motion import JUMP, call_inside, rates
 from foamfit.solve.run import (
+    DRAGGED,
     KIND,
     LARGEST,
     NUMBERS,
+    OVERDAMPED,
     PARAMETERS,
     PRESSED,
     RECORD,
     STEP,
+    VALUE,
     X_AT,
     unpack,
     NOW,
@@ -132,10 +135,25 @@ def dense(c, n, x, out):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _stress_of_momentum(c, x):  # type: ignore[no-untyped-def]
+    """Return the stress from the acceleration of the striker by an implicit step.
+
+    Where an overdamped contact ends, spring and dashpot carry opposite stresses whose sum has lost
+    its digits.
+    """
+    line, wide, rate = c.line, c.wide, 0.0
+    for q in range(c.degree - 1, -1, -1):
+        rate = rate * x + (q + 1) * line[q * wide + 1]
+    return c.drive[VALUE] - c.drive[DRAGGED] * c.state[1] - rate / c.now[STEP] / c.per_mass[0]
+
+
+@inner
 def look(c, x):  # type: ignore[no-untyped-def]
     """Fill the values of all springs at the share x of the step."""
     dense(c, c.base, x, c.state)
     rates(c, c.state, c.f, c.none, c.now[NOW] + x * c.now[STEP])
+    if c.drive[OVERDAMPED] > 0.0 and c.groups == 1:
+        c.carried[0] = _stress_of_momentum(c, x)
 
 
 @inner

@@ -88,8 +88,10 @@ KIND, PARAMETERS, INTERNALS, EPS_AT, X_AT, Z_AT, NUMBERS = 5, 6, 7, 8, 9, 10, 12
 OF_W, OF_V, OF_EPS, OF_SIGMA, SCALES = range(5)
 # The drive now: stress or displacement at the start of the piece and its rate; velocity of a
 # viscous top; 1 if a stress acts on a flat branch; onsite damping of the top, Pa s/m; 0 if time
-# stands still for the laws, else 1; acceleration of the striker by gravity.
-VALUE, VALUE_RATE, TOP_SPEED, FLAT, DRAGGED, PACE, GRAVITY, DRIVES = range(8)
+# stands still for the laws, else 1; acceleration of the striker by gravity; 1
+# if dashpots stop a striker long before the springs, see `rates.is_overdamped`; base
+# stress at the start of an implicit step.
+VALUE, VALUE_RATE, TOP_SPEED, FLAT, DRAGGED, PACE, GRAVITY, OVERDAMPED, BEGINNING, DRIVES = range(10)
 # Numbers that change during a run: time since the piece began, time at which it begins, step,
 # length of the piece, steps, growth of the next step, largest stress, whether the base stress has
 # risen, last error, next sample, number of the piece, switches; of implicit steps: length of the
