@@ -269,7 +269,7 @@ def suspicious(c, dt):  # type: ignore[no-untyped-def]
         eps, old, low, high = s[EPS], s[OLD_EPS], s[LOW], s[HIGH]
         if eps > high or eps < low or s[TURNS] * s[RATE] < 0.0:
             return True
-        if s[OLD_RATE] * s[RATE] < 0.0:  # an extremum is no further away than this
+        if s[OLD_RATE] * s[RATE] < 0.0:  # an extremum is at most this far away
             most = 0.5 * dt * max(abs(s[OLD_RATE]), abs(s[RATE]))
             if max(eps, old) + most > high or min(eps, old) - most < low:
                 return True

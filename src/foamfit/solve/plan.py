@@ -21,7 +21,7 @@ from foamfit.springs.laws.record import Law
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import INTERNAL, Compiled
-from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT
+from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 from foamfit.springs.spring import as_samples
 
 Directions = NDArray[np.int64]
@@ -128,10 +128,12 @@ class Plan(NamedTuple):
         self, rows: Array, directions: Directions, degree: int = 0, integrated: bool = True
     ) -> Layout:
         """Return where everything of a run lies."""
-        damped = (rows[:, 0] > 0.0).tobytes()
+        damped, terms = (rows[:, 0] > 0.0).tobytes(), self.terms
+        if terms and not rows[:, 1 : 1 + 2 * terms : 2].any():  # no strength: as without terms
+            terms = terms if (directions[:, 1] >= OWN_RELAXATION).any() else 0
         solved = degree > 0 or not integrated
         shape = Shape(
-            self.laws.records, self.terms, self.ends, self.top, damped, directions.tobytes(),
+            self.laws.records, terms, self.ends, self.top, damped, directions.tobytes(),
             self.speed > 0.0, degree, solved,
         )  # fmt: skip
         return lay_out(shape, integrated)

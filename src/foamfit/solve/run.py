@@ -171,7 +171,7 @@ def begin_run(template, ints, floats, time, values, out, log, rows, heights, mas
     words[OUT], words[LOG] = address(start(out)), address(start(log))
     words[SAMPLES], words[SHOWN], words[ROOM] = time.size, out.shape[1], log.shape[0]
     c = unpack(words)
-    terms = c.terms
+    terms, own = c.terms, rows.shape[1] - (c.width - c.row)  # first column of the laws
     for i in range(c.count):
         s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
         s[HEIGHT], s[PER_HEIGHT], s[ETA], s[GAIN] = heights[i], 1.0 / heights[i], rows[i, 0], 1.0
@@ -179,8 +179,8 @@ def begin_run(template, ints, floats, time, values, out, log, rows, heights, mas
             s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = rows[i, 1 + 2 * k], rows[i, 2 + 2 * k]
             s[GAIN] += rows[i, 1 + 2 * k]
         row = past(s, c.row)
-        for k in range(1 + 2 * terms, rows.shape[1]):
-            row[k - 1 - 2 * terms] = rows[i, k]
+        for k in range(own, rows.shape[1]):
+            row[k - own] = rows[i, k]
         call_begin(n[BEGIN], row, s)
     for g in range(c.groups):
         c.per_mass[g] = 1.0 / mass[g]
