@@ -364,4 +364,5 @@ def test_springs_may_snap_at_next_to_no_stress(sigma_plus: float) -> None:
         if b > a
     )
     assert got[-1] == pytest.approx(snapped(0.5) + g * (snapped(0.5) - faded), rel=1e-8)
-    assert (np.abs(got[snaps]) < 1e3 * sigma_plus).all()
+    # Branch a, up to the least strain at which micro-springs snap, leaves next to nothing, in Pa.
+    assert (np.abs(got[snaps]) < max(1e3 * sigma_plus, 1e-20)).all()

@@ -10,13 +10,16 @@ from numba.extending import intrinsic
 
 from foamfit.solve.motion import JUMP, call_inside, rates
 from foamfit.solve.run import (
+    DRAGGED,
     KIND,
     LARGEST,
     NUMBERS,
+    OVERDAMPED,
     PARAMETERS,
     PRESSED,
     RECORD,
     STEP,
+    VALUE,
     X_AT,
     unpack,
     NOW,
@@ -132,10 +135,25 @@ def dense(c, n, x, out):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _stress_of_momentum(c, x):  # type: ignore[no-untyped-def]
+    """Return the stress from the acceleration of the striker by an implicit step.
+
+    Where an overdamped contact ends, spring and dashpot carry opposite stresses whose sum has lost
+    its digits.
+    """
+    line, wide, rate = c.line, c.wide, 0.0
+    for q in range(c.degree - 1, -1, -1):
+        rate = rate * x + (q + 1) * line[q * wide + 1]
+    return c.drive[VALUE] - c.drive[DRAGGED] * c.state[1] - rate / c.now[STEP] / c.per_mass[0]
+
+
+@inner
 def look(c, x):  # type: ignore[no-untyped-def]
     """Fill the values of all springs at the share x of the step."""
     dense(c, c.base, x, c.state)
     rates(c, c.state, c.f, c.none, c.now[NOW] + x * c.now[STEP])
+    if c.drive[OVERDAMPED] > 0.0 and c.groups == 1:
+        c.carried[0] = _stress_of_momentum(c, x)
 
 
 @inner
@@ -251,7 +269,7 @@ def suspicious(c, dt):  # type: ignore[no-untyped-def]
         eps, old, low, high = s[EPS], s[OLD_EPS], s[LOW], s[HIGH]
         if eps > high or eps < low or s[TURNS] * s[RATE] < 0.0:
             return True
-        if s[OLD_RATE] * s[RATE] < 0.0:  # an extremum is no further away than this
+        if s[OLD_RATE] * s[RATE] < 0.0:  # an extremum is at most this far away
             most = 0.5 * dt * max(abs(s[OLD_RATE]), abs(s[RATE]))
             if max(eps, old) + most > high or min(eps, old) - most < low:
                 return True

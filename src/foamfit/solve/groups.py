@@ -166,6 +166,22 @@ def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _close(c, i0, i1, rest, pushed):  # type: ignore[no-untyped-def]
+    """Give what rounding leaves of the rate of elongation to the spring with the lightest dashpot.
+
+    Rounding errors of S - T over a light dashpot would change the elongation, which nothing resists.
+    """
+    least, where = math.inf, i0
+    for i in range(i0, i1):
+        s = past(c.springs, i * c.width)
+        if s[LOSS] < least * s[HEIGHT]:
+            least, where = s[LOSS] / s[HEIGHT], i
+    if not pushed:
+        s = past(c.springs, where * c.width)
+        s[RATE] += rest / s[HEIGHT]
+
+
+@inner
 def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):  # type: ignore[no-untyped-def]
     """Fill the strain rates of a group of several springs; `pushed`: its stress is prescribed.
 
@@ -185,6 +201,7 @@ def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):  # type: ignore[
             soft += compliance
             rest += compliance * s[DRIFT]
     if loose < 0:
+        _close(c, i0, i1, rest if not pushed else 0.0, pushed)
         return
     if not pushed and flat < 0:
         climb = rest / soft

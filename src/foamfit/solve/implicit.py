@@ -20,6 +20,7 @@ from foamfit.solve.events import DOUBTFUL, FAILED, SAMPLED, STEPPING, suspicious
 from foamfit.solve.motion import rates
 from foamfit.solve.run import (
     BEFORE,
+    BEGINNING,
     BRIEF,
     DAMPED,
     DAMPING,
@@ -28,9 +29,11 @@ from foamfit.solve.run import (
     GROW,
     HORIZON,
     IN_ROW,
+    LARGEST,
     NOW,
     OF_V,
     OF_W,
+    OVERDAMPED,
     POINTS,
     STEP,
     STEPPED,
@@ -39,7 +42,7 @@ from foamfit.solve.run import (
     unpack,
 )
 from foamfit.solve.scene import FREE, STRESS, VISCOUS
-from foamfit.springs.compiled.contract import ETA, GAIN, HEIGHT, OPTIONS, TANGENT, inner, past
+from foamfit.springs.compiled.contract import ETA, GAIN, HEIGHT, LOSSY, OPTIONS, TANGENT, inner, past
 
 def _radau() -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes c and the matrix A of the method."""
@@ -77,6 +80,7 @@ TURNS_OF_NEWTON = 12
 # Newton's method ends at changes of ENOUGH over the tolerance, of derivatives at ENOUGH/OF_TANGENTS: as
 # they obey linear equations, the next change is smaller by the error of the matrices.
 ENOUGH, OF_TANGENTS = 1e-3, 1e6
+ROUNDED = 1e-15  # relative error that is nothing but rounding
 
 
 # ---------------------------------------------------------------- banded systems
@@ -144,6 +148,7 @@ def linearise(c, at):  # type: ignore[no-untyped-def]
     for k in range(n * wide):
         jacobian[k] = 0.0
     rates(c, y, f0, c.none, at)
+    c.drive[BEGINNING] = abs(c.carried[0])
     for one in range(n):
         step = 1e-8 * max(abs(y[one]), _scale(c, one))
         if step == 0.0:
@@ -200,7 +205,8 @@ def _improve(c, h, column, tol):  # type: ignore[no-untyped-def]
     size = most = 0.0
     for k in range(n):
         one, place = (k if column == 0 else base + k * p + column - 1), c.places[k]
-        scale = max(_scale(c, k), max(abs(c.y[k]), abs(c.y[k] + moves[(POINTS - 1) * wide + k])))
+        last = c.y[k] + moves[(POINTS - 1) * wide + k]
+        scale = max(_scale(c, k), max(abs(c.y[k]), abs(last)))
         per = 1.0 / scale if scale > 0.0 else 0.0
         for i in range(POINTS):
             change = 0.0
@@ -267,18 +273,37 @@ def _solve(c, h, at, tol, first, last):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _is_free(c, g):  # type: ignore[no-untyped-def]
-    """Whether no dashpot acts below or above a node."""
-    return stiffness_of(c, g, True) == 0.0 and stiffness_of(c, g + 1, True) == 0.0
+def _is_lossy(c, g):  # type: ignore[no-untyped-def]
+    """Whether a stress in a group depends on the strain rate, besides that of dashpots."""
+    lossy = False
+    for i in range(c.ends[g - 1] if g > 0 else 0, c.ends[g] if g < c.groups else 0):
+        lossy = lossy or past(c.springs, i * c.width)[LOSSY] > 0.0
+    return lossy
+
+
+@inner
+def _size(c, k, old, new):  # type: ignore[no-untyped-def]
+    """Return the size to which the error of a component is relative.
+
+    Stresses depend on the velocity of a node by its dashpots: by its damping, relative to the
+    largest stress, or to the present one where an overdamped contact ends. Velocities of vibrations
+    that are damped out are not judged, as they would only shorten the steps.
+    """
+    size = max(abs(old), abs(new))
+    if k >= 2 * c.nodes or k % 2 == 0:
+        return max(_scale(c, k), size)
+    g = k // 2
+    if _is_lossy(c, g) or _is_lossy(c, g + 1):
+        return max(_scale(c, k), size)
+    damping = stiffness_of(c, g, True) + stiffness_of(c, g + 1, True)
+    if c.drive[OVERDAMPED] > 0.0:
+        return max(c.drive[BEGINNING], abs(c.carried[0])) / damping
+    return max(c.now[LARGEST] / damping, size) if damping > 0.0 else math.inf
 
 
 @inner
 def _error(c, h, tol):  # type: ignore[no-untyped-def]
-    """Return the error of a step over the tolerance.
-
-    Velocities of nodes without a dashpot are left out: no stress depends on them, and those of
-    vibrations that are damped out would only shorten the steps.
-    """
+    """Return the error of a step over the tolerance."""
     x, wide, n, reach = c.right, c.wide, c.carries, c.reach
     for k in range(n):
         value = c.stage[k]
@@ -288,14 +313,12 @@ def _error(c, h, tol):  # type: ignore[no-untyped-def]
     substitute(c.systems, n, reach, c.pivots, x)
     size = 0.0
     for k in range(n):
-        if k < 2 * c.nodes and k % 2 and _is_free(c, k // 2):
-            continue
-        scale = max(_scale(c, k), max(abs(c.y[k]), abs(c.y[k] + c.stage[2 * POINTS * wide + k])))
         error = abs(x[c.places[k]].real)
         if not error < math.inf:
             return math.inf
-        if scale > 0.0:
-            size = max(size, error / scale)
+        per = _size(c, k, c.y[k], c.y[k] + c.stage[2 * POINTS * wide + k])
+        if per > 0.0 and error > ROUNDED * abs(c.y[k]):
+            size = max(size, error / per)
     return size / tol
 
 

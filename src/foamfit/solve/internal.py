@@ -1,4 +1,4 @@
-"""What only springs of INTERNAL laws need: derivatives, jumps, the stress V, the start of a drive.
+"""What only springs of INTERNAL laws need: derivatives, jumps, the stress V, starts of drives.
 
 The results of such a law, from BY + parameters on, are σ, V and the rates A, B of each internal
 variable; then their derivatives by ε, dε/dt, each internal variable and each parameter.
@@ -245,7 +245,7 @@ def _lose(c, i, common):  # type: ignore[no-untyped-def]
             new = math.sqrt(low * high) if low > 0.0 else 1e-3 * high
             if high == math.inf:
                 new = 1e3 * low
-        if new == low or new == high:
+        if new in (low, high):
             return
         rate = new
         if not rate > LEAST_RATE:
@@ -283,7 +283,7 @@ def _share(c, g):  # type: ignore[no-untyped-def]
                 new = 0.5 * (low + high)
             else:
                 new = now + (1.0 if miss < 0.0 else -1.0) * max(abs(now), 1.0)
-            if new == low or new == high:
+            if new in (low, high):
                 break
         now = new
     c.carried[g] = common
@@ -316,7 +316,8 @@ def _begin_ramp(c, want):  # type: ignore[no-untyped-def]
     masses[c.groups] = drive[PACE]
     drive[VALUE], drive[VALUE_RATE], drive[PACE] = 0.0, c.values[0] / brief, 0.0
     for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
-        s, n, kept = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), past(aside, i * (1 + terms))
+        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+        kept = past(aside, i * (1 + terms))
         kept[0], s[GAIN] = s[ETA], 1.0
         if s[ETA] > 0.0:
             s[ETA] = s[LOSS] = 0.0 if c.top == MOTION else math.inf
@@ -336,7 +337,8 @@ def _end_ramp(c, want):  # type: ignore[no-untyped-def]
     for g in range(c.groups):
         c.per_mass[g] = masses[g]
     for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
-        s, n, kept = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), past(aside, i * (1 + terms))
+        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+        kept = past(aside, i * (1 + terms))
         strain, part = past(c.strain, i * p), past(c.part, i * p)
         for k in range(terms):
             s[RELAX + 2 * k] = kept[1 + k]

@@ -42,6 +42,7 @@ from foamfit.solve.run import (
     OF_EPS,
     OF_V,
     OF_W,
+    OVERDAMPED,
     PARAMETERS,
     PRESSED,
     RECORD,
@@ -85,9 +86,10 @@ from foamfit.springs.compiled.contract import (
 )  # fmt: skip
 
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
-# bound on steps, length of a short implicit step, least scales of displacement, velocity, strain
-# and stress.
-SPEED, TOL, MOST, BRIEFLY, LEAST, REALS = 2, 3, 4, 5, 6, 10
+# bound on steps, length of a short implicit step, whether the contact is overdamped, least scales of
+# displacement, velocity, strain and stress.
+SPEED, TOL, MOST, BRIEFLY, OVER, LEAST, REALS = 2, 3, 4, 5, 6, 7, 11
+FIRST = 40.0  # first implicit step over a short one
 # Results of a run; after them, for each derivative, whether it is one-sided.
 OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, STRESS_LOST = range(9)
 ENDINGS = 9
@@ -257,11 +259,11 @@ def _begin(c, reals, mass):  # type: ignore[no-untyped-def]
         c.scales[k] = reals[LEAST + k]
     for i in range(c.count):  # of the strain of each spring
         c.scales[SCALES + i] = reals[LEAST + OF_EPS]
-    r[BRIEF], r[LAST], r[GROW] = reals[BRIEFLY], 1e-4, 1.0
+    r[BRIEF], r[LAST], r[GROW], c.drive[OVERDAMPED] = reals[BRIEFLY], 1e-4, 1.0, reals[OVER]
     if reals[SPEED] > 0.0:
         c.y[2 * top + 1] = reals[SPEED]
         c.drive[VALUE], c.drive[GRAVITY] = c.values[0], c.values[0] / mass[top]
-        r[HORIZON] = max(c.time[c.samples - 1], 1e-300)  # a sample at contact needs a step
+        r[HORIZON] = max(c.time[c.samples - 1], 1e-30)  # a sample at contact needs a step
         approach(c, reals[SPEED])
 
 
@@ -317,7 +319,8 @@ def integrate(  # type: ignore[no-untyped-def]
     _begin(c, reals, mass)
     if struck:
         rates(c, c.y, c.stage, want, 0.0)
-        r[STEP] = min(r[HORIZON], _first_step(c, tol))
+        short = FIRST * r[BRIEF]
+        r[STEP] = min(r[HORIZON], short if c.degree and short > 0.0 else _first_step(c, tol))
     else:
         done = drive(c, 1, want)
         r[STEP] = r[HORIZON]

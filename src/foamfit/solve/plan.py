@@ -21,7 +21,7 @@ from foamfit.springs.laws.record import Law
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import INTERNAL, TINY, Compiled
-from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT
+from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 from foamfit.springs.spring import as_samples
 
 Directions = NDArray[np.int64]
@@ -40,7 +40,7 @@ MOST_WORK = 6_000_000  # in addition to the samples of a drive
 MOST_SAMPLED = 10_000_000  # in total
 # Error of a step over the requested error.
 ALONE, IN_SERIES, OF_MASSES = 1e-3, 2e-3, 1e-3
-OF_IMPLICIT = 1e-1
+OF_IMPLICIT, OF_IMPLICIT_MASSES = 3e-4, 2e-2  # of an implicit step
 SHORT = 5e-4  # length of a short implicit step, as a share of the duration, for a truncation of 3e-8
 # Least error of a step; of vibrating masses, whose steps would not exceed rounding errors below it.
 LEAST_TOL, LEAST_OF_MASSES, LEAST_VIBRATING = 2e-14, 5e-13, 5e-12  # the last of implicit steps
@@ -128,10 +128,12 @@ class Plan(NamedTuple):
         self, rows: Array, directions: Directions, degree: int = 0, integrated: bool = True
     ) -> Layout:
         """Return where everything of a run lies."""
-        damped = (rows[:, 0] > 0.0).tobytes()
+        damped, terms = (rows[:, 0] > 0.0).tobytes(), self.terms
+        if terms and not rows[:, 1 : 1 + 2 * terms : 2].any():  # no strength: as without terms
+            terms = terms if (directions[:, 1] >= OWN_RELAXATION).any() else 0
         solved = degree > 0 or not integrated
         shape = Shape(
-            self.laws.records, self.terms, self.ends, self.top, damped, directions.tobytes(),
+            self.laws.records, terms, self.ends, self.top, damped, directions.tobytes(),
             self.speed > 0.0, degree, solved,
         )  # fmt: skip
         return lay_out(shape, integrated)
@@ -190,6 +192,8 @@ class Plan(NamedTuple):
 
         Where explicit steps may take as many as all, implicit ones are not tried after them.
         """
+        if self.time.size == 1:
+            return (0,)
         if self.implicit is not None:
             return (POINTS,) if self.implicit else (0,)
         if stiff:
@@ -202,13 +206,18 @@ class Plan(NamedTuple):
         tol, most, brief = max(self.margin * rtol, least), self.max_steps, 0.0
         if degree:
             damped = bool(rows[:, 0].any())
-            tol = max(OF_IMPLICIT * self.margin * rtol, LEAST_TOL if damped else self.least)
+            factor = OF_IMPLICIT if len(self.ends) == 1 else OF_IMPLICIT_MASSES
+            tol = max(factor * rtol, LEAST_TOL if damped else self.least)
             most = min(most, MOST_IMPLICIT_WORK // len(heights))
             brief = self._brief(rows, heights, drag, tol)
         elif self.implicit is None:
             most = self.max_explicit
+        over = False
+        if degree and self.speed > 0.0:
+            first = self.slopes_of(rows)[0]
+            over = rates.is_overdamped(first, rows[:, 0], heights, float(self.mass[-1]))
         scales = self._scales(rows, heights)
-        return np.array((drag, 1.0, self.speed, tol, most, brief, *scales))
+        return np.array((drag, 1.0, self.speed, tol, most, brief, over, *scales))
 
     def _integrate(
         self, rows: Array, heights: Array, directions: Directions, out: Array, log: Array,

@@ -90,9 +90,11 @@ KIND, PARAMETERS, INTERNALS, EPS_AT, X_AT, Z_AT, FIXED, NUMBERS = 5, 6, 7, 8, 9,
 OF_W, OF_V, OF_EPS, OF_SIGMA, SCALES = range(5)
 # The drive now: stress or displacement at the start of the piece and its rate; velocity of a
 # viscous top; 1 if a stress acts on a flat branch; onsite damping of the top, Pa s/m; 0 if time
-# stands still for the laws, else 1; acceleration of the striker by gravity; stress on the top, and
-# rate of the elongation of the group whose stress `internal` solves for.
-VALUE, VALUE_RATE, TOP_SPEED, FLAT, DRAGGED, PACE, GRAVITY, PUSH, SPREAD, DRIVES = range(10)
+# stands still for the laws, else 1; acceleration of the striker by gravity; 1 if dashpots stop a
+# striker long before the springs, see `rates.is_overdamped`; base stress at the start of an implicit
+# step; stress on the top, and rate of the elongation of the group whose stress `internal` solves for.
+VALUE, VALUE_RATE, TOP_SPEED, FLAT, DRAGGED, PACE, GRAVITY, OVERDAMPED, BEGINNING = range(9)
+PUSH, SPREAD, DRIVES = range(9, 12)
 # Numbers that change during a run: time since the piece began, time at which it begins, step,
 # length of the piece, steps, growth of the next step, largest stress, whether the base stress has
 # risen, last error, next sample, number of the piece, switches; of implicit steps: length of the
@@ -172,7 +174,7 @@ def begin_run(template, ints, floats, time, values, out, log, rows, heights, mas
     words[OUT], words[LOG] = address(start(out)), address(start(log))
     words[SAMPLES], words[SHOWN], words[ROOM] = time.size, out.shape[1], log.shape[0]
     c = unpack(words)
-    terms = c.terms
+    terms, own = c.terms, rows.shape[1] - (c.width - c.row)  # first column of the laws
     for i in range(c.count):
         s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
         s[HEIGHT], s[PER_HEIGHT], s[ETA], s[GAIN] = heights[i], 1.0 / heights[i], rows[i, 0], 1.0
@@ -181,8 +183,8 @@ def begin_run(template, ints, floats, time, values, out, log, rows, heights, mas
             s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = rows[i, 1 + 2 * k], rows[i, 2 + 2 * k]
             s[GAIN] += rows[i, 1 + 2 * k]
         row = past(s, c.row)
-        for k in range(1 + 2 * terms, rows.shape[1]):
-            row[k - 1 - 2 * terms] = rows[i, k]
+        for k in range(own, rows.shape[1]):
+            row[k - own] = rows[i, k]
         call_begin(n[BEGIN], row, s)
     for g in range(c.groups):
         c.per_mass[g] = 1.0 / mass[g]
