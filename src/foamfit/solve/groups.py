@@ -48,6 +48,7 @@ from foamfit.solve.run import (
 )
 from foamfit.solve.scene import STRESS, VISCOUS
 from foamfit.springs.compiled.contract import (
+    BY_STRESS,
     DRIFT,
     EPS,
     ETA,
@@ -342,7 +343,8 @@ def _mark_one_sided(c, g):  # type: ignore[no-untyped-def]
         flat += int(s[SIGMA_LOW] == s[SIGMA_HIGH] and s[ETA] == 0.0)
     for i in range(first, last):
         s, total = past(c.springs, i * c.width), past(c.part, (c.count + i) * p)
-        stands = s[TURNS] != 0.0 and abs(s[RATE]) * s[ETA] < STANDS * abs(c.carried[g])
+        snaps = s[TURNS] != 0.0 and c.numbers[i * NUMBERS + KIND] == BY_STRESS
+        stands = snaps and abs(s[RATE]) * s[ETA] < STANDS * abs(c.carried[g])
         for j in range(p):
             if stands and abs(common[j] - total[j]) > MOVES * max(abs(common[j]), abs(total[j])):
                 c.sided[j] = 1.0

@@ -84,6 +84,7 @@ from foamfit.springs.compiled.contract import (
 from foamfit.springs.parameters import OWN_ETA
 
 LEAST_RATE = 1e-25  # smaller strain rates are zero, 1/s
+ENOUGH = 2e-15  # relative change of a rate or stress that ends Newton's method
 RAMP = 1e-9  # time of a ramp to the first sample over the duration
 
 
@@ -239,7 +240,7 @@ def _lose(c, i, common):  # type: ignore[no-untyped-def]
         new = -1.0
         if value > 0.0 and s[LOSS] > 0.0:
             new = rate * (abs(force) / value) ** (value / (s[LOSS] * rate))
-        if abs(new - rate) <= 4e-16 * rate:
+        if abs(new - rate) <= ENOUGH * rate:
             return
         if not low < new < high:
             new = math.sqrt(low * high) if low > 0.0 else 1e-3 * high
@@ -276,7 +277,7 @@ def _share(c, g):  # type: ignore[no-untyped-def]
             miss, soft = miss + now, soft * drag + 1.0
         low, high = (low, now) if miss > 0.0 else (now, high)
         new = now - miss / soft if soft > 0.0 else math.nan
-        if miss == 0.0 or abs(new - now) <= 4e-16 * abs(now):
+        if miss == 0.0 or abs(new - now) <= ENOUGH * abs(now):
             break
         if not low < new < high:
             if low > -math.inf and high < math.inf:
