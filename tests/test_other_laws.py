@@ -225,6 +225,24 @@ def test_power_law_damper_in_an_impact_against_scipy():
     np.testing.assert_allclose(run.base_stress, [total(*y) for y in judged.y.T], rtol=2e-3)
 
 
+@pytest.mark.parametrize("n", [0.5, 2.0])
+def test_derivatives_of_two_power_law_dampers_in_series(n):
+    """With n = 2 they stop the striker within a millionth of the first step of an elastic spring."""
+    time, step = np.linspace(0.0, 2e-4, 21), 1e-5
+
+    def run(c, names=()):
+        springs = [
+            law("power_law_damper").make([*BISTABLE.values(), one, n, 0.0], []) for one in (c, 3e5)
+        ]
+        chain = ff.Chain(springs, [1e-3, 1e-3], area=2e-5)
+        return ff.simulate(chain, ff.Impact(0.01, 1.5), time, 1e-9, sensitivities=names)
+
+    above, below = run(1e5 * (1.0 + step)), run(1e5 * (1.0 - step))
+    found = run(1e5, ["s1_c"]).sensitivities["s1_c"].displacement[-1]
+    wanted = (above.displacement[-1] - below.displacement[-1]) / (2e5 * step)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-3 * np.abs(wanted).max())
+
+
 def test_a_law_that_depends_on_time_needs_one(tmp_path):
     law("fractional")
     path = tmp_path / "t.csv"

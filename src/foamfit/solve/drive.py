@@ -37,17 +37,19 @@ from foamfit.springs.compiled.contract import (
     GAIN,
     HEIGHT,
     INTERNAL,
-    OFFSET,
     OF_LAW,
+    OFFSET,
     OPTIONS,
     RELAX,
     SLOPE,
-    STRESS as TOTAL,
     TANGENT,
     X,
     inner,
     past,
 )  # fmt: skip
+from foamfit.springs.compiled.contract import (
+    STRESS as TOTAL,
+)
 
 _I, _IP = types.int64, types.CPointer(types.int64)
 

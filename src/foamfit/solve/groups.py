@@ -17,9 +17,9 @@ from numba import cfunc
 from foamfit.solve.equilibrium import put, root, strain_at
 from foamfit.solve.motion import (
     GROUP,
-    ONLY_DERIVATIVES,
     LOSE,
     LOSSES,
+    ONLY_DERIVATIVES,
     SHARE,
     call_inside,
     derive_inside,
@@ -64,13 +64,15 @@ from foamfit.springs.compiled.contract import (
     SIGMA_HIGH,
     SIGMA_LOW,
     STEEP,
-    STRESS as TOTAL,
     TANGENT,
     TURNS,
     X,
     inner,
     past,
 )  # fmt: skip
+from foamfit.springs.compiled.contract import (
+    STRESS as TOTAL,
+)
 
 STANDS, MOVES = 1e-12, 1e-9  # relative rates that are nothing but rounding, and more than that
 SNAPPING = (0, 2, 3)  # parameters of a bistable law on which the stress at A1 depends

@@ -13,6 +13,7 @@ steps then grow up to a floor regardless of their error, and the vibration is da
 from __future__ import annotations
 
 import math
+
 import numpy as np
 from numba import cfunc
 
@@ -42,7 +43,17 @@ from foamfit.solve.run import (
     unpack,
 )
 from foamfit.solve.scene import FREE, STRESS, VISCOUS
-from foamfit.springs.compiled.contract import ETA, GAIN, HEIGHT, LOSSY, OPTIONS, TANGENT, inner, past
+from foamfit.springs.compiled.contract import (
+    ETA,
+    GAIN,
+    HEIGHT,
+    LOSSY,
+    OPTIONS,
+    TANGENT,
+    inner,
+    past,
+)
+
 
 def _radau() -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes c and the matrix A of the method."""

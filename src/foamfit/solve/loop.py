@@ -76,7 +76,6 @@ from foamfit.springs.compiled.contract import (
     OPTIONS,
     RATE,
     SLOPE,
-    STRESS as TOTAL,
     TANGENT,
     TURNS,
     by_address,
@@ -84,12 +83,16 @@ from foamfit.springs.compiled.contract import (
     inner,
     past,
 )  # fmt: skip
+from foamfit.springs.compiled.contract import (
+    STRESS as TOTAL,
+)
 
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
 # bound on steps, length of a short implicit step, whether the contact is overdamped, least scales of
 # displacement, velocity, strain and stress.
 SPEED, TOL, MOST, BRIEFLY, OVER, LEAST, REALS = 2, 3, 4, 5, 6, 7, 11
 FIRST = 40.0  # first implicit step over a short one
+STOPPED = 0.1  # most of the velocity that a first step takes
 # Results of a run; after them, for each derivative, whether it is one-sided.
 OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, STRESS_LOST = range(9)
 ENDINGS = 9
@@ -321,6 +324,9 @@ def integrate(  # type: ignore[no-untyped-def]
         rates(c, c.y, c.stage, want, 0.0)
         short = FIRST * r[BRIEF]
         r[STEP] = min(r[HORIZON], short if c.degree and short > 0.0 else _first_step(c, tol))
+        if c.inside_at:  # a stress that depends on the rate may stop the striker at once
+            top = 2 * c.groups - 1
+            r[STEP] = min(r[STEP], STOPPED * abs(c.y[top] / c.stage[top]))
     else:
         done = drive(c, 1, want)
         r[STEP] = r[HORIZON]

@@ -46,7 +46,6 @@ from foamfit.springs.compiled.contract import (
     SETTLE,
     SLOPE,
     STEEP,
-    STRESS as TOTAL,
     TANGENT,
     X,
     by_address,
@@ -56,6 +55,9 @@ from foamfit.springs.compiled.contract import (
     inner,
     past,
 )  # fmt: skip
+from foamfit.springs.compiled.contract import (
+    STRESS as TOTAL,
+)
 from foamfit.springs.parameters import OWN_RELAXATION
 
 _F, _I, _P, _IP = types.float64, types.int64, types.CPointer(types.float64), types.CPointer(types.int64)

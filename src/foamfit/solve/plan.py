@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
-from foamfit.errors import InputError, SimulationError
+from foamfit.errors import InputError
 from foamfit.solve import along, cache, loop, rates, static
 from foamfit.solve import scene as scenes
 from foamfit.solve.layout import Layout, Shape, lay_out
@@ -17,10 +17,10 @@ from foamfit.solve.run import POINTS
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
 from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
-from foamfit.springs.laws.record import Law
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import INTERNAL, TINY, Compiled
+from foamfit.springs.laws.record import Law
 from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 from foamfit.springs.spring import as_samples
 
