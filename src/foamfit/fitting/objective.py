@@ -272,7 +272,7 @@ class Objective:
                     'like mass = "5.56 mg"'
                 )
             masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
-        springs = [law.any_spring() for law in self.model.laws]
+        springs = [law.any_spring(self.model.relaxation) for law in self.model.laws]
         chain = Chain(springs, heights, specimen.area, masses)
         make = partial(make_plan, chain, loading, self._clock, max_steps=MAX_STEPS)
         relaxing = self.model.relaxation > 0

@@ -240,10 +240,10 @@ class Law:
                 values[name] = first + values[name] * (last - first)
         return np.array([values[name] for name in self.own])
 
-    def any_spring(self) -> Any:
-        """Return a spring of the law with arbitrary parameters."""
+    def any_spring(self, terms: int = 0) -> Any:
+        """Return a spring of the law with arbitrary parameters and relaxation terms."""
         own = self.assembled(lambda param: 0.2 if param.of else abs(param.start[0]) or 1.0)
-        return self.make([*own, 0.0], ())
+        return self.make([*own, 0.0], ((0.0, 1.0),) * terms)
 
     def derivative(self, short: str) -> int:
         """Return the index of the derivative by a parameter."""
