@@ -95,7 +95,7 @@ def _change_branch(words, i, up, y):  # type: ignore[no-untyped-def]
         for h in range(2):
             by = past(changes, h * change)
             value = by[OF_STRESS] * d_sigma + by[OF_HELD] * first + by[OF_HELD + 1] * second
-            if directions[2 * j] == i and own < OWN_ETA:
+            if directions[2 * j] == i and 0 <= own < OWN_ETA:
                 value += by[OF_PARAMETER + own]
             held[h * p + j] = value
 
