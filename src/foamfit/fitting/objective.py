@@ -36,7 +36,7 @@ from foamfit.fitting.curves import (
     without_tension,
 )
 from foamfit.fitting.weighing import Weighing
-from foamfit.solve.plan import Plan, Motion
+from foamfit.solve.plan import Motion, Plan
 from foamfit.solve.plan import plan as make_plan
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.model import Model

@@ -28,17 +28,19 @@ from foamfit.springs.compiled.contract import (
     ETA,
     GAIN,
     HEIGHT,
-    OFFSET,
     OF_LAW,
+    OFFSET,
     OPTIONS,
     RELAX,
     SLOPE,
-    STRESS as TOTAL,
     TANGENT,
     X,
     inner,
     past,
 )  # fmt: skip
+from foamfit.springs.compiled.contract import (
+    STRESS as TOTAL,
+)
 
 _I, _IP = types.int64, types.CPointer(types.int64)
 
@@ -108,7 +110,11 @@ def _derive_start(c, g, i0, i1, common):  # type: ignore[no-untyped-def]
         s[ETA] = 0.0 if c.top == MOTION else s[ETA]
     rates_of(c, g, y, c.f, ONLY_DERIVATIVES, 0.0)
     for i in range(i0, i1):
-        s, n, strain = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), past(c.strain, i * p)
+        s, n, strain = (
+            past(c.springs, i * c.width),
+            past(c.numbers, i * NUMBERS),
+            past(c.strain, i * p),
+        )
         s[ETA], s[OFFSET] = s[OFFSET], 0.0
         slope, part, at = s[c.results + SLOPE], past(c.part, i * p), base + n[EPS_AT] * p
         if s[ETA] > 0.0 and n[EPS_AT] >= 0:

@@ -13,6 +13,7 @@ from foamfit.solve.run import (
     DRAGGED,
     KIND,
     LARGEST,
+    NOW,
     NUMBERS,
     OVERDAMPED,
     PARAMETERS,
@@ -22,7 +23,6 @@ from foamfit.solve.run import (
     VALUE,
     X_AT,
     unpack,
-    NOW,
 )
 from foamfit.springs.compiled.contract import (
     BY,
@@ -39,7 +39,6 @@ from foamfit.springs.compiled.contract import (
     OPTIONS,
     RATE,
     SLOPE,
-    STRESS as TOTAL,
     SWITCH,
     TURNS,
     X,
@@ -49,6 +48,9 @@ from foamfit.springs.compiled.contract import (
     inner,
     past,
 )  # fmt: skip
+from foamfit.springs.compiled.contract import (
+    STRESS as TOTAL,
+)
 from foamfit.springs.parameters import OWN_ETA
 
 ROUNDED = 1e-12  # strain past an end that rounding explains, of a spring that moves away from it
@@ -57,7 +59,12 @@ RISEN = 1e-9  # base stress over the largest stress above which its return to ze
 # greatest and a least strain.
 TOP_END, LOW_END, TURN, RELEASE, TOP_TURN, LOW_TURN = range(6)
 PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
-_F, _I, _P, _IP = types.float64, types.int64, types.CPointer(types.float64), types.CPointer(types.int64)
+_F, _I, _P, _IP = (
+    types.float64,
+    types.int64,
+    types.CPointer(types.float64),
+    types.CPointer(types.int64),
+)
 #: record, whether with derivatives, tolerance, time of the next sample, bound on steps
 STEPPING = _I(_IP, _I, _F, _F, _F)
 
@@ -211,7 +218,11 @@ def _earliest(c, before, share):  # type: ignore[no-untyped-def]
     found, who, what = share, -1 + c.none, -1 + c.none
     look(c, found)
     if c.now[PRESSED] > 0.0 and c.carried[0] <= 0.0:
-        found, who, what = _locate(c, before, found, c.none, RELEASE + c.none), c.none, RELEASE + c.none
+        found, who, what = (
+            _locate(c, before, found, c.none, RELEASE + c.none),
+            c.none,
+            RELEASE + c.none,
+        )
         look(c, found)
     for i in range(c.count):
         for kind in range(RELEASE):

@@ -50,12 +50,14 @@ from foamfit.springs.compiled.contract import (
     SIGMA_HIGH,
     SIGMA_LOW,
     SLOPE,
-    STRESS as TOTAL,
     TANGENT,
     TURNS,
     inner,
     past,
 )  # fmt: skip
+from foamfit.springs.compiled.contract import (
+    STRESS as TOTAL,
+)
 
 STANDS, MOVES = 1e-12, 1e-9  # relative rates that are nothing but rounding, and more than that
 SNAPPING = (0, 2, 3)  # parameters of a bistable law on which the stress at A1 depends
@@ -145,7 +147,7 @@ def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
 def _close(c, i0, i1, rest, pushed):  # type: ignore[no-untyped-def]
     """Give what rounding leaves of the rate of elongation to the spring with the lightest dashpot.
 
-    Rounding errors of S - T over a light dashpot would change the elongation, which nothing resists.
+    Rounding errors of S - T over a light dashpot would change the elongation, and nothing resists.
     """
     least, where = math.inf, i0
     for i in range(i0, i1):

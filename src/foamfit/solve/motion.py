@@ -45,7 +45,6 @@ from foamfit.springs.compiled.contract import (
     RELAX,
     SETTLE,
     SLOPE,
-    STRESS as TOTAL,
     TANGENT,
     X,
     by_address,
@@ -55,9 +54,17 @@ from foamfit.springs.compiled.contract import (
     inner,
     past,
 )  # fmt: skip
+from foamfit.springs.compiled.contract import (
+    STRESS as TOTAL,
+)
 from foamfit.springs.parameters import OWN_RELAXATION
 
-_F, _I, _P, _IP = types.float64, types.int64, types.CPointer(types.float64), types.CPointer(types.int64)
+_F, _I, _P, _IP = (
+    types.float64,
+    types.int64,
+    types.CPointer(types.float64),
+    types.CPointer(types.int64),
+)
 #: record, group, state, rates, whether with derivatives, time since the piece began; returns S
 GROUP = _F(_IP, _I, _P, _P, _I, _F)
 #: record, task (below), spring, up, state, rates, derivatives of the strain rate, results
@@ -325,7 +332,7 @@ def _call_rates(typing, where, c, y, f, want, at, only):  # type: ignore[no-unty
 
 @inlined
 def rates(c, y, f, want, at):  # type: ignore[no-untyped-def]
-    """Fill the rates f of a state y (with derivatives if `want`) at a time since the piece began."""
+    """Fill the rates f of a state y (with derivatives if `want`), `at` a time since the piece."""
     _call_rates(c.rates_at, c, y, f, want, at, -1)
 
 

@@ -1,7 +1,7 @@
 """A run in memory: the one record that all compiled functions of the solver take.
 
-`layout.lay_out` gives every array of a run its place, once per kind of scene. The record, `Run`, is a row
-of integers: addresses of arrays and functions, then sizes. Compiled functions read it by name:
+`layout.lay_out` gives every array of a run its place, once per kind of scene. The record, `Run`, is
+a row of integers: addresses of arrays and functions, then sizes. Compiled functions read it by name:
 `c.springs` is a pointer, `c.count` a number.
 
 The state is one array. First come displacement w and velocity v of each node that has a state, then
@@ -9,7 +9,8 @@ of each spring its strain if it has a dashpot and other springs lie between the 
 relaxation terms z_k = q_k/g_k - σ with dz_k/dt = -(z_k + σ)/τ_k, and the internal variables of an
 INTERNAL law. The derivatives by parameter of all these follow. The rest of the state follows from
 them on a branch, but explicit steps integrate it as well, which costs less than to solve for it:
-strains of springs without a dashpot, and the stress of BY_STRESS laws. Its derivatives are computed.
+strains of springs without a dashpot, and the stress of BY_STRESS laws. Its derivatives are
+computed.
 """
 
 from __future__ import annotations
@@ -41,12 +42,12 @@ from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
 # spring and of drag; of the held numbers of each spring; of the stress of each spring at fixed
 # strain, then of its T at fixed strain; of the stress of each group, then zeros and two rows to
 # work with; of the strains; scales of the kinds of components; numbers that change during a run;
-# whether derivatives from above and below differ; rates at the stages of a step; its dense output; the state, that at the end of a step, and one
-# between with its rates; zeros; errors; samples that are computed together. Those of implicit
-# steps: Jacobian, n rows of 2 reach + 1; vibrations, see `implicit.remember`, and the largest
-# motion and stress at a sample; values of the derivatives over the scales; a copy of `springs` and
-# `carried`; factored systems,
-# complex, SYSTEMS of n rows of 3 reach + 1, and their right sides.
+# whether derivatives from above and below differ; rates at the stages of a step; its dense output;
+# the state, that at the end of a step, and one between with its rates; zeros; errors; samples that
+# are computed together. Those of implicit steps: Jacobian, n rows of 2 reach + 1; vibrations, see
+# `implicit.remember`, and the largest motion and stress at a sample; values of the derivatives over
+# the scales; a copy of `springs` and `carried`; factored systems, complex, SYSTEMS of n rows of
+# 3 reach + 1, and their right sides.
 FLOATS = (
     "springs", "per_mass", "drive", "carried", "own", "held", "part", "common", "strain", "scales",
     "now", "sided", "stage", "line", "y", "new", "state", "f", "nil", "errors", "batch",
@@ -91,7 +92,9 @@ OF_W, OF_V, OF_EPS, OF_SIGMA, SCALES = range(5)
 # stands still for the laws, else 1; acceleration of the striker by gravity; 1
 # if dashpots stop a striker long before the springs, see `rates.is_overdamped`; base
 # stress at the start of an implicit step.
-VALUE, VALUE_RATE, TOP_SPEED, FLAT, DRAGGED, PACE, GRAVITY, OVERDAMPED, BEGINNING, DRIVES = range(10)
+VALUE, VALUE_RATE, TOP_SPEED, FLAT, DRAGGED, PACE, GRAVITY, OVERDAMPED, BEGINNING, DRIVES = range(
+    10
+)
 # Numbers that change during a run: time since the piece began, time at which it begins, step,
 # length of the piece, steps, growth of the next step, largest stress, whether the base stress has
 # risen, last error, next sample, number of the piece, switches; of implicit steps: length of the

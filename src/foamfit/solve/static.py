@@ -23,18 +23,20 @@ from foamfit.springs.compiled.contract import (
     HEIGHT,
     HIGH,
     LOW,
-    OPTIONS,
     OF_LAW,
+    OPTIONS,
     SETTLE,
     SIGMA_HIGH,
     SIGMA_LOW,
     SLOPE,
-    STRESS as TOTAL,
     TANGENT,
     TURNS,
     call_number,
     inner,
     past,
+)
+from foamfit.springs.compiled.contract import (
+    STRESS as TOTAL,
 )
 
 MOST_SWITCHES = 100_000  # of all springs between two samples

@@ -47,9 +47,21 @@ BRANCH, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH, TURNS, HELD, OWN, MEMORY = 0, 1, 2, 3,
 # Values: strain and its rate, stress T with relaxation but without dashpot, the part of dT/dt
 # without dε/dt, strain and rate at the start of a step, height, dashpot, 1 + Σ g, 1/height, dε/dσ,
 # dσ/dε along the path of the internal variables, Σ g z.
-EPS, RATE, STRESS, DRIFT, OLD_EPS, OLD_RATE, HEIGHT, ETA, GAIN, PER_HEIGHT, SOFT, TANGENT, OFFSET = (
-    range(MEMORY, MEMORY + 13)
-)
+(
+    EPS,
+    RATE,
+    STRESS,
+    DRIFT,
+    OLD_EPS,
+    OLD_RATE,
+    HEIGHT,
+    ETA,
+    GAIN,
+    PER_HEIGHT,
+    SOFT,
+    TANGENT,
+    OFFSET,
+) = range(MEMORY, MEMORY + 13)
 X, MOST_INTERNAL = 64, 32  # internal variables
 RELAX, MOST_TERMS = 96, 10  # g and τ of relaxation terms
 RESULTS = 128  # of `evaluate`
@@ -127,7 +139,7 @@ def address(typing, pointer):  # type: ignore[no-untyped-def]
     return _I(pointer), emit
 
 
-def _pointer(kind, width):  # type: ignore[no-untyped-def]
+def _pointer(kind: Any, width: Any) -> Any:
     @intrinsic
     def at(typing, number):  # type: ignore[no-untyped-def]
         def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]

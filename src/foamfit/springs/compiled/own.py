@@ -80,7 +80,7 @@ def compile_law(law: Law) -> Compiled:
     values_of = 2 + 2 * inside
 
     def fill(values: Any, row: Any) -> bool:
-        row[: count] = values
+        row[:count] = values
         fine: bool = bool(np.isfinite(values).all()) and bool(admissible(values))
         return fine
 
@@ -121,7 +121,7 @@ def compile_law(law: Law) -> Compiled:
                 out[(at + f) * n + j] = found[f].real
             at += values_of
             for q in range(2 + inside + count):
-                if want == 0 and q > 0 or want == 2 and not (q == 0 or 2 <= q < 2 + inside):
+                if (want == 0 and q > 0) or (want == 2 and not (q == 0 or 2 <= q < 2 + inside)):
                     continue
                 if q == 0:
                     strain += step
