@@ -1,6 +1,6 @@
 """A run in memory: the one record that all compiled functions of the solver take.
 
-`layout.lay_out` gives every array of a run its place, once per kind of scene. The record, `Run`, is
+`layout.lay_out` gives every array of a run its place, once per kind of scene. The record is
 a row of integers: addresses of arrays and functions, then sizes. Compiled functions read it by name:
 `c.springs` is a pointer, `c.count` a number.
 
