@@ -53,7 +53,6 @@ OF_DRIVE = ("those of the drive",)  # default of `Objective.nuisance`
 # the other, as the residuals of both are then errors of the law.
 MODEL_ERROR = 0.005
 MAX_STEPS = 20_000  # a trial that needs more steps is too stiff and counts as failed
-RTOL_OF_ANY_LAW = 1e-5  # least rtol for a registered law, whose solver is slower
 NORMAL = 1.4826  # standard deviation of normal residuals over their median absolute value
 FINEST = 8  # most instants simulated per sample that averages rows of the file
 # Steps of difference quotients: velocity and mass, relative; times, in sampling intervals; and the
@@ -116,7 +115,6 @@ class Objective:
             check_time_shift(self.measurement, self.drive)
         if self.nuisance == OF_DRIVE:
             self.nuisance = nuisances.names_of(self.drive, time_shift=self.time_shift)
-        self.rtol = max(self.rtol, RTOL_OF_ANY_LAW * self.model.is_registered)
         self.measurement = with_noise(self.measurement)
         self.interior = interior_curves(self.measurement, len(self.model.kinds))
         self.accelerated = self.drive == "impact" and self.measurement.acceleration is not None

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from numba import cfunc, types
 
-from foamfit.solve.motion import ONLY_DERIVATIVES, evaluate, rates, rates_of
+from foamfit.solve.motion import (
+    BEGIN_RAMP,
+    END_RAMP,
+    ONLY_DERIVATIVES,
+    call_inside,
+    evaluate,
+    rates,
+    rates_of,
+)
 from foamfit.solve.run import (
     BEGUN,
     EPS_AT,
@@ -28,19 +36,18 @@ from foamfit.springs.compiled.contract import (
     ETA,
     GAIN,
     HEIGHT,
+    INTERNAL,
     OF_LAW,
     OFFSET,
     OPTIONS,
     RELAX,
     SLOPE,
     TANGENT,
+    TOTAL,
     X,
     inner,
     past,
 )  # fmt: skip
-from foamfit.springs.compiled.contract import (
-    STRESS as TOTAL,
-)
 
 _I, _IP = types.int64, types.CPointer(types.int64)
 
@@ -54,6 +61,17 @@ def _begin_piece(c, k):  # type: ignore[no-untyped-def]
     if k + 1 < c.samples:
         r[HORIZON] = t[k + 1] - t[k]
         drive[VALUE_RATE] = (values[k + 1] - values[k]) / (t[k + 1] - t[k])
+
+
+@inner
+def _starts_on_ramp(c):  # type: ignore[no-untyped-def]
+    """Whether internal variables change up to the first sample of a drive."""
+    if c.values[0] == 0.0 or not (c.top == MOTION or c.top == STRESS):
+        return False
+    for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
+        if c.numbers[i * NUMBERS + KIND] == INTERNAL:
+            return True
+    return False
 
 
 @inner
@@ -133,13 +151,17 @@ def _next_piece(c, want):  # type: ignore[no-untyped-def]
     Dashpots have the mean rate at a sample where the prescribed rate jumps.
     """
     r, k, t = c.now, int(c.now[PIECE]) + 1, c.time
+    if k == 0:  # after a ramp
+        call_inside(c, END_RAMP, c.none, want, c.y, c.stage, c.y, c.y)
+        _begin_piece(c, k)
     write(c, c.y, r[NOW], k, want)
     r[PIECE] = k
     if k == c.samples - 1:
         return 1
-    _begin_piece(c, k)
+    if k > 0:
+        _begin_piece(c, k)
     rates(c, c.y, c.stage, want, 0.0)
-    if c.top == MOTION and c.groups == 1:
+    if c.top == MOTION and c.groups == 1 and k > 0:
         share, out = (t[k] - t[k - 1]) / (t[k + 1] - t[k - 1]), row_of(c, c.none, c.none)
         out[k] += share * (c.carried[0] - out[k])
         for j in range(c.p):
@@ -154,6 +176,9 @@ def _drive(words, starts, want):  # type: ignore[no-untyped-def]
     c = unpack(words)
     if not starts:
         return _next_piece(c, want)
+    if _starts_on_ramp(c):
+        call_inside(c, BEGIN_RAMP, c.none, want, c.y, c.stage, c.y, c.y)
+        return c.none
     _start(c)
     rates(c, c.y, c.stage, want, 0.0)
     write(c, c.y, 0.0, c.none, want)

@@ -40,6 +40,7 @@ from foamfit.springs.compiled.contract import (
     RATE,
     SLOPE,
     SWITCH,
+    TOTAL,
     TURNS,
     X,
     by_address,
@@ -48,9 +49,6 @@ from foamfit.springs.compiled.contract import (
     inner,
     past,
 )  # fmt: skip
-from foamfit.springs.compiled.contract import (
-    STRESS as TOTAL,
-)
 from foamfit.springs.parameters import OWN_ETA
 
 ROUNDED = 1e-12  # strain past an end that rounding explains, of a spring that moves away from it

@@ -17,7 +17,11 @@ from numba import cfunc
 from foamfit.solve.equilibrium import put, root, strain_at
 from foamfit.solve.motion import (
     GROUP,
+    LOSE,
+    LOSSES,
     ONLY_DERIVATIVES,
+    SHARE,
+    call_inside,
     derive_inside,
     derive_spring,
     follow_spring,
@@ -29,35 +33,44 @@ from foamfit.solve.run import (
     DRAGGED,
     EPS_AT,
     FLAT,
+    INTERNALS,
+    KIND,
     NUMBERS,
+    PACE,
+    PUSH,
+    SPREAD,
     TOP_SPEED,
     VALUE,
     VALUE_RATE,
+    X_AT,
     Z_AT,
     unpack,
 )
 from foamfit.solve.scene import STRESS, VISCOUS
 from foamfit.springs.compiled.contract import (
+    BY_STRESS,
     DRIFT,
     EPS,
     ETA,
     GAIN,
     HEIGHT,
+    INTERNAL,
+    LOSS,
+    LOSSY,
     OFFSET,
     OPTIONS,
     RATE,
     RELAX,
     SIGMA_HIGH,
     SIGMA_LOW,
-    SLOPE,
+    STEEP,
     TANGENT,
+    TOTAL,
     TURNS,
+    X,
     inner,
     past,
 )  # fmt: skip
-from foamfit.springs.compiled.contract import (
-    STRESS as TOTAL,
-)
 
 STANDS, MOVES = 1e-12, 1e-9  # relative rates that are nothing but rounding, and more than that
 SNAPPING = (0, 2, 3)  # parameters of a bistable law on which the stress at A1 depends
@@ -70,7 +83,7 @@ def _follow(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
     reach, rate = span_of(c, g, y, at)
     last = g == c.groups - 1
     push = c.drive[VALUE] + c.drive[VALUE_RATE] * at
-    weight, total, pull, loose, flat = 0.0, rate, -rate, -1, -1
+    weight, total, pull, loose, flat, lossy = 0.0, rate, -rate, -1, -1, False
     if c.solved:
         solve_loose(c, g, i0, i1, reach, push, y)
     for i in range(i0, i1):
@@ -81,6 +94,7 @@ def _follow(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
             weight += h / eta
             total += h / eta * stress
             pull += h / eta * (push - stress)
+            lossy = lossy or s[LOSSY] * c.drive[PACE] > 0.0
         else:
             loose = i
             if s[TANGENT] == 0.0:
@@ -89,22 +103,28 @@ def _follow(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
         common = push
     elif loose >= 0:
         common = past(c.springs, (loose if flat < 0 else flat) * c.width)[TOTAL]
+    elif lossy:
+        c.drive[PUSH], c.drive[SPREAD] = push, rate
+        call_inside(c, SHARE, g, want, y, f, y, y)
+        common = c.carried[g]
     elif last and c.top == VISCOUS:  # without the difference of S and push, which may be tiny
         common = push - c.drive[DRAGGED] * pull / (c.drive[DRAGGED] * weight + 1.0)
     else:
         common = total / weight
     if last and c.top == VISCOUS:
         drag = c.drive[DRAGGED]
-        speed = (push - common) / drag if loose >= 0 else pull / (drag * weight + 1.0)
-        c.drive[TOP_SPEED] = speed
-        rate += speed
-    share_rate(c, i0, i1, common, rate, loose, flat, last and c.top == STRESS)
+        if loose >= 0:
+            c.drive[TOP_SPEED] = (push - common) / drag
+        elif not lossy:
+            c.drive[TOP_SPEED] = pull / (drag * weight + 1.0)
+        rate += c.drive[TOP_SPEED]
+    c.carried[g] = common
+    share_rate(c, g, i0, i1, rate, loose, flat, last and c.top == STRESS, lossy)
     for i in range(i0, i1):
         s = past(c.springs, i * c.width)
         if s[ETA] > 0.0 or not c.solved:
             f[c.numbers[i * NUMBERS + EPS_AT]] = s[RATE]
         move_inside(c, i, f)
-    c.carried[g] = common
 
 
 @inner
@@ -121,6 +141,9 @@ def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
             rest -= s[HEIGHT] * y[n[EPS_AT]]
             continue
         some = True
+        if n[KIND] == INTERNAL:
+            for k in range(n[INTERNALS]):
+                s[X + k] = y[n[X_AT] + k]
         if s[SIGMA_LOW] == s[SIGMA_HIGH]:
             flat = i
     if not some:
@@ -152,21 +175,27 @@ def _close(c, i0, i1, rest, pushed):  # type: ignore[no-untyped-def]
     least, where = math.inf, i0
     for i in range(i0, i1):
         s = past(c.springs, i * c.width)
-        if s[ETA] < least * s[HEIGHT]:
-            least, where = s[ETA] / s[HEIGHT], i
+        if s[LOSS] < least * s[HEIGHT]:
+            least, where = s[LOSS] / s[HEIGHT], i
     if not pushed:
         s = past(c.springs, where * c.width)
         s[RATE] += rest / s[HEIGHT]
 
 
 @inner
-def share_rate(c, i0, i1, common, rate, loose, flat, pushed):  # type: ignore[no-untyped-def]
-    """Fill the strain rates of a group of several springs; `pushed`: its stress is prescribed."""
-    soft, rest, climb = 0.0, rate, c.drive[VALUE_RATE]
+def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):  # type: ignore[no-untyped-def]
+    """Fill the strain rates of a group of several springs; `pushed`: its stress is prescribed.
+
+    `lossy`: a stress of its springs depends on the strain rate, besides that of dashpots.
+    """
+    soft, rest, climb, common = 0.0, rate, c.drive[VALUE_RATE], c.carried[g]
     for i in range(i0, i1):
         s = past(c.springs, i * c.width)
         if s[ETA] > 0.0:
-            s[RATE] = (common - s[TOTAL]) / s[ETA]
+            if lossy and s[LOSSY] > 0.0:
+                call_inside(c, LOSE, i, g, c.y, c.f, c.y, c.y)
+            else:
+                s[RATE] = (common - s[TOTAL]) / s[ETA]
             rest -= s[HEIGHT] * s[RATE]
         elif flat < 0:
             compliance = s[HEIGHT] / (s[GAIN] * s[TANGENT])
@@ -204,17 +233,17 @@ def derive_group(c, g, y, f):  # type: ignore[no-untyped-def]
     reach, rate = past(c.common, (c.groups + 1) * p), past(c.common, (c.groups + 2) * p)
     span_tangents(c, g, y, reach, rate)
     loose, soft, weight, flat = -1, 0.0, 0.0, -1
-    last, common = g == c.groups - 1, c.carried[g]
+    last = g == c.groups - 1
     for i in range(i0, i1):
         s = past(c.springs, i * c.width)
         if s[ETA] > 0.0:
-            weight += s[HEIGHT] / s[ETA]
+            weight += s[HEIGHT] / s[LOSS]
             continue
         loose = i
-        if s[c.results + SLOPE] == 0.0:
+        if s[TANGENT] == 0.0:
             flat = i
         else:
-            soft += s[HEIGHT] / (s[GAIN] * s[c.results + SLOPE])
+            soft += s[HEIGHT] / (s[GAIN] * s[TANGENT])
     for i in range(i0, i1):  # of damped springs `total` becomes the whole derivative
         derive_spring(c, i, y)
         s, own, total = (
@@ -222,17 +251,19 @@ def derive_group(c, g, y, f):  # type: ignore[no-untyped-def]
             past(c.own, 2 * i * p),
             past(c.part, (c.count + i) * p),
         )
-        slope, at, share = s[GAIN] * s[c.results + SLOPE], c.numbers[i * NUMBERS + EPS_AT], 0.0
+        slope, at, share = s[GAIN] * s[STEEP], c.numbers[i * NUMBERS + EPS_AT], 0.0
         if s[ETA] > 0.0:
-            share = s[HEIGHT] / s[ETA]
+            share = s[HEIGHT] / s[LOSS]
             for j in range(p):
                 total[j] += slope * y[c.base + at * p + j]
+            if s[LOSSY] > 0.0:
+                call_inside(c, LOSSES, i, c.none, y, f, y, total)
         else:
             for j in range(p):
                 total[j] += own[p + j] * s[RATE]
             if slope > 0.0:
                 share = s[HEIGHT] / slope
-        over = (s[TOTAL] - common) / s[ETA] if loose < 0 else 0.0
+        over = -s[RATE] if loose < 0 else 0.0
         for j in range(p):
             if loose < 0:
                 rate[j] += share * total[j] + over * (own[j] - share * own[p + j])
@@ -264,7 +295,7 @@ def derive_common(c, last, loose, flat, soft, weight, reach, rate, out):  # type
             out[j] = -drag * rate[j] - of_drag[j] * speed
     elif loose < 0:
         for j in range(p):
-            out[j] = rate[j] / weight
+            out[j] = rate[j] / weight if weight > 0.0 else 0.0  # all at rest
     elif flat < 0:
         for j in range(p):
             out[j] = reach[j] / soft
@@ -287,12 +318,12 @@ def derive_share(c, i, y, f, is_flat, reach, out):  # type: ignore[no-untyped-de
     if s[ETA] > 0.0:
         for j in range(p):
             strain[j] = y[mine + j]
-            f[mine + j] = (out[j] - total[j] - s[RATE] * own[p + j]) / s[ETA]
+            f[mine + j] = (out[j] - total[j] - s[RATE] * own[p + j]) / s[LOSS]
     elif is_flat:
         for j in range(p):
             strain[j] = reach[j] / s[HEIGHT]
     else:
-        slope = s[GAIN] * s[c.results + SLOPE]
+        slope = s[GAIN] * s[STEEP]
         for j in range(p):
             strain[j] = (out[j] - total[j]) / slope if slope > 0.0 else 0.0
     derive_inside(c, i, y, f, past(f, mine) if s[ETA] > 0.0 else strain)
@@ -312,7 +343,8 @@ def _mark_one_sided(c, g):  # type: ignore[no-untyped-def]
         flat += int(s[SIGMA_LOW] == s[SIGMA_HIGH] and s[ETA] == 0.0)
     for i in range(first, last):
         s, total = past(c.springs, i * c.width), past(c.part, (c.count + i) * p)
-        stands = s[TURNS] != 0.0 and abs(s[RATE]) * s[ETA] < STANDS * abs(c.carried[g])
+        snaps = s[TURNS] != 0.0 and c.numbers[i * NUMBERS + KIND] == BY_STRESS
+        stands = snaps and abs(s[RATE]) * s[ETA] < STANDS * abs(c.carried[g])
         for j in range(p):
             if stands and abs(common[j] - total[j]) > MOVES * max(abs(common[j]), abs(total[j])):
                 c.sided[j] = 1.0

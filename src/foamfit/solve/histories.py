@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ def stress_along(spring: Spring, strain: Array) -> tuple[Array, NDArray[np.int64
     log, endings = np.empty((4 * strain.size + 64, 5)), np.empty(loop.ENDINGS)
     loop.integrate(*given, log, endings)
     for at, _, _, entered, _ in log[: int(endings[loop.SWITCHES])].tolist():
-        branches[int(np.searchsorted(given[8], at)) :] = int(entered)
+        branches[int(np.searchsorted(given[8], at, "right")) :] = int(entered)
     if endings[loop.OUTCOME] != DONE:
         out[0, 0, int(np.searchsorted(given[8], endings[loop.ENDED])) :] = np.inf
     return out[0, 0], branches
@@ -77,9 +78,13 @@ def slope_along(spring: Spring, strain: Array) -> Array:
         slopes, branches = np.empty(strain.size), np.empty(strain.size, np.int64)
         along.follow(*given, _NO_LOG, np.zeros((strain.size, 2)), branches, slopes)
         return slopes
-    # Differences over the last thousandth of the way to each sample.
-    step = 1e-3 * np.diff(strain, prepend=0.0)
-    step[step == 0.0] = 1e-9
-    ways = (strain[:, None] - step[:, None] * np.array((2.0, 1.0, 0.0))).ravel()
+    # Differences over the last thousandth of the way to each sample; a sample without a way has the
+    # slope of the one before it.
+    moves = np.diff(strain, prepend=math.nan) != 0.0
+    moved = strain[moves]
+    step = 1e-3 * np.diff(moved, prepend=0.0)
+    step[step == 0.0] = 1e-9  # the first
+    ways = (moved[:, None] - step[:, None] * np.array((2.0, 1.0, 0.0))).ravel()
     stress = stress_along(spring, ways)[0].reshape(-1, 3)
-    return np.asarray((stress[:, 0] - 4.0 * stress[:, 1] + 3.0 * stress[:, 2]) / (2.0 * step))
+    found = (stress[:, 0] - 4.0 * stress[:, 1] + 3.0 * stress[:, 2]) / (2.0 * step)
+    return np.asarray(found[np.cumsum(moves) - 1])

@@ -43,7 +43,16 @@ from foamfit.solve.run import (
     unpack,
 )
 from foamfit.solve.scene import FREE, STRESS, VISCOUS
-from foamfit.springs.compiled.contract import ETA, GAIN, HEIGHT, OPTIONS, TANGENT, inner, past
+from foamfit.springs.compiled.contract import (
+    ETA,
+    GAIN,
+    HEIGHT,
+    LOSSY,
+    OPTIONS,
+    TANGENT,
+    inner,
+    past,
+)
 
 
 def _radau() -> tuple[np.ndarray, np.ndarray]:
@@ -277,6 +286,15 @@ def _solve(c, h, at, tol, first, last):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _is_lossy(c, g):  # type: ignore[no-untyped-def]
+    """Whether a stress in a group depends on the strain rate, besides that of dashpots."""
+    lossy = False
+    for i in range(c.ends[g - 1] if g > 0 else 0, c.ends[g] if g < c.groups else 0):
+        lossy = lossy or past(c.springs, i * c.width)[LOSSY] > 0.0
+    return lossy
+
+
+@inner
 def _size(c, k, old, new):  # type: ignore[no-untyped-def]
     """Return the size to which the error of a component is relative.
 
@@ -288,6 +306,8 @@ def _size(c, k, old, new):  # type: ignore[no-untyped-def]
     if k >= 2 * c.nodes or k % 2 == 0:
         return max(_scale(c, k), size)
     g = k // 2
+    if _is_lossy(c, g) or _is_lossy(c, g + 1):
+        return max(_scale(c, k), size)
     damping = stiffness_of(c, g, True) + stiffness_of(c, g + 1, True)
     if c.drive[OVERDAMPED] > 0.0:
         return max(c.drive[BEGINNING], abs(c.carried[0])) / damping

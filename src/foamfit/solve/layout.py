@@ -13,12 +13,12 @@ from foamfit.solve.run import (
     BATCH,
     DRIVES,
     EPS_AT,
+    FIXED,
     FLOATS,
     GIVEN,
     INTERNALS,
     KIND,
     LINE,
-    MOST_OWN,
     NUMBERS,
     OF_SIGMA,
     RUN,
@@ -83,6 +83,7 @@ def place_state(shape: Shape, numbers: NDArray[np.int64], nodes: int) -> tuple[l
             several[i] = not alone
     for i, own in enumerate(numbers):
         own[EPS_AT] = own[X_AT] = -1
+        own[FIXED] = several[i] and not damped[i]
         if several[i] and damped[i]:
             own[EPS_AT] = len(kinds)
             kinds.append(SCALES + i)
@@ -191,6 +192,8 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     width = row + max(one.columns for one in made)
     places, groups_of, reach = order(shape, numbers, nodes) if shape.degree else ([], [], 0)
     size = carries if shape.degree else 0
+    parameters = max(one.derivatives for one in made)
+    internal = any(one.kind == INTERNAL for one in made)
     lengths = {
         "springs": count * width, "per_mass": groups, "drive": DRIVES, "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
@@ -198,7 +201,8 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
         "scales": SCALES + count + 2 * nodes + internals,
         "now": RUN, "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide, "new": wide,
         "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
-        "batch": BATCH * (6 + BY + MOST_OWN) + 3 * p + MOST_TERMS * (9 + p),
+        "batch": BATCH * (6 + BY + parameters) + 3 * p + MOST_TERMS * (9 + p),
+        "aside": count * (1 + shape.terms) + groups + 1 if internal else 0,
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
         "largest": p if size else 0, "kept": count * width + groups if size and p else 0,
         "systems": 2 * SYSTEMS * size * (3 * reach + 1),
@@ -211,7 +215,6 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     at = np.cumsum([0, *(lengths[name] for name in FLOATS)])
     whole = np.cumsum([WORDS, *map(len, arrays)])
     several = any(len(springs) > 1 for springs in _groups(shape))
-    internal = any(one.kind == INTERNAL for one in made)
     several = several or shape.top in (STRESS, VISCOUS)
     words = [
         *at[:-1], *whole[:-1], *([0] * len(GIVEN)),

@@ -32,6 +32,7 @@ from foamfit.solve.run import (
     GRAVITY,
     GROW,
     HORIZON,
+    INTERNALS,
     KIND,
     LARGEST,
     LAST,
@@ -42,6 +43,7 @@ from foamfit.solve.run import (
     OF_V,
     OF_W,
     OVERDAMPED,
+    PARAMETERS,
     PRESSED,
     RECORD,
     SAMPLE,
@@ -63,25 +65,25 @@ from foamfit.solve.scene import (
 )
 from foamfit.springs.compiled.contract import (
     BRANCH,
+    BY,
     BY_STRESS,
     EPS,
     ETA,
     GAIN,
     HEIGHT,
+    INTERNAL,
     MISS,
     OPTIONS,
     RATE,
     SLOPE,
     TANGENT,
+    TOTAL,
     TURNS,
     by_address,
     inlined,
     inner,
     past,
 )  # fmt: skip
-from foamfit.springs.compiled.contract import (
-    STRESS as TOTAL,
-)
 
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
 # bound on steps, length of a short implicit step, whether the contact is overdamped, least scales
@@ -154,6 +156,9 @@ def _mend(c, y):  # type: ignore[no-untyped-def]
                 y[n[EPS_AT]] += longer
                 if n[KIND] == BY_STRESS:
                     y[n[X_AT]] += longer * s[TANGENT]
+                elif n[KIND] == INTERNAL:
+                    for k in range(n[INTERNALS]):
+                        y[n[X_AT] + k] += longer * s[c.results + BY + n[PARAMETERS] + 2 + k]
 
 
 @inner

@@ -12,7 +12,7 @@ from numba.extending import intrinsic
 
 from foamfit.solve.run import (
     DRAGGED,
-    EPS_AT,
+    FIXED,
     INTERNALS,
     KIND,
     NUMBERS,
@@ -45,7 +45,9 @@ from foamfit.springs.compiled.contract import (
     RELAX,
     SETTLE,
     SLOPE,
+    STEEP,
     TANGENT,
+    TOTAL,
     X,
     by_address,
     call_evaluate,
@@ -54,9 +56,6 @@ from foamfit.springs.compiled.contract import (
     inner,
     past,
 )  # fmt: skip
-from foamfit.springs.compiled.contract import (
-    STRESS as TOTAL,
-)
 from foamfit.springs.parameters import OWN_RELAXATION
 
 _F, _I, _P, _IP = (
@@ -67,9 +66,10 @@ _F, _I, _P, _IP = (
 )
 #: record, group, state, rates, whether with derivatives, time since the piece began; returns S
 GROUP = _F(_IP, _I, _P, _P, _I, _F)
-#: record, task (below), spring, up, state, rates, derivatives of the strain rate, results
+#: record, task (below), spring or group, up or whether with derivatives, state, rates, derivatives
+#: of the strain rate, results
 INSIDE = types.void(_IP, _I, _I, _I, _P, _P, _P, _P)
-PART, FLOW, FRICTION, JUMP = range(4)
+PART, FLOW, FRICTION, JUMP, PATH, LOSE, SHARE, LOSSES, BEGIN_RAMP, END_RAMP = range(10)
 ONLY_DERIVATIVES = 2  # instead of 0 or 1 for `want`, where the values are known
 
 
@@ -111,15 +111,11 @@ def follow_spring(c, i, eps, y, f, want):  # type: ignore[no-untyped-def]
         for k in range(n[INTERNALS]):
             s[X + k] = y[n[X_AT] + k]
     s[EPS] = eps
-    evaluate(c, i, want if kind != INTERNAL or want else 2 * int(n[EPS_AT] >= 0))
+    evaluate(c, i, want if kind != INTERNAL or want else 2 * n[FIXED])
     sigma, tangent, drift = out[OF_LAW], out[SLOPE], 0.0
-    if kind == INTERNAL and (want or n[EPS_AT] >= 0):
-        x, values = n[INTERNALS], past(out, BY + n[PARAMETERS])
-        size = 2 + 2 * x
-        for k in range(x):
-            by_x = values[size + (2 + k) * size]
-            tangent += by_x * values[2 + k]
-            drift += c.drive[PACE] * s[GAIN] * by_x * values[2 + x + k]
+    if kind == INTERNAL and n[FIXED]:
+        call_inside(c, PATH, i, c.none, y, f, y, y)
+        tangent, drift = s[TANGENT], s[DRIFT]
     stress = s[GAIN] * sigma
     for k in range(c.terms):
         z, at = y[n[Z_AT] + k], RELAX + 2 * k
@@ -149,6 +145,7 @@ def derive_spring(c, i, y):  # type: ignore[no-untyped-def]
     s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
     part, total = past(c.part, i * p), past(c.part, (c.count + i) * p)
     out, owned, directions = past(s, c.results), c.owned, c.directions
+    s[STEEP] = s[TANGENT] if n[FIXED] else out[SLOPE]
     for j in range(p):
         part[j] = 0.0
     if n[KIND] == BY_STRESS:
@@ -174,11 +171,11 @@ def derive_spring(c, i, y):  # type: ignore[no-untyped-def]
 def derive_inside(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
     """Fill the rates of the derivatives of relaxation terms and of internal variables.
 
-    `quicker` are the derivatives of the strain rate, for INTERNAL laws.
+    `quicker` are the derivatives of the strain rate, for INTERNAL laws; not read if unknown.
     """
     s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
     part, strain, out = past(c.part, i * p), past(c.strain, i * p), past(s, c.results)
-    directions, slope = c.directions, out[SLOPE]
+    directions, slope = c.directions, s[STEEP]
     for k in range(c.terms):
         at, per = c.base + (n[Z_AT] + k) * p, 1.0 / s[RELAX + 2 * k + 1]
         more, of_tau = (y[n[Z_AT] + k] + out[OF_LAW]) * per * per, OWN_RELAXATION + 2 * k + 1

@@ -19,7 +19,7 @@ from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled
-from foamfit.springs.compiled.contract import INTERNAL, Compiled
+from foamfit.springs.compiled.contract import INTERNAL, TINY, Compiled
 from foamfit.springs.laws.record import Law
 from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 from foamfit.springs.spring import as_samples
@@ -365,16 +365,9 @@ class Plan(NamedTuple):
         """Return the radians of vibration and relaxation that explicit steps would cover."""
         first, steep = self.slopes_of(rows)
         gain = 1.0 + rows[:, 1 : 1 + 2 * self.terms : 2].sum(axis=1)
-        chain = (
-            gain * first,
-            gain * steep,
-            rows[:, 0],
-            heights,
-            np.array(self.ends),
-            self.mass,
-            drag,
-            self.top,
-        )
+        eta = np.where(rows[:, 0] > TINY, rows[:, 0], 0.0)
+        ends = np.array(self.ends)
+        chain = gain * first, gain * steep, eta, heights, ends, self.mass, drag, self.top
         return rates.fastest_rates(*chain, self.speed > 0.0, self._duration)
 
 

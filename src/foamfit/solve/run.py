@@ -1,7 +1,7 @@
 """A run in memory: the one record that all compiled functions of the solver take.
 
-`layout.lay_out` gives every array of a run its place, once per kind of scene. The record is
-a row of integers: addresses of arrays and functions, then sizes. Compiled functions read it by name:
+`layout.lay_out` gives every array of a run its place, once per kind of scene. The record is a row
+of integers: addresses of arrays and functions, then sizes. Compiled functions read it by name:
 `c.springs` is a pointer, `c.count` a number.
 
 The state is one array. First come displacement w and velocity v of each node that has a state, then
@@ -27,6 +27,7 @@ from foamfit.springs.compiled.contract import (
     ETA,
     GAIN,
     HEIGHT,
+    LOSS,
     PER_HEIGHT,
     RELAX,
     address,
@@ -44,13 +45,13 @@ from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
 # work with; of the strains; scales of the kinds of components; numbers that change during a run;
 # whether derivatives from above and below differ; rates at the stages of a step; its dense output;
 # the state, that at the end of a step, and one between with its rates; zeros; errors; samples that
-# are computed together. Those of implicit steps: Jacobian, n rows of 2 reach + 1; vibrations, see
-# `implicit.remember`, and the largest motion and stress at a sample; values of the derivatives over
-# the scales; a copy of `springs` and `carried`; factored systems, complex, SYSTEMS of n rows of
-# 3 reach + 1, and their right sides.
+# are computed together; what is set aside during a ramp, see `internal`. Those of implicit
+# steps: Jacobian, n rows of 2 reach + 1; vibrations, see `implicit.remember`, and the largest
+# motion and stress at a sample; values of the derivatives over the scales; a copy of `springs` and
+# `carried`; factored systems, complex, SYSTEMS of n rows of 3 reach + 1, and their right sides.
 FLOATS = (
     "springs", "per_mass", "drive", "carried", "own", "held", "part", "common", "strain", "scales",
-    "now", "sided", "stage", "line", "y", "new", "state", "f", "nil", "errors", "batch",
+    "now", "sided", "stage", "line", "y", "new", "state", "f", "nil", "errors", "batch", "aside",
     "jacobian", "alive", "worst", "largest", "kept", "systems", "right",
 )  # fmt: skip
 # Arrays of integers: rows of NUMBERS of the springs; one past the last spring of each group;
@@ -80,21 +81,21 @@ SAMPLES, SHOWN, ROOM = AT["samples"], AT["shown"], AT["room"]
 _FLOATS_END, _INTEGERS_END = len(FLOATS), len(FLOATS) + len(INTEGERS)
 
 # Integers of a spring: the addresses of its law, kind, number of parameters and of internal
-# variables; and the places of strain, internal variables and relaxation terms in the state (-1:
-# none).
-KIND, PARAMETERS, INTERNALS, EPS_AT, X_AT, Z_AT, NUMBERS = 5, 6, 7, 8, 9, 10, 12
+# variables; the places of strain, internal variables and relaxation terms in the state (-1: none);
+# and whether the derivatives of its internal variables are those at a fixed strain, see `internal`.
+KIND, PARAMETERS, INTERNALS, EPS_AT, X_AT, Z_AT, FIXED, NUMBERS = 5, 6, 7, 8, 9, 10, 11, 12
 # Kinds of components of the state, which share a scale: displacement, velocity, strain, stress.
 # Then follow the strain of each spring, displacement and velocity of each node, and each internal
 # variable, which have scales of their own.
 OF_W, OF_V, OF_EPS, OF_SIGMA, SCALES = range(5)
 # The drive now: stress or displacement at the start of the piece and its rate; velocity of a
 # viscous top; 1 if a stress acts on a flat branch; onsite damping of the top, Pa s/m; 0 if time
-# stands still for the laws, else 1; acceleration of the striker by gravity; 1
-# if dashpots stop a striker long before the springs, see `rates.is_overdamped`; base
-# stress at the start of an implicit step.
-VALUE, VALUE_RATE, TOP_SPEED, FLAT, DRAGGED, PACE, GRAVITY, OVERDAMPED, BEGINNING, DRIVES = range(
-    10
-)
+# stands still for the laws, else 1; acceleration of the striker by gravity; 1 if dashpots stop a
+# striker long before the springs, see `rates.is_overdamped`; base stress at the start of an
+# implicit step; stress on the top, and rate of the elongation of the group whose stress `internal`
+# solves for.
+VALUE, VALUE_RATE, TOP_SPEED, FLAT, DRAGGED, PACE, GRAVITY, OVERDAMPED, BEGINNING = range(9)
+PUSH, SPREAD, DRIVES = range(9, 12)
 # Numbers that change during a run: time since the piece began, time at which it begins, step,
 # length of the piece, steps, growth of the next step, largest stress, whether the base stress has
 # risen, last error, next sample, number of the piece, switches; of implicit steps: length of the
@@ -102,7 +103,7 @@ VALUE, VALUE_RATE, TOP_SPEED, FLAT, DRAGGED, PACE, GRAVITY, OVERDAMPED, BEGINNIN
 # size of all vibrations that were damped out, and of those in the last steps.
 NOW, BEGUN, STEP, HORIZON, TAKEN, GROW, LARGEST, PRESSED, LAST, SAMPLE, PIECE, LOGGED = range(12)
 BEFORE, FLOOR, BRIEF, IN_ROW, DAMPED, DAMPING, RUN = range(12, 19)
-BATCH, MOST_OWN = 64, 10  # samples that are computed together; parameters of a built-in law
+BATCH = 64  # samples that are computed together
 # Rows of the stages; the row with the rates at the end of a step; rows of the dense output.
 STAGES, STEPPED, LINE = 16, 12, 7
 POINTS, SYSTEMS = 5, 3  # of an implicit step; linear systems, one for a pair of eigenvalues
@@ -178,6 +179,7 @@ def begin_run(template, ints, floats, time, values, out, log, rows, heights, mas
     for i in range(c.count):
         s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
         s[HEIGHT], s[PER_HEIGHT], s[ETA], s[GAIN] = heights[i], 1.0 / heights[i], rows[i, 0], 1.0
+        s[LOSS] = s[ETA]
         for k in range(terms):
             s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = rows[i, 1 + 2 * k], rows[i, 2 + 2 * k]
             s[GAIN] += rows[i, 1 + 2 * k]

@@ -30,13 +30,11 @@ from foamfit.springs.compiled.contract import (
     SIGMA_LOW,
     SLOPE,
     TANGENT,
+    TOTAL,
     TURNS,
     call_number,
     inner,
     past,
-)
-from foamfit.springs.compiled.contract import (
-    STRESS as TOTAL,
 )
 
 MOST_SWITCHES = 100_000  # of all springs between two samples

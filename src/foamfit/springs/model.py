@@ -95,11 +95,6 @@ class Model:
         """The law of each spring."""
         return tuple(laws.law(kind) for kind in self.kinds)
 
-    @cached_property
-    def is_registered(self) -> bool:
-        """Whether a spring has a registered law."""
-        return any(laws.is_registered(kind) for kind in self.kinds)
-
     def param(self, name: str) -> Param:
         """Return the record of a parameter."""
         return param_of(self.kinds, name)

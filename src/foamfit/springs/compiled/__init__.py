@@ -53,10 +53,14 @@ def solver_row(law: Law, values: Array, terms: ArrayLike, room: int) -> Array | 
     `values` are the parameters and eta. The row contains eta, `room` relaxation terms (g, τ), and
     the row of the law.
     """
+    from foamfit.springs.compiled.contract import TINY
+
     made, pairs = compiled(law), np.ravel(terms)
     row = np.zeros(1 + 2 * room + made.columns)
     fine = made.fill(values[:-1], row[1 + 2 * room :]) and values[-1] >= 0.0
     row[0], row[2 : 1 + 2 * room : 2] = values[-1], np.inf  # unused terms
+    if made.damps and values[-1] == 0.0:
+        row[0] = TINY
     row[1 : 1 + pairs.size] = pairs
     for g, tau in pairs.reshape(-1, 2).tolist():
         fine = fine and 0.0 <= g < math.inf and 0.0 < tau < math.inf

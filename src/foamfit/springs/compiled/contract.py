@@ -17,7 +17,8 @@ row, the constants that `fill` computes from its parameters.
         the next. At an end, EPS and X become those of the end. A BY_STRESS law fills in `out`, for
         each held number, its derivatives by the stress, by both held numbers before, and by the
         parameters; an INTERNAL one, for each internal variable, its derivatives by ε, by all
-        internal variables before, and by the parameters.
+        internal variables before, and by the parameters, and then those of the strain at the end (1
+        and zeros at a turning point).
     settle(row, s, eps)
         Bring a spring to a strain on its branch: fill EPS, X and SLOPE.
     strain(row, s, sigma) -> ε
@@ -46,22 +47,14 @@ from numba.extending import intrinsic
 BRANCH, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH, TURNS, HELD, OWN, MEMORY = 0, 1, 2, 3, 4, 5, 6, 8, 48
 # Values: strain and its rate, stress T with relaxation but without dashpot, the part of dT/dt
 # without dε/dt, strain and rate at the start of a step, height, dashpot, 1 + Σ g, 1/height, dε/dσ,
-# dσ/dε along the path of the internal variables, Σ g z.
-(
-    EPS,
-    RATE,
-    STRESS,
-    DRIFT,
-    OLD_EPS,
-    OLD_RATE,
-    HEIGHT,
-    ETA,
-    GAIN,
-    PER_HEIGHT,
-    SOFT,
-    TANGENT,
-    OFFSET,
-) = range(MEMORY, MEMORY + 13)
+# dσ/dε along the path of the internal variables, Σ g z, dσ/dε of the derivatives, dashpot and ∂V by
+# the strain rate, and 1 if V depends on that rate, which `begin` sets.
+EPS, RATE, TOTAL, DRIFT, OLD_EPS, OLD_RATE, HEIGHT, ETA, GAIN, PER_HEIGHT, SOFT, TANGENT = range(
+    MEMORY, MEMORY + 12
+)
+OFFSET, STEEP, LOSS, LOSSY = range(MEMORY + 12, MEMORY + 16)
+# Dashpot of a law with V that has none: it counts as damped.
+TINY = 1e-300
 X, MOST_INTERNAL = 64, 32  # internal variables
 RELAX, MOST_TERMS = 96, 10  # g and τ of relaxation terms
 RESULTS = 128  # of `evaluate`
@@ -98,6 +91,7 @@ class Compiled(NamedTuple):
     #: columns of the row with slopes dσ/dε (Pa) of branches at zero stress, that at rest first
     slopes: tuple[int, ...] = ()
     pole: int = -1  #: column of the row with ε_*, if the strain stays below 1 + ε_*
+    damps: bool = False  #: whether V depends on the strain rate
 
 
 BEGIN, EVALUATE, SWITCH, SETTLE, STRAIN = range(5)

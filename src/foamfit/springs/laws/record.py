@@ -100,8 +100,8 @@ class Param:
 class Functions(NamedTuple):
     """The formulas of a registered law; "Your own law" in the documentation specifies them.
 
-    p and x are arrays of the parameters and of the internal variables, `strain` and `rate` numbers,
-    all complex; `branch` is a number.
+    p is the tuple of the parameters, x the array of the internal variables, `strain` and `rate` are
+    numbers, all complex; `branch` is the number of the branch.
     """
 
     stress: Callable[..., Any]  #: stress(p, x, strain, branch) -> σ, Pa
@@ -110,7 +110,8 @@ class Functions(NamedTuple):
     #: ends(p, x, strain, branch, out): fill strains at the lower and upper end of the branch, and
     #: 1 (-1) if it ends where the strain stops rising (falling)
     ends: Callable[..., None] | None = None
-    switch: Callable[..., int] | None = None  #: switch(p, x, strain, branch, up) -> next branch
+    #: switch(p, x, strain, branch, up) -> next branch; it may change x
+    switch: Callable[..., int] | None = None
     #: viscous(p, x, strain, rate, branch): a stress (Pa) that depends on the strain rate (1/s)
     viscous: Callable[..., Any] | None = None
     admissible: Callable[[Array], bool] | None = None  #: admissible(p) -> bool, of real numbers
@@ -226,8 +227,9 @@ class Law:
 
     @property
     def is_viscous(self) -> bool:
-        """Whether the stress depends on the strain rate."""
-        return isinstance(self.functions, Functions) and self.functions.viscous is not None
+        """Whether the stress depends on time."""
+        given = self.functions
+        return isinstance(given, Functions) and bool(given.viscous or given.decay)
 
     def assembled(self, chosen: Callable[[Param], float]) -> Array:
         """Return parameters from a choice for each: its position between its ends, or its value."""
