@@ -218,9 +218,7 @@ def test_derivatives_by_all_parameters_are_those_of_differences(name: str) -> No
                 low, lower, higher, high = (getattr(r, what) for r in near)
                 wanted = (low - 8.0 * lower + 8.0 * higher - high) / (12.0 * step)
                 got = getattr(run.sensitivities[short], what)
-                size = max(
-                    np.abs(got).max(), 2e-5 * np.abs(getattr(run, what)).max() / abs(value)
-                )
+                size = max(np.abs(got).max(), 2e-5 * np.abs(getattr(run, what)).max() / abs(value))
                 misses[-1].append(np.abs(wanted - got)[..., away].max() / size)
         assert np.min(misses, axis=0).max() < 1e-6, short
 

@@ -14,7 +14,7 @@ from numba import njit
 
 from foamfit.solve.events import change_branch
 from foamfit.solve.motion import evaluate
-from foamfit.solve.run import KIND, NUMBERS, begin_run
+from foamfit.solve.run import KIND, begin_run
 from foamfit.solve.samples import row_of
 from foamfit.springs.compiled.contract import (
     BRANCH,
@@ -141,7 +141,11 @@ def step_to(c, part, h, m, seed, y, tol, weight):  # type: ignore[no-untyped-def
     m: largest stress, tables, and room for the derivatives at the start and in the middle.
     """
     s, p = c.springs, c.p
-    tables, d_first, d_middle = past(m, 2), past(m, 2 + c.terms * TABLE), past(m, 2 + c.terms * TABLE + p)
+    tables, d_first, d_middle = (
+        past(m, 2),
+        past(m, 2 + c.terms * TABLE),
+        past(m, 2 + c.terms * TABLE + p),
+    )
     out = past(s, c.results)
     origin, first, slope, x = s[EPS], out[OF_LAW], out[SLOPE], s[X]
     step = part - origin

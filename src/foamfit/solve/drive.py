@@ -43,6 +43,7 @@ from foamfit.springs.compiled.contract import (
     RELAX,
     SLOPE,
     TANGENT,
+    TOTAL,
     X,
     inner,
     past,
@@ -130,7 +131,11 @@ def _derive_start(c, g, i0, i1, common):  # type: ignore[no-untyped-def]
         s[ETA] = 0.0 if c.top == MOTION else s[ETA]
     rates_of(c, g, y, c.f, ONLY_DERIVATIVES, 0.0)
     for i in range(i0, i1):
-        s, n, strain = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), past(c.strain, i * p)
+        s, n, strain = (
+            past(c.springs, i * c.width),
+            past(c.numbers, i * NUMBERS),
+            past(c.strain, i * p),
+        )
         s[ETA], s[OFFSET] = s[OFFSET], 0.0
         slope, part, at = s[c.results + SLOPE], past(c.part, i * p), base + n[EPS_AT] * p
         if s[ETA] > 0.0 and n[EPS_AT] >= 0:

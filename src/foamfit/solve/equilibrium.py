@@ -92,7 +92,9 @@ def root(c, i0, i1, target, sigma, low, high, loose):  # type: ignore[no-untyped
             if low > -math.inf and high < math.inf:
                 new = 0.5 * (low + high)
             elif not low < new < high:
-                new = sigma + (2.0 if miss < 0.0 else -2.0) * max(abs(sigma), abs(miss / compliance))
+                new = sigma + (2.0 if miss < 0.0 else -2.0) * max(
+                    abs(sigma), abs(miss / compliance)
+                )
             if new in (low, high):  # neighbouring floating-point numbers
                 return _split_jump(c, i0, i1, target, low, high, loose)
         sigma = new
@@ -100,5 +102,3 @@ def root(c, i0, i1, target, sigma, low, high, loose):  # type: ignore[no-untyped
         if not (loose and past(c.springs, i * c.width)[ETA] > 0.0):
             put(c, i, strain_at(c, i, sigma), sigma)
     return sigma
-
-

@@ -13,6 +13,7 @@ from foamfit.solve.run import (
     DRAGGED,
     KIND,
     LARGEST,
+    NOW,
     NUMBERS,
     OVERDAMPED,
     PARAMETERS,
@@ -22,7 +23,6 @@ from foamfit.solve.run import (
     VALUE,
     X_AT,
     unpack,
-    NOW,
 )
 from foamfit.springs.compiled.contract import (
     BY,
@@ -39,8 +39,8 @@ from foamfit.springs.compiled.contract import (
     OPTIONS,
     RATE,
     SLOPE,
-    STRESS as TOTAL,
     SWITCH,
+    TOTAL,
     TURNS,
     X,
     by_address,
@@ -57,7 +57,12 @@ RISEN = 1e-9  # base stress over the largest stress above which its return to ze
 # greatest and a least strain.
 TOP_END, LOW_END, TURN, RELEASE, TOP_TURN, LOW_TURN = range(6)
 PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
-_F, _I, _P, _IP = types.float64, types.int64, types.CPointer(types.float64), types.CPointer(types.int64)
+_F, _I, _P, _IP = (
+    types.float64,
+    types.int64,
+    types.CPointer(types.float64),
+    types.CPointer(types.int64),
+)
 #: record, whether with derivatives, tolerance, time of the next sample, bound on steps
 STEPPING = _I(_IP, _I, _F, _F, _F)
 
@@ -95,7 +100,7 @@ def _change_branch(words, i, up, y):  # type: ignore[no-untyped-def]
         for h in range(2):
             by = past(changes, h * change)
             value = by[OF_STRESS] * d_sigma + by[OF_HELD] * first + by[OF_HELD + 1] * second
-            if directions[2 * j] == i and own < OWN_ETA:
+            if directions[2 * j] == i and 0 <= own < OWN_ETA:
                 value += by[OF_PARAMETER + own]
             held[h * p + j] = value
 
@@ -211,7 +216,11 @@ def _earliest(c, before, share):  # type: ignore[no-untyped-def]
     found, who, what = share, -1 + c.none, -1 + c.none
     look(c, found)
     if c.now[PRESSED] > 0.0 and c.carried[0] <= 0.0:
-        found, who, what = _locate(c, before, found, c.none, RELEASE + c.none), c.none, RELEASE + c.none
+        found, who, what = (
+            _locate(c, before, found, c.none, RELEASE + c.none),
+            c.none,
+            RELEASE + c.none,
+        )
         look(c, found)
     for i in range(c.count):
         for kind in range(RELEASE):

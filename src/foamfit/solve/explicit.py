@@ -22,8 +22,9 @@ ALL_STAGES = 16  # those of a step and of the dense output
 _A = np.zeros((ALL_STAGES, ALL_STAGES))
 _A[:, : pair.A.shape[1]] = pair.A
 _A[STEPPED, :STEPPED] = pair.B
-# Coefficients without zeros: stage s is the sum of WEIGHT[k] K[FROM[k]], FIRST[s] <= k < FIRST[s+1];
-# after the stages come the four higher terms of the dense output, and the errors of order 5 and 3.
+# Coefficients without zeros: stage s is the sum of WEIGHT[k] K[FROM[k]] for FIRST[s] <= k <
+# FIRST[s+1]; after the stages come the four higher terms of the dense output, and the errors of
+# order 5 and 3.
 _FULL = np.zeros((22, ALL_STAGES))
 _FULL[:16], _FULL[16:20], _FULL[20, :13], _FULL[21, :13] = _A, pair.D, pair.E5, pair.E3
 _ROWS = [np.flatnonzero(row) for row in _FULL]
@@ -77,7 +78,13 @@ def take(c, n, dt, at, want):  # type: ignore[no-untyped-def]
     for s in range(1, STEPPED + 1):
         target = c.new if s == STEPPED else c.state
         combine(c, n, s, dt, c.y, target)
-        rates(c, target, past(c.stage, s * c.wide), want, at + TIMES[s] * dt if s < STEPPED else at + dt)
+        rates(
+            c,
+            target,
+            past(c.stage, s * c.wide),
+            want,
+            at + TIMES[s] * dt if s < STEPPED else at + dt,
+        )
 
 
 @inner

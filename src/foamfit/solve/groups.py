@@ -65,6 +65,7 @@ from foamfit.springs.compiled.contract import (
     SIGMA_LOW,
     STEEP,
     TANGENT,
+    TOTAL,
     TURNS,
     X,
     inner,
@@ -172,7 +173,7 @@ def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
 def _close(c, i0, i1, rest, pushed):  # type: ignore[no-untyped-def]
     """Give what rounding leaves of the rate of elongation to the spring with the lightest dashpot.
 
-    Rounding errors of S - T over a light dashpot would change the elongation, which nothing resists.
+    Rounding errors of S - T over a light dashpot would change the elongation, and nothing resists.
     """
     least, where = math.inf, i0
     for i in range(i0, i1):

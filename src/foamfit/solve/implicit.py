@@ -76,7 +76,9 @@ _kept = [int(np.argmin(np.abs(_values.imag)))] + [
 EIGEN = np.array(_values[_kept])  # one of each pair
 assert len(_kept) == SYSTEMS
 TO_BASIS = np.ascontiguousarray(np.linalg.inv(_vectors)[_kept])
-FROM_BASIS = np.ascontiguousarray(_vectors[:, _kept] * np.where(np.abs(EIGEN.imag) > 1e-9, 2.0, 1.0))
+FROM_BASIS = np.ascontiguousarray(
+    _vectors[:, _kept] * np.where(np.abs(EIGEN.imag) > 1e-9, 2.0, 1.0)
+)
 # Coefficients 1 … 5 of the polynomial over the step [0, 1], from increments at the points.
 COEFFICIENTS = np.linalg.inv(NODES[:, None] ** np.arange(1, POINTS + 1))
 # The error of an embedded method of order 5 that also uses the rate at the start, with weight
@@ -88,8 +90,8 @@ OF_ERROR = (_weights - _A[-1]) @ _INVERSE / _gamma
 
 FOLLOW_LIMIT = 600  # number of short steps in a row that are taken
 TURNS_OF_NEWTON = 12
-# Newton's method ends at changes of ENOUGH over the tolerance, of derivatives at ENOUGH/OF_TANGENTS: as
-# they obey linear equations, the next change is smaller by the error of the matrices.
+# Newton's method ends at changes of ENOUGH over the tolerance, for derivatives ENOUGH/OF_TANGENTS:
+# as they obey linear equations, the next change is smaller by the error of the matrices.
 ENOUGH, OF_TANGENTS = 1e-3, 1e6
 ROUNDED = 1e-15  # relative error that is nothing but rounding
 
@@ -145,7 +147,7 @@ def substitute(a, n, reach, pivots, x):  # type: ignore[no-untyped-def]
 
 @inner
 def _scale(c, k):  # type: ignore[no-untyped-def]
-    """Return the scale of a component; that of a node is shared, as fast vibrations are not resolved."""
+    """Return the scale of a component; that of nodes is shared."""
     if k < 2 * c.nodes:
         return c.scales[OF_V if k % 2 else OF_W]
     return c.scales[c.kinds[k]]
@@ -414,7 +416,7 @@ def remember(c, span, wait):  # type: ignore[no-untyped-def]
         damping += c.drive[DRAGGED] if g == c.groups - 1 else 0.0
         own = math.sqrt((below + above) * c.per_mass[g])
         fade, root = 0.5 * damping * c.per_mass[g], math.sqrt(own)
-        if g == c.groups - 1 and c.top != FREE or own == 0.0:
+        if (g == c.groups - 1 and c.top != FREE) or own == 0.0:
             continue
         started = 0.0
         if own * span > 2.0 and fade < own:

@@ -7,7 +7,7 @@ The derivatives δx of internal variables need those of the strain rate. Where n
 strain these are unknown, and u = δx - A δε is integrated instead, the derivatives at fixed strain:
 du/dt = dε/dt (A_x u + A_p) + δB - A_x B δε.
 
-In a group of several springs the strain rate of a spring with a stress V solves T + V + η dε/dt = S.
+In a group of several springs the strain rate of one with a stress V solves T + V + η dε/dt = S.
 
 A drive whose first sample is not zero takes internal variables there on a ramp, while time stands
 still: B, V, dashpots and relaxation terms do nothing, and nodes rest.
@@ -75,6 +75,7 @@ from foamfit.springs.compiled.contract import (
     STEEP,
     SWITCH,
     TANGENT,
+    TOTAL,
     X,
     call_switch,
     inner,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -65,7 +66,7 @@ class Shape(NamedTuple):
 
 def _groups(shape: Shape) -> list[range]:
     """Return the springs of each group."""
-    return [range(i, j) for i, j in zip((0, *shape.ends), shape.ends, strict=False)]
+    return [range(i, j) for i, j in pairwise((0, *shape.ends))]
 
 
 def place_state(shape: Shape, numbers: NDArray[np.int64], nodes: int) -> tuple[list[int], int]:
@@ -103,9 +104,7 @@ def place_state(shape: Shape, numbers: NDArray[np.int64], nodes: int) -> tuple[l
     return kinds, carries
 
 
-def order(
-    shape: Shape, numbers: NDArray[np.int64], nodes: int
-) -> tuple[list[int], list[int], int]:
+def order(shape: Shape, numbers: NDArray[np.int64], nodes: int) -> tuple[list[int], list[int], int]:
     """Order the components by groups: return place and group of each, and the reach.
 
     Components couple with those of the neighbouring groups: at places closer than the reach.
@@ -127,7 +126,7 @@ def order(
     places, groups = [0] * len(found), [0] * len(found)
     for place, (k, g) in enumerate(found):
         places[k], groups[k] = place, g
-    return places, groups, max(a + b for a, b in zip(sizes, sizes[1:], strict=False)) - 1
+    return places, groups, max(a + b for a, b in pairwise(sizes)) - 1
 
 
 def _owned(count: int, directions: list[list[int]]) -> list[int]:
@@ -198,13 +197,15 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     lengths = {
         "springs": count * width, "per_mass": groups, "drive": DRIVES, "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
-        "common": (groups + 3) * p, "strain": count * p, "scales": SCALES + count + 2 * nodes + internals,
+        "common": (groups + 3) * p, "strain": count * p,
+        "scales": SCALES + count + 2 * nodes + internals,
         "now": RUN, "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide, "new": wide,
         "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
         "batch": BATCH * (6 + BY + parameters) + 3 * p + MOST_TERMS * (9 + p),
         "aside": count * (1 + shape.terms) + groups + 1 if internal else 0,
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
-        "largest": p if size else 0, "kept": count * width + groups if size and p else 0, "systems": 2 * SYSTEMS * size * (3 * reach + 1),
+        "largest": p if size else 0, "kept": count * width + groups if size and p else 0,
+        "systems": 2 * SYSTEMS * size * (3 * reach + 1),
         "right": 2 * SYSTEMS * size,
     }  # fmt: skip
     arrays = (

@@ -77,6 +77,7 @@ from foamfit.springs.compiled.contract import (
     RATE,
     SLOPE,
     TANGENT,
+    TOTAL,
     TURNS,
     by_address,
     inlined,
@@ -88,13 +89,15 @@ from foamfit.springs.compiled.contract import (
 )
 
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
-# bound on steps, length of a short implicit step, whether the contact is overdamped, least scales of
-# displacement, velocity, strain and stress.
+# bound on steps, length of a short implicit step, whether the contact is overdamped, least scales
+# of displacement, velocity, strain and stress.
 SPEED, TOL, MOST, BRIEFLY, OVER, LEAST, REALS = 2, 3, 4, 5, 6, 7, 11
 FIRST = 40.0  # first implicit step over a short one
 STOPPED = 0.1  # most of the velocity that a first step takes
 # Results of a run; after them, for each derivative, whether it is one-sided.
-OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, STRESS_LOST = range(9)
+OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, STRESS_LOST = range(
+    9
+)
 ENDINGS = 9
 LEAST_SHARE = 1e-6  # of the largest scale of nodes, see `_fresh_scales`
 SWITCHED, RELEASED, STALLED = 1, 2, 3  # what happened in a step
@@ -200,7 +203,7 @@ def _turn(c, want):  # type: ignore[no-untyped-def]
 
 @inner
 def _pass_event(c, want, share, who, kind):  # type: ignore[no-untyped-def]
-    """Move to an event within the step; return dS/dt at the end of contact, or change the branch."""
+    """Move to an event in the step; return dS/dt at the end of contact, or change the branch."""
     r, y, n, slope = c.now, c.y, c.base + c.carries * c.p, 0.0
     if kind == RELEASE:
         look(c, share - 1e-3)
@@ -354,7 +357,11 @@ def integrate(  # type: ignore[no-untyped-def]
         r[STEP] = dt
     endings[OUTCOME], endings[ENDED] = outcome, ended
     endings[STEPS], endings[SWITCHES] = r[TAKEN], r[LOGGED]
-    endings[STRONGEST], endings[FARTHEST], endings[DAMPED_OUT] = r[LARGEST], c.scales[OF_W], r[DAMPED]
+    endings[STRONGEST], endings[FARTHEST], endings[DAMPED_OUT] = (
+        r[LARGEST],
+        c.scales[OF_W],
+        r[DAMPED],
+    )
     endings[MOTION_LOST], endings[STRESS_LOST] = c.worst[0], c.worst[1]
     for j in range(c.p):
         endings[ENDINGS + j] = c.sided[j]

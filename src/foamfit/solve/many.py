@@ -22,7 +22,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-
 from numba import njit
 
 from foamfit.arrays import Array
@@ -84,7 +83,13 @@ def shapes_of(plan: Any, rows: Array) -> Array | None:
     It holds undamped bistable and linear springs without flat branches and gaps.
     """
     from foamfit.springs.compiled.bistable import (
-        EPS_A, EPS_C, EPS_HAT_A, EPS_HAT_C, TABLE, TO_STRESS, WIDE,
+        EPS_A,
+        EPS_C,
+        EPS_HAT_A,
+        EPS_HAT_C,
+        TABLE,
+        TO_STRESS,
+        WIDE,
     )  # fmt: skip
 
     own, out = rows[:, 1 + 2 * plan.terms :], np.zeros((len(rows), 4, SHAPE))

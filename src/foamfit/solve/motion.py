@@ -47,6 +47,7 @@ from foamfit.springs.compiled.contract import (
     SLOPE,
     STEEP,
     TANGENT,
+    TOTAL,
     X,
     by_address,
     call_evaluate,
@@ -60,7 +61,12 @@ from foamfit.springs.compiled.contract import (
 )
 from foamfit.springs.parameters import OWN_RELAXATION
 
-_F, _I, _P, _IP = types.float64, types.int64, types.CPointer(types.float64), types.CPointer(types.int64)
+_F, _I, _P, _IP = (
+    types.float64,
+    types.int64,
+    types.CPointer(types.float64),
+    types.CPointer(types.int64),
+)
 #: record, group, state, rates, whether with derivatives, time since the piece began; returns S
 GROUP = _F(_IP, _I, _P, _P, _I, _F)
 #: record, task (below), spring or group, up or whether with derivatives, state, rates, derivatives
@@ -326,7 +332,7 @@ def _call_rates(typing, where, c, y, f, want, at, only):  # type: ignore[no-unty
 
 @inlined
 def rates(c, y, f, want, at):  # type: ignore[no-untyped-def]
-    """Fill the rates f of a state y (with derivatives if `want`) at a time since the piece began."""
+    """Fill the rates f of a state y (with derivatives if `want`), `at` a time since the piece."""
     _call_rates(c.rates_at, c, y, f, want, at, -1)
 
 

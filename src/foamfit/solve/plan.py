@@ -28,7 +28,10 @@ Directions = NDArray[np.int64]
 
 FIRST_ORDER, SECOND_ORDER = "first order", "second order"
 EXPLICIT_STEPS, RADAU, AGGREGATE = "Dormand-Prince", "Radau IIA", "aggregate"
-LEAST_AGGREGATE, AS_ONE = 9, 1e-4  # springs that an impact treats as one; error over rtol and springs
+LEAST_AGGREGATE, AS_ONE = (
+    9,
+    1e-4,
+)  # springs that an impact treats as one; error over rtol and springs
 MAX_STEPS = 2_000_000
 # Implicit steps replace explicit ones above these limits.
 MOST_RELAXATION = 3e3  # relaxation times in the duration of the scene
@@ -41,7 +44,9 @@ MOST_SAMPLED = 10_000_000  # in total
 # Error of a step over the requested error.
 ALONE, IN_SERIES, OF_MASSES = 1e-3, 2e-3, 1e-3
 OF_IMPLICIT, OF_IMPLICIT_MASSES = 3e-4, 2e-2  # of an implicit step
-SHORT = 5e-4  # length of a short implicit step, as a share of the duration, for a truncation of 3e-8
+SHORT = (
+    5e-4  # length of a short implicit step, as a share of the duration, for a truncation of 3e-8
+)
 # Least error of a step; of vibrating masses, whose steps would not exceed rounding errors below it.
 LEAST_TOL, LEAST_OF_MASSES, LEAST_VIBRATING = 2e-14, 5e-13, 5e-12  # the last of implicit steps
 # Outcomes of explicit steps after which implicit ones are tried.
@@ -172,7 +177,11 @@ class Plan(NamedTuple):
             stiff = vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION
         shown = len(heights) if everything else 1
         out = np.empty((1 + len(directions), 1 + shown, self.time.size))
-        if not stiff and not len(directions) and (found := self._as_one(rows, heights, rtol, drag, out)):
+        if (
+            not stiff
+            and not len(directions)
+            and (found := self._as_one(rows, heights, rtol, drag, out))
+        ):
             return found
         log, endings = np.empty((logged, 5)), np.empty(loop.ENDINGS + len(directions))
         given = rows, heights, directions, out, log, endings
@@ -256,7 +265,8 @@ class Plan(NamedTuple):
             first = self.slopes_of(rows)[0]
             lasts = rates.contact_time(first, rows[:, 0], heights, float(self.mass[-1]), drag)
             duration = min(duration, 5.0 * lasts)
-        return SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0)
+        short: float = SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0)
+        return short
 
     def _motion(
         self, out: Array, method: str, endings: Array, log: Array, rows: Array, lost: float
@@ -284,15 +294,18 @@ class Plan(NamedTuple):
         count, wanted, n = len(heights), len(directions) > 0, self.time.size
         alone = self.top == scenes.MOTION and count == 1
         shown = count if everything else 1
-        out, branches = np.empty((1 + len(directions), 1 + shown, n)), np.empty((count, n), np.int64)
+        out, branches = (
+            np.empty((1 + len(directions), 1 + shown, n)),
+            np.empty((count, n), np.int64),
+        )
         reals = np.array((0.0, 1.0, 0.0, rtol))
         layout = self._layout(rows, directions, integrated=False)
         if alone:
             strain = (self.values / heights)[None, :]
             moved = bool((directions[:, 1] == MOVED).any())
             along.follow(
-                *_memory(layout), rows, heights, self.mass, reals, strain[0], self.time, out, _NO_LOG,
-                seeds(strain[0], moved), branches[0], np.empty(n),
+                *_memory(layout), rows, heights, self.mass, reals, strain[0], self.time, out,
+                _NO_LOG, seeds(strain[0], moved), branches[0], np.empty(n),
             )  # fmt: skip
             out[0, 1], out[1:, 1] = self.values, 0.0
             self._add_dashpot(out, strain[0], rows[0, 0], heights, directions)
@@ -444,7 +457,8 @@ def plan(
         elif above == 0.0:
             top = scenes.VISCOUS if chain.site_damping > 0.0 else scenes.STRESS
     arrays, count, laws = chain.arrays, len(chain.springs), _laws(chain)
-    ends, masses = (count,), np.array([above / chain.area])
+    ends: tuple[int, ...] = (count,)
+    masses = np.array([above / chain.area])
     if arrays.heavy:
         inside = np.flatnonzero(arrays.masses[:-1] > 0.0)
         ends = (*(inside + 1).tolist(), count)

@@ -63,7 +63,9 @@ def fastest_rates(
             stiff = float(steep[i0] / heights[i0])
         elif end - i0 > 1 and not loose.all():
             rest = steep[own] + heights[own] * stiff
-            relaxation = max(relaxation, float(np.max((rest / np.where(loose, 1.0, eta[own]))[~loose])))
+            relaxation = max(
+                relaxation, float(np.max((rest / np.where(loose, 1.0, eta[own]))[~loose]))
+            )
         if g > 0:
             relaxation = max(relaxation, (below_damp + damp) / float(mass[g - 1]))
             vibration = max(vibration, math.sqrt((below_stiff + stiff) / float(mass[g - 1])))

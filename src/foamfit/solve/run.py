@@ -1,6 +1,6 @@
 """A run in memory: the one record that all compiled functions of the solver take.
 
-`layout.lay_out` gives every array of a run its place, once per kind of scene. The record, `Run`, is a row
+`layout.lay_out` gives every array of a run its place, once per kind of scene. The record is a row
 of integers: addresses of arrays and functions, then sizes. Compiled functions read it by name:
 `c.springs` is a pointer, `c.count` a number.
 
@@ -9,7 +9,8 @@ of each spring its strain if it has a dashpot and other springs lie between the 
 relaxation terms z_k = q_k/g_k - σ with dz_k/dt = -(z_k + σ)/τ_k, and the internal variables of an
 INTERNAL law. The derivatives by parameter of all these follow. The rest of the state follows from
 them on a branch, but explicit steps integrate it as well, which costs less than to solve for it:
-strains of springs without a dashpot, and the stress of BY_STRESS laws. Its derivatives are computed.
+strains of springs without a dashpot, and the stress of BY_STRESS laws. Its derivatives are
+computed.
 """
 
 from __future__ import annotations
@@ -47,8 +48,7 @@ from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
 # are computed together; what is set aside during a ramp, see `internal`. Those of implicit
 # steps: Jacobian, n rows of 2 reach + 1; vibrations, see `implicit.remember`, and the largest
 # motion and stress at a sample; values of the derivatives over the scales; a copy of `springs` and
-# `carried`; factored systems,
-# complex, SYSTEMS of n rows of 3 reach + 1, and their right sides.
+# `carried`; factored systems, complex, SYSTEMS of n rows of 3 reach + 1, and their right sides.
 FLOATS = (
     "springs", "per_mass", "drive", "carried", "own", "held", "part", "common", "strain", "scales",
     "now", "sided", "stage", "line", "y", "new", "state", "f", "nil", "errors", "batch", "aside",
@@ -91,8 +91,9 @@ OF_W, OF_V, OF_EPS, OF_SIGMA, SCALES = range(5)
 # The drive now: stress or displacement at the start of the piece and its rate; velocity of a
 # viscous top; 1 if a stress acts on a flat branch; onsite damping of the top, Pa s/m; 0 if time
 # stands still for the laws, else 1; acceleration of the striker by gravity; 1 if dashpots stop a
-# striker long before the springs, see `rates.is_overdamped`; base stress at the start of an implicit
-# step; stress on the top, and rate of the elongation of the group whose stress `internal` solves for.
+# striker long before the springs, see `rates.is_overdamped`; base stress at the start of an
+# implicit step; stress on the top, and rate of the elongation of the group whose stress `internal`
+# solves for.
 VALUE, VALUE_RATE, TOP_SPEED, FLAT, DRAGGED, PACE, GRAVITY, OVERDAMPED, BEGINNING = range(9)
 PUSH, SPREAD, DRIVES = range(9, 12)
 # Numbers that change during a run: time since the piece began, time at which it begins, step,

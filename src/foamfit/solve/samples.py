@@ -16,7 +16,6 @@ from foamfit.solve.run import (
     GRAVITY,
     KIND,
     NOW,
-    NUMBERS,
     RECORD,
     SAMPLE,
     STEP,
@@ -52,7 +51,12 @@ from foamfit.springs.compiled.contract import (
 from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 
 INSIDE, FLIGHT, APPROACH = -1, -2, -3  # instead of the number of a sample
-_F, _I, _P, _IP = types.float64, types.int64, types.CPointer(types.float64), types.CPointer(types.int64)
+_F, _I, _P, _IP = (
+    types.float64,
+    types.int64,
+    types.CPointer(types.float64),
+    types.CPointer(types.int64),
+)
 
 
 @inlined

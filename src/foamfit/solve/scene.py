@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foamfit.errors import SimulationError
 from foamfit.arrays import Array
+from foamfit.errors import SimulationError
 
 # Top of the chain: with a mass, with an onsite damper only, under known stress, in known motion.
 FREE, VISCOUS, STRESS, MOTION = range(4)
@@ -19,8 +19,8 @@ _FAILURES = {
     STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s, where the scene "
     "changes faster than numbers can resolve (a strain at the end of its branch, a very light "
     "mass, or many springs on a flat branch)",
-    TOO_FAST: "something in the scene is too fast to be followed (a light mass, or a dashpot that is "
-    "very light beside a stiff spring)",
+    TOO_FAST: "something in the scene is too fast to be followed (a light mass, or a dashpot that "
+    "is very light beside a stiff spring)",
     FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
     "that nothing slows; give the top a mass or the spring a dashpot",
     NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "

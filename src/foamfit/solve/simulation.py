@@ -56,7 +56,8 @@ class Response:
     contact_end: float | None
     solver: str  #: "closed form", "first order" or "second order": the simplest that suffices
     #: "closed form", "Dormand-Prince" (explicit steps), "aggregate" (explicit steps of many springs
-    #: under one stress) or "Radau IIA" (implicit steps, where light masses or dashpots make the scene stiff; they damp unresolved vibrations)
+    #: under one stress) or "Radau IIA" (implicit steps, where light masses or dashpots make the
+    #: scene stiff; they damp unresolved vibrations)
     method: str
     #: time (s), spring (0 at the base), branch left, branch entered, and strain, (m, 5)
     switches: Array

@@ -107,7 +107,7 @@ class Spring(ABC):
 
     @cached_property
     def row(self) -> Array:
-        """The row of the spring for the kernels, without relaxation."""
+        """The row of the spring for the solver, without relaxation."""
         return self.solver_row(0)
 
     def solver_row(self, room: int) -> Array:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from numba import njit
+
 from foamfit.springs.compiled.contract import (
     BRANCH,
     BY,
@@ -29,7 +31,6 @@ from foamfit.springs.compiled.contract import (
     switching,
 )  # fmt: skip
 from foamfit.springs.law import admissible, derived_points
-from numba import njit
 
 # Branches; LINE and OPEN of linear springs. OPEN is that of a unilateral one out of contact.
 A, D, C, E, LINE, OPEN = range(6)
@@ -190,7 +191,10 @@ def fill_unilateral(values, row):  # type: ignore[no-untyped-def]
 def evaluate_linear(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
     touches = 1.0 if s[BRANCH] == LINE else 0.0
     for j in range(count):
-        out[OF_LAW * count + j], out[SLOPE * count + j] = touches * row[0] * eps[j], touches * row[0]
+        out[OF_LAW * count + j], out[SLOPE * count + j] = (
+            touches * row[0] * eps[j],
+            touches * row[0],
+        )
         out[MISS * count + j], out[BY * count + j] = 0.0, touches * eps[j]
     return 0.0
 

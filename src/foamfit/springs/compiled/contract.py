@@ -49,8 +49,8 @@ BRANCH, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH, TURNS, HELD, OWN, MEMORY = 0, 1, 2, 3,
 # without dε/dt, strain and rate at the start of a step, height, dashpot, 1 + Σ g, 1/height, dε/dσ,
 # dσ/dε along the path of the internal variables, Σ g z, dσ/dε of the derivatives, dashpot and ∂V by
 # the strain rate, and 1 if V depends on that rate, which `begin` sets.
-EPS, RATE, STRESS, DRIFT, OLD_EPS, OLD_RATE, HEIGHT, ETA, GAIN, PER_HEIGHT, SOFT, TANGENT = (
-    range(MEMORY, MEMORY + 12)
+EPS, RATE, TOTAL, DRIFT, OLD_EPS, OLD_RATE, HEIGHT, ETA, GAIN, PER_HEIGHT, SOFT, TANGENT = range(
+    MEMORY, MEMORY + 12
 )
 OFFSET, STEEP, LOSS, LOSSY = range(MEMORY + 12, MEMORY + 16)
 # Dashpot of a law with V that has none: it counts as damped.
@@ -133,7 +133,7 @@ def address(typing, pointer):  # type: ignore[no-untyped-def]
     return _I(pointer), emit
 
 
-def _pointer(kind, width):  # type: ignore[no-untyped-def]
+def _pointer(kind: Any, width: Any) -> Any:
     @intrinsic
     def at(typing, number):  # type: ignore[no-untyped-def]
         def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]

@@ -413,7 +413,7 @@ def _turn(row, s, up, out):  # type: ignore[no-untyped-def]
     """Hold the rank that a spring has reached where its strain turns."""
     branch, remembers, rank = s[BRANCH], row[REMEMBERS] > 0.0, rank_now(row, s)
     first = 5 if branch == BACK else 3
-    place, scale = line(row, int(branch))
+    scale = line(row, int(branch))[1]
     for h in range(2 if branch == SNAP and remembers else 1):
         by = past(out, h * CHANGE)
         by[OF_HELD + h], by[OF_STRESS] = 0.0, 1.0 / (scale * s[X])
