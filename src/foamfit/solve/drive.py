@@ -48,9 +48,6 @@ from foamfit.springs.compiled.contract import (
     inner,
     past,
 )  # fmt: skip
-from foamfit.springs.compiled.contract import (
-    STRESS as TOTAL,
-)
 
 _I, _IP = types.int64, types.CPointer(types.int64)
 

@@ -71,9 +71,6 @@ from foamfit.springs.compiled.contract import (
     inner,
     past,
 )  # fmt: skip
-from foamfit.springs.compiled.contract import (
-    STRESS as TOTAL,
-)
 
 STANDS, MOVES = 1e-12, 1e-9  # relative rates that are nothing but rounding, and more than that
 SNAPPING = (0, 2, 3)  # parameters of a bistable law on which the stress at A1 depends

@@ -81,9 +81,6 @@ from foamfit.springs.compiled.contract import (
     inner,
     past,
 )  # fmt: skip
-from foamfit.springs.compiled.contract import (
-    STRESS as TOTAL,
-)
 from foamfit.springs.parameters import OWN_ETA
 
 LEAST_RATE = 1e-25  # smaller strain rates are zero, 1/s

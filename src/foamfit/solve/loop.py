@@ -84,9 +84,6 @@ from foamfit.springs.compiled.contract import (
     inner,
     past,
 )  # fmt: skip
-from foamfit.springs.compiled.contract import (
-    STRESS as TOTAL,
-)
 
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
 # bound on steps, length of a short implicit step, whether the contact is overdamped, least scales

@@ -56,9 +56,6 @@ from foamfit.springs.compiled.contract import (
     inner,
     past,
 )  # fmt: skip
-from foamfit.springs.compiled.contract import (
-    STRESS as TOTAL,
-)
 from foamfit.springs.parameters import OWN_RELAXATION
 
 _F, _I, _P, _IP = (
