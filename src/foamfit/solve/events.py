@@ -293,4 +293,6 @@ def keep_values(c):  # type: ignore[no-untyped-def]
         s = past(c.springs, i * c.width)
         s[OLD_EPS], s[OLD_RATE] = s[EPS], s[RATE]
         largest = max(largest, abs(s[TOTAL]))
+    for g in range(c.groups):  # with dashpots
+        largest = max(largest, abs(c.carried[g]))
     c.now[LARGEST] = largest

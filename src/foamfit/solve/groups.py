@@ -15,6 +15,7 @@ import math
 from numba import cfunc
 
 from foamfit.solve.equilibrium import put, root, strain_at
+from foamfit.solve.events import ROUNDED
 from foamfit.solve.motion import (
     GROUP,
     LOSE,
@@ -54,9 +55,11 @@ from foamfit.springs.compiled.contract import (
     ETA,
     GAIN,
     HEIGHT,
+    HIGH,
     INTERNAL,
     LOSS,
     LOSSY,
+    LOW,
     OFFSET,
     OPTIONS,
     RATE,
@@ -336,11 +339,13 @@ def _mark_one_sided(c, g):  # type: ignore[no-untyped-def]
     A snapping spring that stands still continues for one sign of the change of a parameter and is
     held for the other; of several springs on flat branches, the sign decides which moves first.
     """
-    p, flat, common = c.p, 0, past(c.common, g * c.p)
+    p, flat, ready, common = c.p, 0, 0, past(c.common, g * c.p)
     first, last = (c.ends[g - 1] if g > 0 else 0), c.ends[g]
     for i in range(first, last):
         s = past(c.springs, i * c.width)
+        ends = min(abs(s[EPS] - s[HIGH]), abs(s[EPS] - s[LOW])) < ROUNDED  # and may go on to one
         flat += int(s[SIGMA_LOW] == s[SIGMA_HIGH] and s[ETA] == 0.0)
+        ready += int(s[SIGMA_LOW] < s[SIGMA_HIGH] and ends and s[ETA] == 0.0)
     for i in range(first, last):
         s, total = past(c.springs, i * c.width), past(c.part, (c.count + i) * p)
         snaps = s[TURNS] != 0.0 and c.numbers[i * NUMBERS + KIND] == BY_STRESS
@@ -348,8 +353,9 @@ def _mark_one_sided(c, g):  # type: ignore[no-untyped-def]
         for j in range(p):
             if stands and abs(common[j] - total[j]) > MOVES * max(abs(common[j]), abs(total[j])):
                 c.sided[j] = 1.0
-            mine = flat > 1 and c.directions[2 * j] == i and s[SIGMA_LOW] == s[SIGMA_HIGH]
-            if mine and s[ETA] == 0.0 and c.directions[2 * j + 1] in SNAPPING:
+            several = flat > 1 or (flat == 1 and ready > 0)
+            mine = c.directions[2 * j] == i and s[SIGMA_LOW] == s[SIGMA_HIGH] and s[ETA] == 0.0
+            if several and mine and c.directions[2 * j + 1] in SNAPPING:
                 c.sided[j] = 1.0
 
 

@@ -190,9 +190,9 @@ class Plan(NamedTuple):
             self._integrate(*given, reals, degree)
             if endings[loop.OUTCOME] not in _STIFF:
                 break
-        fastest = max(self.fastest_rates(rows, heights, drag))
-        if endings[loop.OUTCOME] == scenes.STEP_UNDERFLOW and fastest > FASTEST:
-            endings[loop.OUTCOME] = scenes.TOO_FAST
+        if endings[loop.OUTCOME] == scenes.STEP_UNDERFLOW:
+            fastest = max(self.fastest_rates(rows, heights, drag))
+            endings[loop.OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
         lost = _lost(endings) if degree else 0.0
         return self._motion(out, RADAU if degree else EXPLICIT_STEPS, endings, log, rows, lost)
 
