@@ -58,7 +58,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the loops shared by the test processes once, on all cores.
+    """Compile the loops shared by the test processes once.
 
     The loops of a first fit are compiled before the processes start, the others during collection.
     """
@@ -91,7 +91,7 @@ def pytest_xdist_node_collection_finished(node: Any) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def compiled() -> Iterator[None]:
-    """Compile once, in two processes, the loops that most tests need.
+    """Compile once the loops that most tests need.
 
     Commands then print no message about compiling.
     """

@@ -17,7 +17,6 @@ import pytest
 from click.testing import CliRunner
 
 import fabricated
-import foamfit as ff
 from conftest import EXPERIMENTS, without_pictures
 from foamfit import api
 from foamfit.cli import main
@@ -25,7 +24,7 @@ from foamfit.solve import along, cache, loop, precompile
 from foamfit.springs.compiled import bistable
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
-# Reads a test, compiles for a model as two processes would, fits, and prints what the fit compiled
+# Reads a test, compiles for a model, fits, and prints what the fit compiled
 # or read from the cache besides.
 FIT = """
 import json
@@ -55,9 +54,8 @@ def compiled():
 
 path, model = sys.argv[1:]
 test = ff.read_test(path) if path else synthetic_loop()[1]
-precompile.run(precompile.LOOPS[0], model)
-for loop in precompile.LOOPS[1:]:
-    precompile.run(loop)
+for loop in precompile.LOOPS:
+    precompile.run(loop, model)
 before = compiled()
 if path:
     ff.fit(test, model=model, starts=2)
@@ -110,108 +108,31 @@ def test_a_small_scene_calls_its_loop_with_a_derivative(
         assert {shape for _, shape in asked} == {(2, 2, 4)}  # of one spring, with a derivative
 
 
-class Other:
-    """Stands for the other process."""
-
-    def __init__(self, asked: list[Any], command: list[str]) -> None:
-        self.asked, self.running = asked, True
-        asked.append(command)
-
-    def poll(self) -> int | None:
-        """Return None while the process runs."""
-        return None if self.running else 0
-
-    def wait(self) -> None:
-        """Note that the process was waited for."""
-        self.running = False
-        self.asked.append("waited")
-
-    def terminate(self) -> None:
-        """Note that the process was stopped."""
-        self.running = False
-        self.asked.append("terminated")
-
-
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Return what was run here and by the other process, in order, with an empty cache."""
+    """Return what was run, in order, with an empty cache."""
     done: list[Any] = []
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(subprocess, "Popen", lambda command, **_: Other(done, command))
     monkeypatch.setattr(precompile, "run", lambda *given: done.append(given))
     monkeypatch.setattr(cache, "compiled", lambda *_: False)
     return done
 
 
-def command(name: str) -> list[str]:
-    return [sys.executable, "-c", precompile.CALL.format(name)]
-
-
-def test_the_two_processes_share_the_loops(asked: list[Any]) -> None:
-    """The body may finish as often as it likes; the first time it waits for the other process."""
+def test_the_loops_are_compiled_once(asked: list[Any]) -> None:
+    """The body may finish as often as it likes."""
     told: list[str] = []
     with precompile.at_first_use("linear", 0, lambda: told.append("compiling")) as finish:
         assert told == ["compiling"]
-        assert asked == [command("follow")]
+        assert asked == []
         finish()
         finish()
-        assert asked == [command("follow"), ("integrate", "linear"), "waited"]
-    assert asked == [command("follow"), ("integrate", "linear"), "waited"]
+    assert asked == [("integrate", "linear"), ("follow", "linear")]
     assert told == ["compiling"]
 
 
-def test_one_core_starts_no_other_process(
-    asked: list[Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)
-    with precompile.at_first_use() as finish:
-        finish()
-    assert asked == [("integrate", "bistable")]
-
-
-@pytest.mark.parametrize("finishes", [True, False])
-def test_the_other_process_is_stopped_if_the_body_raises(asked: list[Any], finishes: bool) -> None:
-    """Unless it has ended before."""
-
-    def fails() -> None:
-        with precompile.at_first_use() as finish:
-            if finishes:
-                finish()
-            raise click.UsageError("no such file")
-
-    with pytest.raises(click.UsageError):
-        fails()
-    assert ("terminated" in asked) == (not finishes)
-    assert asked[-1] == "waited"
-
-
-def test_the_other_process_finds_this_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It starts with this package first in its path, whatever the path of this process."""
-    given: list[dict[str, str]] = []
-
-    def other(_: list[str], **options: Any) -> Other:
-        given.append(options["env"])
-        return Other([], [])
-
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(subprocess, "Popen", other)
-    monkeypatch.setattr(cache, "compiled", lambda *_: False)
-    monkeypatch.setenv("PYTHONPATH", "/elsewhere")
-    with precompile.at_first_use():
-        pass
-    here = str(Path(ff.__file__).parents[1])
-    assert given[0]["PYTHONPATH"] == os.pathsep.join((here, "/elsewhere"))
-
-
-def test_the_call_of_the_other_process_compiles() -> None:
-    """The other process runs with the real command; it needs no argument but the loop."""
-    assert set(precompile.LOOPS) == {"integrate", "follow"}
-    for name in precompile.LOOPS:
-        text = f"import foamfit.solve.precompile as p; p.run = print; {precompile.CALL}"
-        done = subprocess.run(
-            [sys.executable, "-c", text.format(name)], capture_output=True, text=True, check=True
-        )
-        assert done.stdout == f"{name}\n"
+def test_nothing_is_compiled_if_the_body_raises_before(asked: list[Any]) -> None:
+    with pytest.raises(click.UsageError), precompile.at_first_use():
+        raise click.UsageError("no such file")
+    assert asked == []
 
 
 def test_the_first_use_says_that_it_compiles(
@@ -225,7 +146,7 @@ def test_the_first_use_says_that_it_compiles(
         told = CliRunner().invoke(main, ["fit", str(RECONSTRUCTION), "--out", out])
         assert told.exit_code == 0, told.output
         assert ("compiling the solver" in told.stderr) == (not ready)
-    assert asked == [command("follow"), ("integrate", "bistable"), "waited"]
+    assert asked == [("integrate", "bistable"), ("follow", "bistable")]
 
 
 @pytest.mark.parametrize(
@@ -248,9 +169,8 @@ def test_the_first_use_compiles_what_the_model_needs(
     without_pictures(monkeypatch)
     args = ["fit", str(RECONSTRUCTION), "--out", str(tmp_path / "r"), "--model", *model]
     assert CliRunner().invoke(main, args).exit_code == 0
-    here = [given for given in asked if isinstance(given, tuple)]
-    assert here == ([] if runs is None else [("integrate", runs)])
-    assert (command("follow") in asked) == (runs is not None)
+    missing = [loop for loop in precompile.LOOPS if loop not in there]
+    assert asked == ([] if runs is None else [(loop, runs) for loop in missing])
 
 
 def test_what_was_compiled_of_another_source_is_no_use(

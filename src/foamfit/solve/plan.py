@@ -145,24 +145,23 @@ class Plan(NamedTuple):
 
     def slopes_of(self, rows: Array) -> tuple[Array, Array]:
         """Return the slopes dσ/dε (Pa) of the springs at rest, and the steepest at zero stress."""
-        own = rows[:, 1 + 2 * self.terms :]
-        first, steep = np.ones(len(rows)), np.ones(len(rows))
+        at, first, steep = 1 + 2 * self.terms, [], []
         for i, one in enumerate(self.laws.made):
-            if one.slopes:
-                found = own[i, list(one.slopes)]
-                first[i], steep[i] = found[0], found.max()
-        return first, steep
+            found = [rows.item(i, at + column) for column in one.slopes] or [1.0]
+            first.append(found[0])
+            steep.append(max(found))
+        return np.array(first), np.array(steep)
 
-    def _scales(self, rows: Array, heights: Array) -> Array:
+    def _scales(self, rows: Array, heights: Array) -> tuple[float, float, float, float]:
         """Return least scales of displacement, velocity, strain and stress."""
-        first, total = float(self.slopes_of(rows)[0].min()), float(heights.sum())
         if self.speed > 0.0:
-            return np.array((0.0, self.speed, 0.0, 0.0))
+            return 0.0, self.speed, 0.0, 0.0
+        first, total = float(self.slopes_of(rows)[0].min()), float(heights.sum())
         most = float(np.abs(self.values).max())
         if self.top == scenes.MOTION:
             rate = np.abs(np.diff(self.values) / np.diff(self.time)).max(initial=0.0)
-            return np.array((most, rate, most / total, 1e-3 * first * most / total))
-        return np.array((1e-3 * most * total / first, 0.0, 1e-3 * most / first, most))
+            return most, rate, most / total, 1e-3 * first * most / total
+        return 1e-3 * most * total / first, 0.0, 1e-3 * most / first, most
 
     # ------------------------------------------------------------------ integration in time
 

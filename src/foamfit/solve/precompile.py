@@ -1,15 +1,13 @@
-"""Compilation at first use by two processes in parallel, into numba's cache.
+"""Compilation at first use, into numba's cache, before a fit begins.
 
 Nothing depends on this module: a loop missing from the cache is compiled, and announced, where it
-is first needed.
+is first needed. Both loops share the compiled laws, so a second process would save little time and
+compile them twice.
 """
 
 from __future__ import annotations
 
 import gc
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
@@ -18,8 +16,7 @@ import numpy as np
 from foamfit.errors import SimulationError
 from foamfit.solve import cache
 
-LOOPS = ("integrate", "follow")  # in the order of the processes
-CALL = "from foamfit.solve.precompile import run; run({!r})"
+LOOPS = ("integrate", "follow")
 
 
 def run(loop: str, model: str = "microscale") -> None:
@@ -44,41 +41,22 @@ def run(loop: str, model: str = "microscale") -> None:
 def at_first_use(
     model: str = "bistable", relaxation: int = 0, announce: Callable[[], None] | None = None
 ) -> Iterator[Callable[[], None]]:
-    """Compile at first use, in another process beside the body.
+    """Announce what is compiled at first use, and yield the function that compiles it.
 
-    The body calls the function that it receives before it simulates. `announce` is called first.
+    The body calls this function before it simulates.
     """
-    known = model if model != "auto" else "bistable+microscale"
-    if all(map(cache.compiled, LOOPS)):
-        yield lambda: None
-        return
-    (announce or (lambda: cache.warn("the solver")))()
-    other = None
-    if (os.cpu_count() or 1) > 1:
-        path = (str(cache.PACKAGE.parent), os.environ.get("PYTHONPATH", ""))
-        other = subprocess.Popen(
-            [sys.executable, "-c", CALL.format(LOOPS[1])],
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path))},
-            process_group=0,  # Ctrl-C must reach only the process that starts this one
-        )
-    done = False
+    missing = [loop for loop in LOOPS if not cache.compiled(loop)]
+    if missing:
+        (announce or (lambda: cache.warn("the solver")))()
 
     def finish() -> None:
-        nonlocal done
-        if done:
+        if not missing:
             return
-        done = True
         gc.disable()  # a fifth of the time
         try:
-            run(LOOPS[0], known)
+            while missing:
+                run(missing.pop(0), model if model != "auto" else "bistable+microscale")
         finally:
             gc.enable()
-        if other is not None:
-            other.wait()
 
-    try:
-        yield finish
-    finally:
-        if other is not None and other.poll() is None:
-            other.terminate()
-            other.wait()
+    yield finish
