@@ -4,53 +4,30 @@ On loading and unloading alike dz/dε = 1 - |z/limit|^n as long as z grows in th
 motion, else 1.
 """
 
-from numba import njit
-
 import foamfit as ff
 
-EPS, SIGMA, BRANCH, Z = range(4)
+
+def stress(p, x, strain, branch):
+    """σ, Pa."""
+    k, alpha, _, _ = p
+    return alpha * k * strain + (1.0 - alpha) * k * x[0]
 
 
-def fill(values, row):
-    """Copy the parameters; refuse what no spring has."""
-    row[0], row[1], row[2], row[3] = values
-    return values[0] > 0.0 and values[2] > 0.0
-
-
-def begin(row, state):
-    """Rest: no strain, no stress, z = 0."""
-    state[:] = 0.0
-
-
-def leaves(row, state, strain):
-    """Whether the strain turns."""
-    return strain != state[EPS] and (strain > state[EPS]) != (state[BRANCH] == 0.0)
-
-
-def switch(row, state, up):
-    """Loading is branch 0, unloading branch 1."""
-    state[BRANCH] = 0.0 if up else 1.0
-
-
-@njit
-def slope(z, step, limit, n):
+def along(p, x, strain, branch, out):
     """dz/dε."""
-    return 1.0 - (abs(z) / limit) ** n if z * step > 0.0 else 1.0
+    _, _, limit, n = p
+    grown = x[0] / limit if branch == 0 else -x[0] / limit
+    out[0] = 1.0 - grown**n if grown.real > 0.0 else 1.0
 
 
-def settle(row, state, strain):
-    """Follow z to a strain on the same branch."""
-    k, alpha, limit, n = row
-    count = int(abs(strain - state[EPS]) / (0.01 * limit)) + 1
-    step, z = (strain - state[EPS]) / count, state[Z]
-    for _ in range(count):  # the classical Runge-Kutta method
-        one = slope(z, step, limit, n)
-        two = slope(z + 0.5 * step * one, step, limit, n)
-        three = slope(z + 0.5 * step * two, step, limit, n)
-        four = slope(z + step * three, step, limit, n)
-        z += step * (one + 2.0 * two + 2.0 * three + four) / 6.0
-    state[EPS], state[Z] = strain, z
-    state[SIGMA] = alpha * k * strain + (1.0 - alpha) * k * z
+def ends(p, x, strain, branch, out):
+    """Loading (branch 0) ends where the strain stops rising, unloading (1) where it rises again."""
+    out[2] = 1.0 if branch == 0 else -1.0
+
+
+def switch(p, x, strain, branch, up):
+    """The next branch."""
+    return 1 - branch
 
 
 LAW = ff.Law(
@@ -68,7 +45,7 @@ LAW = ff.Law(
         ),
         ff.Param("n", ("n", ""), "", "sharpness of the yield", (1.0, "one"), (0.3, 10.0)),
     ),
-    functions=ff.Functions(fill, begin, leaves, switch, settle),
-    states=4,
+    functions=ff.Functions(stress, along, ends=ends, switch=switch),
+    internal=1,
     branches={"loading": "the strain grows", "unloading": "the strain falls"},
 )  # fmt: skip

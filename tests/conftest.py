@@ -40,11 +40,7 @@ needs_data = pytest.mark.skipif(
 
 # This script compiles, in a separate process, the loops that a first fit does not need.
 FIRST_USE = Path(__file__).with_name("first_use.py")
-LOOPS = {
-    "struck": "integrate_with_memory",  # first because it takes longest
-    "along": "relaxed_along",
-    "many": "integrate_aggregate",
-}
+LOOPS = {"along": "balance"}
 BEGUN = pytest.StashKey[list[subprocess.Popen[bytes]]]()
 
 
@@ -62,7 +58,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the loops shared by the test processes once, on all cores.
+    """Compile the loops shared by the test processes once.
 
     The loops of a first fit are compiled before the processes start, the others during collection.
     """
@@ -73,7 +69,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if asked.collectonly or not getattr(asked, "numprocesses", None):
         return
     if not cache.compiled():
-        with precompile.side_by_side() as compile_rest:
+        with precompile.at_first_use() as compile_rest:
             compile_rest()
     missing = [part for part, loop in LOOPS.items() if not cache.compiled(loop)]
     judge = ["judge"] if missing else []  # the stability study has a separate cache
@@ -95,18 +91,16 @@ def pytest_xdist_node_collection_finished(node: Any) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def compiled() -> Iterator[None]:
-    """Compile once, in two processes, the loops that most tests need.
+    """Compile once the loops that most tests need.
 
-    Commands then print no message about compiling. The loops for many springs are compiled while
-    the first tests run.
+    Commands then print no message about compiling.
     """
     if cache.compiled():
         yield
         return
-    with precompile.side_by_side() as compile_rest:
+    with precompile.at_first_use() as compile_rest:
         compile_rest()
-    with first_use("many"):
-        yield
+    yield
 
 
 def thinned(path: Path, folder: Path, every: int) -> Path:

@@ -402,32 +402,3 @@ def test_a_signal_while_writing(here: Path, number: signal.Signals) -> None:
         assert process.returncode == 128 + number
         assert re.fullmatch(r"foamfit: (ended by SIGTERM|interrupted by Ctrl-C)", told)
         assert names(here) == []
-
-
-@posix
-def test_the_process_that_compiles_is_ended_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C does not reach the separate process group, so a signal that ends us must stop it.
-
-    This must also work while we wait for that process to end.
-    """
-    from foamfit.solve import precompile
-
-    begun: list[subprocess.Popen[bytes]] = []
-    real = subprocess.Popen
-
-    def other(command: list[str], **options: object) -> subprocess.Popen[bytes]:
-        process = real(["sleep", "60"], **options)  # type: ignore[call-overload]
-        begun.append(process)
-        assert os.getpgid(process.pid) == process.pid != os.getpgid(0)
-        return process
-
-    monkeypatch.setattr(subprocess, "Popen", other)
-    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    began = time.monotonic()
-    try:
-        with pytest.raises(KeyboardInterrupt), precompile.side_by_side():
-            signal.setitimer(signal.ITIMER_REAL, 0.1)
-    finally:
-        signal.signal(signal.SIGALRM, before)
-    assert begun[0].wait() == -signal.SIGTERM
-    assert time.monotonic() - began < 10

@@ -20,29 +20,8 @@ from foamfit.springs import laws
 LAW = """\
 import foamfit as ff
 
-EPS, SIGMA = 0, 1
-
-
-def fill(values, row):
-    row[0], row[1] = values
-    return values[0] > 0.0 and values[1] > 0.0
-
-
-def begin(row, state):
-    state[:] = 0.0
-
-
-def leaves(row, state, strain):
-    return False
-
-
-def switch(row, state, up):
-    pass
-
-
-def settle(row, state, strain):
-    state[EPS] = strain
-    state[SIGMA] = row[0] * strain + row[1] * strain**3
+def stress(p, x, strain, branch):
+    return p[0] * strain + p[1] * strain**3
 
 
 LAW = ff.Law(
@@ -55,7 +34,7 @@ LAW = ff.Law(
         ff.Param("q", ("q", ""), "Pa", "factor of the cube", (1.0, "slope"), (1e-2, 1e2), "slope",
                  example="3 MPa"),
     ),
-    functions=ff.Functions(fill, begin, leaves, switch, settle),
+    functions=ff.Functions(stress),
 )
 """
 COMMANDS = ("batch", "check", "compare", "fit", "init", "joint", "page", "predict", "simulate")
@@ -195,7 +174,7 @@ def test_no_toml_no_result_and_no_browser_names_a_law_file(here: Path) -> None:
         ("x = 1\n", ("none.py", "no law")),
         ("def f(:\n", ("none.py", "cannot be run", "SyntaxError")),
         ("raise KeyError('two\\nlines')\n", ("none.py", "cannot be run", "KeyError")),
-        (LAW.replace("= row[0] * strain", "= -row[0] * strain"), ("none.py", "cubic")),
+        (LAW.replace("return p[0] * strain", "return -p[0] * strain"), ("none.py", "cubic")),
         (LAW.replace('kind="cubic"', 'kind="+"'), ("none.py", "+")),
     ],
 )

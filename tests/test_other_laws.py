@@ -159,7 +159,7 @@ def test_power_law_damper_adds_a_power_of_the_rate():
     spring = law("power_law_damper").make([*BISTABLE.values(), c, n, 0.0], [])
     time = np.linspace(0.0, 1.0, 501)
     strain = 0.36 * (1.0 - np.abs(1.0 - 2.0 * time))
-    rate = np.where(time <= 0.5, 0.72, -0.72) * (time > 0.0)
+    rate = np.where(time < 0.5, 0.72, -0.72) * (time != 0.5)  # the mean at the turn
     wanted = ff.BistableSpring(**BISTABLE).stress(strain) + c * np.abs(rate) ** n * np.sign(rate)
     np.testing.assert_allclose(pressed(spring, time, strain), wanted, rtol=1e-9, atol=1e-3)
 
@@ -175,6 +175,32 @@ def test_power_law_damper_of_power_one_is_the_dashpot_in_an_impact():
     top = wanted.base_stress.max()
     np.testing.assert_allclose(found.base_stress[1:60], wanted.base_stress[1:60], atol=2e-3 * top)
     assert found.base_stress[0] == pytest.approx(eta * 2.0 / 1.19e-3)
+
+
+@pytest.mark.parametrize("drive", [ff.DisplacementDrive, ff.StressDrive, None])
+def test_power_law_damper_of_power_one_is_the_dashpot_in_a_chain(drive):
+    eta, time, names = 2e4, np.linspace(0.0, 1.0, 41), ["s2_k0", "s2_eps_a"]
+    size = {ff.DisplacementDrive: 4e-4, ff.StressDrive: 1e6}.get(drive, 0.0)
+    given = drive(size * np.sin(np.pi * time) ** 2) if drive else ff.Impact(7e-3, 2.0)
+    time = time if drive else 4e-4 * time
+    springs = (
+        law("power_law_damper").make([*BISTABLE.values(), eta, 1.0, 0.0], []),
+        ff.BistableSpring(**BISTABLE, eta=eta),
+    )
+    found, wanted = (
+        ff.simulate(
+            ff.Chain([ff.LinearSpring(4e6), one], [6e-4, 6e-4], area=1.9635e-5), given, time, 1e-9,
+            sensitivities=names,
+        )
+        for one in springs
+    )  # fmt: skip
+    pairs = [(found, wanted), *((found.sensitivities[n], wanted.sensitivities[n]) for n in names)]
+    for one, other in pairs:
+        for a, b in zip(
+            (one.base_stress, one.displacement), (other.base_stress, other.displacement),
+            strict=True,
+        ):  # fmt: skip
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * np.abs(b).max() + 1e-15)
 
 
 def test_power_law_damper_in_an_impact_against_scipy():
@@ -197,6 +223,24 @@ def test_power_law_damper_in_an_impact_against_scipy():
     )  # fmt: skip
     np.testing.assert_allclose(run.displacement[-1], judged.y[0], atol=2e-4 * judged.y[0].max())
     np.testing.assert_allclose(run.base_stress, [total(*y) for y in judged.y.T], rtol=2e-3)
+
+
+@pytest.mark.parametrize("n", [0.5, 2.0])
+def test_derivatives_of_two_power_law_dampers_in_series(n):
+    """With n = 2 they stop the striker long before an elastic spring would."""
+    time, step = np.linspace(0.0, 2e-4, 21), 1e-5
+
+    def run(c, names=()):
+        springs = [
+            law("power_law_damper").make([*BISTABLE.values(), one, n, 0.0], []) for one in (c, 3e5)
+        ]
+        chain = ff.Chain(springs, [1e-3, 1e-3], area=2e-5)
+        return ff.simulate(chain, ff.Impact(0.01, 1.5), time, 1e-9, sensitivities=names)
+
+    above, below = run(1e5 * (1.0 + step)), run(1e5 * (1.0 - step))
+    found = run(1e5, ["s1_c"]).sensitivities["s1_c"].displacement[-1]
+    wanted = (above.displacement[-1] - below.displacement[-1]) / (2e5 * step)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-3 * np.abs(wanted).max())
 
 
 def test_a_law_that_depends_on_time_needs_one(tmp_path):

@@ -1,8 +1,8 @@
 """Compiled fixed-step schemes, as one would write them by hand for the same scenes.
 
-The law is that of foamfit (`springs.kernels`), so only the integration differs. The branch is
-constant within a step and updated at its end; the step is the sampling interval divided by an
-integer. Velocity Verlet evaluates dashpots at the velocity predicted for the end of the step.
+The law is that of `written_law`, as for SciPy's integrators. The branch is constant within a step
+and updated at its end; the step is the sampling interval divided by an integer. Velocity Verlet
+evaluates dashpots at the velocity predicted for the end of the step.
 Sources: Hairer, Lubich & Wanner, Geometric Numerical Integration (2006), I.1 and II.1.
 """
 
@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-
-from foamfit.springs.equilibrium import Group, equilibrate
-from foamfit.springs.kernels import ETA, branch_at_strain, first_branch, stress_on
+from written_law import ETA, branch_at, equilibrate, first_branch, stress_on
 
 VERLET, RK4 = range(2)
 NAMES = ("velocity Verlet", "Runge-Kutta 4")
@@ -32,12 +30,10 @@ def _group(rows, branches, heights, i0, i1, u, rate, guess, freeze):
     if i1 - i0 == 1:
         eps = u / heights[i0]
         if not freeze:
-            branches[i0] = branch_at_strain(rows[i0], branches[i0], eps)
+            branches[i0] = branch_at(rows[i0], branches[i0], eps)
         return stress_on(rows[i0], branches[i0], eps) + rows[i0, ETA] * rate / heights[i0]
     own = branches[i0:i1].copy() if freeze else branches[i0:i1]
-    eps = np.empty(i1 - i0)
-    none = np.zeros((i1 - i0, 2))  # no spring has a fixed rank
-    return equilibrate(Group(rows[i0:i1], own, none, heights[i0:i1]), u, guess, eps)
+    return equilibrate(rows[i0:i1], own, heights[i0:i1], u, guess)
 
 
 @compiled

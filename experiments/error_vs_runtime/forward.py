@@ -6,7 +6,7 @@ are plotted over the median time of many runs. All solvers of a scene alternate 
 processor time is measured, so that a busy machine affects all of them equally; ratios compare
 medians of one run. A table (CSV, Markdown) and a figure per scene and a summary go to `forward/`.
 
-Answer. For an error below 2e-6 foamfit takes 12 µs to 5 ms, SciPy 50 to 370 times as long: see
+Answer. For an error below 2e-6 foamfit takes 24 µs to 17 ms, SciPy 14 to 170 times as long: see
 forward/summary.md.
 
     python experiments/error_vs_runtime/forward.py                      # all: about 5 minutes

@@ -14,25 +14,15 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+import written_law as law
 from numba import njit
 from scipy.integrate import DOP853, LSODA, Radau
 from scipy.optimize import brentq
-
-from foamfit.springs import kernels as law
 
 METHODS = {"DOP853": DOP853, "LSODA": LSODA, "Radau": Radau}
 TINY = 4 * np.finfo(float).eps
 
 compiled = njit(cache=True, error_model="numpy")
-
-
-# Compiled loops of foamfit without a Python interface are wrapped here.
-
-
-@compiled
-def at_rest(row):
-    """Return the branch of a spring at rest."""
-    return law.first_branch(row)
 
 
 @compiled
@@ -41,7 +31,7 @@ def entered(branch, rising):
     return law.above(branch) if rising else law.below(branch)
 
 
-# ---------------------------------------------------------------- a mass law.above every spring
+# ---------------------------------------------------------------- a mass above every spring
 
 
 @compiled
@@ -168,16 +158,7 @@ def series_limits(rows, branches, pressed):
     """
     low, high, who_low, who_high = (0.0 if pressed else -np.inf), np.inf, -1, -1
     for i in range(branches.size):
-        if branches[i] == law.A:
-            down, up = -np.inf, rows[i, law.SIGMA_A]
-        elif branches[i] == law.D:
-            down, up = rows[i, law.SIGMA_A], rows[i, law.SIGMA_HAT_C]
-        elif branches[i] == law.C:
-            down, up = rows[i, law.SIGMA_C], np.inf
-        elif branches[i] == law.E:
-            down, up = rows[i, law.SIGMA_HAT_A], rows[i, law.SIGMA_C]
-        else:
-            down, up = -np.inf, np.inf
+        down, up = law.interval(rows[i], branches[i], law.OF_STRESS)
         if down > low:
             low, who_low = down, i
         if up < high:
@@ -227,7 +208,7 @@ class System:
         """Choose the state: nodes if every spring has a mass above it, else the stress."""
         self.series = self.mass.size == 1 and self.heights.size > 1
         assert self.series or self.mass.size == self.heights.size
-        self.branches = np.array([at_rest(row) for row in self.rows])
+        self.branches = np.array([law.first_branch(row) for row in self.rows])
         self.pressed = False
         self.unit = self.rows[0, law.K0]
         n = self.mass.size

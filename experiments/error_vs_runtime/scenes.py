@@ -11,6 +11,7 @@ import fixed_step
 import numpy as np
 import restarted
 import restarted_memory
+import written_law
 
 import foamfit as ff
 from foamfit.solve.plan import Plan, plan
@@ -177,8 +178,7 @@ def others(scene: Scene) -> dict[str, list[Competitor]]:
     """Return the fixed-step schemes and SciPy's integrators."""
     if isinstance(scene.chain.springs[-1], ff.MicroscaleSpring):
         return _memory(scene)
-    rows = np.array([spring.row for spring in scene.chain.springs])
-    heights = np.array(scene.chain.heights)
+    rows, heights = written_law.rows_of(scene.chain), np.array(scene.chain.heights)
     made = plan(scene.chain, scene.drive, scene.time)
     return _impact(scene, made, rows, heights)
 
@@ -188,7 +188,7 @@ def _impact(scene: Scene, made: Plan, rows: Array, heights: Array) -> dict[str, 
 
     def fixed(scheme: int, substeps: int) -> Answer:
         out = np.zeros(t.size), np.zeros(t.size)
-        given = rows, heights, made.ends, made.mass, made.drag, made.speed, t
+        given = rows, heights, np.array(made.ends), made.mass, made.drag, made.speed, t
         fixed_step.impact(*given, substeps, scheme, *out)
         return out
 

@@ -10,60 +10,35 @@ Eng. 16, 161.
 """
 
 import numpy as np
-from numba import njit
-from ogden import CURVE, curve, read_curve
+from ogden import CURVE, curve, is_curve, read_curve
 
 import foamfit as ff
 
-EPS, SIGMA, BRANCH, Z = range(4)
+
+def admissible(p):
+    """Return whether the parameters are admissible."""
+    return is_curve(p) and p[4:].min() > 0.0
 
 
-def fill(values, row):
-    """Copy the parameters; return whether they are admissible."""
-    for j in range(7):
-        row[j] = values[j]
-    return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4:].min() > 0.0
+def stress(p, x, strain, branch):
+    """Return the stress."""
+    return curve(strain, p[0], p[1], p[2], p[3])[0] + p[4] * x[0]
 
 
-def begin(row, state):
-    """Set the state at rest."""
-    state[:] = 0.0
+def along(p, x, strain, branch, out):
+    """Fill dz/dε."""
+    grown = x[0] / p[5] if branch == 0 else -x[0] / p[5]
+    out[0] = 1.0 - grown ** p[6] if grown.real > 0.0 else 1.0
 
 
-def leaves(row, state, strain):
-    """Return whether the strain reverses."""
-    return strain != state[EPS] and (strain > state[EPS]) != (state[BRANCH] == 0.0)
+def ends(p, x, strain, branch, out):
+    """End loading (branch 0) and unloading (1) where the strain turns."""
+    out[2] = 1.0 if branch == 0 else -1.0
 
 
-def switch(row, state, up):
-    """Set branch 0 for loading, 1 for unloading."""
-    state[BRANCH] = 0.0 if up else 1.0
-
-
-@njit
-def slope(z, step, limit, n):
-    """Return dz/dε."""
-    return 1.0 - min(abs(z) / limit, 1.0) ** n if z * step > 0.0 else 1.0
-
-
-def settle(row, state, strain):
-    """Follow z to a strain on the same branch."""
-    limit, n, z = row[5], row[6], state[Z]
-    left = strain - state[EPS]
-    if z * left < 0.0:  # up to z = 0 the slope is 1
-        free = min(abs(left), abs(z)) * (1.0 if left > 0.0 else -1.0)
-        z, left = z + free, left - free
-    count = int(min(abs(left), 40.0 * limit) / (0.05 * limit)) + 1  # beyond, z = ±limit
-    step = left / count
-    for _ in range(count):  # the classical Runge-Kutta method
-        one = slope(z, step, limit, n)
-        two = slope(z + 0.5 * step * one, step, limit, n)
-        three = slope(z + 0.5 * step * two, step, limit, n)
-        four = slope(z + step * three, step, limit, n)
-        z += step * (one + 2.0 * two + 2.0 * three + four) / 6.0
-    state[EPS], state[Z] = strain, min(max(z, -limit), limit)
-    elastic = curve(strain, row[0], row[1], row[2], row[3])[0]
-    state[SIGMA] = elastic + row[4] * state[Z]
+def switch(p, x, strain, branch, up):
+    """Return the other branch."""
+    return 1 - branch
 
 
 def read_off(loop, marks, scales, way):
@@ -90,8 +65,8 @@ LAW = ff.Law(
         ),
         ff.Param("n", ("n", ""), "", "sharpness of the yield", (1.0, "one"), (0.3, 10.0)),
     ),
-    functions=ff.Functions(fill, begin, leaves, switch, settle),
-    states=4,
+    functions=ff.Functions(stress, along, None, ends, switch, admissible=admissible),
+    internal=1,
     branches={"loading": "the strain grows", "unloading": "the strain falls"},
     read_off=read_off,
 )  # fmt: skip

@@ -18,51 +18,36 @@ Koeller 1984, J. Appl. Mech. 51, 299; Doehring, Freed, Carew & Vesely 2005, J. B
 import math
 
 import numpy as np
-from ogden import CURVE, begin, curve, leaves, read_curve, switch
+from ogden import CURVE, curve, is_curve, near, read_curve
 
 import foamfit as ff
 
-EPS, SIGMA, BRANCH, LAST, TIME, FIRST = range(6)
 N, SLOWEST, RATIO = 17, 1e-4, 4.0
 
 
-def fill(values, row):
-    """Copy the parameters and compute the strength of each exponential."""
-    for j in range(6):
-        row[j] = values[j]
-    g, a = values[4], values[5]
-    if values[:3].min() <= 0.0 or values[3] < -3.0 or g <= 0.0 or not 0.0 < a < 1.0:
-        return False
+def admissible(p):
+    """Return whether the parameters are admissible."""
+    return is_curve(p) and p[4] > 0.0 and 0.0 < p[5] < 1.0
+
+
+def stress(p, x, strain, branch):
+    """Return the stress of curve, spring and exponentials; elastic + x[j] are their strains."""
+    elastic, a = curve(strain, p[0], p[1], p[2], p[3])[0], p[5]
+    sine = near(math.sin(math.pi * a.real), math.pi * math.cos(math.pi * a.real), a)
+    strength, ratio = p[4] * sine / math.pi * SLOWEST**a, RATIO**a
+    out = (1.0 + strength / a) * elastic  # slower exponentials are a spring
     for j in range(N):
-        row[6 + j] = g * math.sin(math.pi * a) / math.pi * (SLOWEST * RATIO**j) ** a
-    row[6] *= 0.5  # the other half belongs to the spring
-    row[6 + N] = row[6] * 2.0 / a  # the integral from zero to the slowest rate
-    for j in range(N):
-        row[6 + j] *= math.log(RATIO)
-    return True
-
-
-def settle(row, state, strain):
-    """Follow the curve."""
-    state[EPS], state[SIGMA] = strain, curve(strain, row[0], row[1], row[2], row[3])[0]
-
-
-def viscous(row, state, rate, h):
-    """Relax each exponential; the stress of the curve is linear in time."""
-    kept, rising = FIRST + N, FIRST + 2 * N  # of each exponential, for steps of this length
-    if abs(h - state[TIME]) > 1e-7 * h:
-        state[TIME] = h
-        for j in range(N):
-            x = SLOWEST * RATIO**j * h
-            state[kept + j], state[rising + j] = math.exp(-x), -math.expm1(-x) / x
-    rise, out = state[SIGMA] - state[LAST], row[6 + N] * state[SIGMA]
-    if h == 0.0:
-        return out
-    state[LAST] = state[SIGMA]
-    for j in range(N):
-        state[FIRST + j] = state[kept + j] * state[FIRST + j] + state[rising + j] * rise
-        out += row[6 + j] * state[FIRST + j]
+        share = 0.5 if j == 0 else 1.0  # the other half belongs to the spring
+        out += math.log(RATIO) * share * strength * (elastic + x[j])
+        strength *= ratio
     return out
+
+
+def decay(p, x, strain, branch, out):
+    """Relax each exponential."""
+    elastic = curve(strain, p[0], p[1], p[2], p[3])[0]
+    for j in range(N):
+        out[j] = -SLOWEST * RATIO**j * (elastic + x[j])
 
 
 def read_off(loop, marks, scales, way):
@@ -89,9 +74,8 @@ LAW = ff.Law(
             admissible="between 0 and 1",
         ),
     ),
-    functions=ff.Functions(fill, begin, leaves, switch, settle, viscous),
-    columns=7 + N,
-    states=5 + 3 * N,
+    functions=ff.Functions(stress, decay=decay, admissible=admissible),
+    internal=N,
     branches={"elastic": "all along"},
     read_off=read_off,
 )  # fmt: skip

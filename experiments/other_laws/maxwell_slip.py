@@ -2,7 +2,7 @@
 
     σ = σ_0(ε) + (k/N) Σ e_j,   de_j = dε  as long as |e_j| < y_j,   y_j = slip ((j - ½)/N)^spread
 
-σ_0 is the Ogden curve (`ogden.py`), e_j the elastic strain of slider j, its only state variable.
+σ_0 is the Ogden curve (`ogden.py`), e_j the elastic strain of slider j.
 The slip strains are those of Segalman's power law, spread = 1/(1 + χ), in N = 24 equal shares of
 the stiffness k. For N → ∞ loading from rest adds k ε (1 - u spread/(1 + spread)) with u =
 (ε/slip)^(1/spread) as long as ε <= slip, and unloading subtracts twice this curve at half the
@@ -12,33 +12,39 @@ Iwan 1966, J. Appl. Mech. 33, 893; Segalman 2005, J. Appl. Mech. 72, 752.
 """
 
 import numpy as np
-from bouc_wen_foam import begin, leaves, switch
+from bouc_wen_foam import admissible, ends
+from numba import njit
 from ogden import CURVE, curve, read_curve
 
 import foamfit as ff
 
-EPS, SIGMA, BRANCH, FIRST = range(4)
-N = 24
+N = 24  # sliders; their elastic strains at the last turn, and the strain there, are internal
 
 
-def fill(values, row):
-    """Copy the parameters and compute the slip strains."""
-    for j in range(7):
-        row[j] = values[j]
+@njit
+def held(p, x, strain, j):
+    """Return the elastic strain of a slider."""
+    limit = p[5] * ((j + 0.5) / N) ** p[6]
+    value = x[j] + strain - x[N]
+    if abs(value.real) <= limit.real:
+        return value
+    return limit if value.real > 0.0 else -limit
+
+
+def stress(p, x, strain, branch):
+    """Return the stress."""
+    total = 0j
     for j in range(N):
-        row[7 + j] = values[5] * ((j + 0.5) / N) ** values[6]
-    return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4:].min() > 0.0
+        total += held(p, x, strain, j)
+    return curve(strain, p[0], p[1], p[2], p[3])[0] + p[4] / N * total
 
 
-def settle(row, state, strain):
-    """Move each slider; those at their limit slip."""
-    step, total = strain - state[EPS], 0.0
+def switch(p, x, strain, branch, up):
+    """Keep the strains at a turn; return the other branch."""
     for j in range(N):
-        limit = row[7 + j]
-        state[FIRST + j] = min(max(state[FIRST + j] + step, -limit), limit)
-        total += state[FIRST + j]
-    state[EPS] = strain
-    state[SIGMA] = curve(strain, row[0], row[1], row[2], row[3])[0] + row[4] / N * total
+        x[j] = held(p, x, strain, j)
+    x[N] = strain
+    return 1 - branch
 
 
 def read_off(loop, marks, scales, way):
@@ -64,9 +70,8 @@ LAW = ff.Law(
         ),
         ff.Param("spread", ("s", ""), "", "spread of the slip strains", (1.0, "one"), (0.1, 10.0)),
     ),
-    functions=ff.Functions(fill, begin, leaves, switch, settle),
-    columns=7 + N,
-    states=3 + N,
+    functions=ff.Functions(stress, ends=ends, switch=switch, admissible=admissible),
+    internal=N + 1,
     branches={"loading": "the strain grows", "unloading": "the strain falls"},
     read_off=read_off,
 )  # fmt: skip

@@ -15,6 +15,7 @@ N terms, which gives quasi-linear viscoelasticity. Other laws of this folder use
 Storåkers 1986, J. Mech. Phys. Solids 34, 125; Fung 1981, Biomechanics, chapter 7.
 """
 
+import cmath
 import math
 
 import numpy as np
@@ -23,7 +24,6 @@ from scipy.optimize import nnls
 
 import foamfit as ff
 
-EPS, SIGMA, BRANCH = range(3)
 CURVE = (
     ff.Param("mu", ("µ", ""), "Pa", "plateau modulus", (0.5, "slope"), (1e-3, 1e2), "slope"),
     ff.Param("alpha", ("α", ""), "", "sharpness of the plateau", (15.0, "one"), (1.0, 200.0)),
@@ -36,23 +36,36 @@ CURVE = (
 
 
 @njit
+def near(value, slope, z):
+    """Return value + i slope Im z: a real function at z, if its imaginary part is a tiny step."""
+    return complex(value, slope * z.imag)
+
+
+@njit
 def curve(strain, mu, alpha, nu, beta):
     """Return stress (Pa) and energy (J/m³) of the elastic curve."""
-    if strain >= 1.0:
-        return math.inf, math.inf
-    if strain <= 0.0:
+    if strain.real >= 1.0:
+        return complex(math.inf, 0.0), complex(math.inf, 0.0)
+    if strain.real <= 0.0:
         return 2.0 * (mu + nu) * strain, (mu + nu) * strain**2
-    log = math.log(1.0 - strain)
-    stress, energy = 0.0, 0.0
+    log = cmath.log(1.0 - strain)
+    stress, energy = 0j, 0j
     for m, a in ((mu, alpha), (nu, -beta)):
-        if abs(a * log) < 1e-4:  # series about a = 0
-            stress -= 2.0 * m * log * (1.0 + 0.5 * a * log)
-            energy += m * log**2 * (1.0 + a * log / 3.0)
+        u = a * log
+        if abs(u.real) < 1e-4:  # series about a = 0
+            stress -= 2.0 * m * log * (1.0 + 0.5 * u + u * u / 6.0)
+            energy += m * log**2 * (1.0 + u / 3.0 + u * u / 12.0)
         else:
-            grown = math.expm1(a * log)
+            grown = near(math.expm1(u.real), math.exp(u.real), u)
             stress -= 2.0 * m / a * grown
             energy += 2.0 * m / a * (grown / a - log)
     return stress / (1.0 - strain), energy
+
+
+def real_curve(strain, *values):
+    """Return the same for real numbers."""
+    stress, energy = curve(complex(strain), *map(complex, values))
+    return stress.real, energy.real
 
 
 def read_curve(loop, marks, scales, share):
@@ -62,37 +75,21 @@ def read_curve(loop, marks, scales, share):
     up = np.array([loop.at(e, loading=True) for e in strain])
     down = np.array([loop.at(e, loading=False) for e in strain])
     terms = [
-        [curve(e, *one)[0] for e in strain]
+        [real_curve(e, *one)[0] for e in strain]
         for one in ((1.0, alpha, 0.0, 1.0), (0.0, 1.0, 1.0, beta))
     ]
     mu, nu = nnls(np.transpose(terms), share * up + (1.0 - share) * down)[0]
     return [max(mu, 2e-3 * scales.slope), alpha, max(nu, 2e-6 * scales.slope), beta]
 
 
-def fill(values, row):
-    """Copy the parameters; return whether they are admissible."""
-    for j in range(4):  # `row[:] = values` takes two seconds to compile
-        row[j] = values[j]
-    return values[:3].min() > 0.0 and values[3] >= -3.0
+def is_curve(p):
+    """Return whether the first four parameters are admissible."""
+    return p[:3].min() > 0.0 and p[3] >= -3.0
 
 
-def begin(row, state):
-    """Set the state at rest."""
-    state[:] = 0.0
-
-
-def leaves(row, state, strain):
-    """Return False: there is only one branch."""
-    return False
-
-
-def switch(row, state, up):
-    """Do nothing: there is no other branch."""
-
-
-def settle(row, state, strain):
-    """Follow the curve."""
-    state[EPS], state[SIGMA] = strain, curve(strain, row[0], row[1], row[2], row[3])[0]
+def stress(p, x, strain, branch):
+    """Return the stress of the curve."""
+    return curve(strain, p[0], p[1], p[2], p[3])[0]
 
 
 def read_off(loop, marks, scales, way):
@@ -104,7 +101,7 @@ LAW = ff.Law(
     kind="ogden",
     title="Ogden spring",
     params=CURVE,
-    functions=ff.Functions(fill, begin, leaves, switch, settle),
+    functions=ff.Functions(stress, admissible=is_curve),
     branches={"elastic": "all along"},
     read_off=read_off,
 )

@@ -2,9 +2,9 @@
 
     σ = η σ_0(ε),   η = 1 - (1/r) erf((W_m - W_0(ε)) / m)
 
-σ_0 and W_0 are stress and energy of the Ogden curve (`ogden.py`), W_m is the largest energy so far,
-the only state variable. On the loading curve η = 1; unloading and reloading below the largest
-strain follow the same softer path. r >= 1 and m > 0 (J/m³).
+σ_0 and W_0 are stress and energy of the Ogden curve (`ogden.py`), W_m is W_0 at the largest strain
+so far. On the loading curve η = 1; unloading and reloading below the largest strain follow the same
+softer path. r >= 1 and m > 0 (J/m³).
 
 Ogden & Roxburgh 1999, Proc. R. Soc. A 455, 2861, equation (51).
 """
@@ -12,27 +12,38 @@ Ogden & Roxburgh 1999, Proc. R. Soc. A 455, 2861, equation (51).
 import math
 
 import numpy as np
-from ogden import CURVE, begin, curve, leaves, read_curve, switch
+from ogden import CURVE, curve, is_curve, near, read_curve, real_curve
 
 import foamfit as ff
 
-EPS, SIGMA, BRANCH, LARGEST = range(4)
+
+def admissible(p):
+    """Return whether the parameters are admissible."""
+    return is_curve(p) and p[4] >= 1.0 and p[5] > 0.0
 
 
-def fill(values, row):
-    """Copy the parameters; return whether they are admissible."""
-    for j in range(6):
-        row[j] = values[j]
-    return values[:3].min() > 0.0 and values[3] >= -3.0 and values[4] >= 1.0 and values[5] > 0.0
+def stress(p, x, strain, branch):
+    """Soften below the largest strain, x[0]."""
+    stress, energy = curve(strain, p[0], p[1], p[2], p[3])
+    if branch == 0:
+        return stress
+    u = (curve(x[0], p[0], p[1], p[2], p[3])[1] - energy) / p[5]
+    erf = near(math.erf(u.real), 2.0 / math.sqrt(math.pi) * math.exp(-(u.real**2)), u)
+    return stress * (1.0 - erf / p[4])
 
 
-def settle(row, state, strain):
-    """Soften by the largest energy."""
-    stress, energy = curve(strain, row[0], row[1], row[2], row[3])
-    state[LARGEST] = max(state[LARGEST], energy)
-    state[EPS], state[SIGMA] = strain, stress
-    if energy < state[LARGEST]:
-        state[SIGMA] *= 1.0 - math.erf((state[LARGEST] - energy) / row[5]) / row[4]
+def ends(p, x, strain, branch, out):
+    """End loading where the strain falls, and the softened curve at the largest strain."""
+    if branch == 0:
+        out[2] = 1.0
+    else:
+        out[1] = x[0]
+
+
+def switch(p, x, strain, branch, up):
+    """Keep the largest strain; return the other branch."""
+    x[0] = strain
+    return 1 - branch
 
 
 def read_off(loop, marks, scales, way):
@@ -40,9 +51,9 @@ def read_off(loop, marks, scales, way):
     elastic = read_curve(loop, marks, scales, 1.0)
     half = 0.5 * scales.strain
     lost = 1.0 - loop.at(half, loading=False) / loop.at(half, loading=True)
-    top = curve(scales.strain, *elastic)[1]
+    top = real_curve(scales.strain, *elastic)[1]
     m = top * 10.0 ** (1.5 * marks[2] - 1.0)
-    reached = math.erf((top - curve(half, *elastic)[1]) / m)
+    reached = math.erf((top - real_curve(half, *elastic)[1]) / m)
     r = reached / min(max(lost, 0.02), 0.98)
     return np.array([*elastic, min(max(r, 1.01), 50.0), m, 0.0])
 
@@ -58,8 +69,8 @@ LAW = ff.Law(
             "stress",
         ),
     ),
-    functions=ff.Functions(fill, begin, leaves, switch, settle),
-    states=4,
-    branches={"elastic": "the softened curve"},
+    functions=ff.Functions(stress, ends=ends, switch=switch, admissible=admissible),
+    internal=1,
+    branches={"loading": "beyond the largest strain", "softened": "below it"},
     read_off=read_off,
 )  # fmt: skip

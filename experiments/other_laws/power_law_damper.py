@@ -7,30 +7,61 @@ dashpot, n near 0 dry friction.
 Carretero-González, Khatri, Porter, Kevrekidis & Daraio 2009, Phys. Rev. Lett. 102, 024102.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
 
 import foamfit as ff
+from foamfit.springs import law as formulas
 from foamfit.springs import laws
-from foamfit.springs.laws import followed
 
 PAPER = laws.law("bistable")
-PAPER_FUNCTIONS = PAPER.loaded_functions()
-COLUMNS, STATES = followed.sizes_of(PAPER)
-paper_fill = PAPER_FUNCTIONS.fill
+points_of = njit(formulas.derived_points)
+A, D, C, E = range(4)  # branches
 
 
-def fill(values, row):
-    """Fill in the row of the paper's spring, then the damper."""
-    row[COLUMNS], row[COLUMNS + 1] = values[7], values[8]
-    return paper_fill(values[:7], row[:COLUMNS]) and values[7] >= 0.0 and values[8] > 0.0
+def admissible(p):
+    """Return whether the parameters are admissible."""
+    return formulas.admissible(*p[:7]) and p[7] >= 0.0 and p[8] > 0.0
 
 
-def viscous(row, state, rate, h):
+def stress(p, x, strain, branch):
+    """Return the stress of the paper's spring (eqs. 2 and 3)."""
+    k0, kc, dsigma, eps_a, eps_c, plus, minus = p[:7]
+    sigma_a = k0 * eps_a / (1.0 - eps_a)
+    sigma_c = sigma_a + dsigma
+    if branch == D:
+        return sigma_a + plus * (strain - eps_a)
+    if branch == E:
+        return sigma_c + minus * (strain - eps_c)
+    k, r = (k0, strain) if branch == A else (kc, strain - eps_c + sigma_c / (kc + sigma_c))
+    return k * r / (1.0 - r) if r.real < 1.0 else math.inf
+
+
+def ends(p, x, strain, branch, out):
+    """Fill the ends of the branch (eqs. 4 and 5)."""
+    k0, kc, dsigma, eps_a, eps_c, plus, minus = p[:7]
+    points = points_of(k0.real, kc.real, dsigma.real, eps_a.real, eps_c.real, plus.real, minus.real)
+    if branch != A:
+        out[0] = eps_a if branch == D else eps_c if branch == C else points[3]
+    if branch != C:
+        out[1] = points[4] if branch == D else eps_c if branch == E else eps_a
+
+
+def switch(p, x, strain, branch, up):
+    """Return the next branch."""
+    if up:
+        return D if branch == A else C
+    return E if branch == C else A
+
+
+def viscous(p, x, strain, rate, branch):
     """Return the stress of the damper."""
-    force = row[COLUMNS] * abs(rate) ** row[COLUMNS + 1]
-    return force if rate > 0.0 else -force
+    if rate.real == 0.0:
+        return 0j
+    return p[7] * rate ** p[8] if rate.real > 0.0 else -p[7] * (-rate) ** p[8]
 
 
 def read_off(loop, marks, scales, way):
@@ -52,10 +83,12 @@ LAW = replace(
         ),
         ff.Param("n", ("n", ""), "", "exponent of the damper", (0.5, "one"), (0.02, 2.0)),
     ),
-    functions=PAPER_FUNCTIONS._replace(fill=fill, viscous=viscous),
-    columns=COLUMNS + 2,
-    states=STATES,
+    functions=ff.Functions(
+        stress, ends=ends, switch=switch, viscous=viscous, admissible=admissible
+    ),
+    numbered=tuple("adce"),
     spring=None,
+    published=False,
     searched=(*PAPER.searched, "c", "n"),
     read_off=read_off,
     read_in_series=None,
@@ -64,5 +97,4 @@ LAW = replace(
     exchanged=None,
     points=(),
     compared=(),
-    published=False,
 )  # fmt: skip

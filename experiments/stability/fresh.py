@@ -662,7 +662,6 @@ REASONS = {
     "not finite": "no longer finite",
     "flat branch under stress": "flat branch",
     "bound on steps": "the bound of",
-    "too fast for explicit steps": "are followed by explicit steps",
 }
 
 

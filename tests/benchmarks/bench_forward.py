@@ -37,8 +37,7 @@ SAMPLES = (100, 1000, 10_000, 100_000)
 def kernel(chain: ff.Chain, drive: Any, time: np.ndarray) -> Any:
     """Return the bare simulation that the fit calls, as a function without arguments."""
     made = plan(chain, drive, time)
-    rows = np.array([spring.row for spring in chain.springs])
-    heights = np.array(chain.heights)
+    rows, heights = chain.arrays.rows, chain.arrays.heights
     return lambda: made.run(rows, heights, everything=False)
 
 

@@ -183,7 +183,7 @@ def test_a_motion_is_as_exact_as_asked_for(name: str) -> None:
         got = ff.simulate(given, drive, TIME, rtol)
         assert difference(pressed, got.base_stress) < rtol
         assert max(map(difference, moved, got.displacement)) < rtol
-        assert got.method == "Taylor series"
+        assert got.method == "Dormand-Prince"
         if not np.isnan(end):
             assert got.contact_end == pytest.approx(end, rel=rtol)
 
@@ -206,18 +206,21 @@ def test_derivatives_by_all_parameters_are_those_of_differences(name: str) -> No
     run = ff.simulate(given, drive, TIME, 1e-10, sensitivities=names)
     away = np.abs(TIME - (run.contact_end or -1.0)) > 6e-5  # derivatives jump at the end of contact
     for short in names:
-        value = value_of(given, short)
-        step = 1e-4 * value
-        near = [
-            ff.simulate(with_value(given, short, value + k * step), drive, TIME, 1e-10)
-            for k in (-2, -1, 1, 2)
-        ]
-        for what in ("displacement", "base_stress"):
-            low, lower, higher, high = (getattr(r, what) for r in near)
-            wanted = (low - 8.0 * lower + 8.0 * higher - high) / (12.0 * step)
-            got = getattr(run.sensitivities[short], what)
-            size = max(np.abs(got).max(), 2e-5 * np.abs(getattr(run, what)).max() / abs(value))
-            assert np.abs(wanted - got)[..., away].max() < 1e-6 * size, (short, what)
+        value, misses = value_of(given, short), []
+        # The wide step for derivatives that are nearly zero, the short one beside switches.
+        for step in (1e-3 * value, 1e-4 * value):
+            near = [
+                ff.simulate(with_value(given, short, value + k * step), drive, TIME, 1e-10)
+                for k in (-2, -1, 1, 2)
+            ]
+            misses.append([])
+            for what in ("displacement", "base_stress"):
+                low, lower, higher, high = (getattr(r, what) for r in near)
+                wanted = (low - 8.0 * lower + 8.0 * higher - high) / (12.0 * step)
+                got = getattr(run.sensitivities[short], what)
+                size = max(np.abs(got).max(), 2e-5 * np.abs(getattr(run, what)).max() / abs(value))
+                misses[-1].append(np.abs(wanted - got)[..., away].max() / size)
+        assert np.min(misses, axis=0).max() < 1e-6, short
 
 
 @pytest.mark.parametrize("moved", [True, False])
@@ -283,15 +286,32 @@ def test_a_wholly_snapped_spring_without_spread_is_on_branch_c() -> None:
 
 
 @pytest.mark.parametrize(
+    ("given", "drive", "limit"),
+    [
+        (chain([relaxing(MICRO, [(0.5, 1e-12)])]), IMPACT, chain([MICRO])),
+        (chain([LINEAR, relaxing(MICRO, [(0.5, 1e-11)])]), MOVED, chain([LINEAR, MICRO])),
+        (chain([damped(MICRO, 1e-5), FOAM]), MOVED, chain([MICRO, FOAM])),
+    ],
+    ids=["term", "term above a linear spring", "dashpot"],
+)
+def test_what_is_too_fast_for_explicit_steps_has_its_limit(
+    given: ff.Chain, drive: Drive, limit: ff.Chain
+) -> None:
+    """A term or a dashpot next to nothing changes nothing."""
+    got, want = ff.simulate(given, drive, TIME), ff.simulate(limit, drive, TIME, 1e-9)
+    assert got.method == "Radau IIA"
+    assert difference(want.base_stress, got.base_stress) < 1e-6
+    assert max(map(difference, want.displacement, got.displacement)) < 1e-6
+
+
+@pytest.mark.parametrize(
     ("given", "drive", "culprit"),
     [
-        (chain([relaxing(MICRO, [(0.5, 1e-12)])]), IMPACT, "s1_tau1 = 1e-12 s"),
-        (chain([LINEAR, relaxing(MICRO, [(0.5, 1e-11)])]), MOVED, "s2_tau1 = 1e-11 s"),
         (chain([damped(MICRO, 1e-7), FOAM]), MOVED, "dashpot"),
-        (chain([MICRO, FOAM], [1e-18, 0.0]), IMPACT, "light mass"),
+        (chain([MICRO, FOAM], [1e-18, 0.0]), IMPACT, "mass"),
     ],
 )
-def test_what_explicit_steps_cannot_follow_is_refused_by_name(
+def test_what_no_steps_can_follow_is_refused_by_name(
     given: ff.Chain, drive: Drive, culprit: str
 ) -> None:
     with pytest.raises(ff.SimulationError, match="too fast") as refused:

@@ -233,5 +233,5 @@ def test_a_refusal_names_what_is_too_fast_only_where_something_is() -> None:
 
 def test_a_spring_that_turns_at_the_end_of_its_branch_between_samples_is_refused() -> None:
     """No sample is near the turn, where one ulp of the strain changes the stress by 0.3 %."""
-    with pytest.raises(ff.SimulationError, match="end of its branch"):
+    with pytest.raises(ff.SimulationError, match=r"end of its branch|smallest error"):
         ff.simulate(*fresh.scene_from(fresh.spec_of("worn", 104)), 1e-6)

@@ -2,170 +2,175 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
 import subprocess
-from contextlib import contextmanager
-from dataclasses import replace
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import click
-import numpy as np
 import pytest
 from click.testing import CliRunner
-from numba import types
 
 import fabricated
-import foamfit as ff
-from conftest import EXPERIMENTS, synthetic_loop, without_pictures
+from conftest import EXPERIMENTS, without_pictures
 from foamfit import api
 from foamfit.cli import main
-from foamfit.solve import cache, polynomial, precompile, rates, relaxation
-from foamfit.solve.explicit import memory, taylor
-from foamfit.springs import kernels, microscale_kernels, sensitivities
-from foamfit.springs.laws import followed
+from foamfit.solve import along, cache, loop, precompile
+from foamfit.springs.compiled import bistable
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
+# Reads a test, compiles for a model, fits, and prints what the fit compiled
+# or read from the cache besides.
+FIT = """
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+from numba.core.ccallback import CFunc
+from numba.core.dispatcher import Dispatcher
+
+import foamfit as ff
+from conftest import synthetic_loop
+from foamfit.solve import precompile
+
+
+def compiled():
+    found = set()
+    modules = [module for name, module in sys.modules.items() if name.startswith("foamfit")]
+    for value in [value for module in modules for value in vars(module).values()]:
+        if isinstance(value, Dispatcher):
+            name = f"{value.py_func.__module__}.{value.py_func.__name__}"
+            found |= {f"{name} {signature}" for signature in value.signatures}
+        elif isinstance(value, CFunc):
+            found.add(f"{value.__wrapped__.__module__}.{value.__name__}")
+    return found
+
+
+path, model = sys.argv[1:]
+test = ff.read_test(path) if path else synthetic_loop()[1]
+for loop in precompile.LOOPS:
+    precompile.run(loop, model)
+before = compiled()
+if path:
+    ff.fit(test, model=model, starts=2)
+else:
+    timed = replace(test, time=np.linspace(0.0, 1.0, test.stress.size))
+    for relaxation in (1, 0):
+        ff.fit(timed, model=model, relaxation=relaxation, starts=1, intervals="local")
+print(json.dumps([len(before), sorted(compiled() - before)]))
+"""
 
 
 def keep_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the loops of this package report `folder` as their numba cache."""
-    loop = SimpleNamespace(stats=SimpleNamespace(cache_path=str(folder)))
-    for module, name in (
-        (kernels, "fault"), (followed, "_begin"), (polynomial, "first_crossing"),
-        (taylor, "integrate"), (rates, "fastest_rates"),
-    ):  # fmt: skip
-        monkeypatch.setattr(module, name, loop)
+    stored = SimpleNamespace(stats=SimpleNamespace(cache_path=str(folder)))
+    monkeypatch.setattr(loop, "integrate", stored)
+    monkeypatch.setattr(bistable, "fill", stored)
 
 
-def is_other(kind: Any) -> bool:
-    """Return whether an argument is a literal or belongs to springs with memory, compiled apart."""
-    strided = getattr(kind, "layout", "C") == "A"  # a series of the memory
-    return (
-        strided
-        or isinstance(kind, types.Literal)
-        or getattr(kind, "instance_class", 0) is memory.Memory
-    )
+@pytest.mark.parametrize(("path", "model"), [(str(RECONSTRUCTION), "bistable"), ("", "microscale")])
+def test_a_fit_calls_what_was_compiled_and_nothing_else(path: str, model: str) -> None:
+    """Neither a function nor a signature of one is new; modules compile theirs when imported."""
+    done = subprocess.run(
+        [sys.executable, "-c", FIT, path, model],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    known, new = json.loads(done.stdout.splitlines()[-1])
+    assert known > 10
+    assert new == []
 
 
-def test_a_fit_calls_what_was_compiled_and_nothing_else() -> None:
-    """Every loop that a fit calls has a single signature, that of the small scenes."""
-    precompile._rest()
-    ff.fit(ff.read_test(RECONSTRUCTION), starts=2)
-    assert taylor.integrate.signatures == [precompile._calls()[taylor.integrate]]
-    for function in (
-        kernels.fill_bistable, kernels.stress_along, kernels.fault, kernels.total,
-        sensitivities.equilibrium_tangents, rates.fastest_rates,
-    ):  # fmt: skip
-        assert len(function.signatures) == 1, function.py_func.__name__
+@pytest.mark.parametrize("name", precompile.LOOPS)
+def test_a_small_scene_calls_its_loop_with_a_derivative(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """A model is run with a spring of each law; errors of a scene do not matter."""
+    owner, asked = {"integrate": loop, "follow": along}[name], []
+    real = getattr(owner, name)
+
+    def kept(*given: Any) -> Any:
+        asked.append((given[3].tobytes(), given[9].shape))
+        return real(*given)
+
+    monkeypatch.setattr(owner, name, kept)
+    for model in ("bistable", "microscale+microscale", "bistable+microscale+linear"):
+        asked.clear()
+        precompile.run(name, model)
+        assert len({row for row, _ in asked}) == len(set(model.split("+")))
+        assert {shape for _, shape in asked} == {(2, 2, 4)}  # of one spring, with a derivative
 
 
-def test_a_fit_of_springs_with_memory_calls_what_was_compiled_and_nothing_else() -> None:
-    for relaxed in (True, False):
-        precompile._memory(relaxed)
-    measurement = synthetic_loop()[1]
-    timed = replace(measurement, time=np.linspace(0.0, 1.0, measurement.stress.size))
-    ff.fit(timed, model="microscale", relaxation=1, starts=1, intervals="local")
-    ff.fit(timed, model="microscale", starts=1, intervals="local")
-    for function in (
-        relaxation.relaxed_along,
-        kernels.fill_microscale,
-        microscale_kernels.stress_along,
-        microscale_kernels.stress_tangents_along,
-    ):
-        assert len(function.signatures) == 1, function.py_func.__name__
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Return what was run, in order, with an empty cache."""
+    done: list[Any] = []
+    monkeypatch.setattr(precompile, "run", lambda *given: done.append(given))
+    monkeypatch.setattr(cache, "compiled", lambda *_: False)
+    return done
 
 
-def test_the_small_scenes_meet_every_loop_of_the_integrator() -> None:
-    """Compiling the integrator must not compile a loop with other argument types.
+def test_the_loops_are_compiled_once(asked: list[Any]) -> None:
+    """The body may finish as often as it likes."""
+    told: list[str] = []
+    with precompile.at_first_use("linear", 0, lambda: told.append("compiling")) as finish:
+        assert told == ["compiling"]
+        assert asked == []
+        finish()
+        finish()
+    assert asked == [("integrate", "linear"), ("follow", "linear")]
+    assert told == ["compiling"]
 
-    Other loops may also call `first_crossing` with an order known at compile time.
-    """
-    calls = precompile._calls()
-    text = Path(taylor.__file__).read_text()
-    body = text.split("def _integrated(")[1].split("def integrate(")[0]
-    read = set(re.findall(r"\w+", body)) & set(vars(taylor))
-    loops = {vars(taylor)[name] for name in read if hasattr(vars(taylor)[name], "py_func")}
-    without = {loop for loop in loops if loop.__module__ != memory.__name__}
-    with_memory = {taylor.settle_together}
-    assert without - with_memory <= set(calls)
-    for function, arguments in calls.items():
-        made = [kinds for kinds in function.signatures if not any(map(is_other, kinds))]
-        assert made in ([], [arguments]), function.py_func.__name__
+
+def test_nothing_is_compiled_if_the_body_raises_before(asked: list[Any]) -> None:
+    with pytest.raises(click.UsageError), precompile.at_first_use():
+        raise click.UsageError("no such file")
+    assert asked == []
 
 
 def test_the_first_use_says_that_it_compiles(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    asked: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    done = []
-
-    @contextmanager
-    def quickly(*_: bool) -> Any:
-        yield lambda: done.append("rest")
-
-    monkeypatch.setattr(precompile, "side_by_side", quickly)
     monkeypatch.setattr(api, "fit", lambda *_, **__: fabricated.result())
     without_pictures(monkeypatch)
     for ready in (False, True):
         monkeypatch.setattr(cache, "compiled", lambda *_, ready=ready: ready)
-        told = CliRunner().invoke(main, ["fit", str(RECONSTRUCTION), "--out", str(tmp_path / "r")])
+        out = str(tmp_path / f"{ready}")
+        told = CliRunner().invoke(main, ["fit", str(RECONSTRUCTION), "--out", out])
+        assert told.exit_code == 0, told.output
         assert ("compiling the solver" in told.stderr) == (not ready)
-    assert done == ["rest"]
+    assert asked == [("integrate", "bistable"), ("follow", "bistable")]
 
 
 @pytest.mark.parametrize(
-    ("model", "there", "asked"),
+    ("model", "there", "runs"),
     [
-        (["bistable"], (), [(True, False)]),
-        (["microscale"], (), [(False, True)]),
-        (["bistable", "--relaxation", "1"], ("integrate",), [(False, True)]),
-        (["auto"], (), [(True, True)]),
-        (["auto"], ("integrate",), [(False, True)]),
-        (["auto"], ("integrate", "relaxed_along"), []),
+        (["bistable"], (), "bistable"),
+        (["microscale"], ("integrate",), "microscale"),
+        (["bistable", "--relaxation", "1"], ("follow",), "bistable"),
+        (["auto"], (), "bistable+microscale"),
+        (["auto"], precompile.LOOPS, None),
+        (["linear+microscale"], precompile.LOOPS, None),
     ],
 )
 def test_the_first_use_compiles_what_the_model_needs(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: list[str], there: Any, asked: Any
-) -> None:
-    done = []
-
-    @contextmanager
-    def quickly(*parts: bool) -> Any:
-        done.append(parts)
-        yield lambda: None
-
-    monkeypatch.setattr(precompile, "side_by_side", quickly)
+    asked: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: list[str],
+    there: tuple[str, ...], runs: str | None,
+) -> None:  # fmt: skip
     monkeypatch.setattr(cache, "compiled", lambda name="integrate": name in there)
     monkeypatch.setattr(api, "fit", lambda *_, **__: fabricated.result())
     without_pictures(monkeypatch)
     args = ["fit", str(RECONSTRUCTION), "--out", str(tmp_path / "r"), "--model", *model]
     assert CliRunner().invoke(main, args).exit_code == 0
-    assert done == asked
-
-
-def test_the_other_process_finds_this_package_and_is_stopped(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The process starts with this package in its path and is stopped if the body raises."""
-    asked: list[Any] = []
-
-    class Other(subprocess.Popen):  # type: ignore[type-arg]
-        def __init__(self, command: list[str], **options: Any) -> None:
-            asked.append(options["env"]["PYTHONPATH"].split(":")[0])
-            assert command[1:] == ["-m", "foamfit.solve.precompile", "integrator"]
-            super().__init__(["sleep", "60"], stdout=options["stdout"])
-
-        def terminate(self) -> None:
-            asked.append("terminated")
-            super().terminate()
-
-    monkeypatch.setattr(subprocess, "Popen", Other)
-    with pytest.raises(click.UsageError), precompile.side_by_side():
-        raise click.UsageError("no such file")
-    assert asked == [str(Path(ff.__file__).parents[1]), "terminated"]
+    missing = [loop for loop in precompile.LOOPS if loop not in there]
+    assert asked == ([] if runs is None else [(loop, runs) for loop in missing])
 
 
 def test_what_was_compiled_of_another_source_is_no_use(
@@ -173,7 +178,7 @@ def test_what_was_compiled_of_another_source_is_no_use(
 ) -> None:
     keep_in(tmp_path, monkeypatch)
     assert not cache.compiled()
-    made = [tmp_path / f"taylor.integrate-30.py311.{end}" for end in ("nbi", "1.nbc")]
+    made = [tmp_path / f"loop.integrate-30.py311.{end}" for end in ("nbi", "1.nbc")]
     for path in made:
         path.touch()
     assert cache.compiled()
@@ -194,8 +199,8 @@ def test_what_is_compiled_where_it_is_needed_is_announced_once(
     new, known, kept, other = Loop(), Loop(), Loop(), Loop()
     known.signatures = ((),)
     cache._first.cache_clear()
-    for loop in (new, new, known, other):
-        cache.announce(loop, "the solver of slow scenes")
+    for one in (new, new, known, other):
+        cache.announce(one, "the solver of slow scenes")
     (tmp_path / "implicit.integrate_slowly-30.py311.1.nbc").touch()
     cache.announce(kept, "the solver of slow scenes")
     assert [record.getMessage() for record in caplog.records] == [
@@ -205,9 +210,13 @@ def test_what_is_compiled_where_it_is_needed_is_announced_once(
 
 
 def test_every_module_with_compiled_loops_is_known() -> None:
+    """Modules outside `FOLDERS` do not compile; the folders of all caches are watched."""
     written = {
-        path.relative_to(cache.PACKAGE).parts[0]
+        path.relative_to(cache.PACKAGE)
         for path in cache.PACKAGE.rglob("*.py")
-        if re.search(r"^@(compiled|inner|inlined|piece|maker|once)$", path.read_text(), re.M)
+        if re.search(r"\b(njit|cfunc)\b|^@(inner|inlined|outer)$", path.read_text(), re.M)
     }
-    assert set(cache.FOLDERS) == written
+    assert set(cache.FOLDERS) == {path.parts[0] for path in written}
+    stored = {cache.PACKAGE / path.parent / "__pycache__" for path in written}
+    if not os.environ.get("NUMBA_CACHE_DIR"):
+        assert cache._caches() == stored

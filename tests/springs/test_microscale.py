@@ -11,8 +11,6 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 
 import foamfit as ff
-from foamfit.springs import microscale_kernels
-from foamfit.springs.sensitivities import equilibrium_tangents
 
 SHOE = ff.MicroscaleSpring(5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
 SPRINGS = {
@@ -160,31 +158,34 @@ def check_derivative(
 def test_derivatives_along_histories(spring: ff.MicroscaleSpring) -> None:
     """By every parameter of the spring, including where the rank stays constant after a turn."""
     strain = walk(TURNS, 7)[1:]
-    path = microscale_kernels.stress_along(spring.row, strain)
-    assert {6, 7, 8} <= set(path[2].tolist())
-    by, slope = microscale_kernels.stress_tangents_along(spring.row, strain, *path)
+    assert {"held", "snap-through", "snap-back"} <= set(spring.branches(strain).tolist())
     stress = walk((0.0, 3e5, 2e4, 1.51e5, 5.1e4, 4e5, -1e4, 2e5), 7)[1:]
-    strains, _, branches = microscale_kernels.strain_along(spring.row, stress)
-    directions = np.column_stack((np.zeros(7, int), np.arange(7)))
-    inverse = equilibrium_tangents(
-        spring.row[None], np.ones(1), stress, strains[None], branches[None], False, directions
-    )[0][:, 0]
-    for own, name in enumerate(NAMES):
-        check_derivative(spring, name, strain, "stress", by[own])
-        check_derivative(spring, name, stress, "strain", inverse[own])
+    chain, names = ff.Chain([spring], [1.0], 1.0), [f"s1_{name}" for name in (*NAMES, "height")]
+    by, inverse = (
+        ff.simulate(chain, drive, np.arange(float(size)), sensitivities=names).sensitivities
+        for drive, size in (
+            (ff.DisplacementDrive(strain), strain.size),
+            (ff.StressDrive(stress), stress.size),
+        )
+    )
+    for name in NAMES:
+        check_derivative(spring, name, strain, "stress", by[f"s1_{name}"].base_stress)
+        check_derivative(spring, name, stress, "strain", inverse[f"s1_{name}"].displacement[0])
     at = [spring.stress(strain * (1 + k * 1e-5)) for k in (-2, -1, 1, 2)]
     want = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / 12e-5
-    assert np.abs(by[7] - want).max() <= 1e-6 * np.abs(want).max()
-    np.testing.assert_allclose(slope, spring.tangent(strain), rtol=0)
+    # a larger height reduces all strains alike
+    assert np.abs(by["s1_height"].base_stress + want).max() <= 1e-6 * np.abs(want).max()
 
 
 def test_the_held_rank_at_the_end_of_its_stresses_is_held() -> None:
     """After snapping back to rank 0, a spring keeps its rank up to and including sigma_plus."""
     spring = SPRINGS["reversible at low ranks"]
-    stress = np.array([3e5, 5e4, 1e5])
-    _, (ranks, _), branches = microscale_kernels.strain_along(spring.row, stress)
-    assert (ranks[1:] == 0.0).all()
-    assert branches.tolist() == [7, 8, 6]
+    stress = np.array([0.0, 3e5, 5e4, 1e5])
+    assert (spring.fraction_along(stress)[2:] == 0.5).all()
+    got = ff.simulate(ff.Chain([spring], [1.0], 1.0), ff.StressDrive(stress), np.arange(4.0))
+    np.testing.assert_array_equal(got.switches[:, [0, 3]], [(1.0, 7), (2.0, 8), (3.0, 6)])
+    want = [strain_of(spring, 0.5, sigma) for sigma in (5e4, 1e5)]
+    np.testing.assert_allclose(got.displacement[0, 2:], want, rtol=1e-15)
 
 
 def test_the_fraction_that_has_snapped_follows_its_two_laws() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from foamfit.springs.kernels import N_COLUMNS
+from foamfit.springs.compiled import compiled
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT, OWN_RELAXATION, unit_of
 
@@ -28,14 +28,18 @@ def test_a_vector_with_relaxation_becomes_springs_and_rows() -> None:
     )
     rows = model.rows(values)
     assert rows is not None
-    assert rows.shape == (3, N_COLUMNS + 4)
+    linear, own, _ = columns = [compiled(law).columns for law in model.laws]
+    assert rows.shape == (3, 5 + max(columns))  # dashpot, terms, and the row of the law
     np.testing.assert_array_equal(chain.arrays.rows, rows)
-    np.testing.assert_array_equal(rows[1:, N_COLUMNS:], [flat, flat])
-    np.testing.assert_array_equal(rows[0, N_COLUMNS:], [0.0, np.inf, 0.0, np.inf])
+    np.testing.assert_array_equal(rows[:, 0], [0.0, 3.0, 0.0])
+    np.testing.assert_array_equal(rows[1:, 1:5], [flat, flat])
+    np.testing.assert_array_equal(rows[0, 1:5], [0.0, np.inf, 0.0, np.inf])
+    assert not rows[0, 5 + linear :].any()
     bare = Model.parse("microscale").rows(np.array([*MICROSCALE, 0.0]))
     assert bare is not None
-    assert bare.shape == (1, N_COLUMNS)
-    np.testing.assert_array_equal(bare[0], rows[1, :N_COLUMNS])
+    assert bare.shape == (1, 1 + own)
+    np.testing.assert_array_equal(bare[0, 0], rows[1, 0])
+    np.testing.assert_array_equal(bare[0, 1:], rows[1, 5 : 5 + own])
 
 
 def test_names_units_and_directions_of_relaxation_terms() -> None:

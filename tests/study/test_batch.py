@@ -647,7 +647,7 @@ def test_one_fit_compiles_what_all_need_before_the_others_start(here, monkeypatc
             """Do nothing: there is no process to stop."""
 
     def fit(test, **options):
-        second.wait(60.0 if module.cache.compiled("integrate_with_memory") else 0.02)
+        second.wait(60.0 if module.cache.compiled("follow") else 0.02)
         order.append(f"{test.name} fitted")
         return fabricated.result(measurement=test)
 
@@ -656,7 +656,7 @@ def test_one_fit_compiles_what_all_need_before_the_others_start(here, monkeypatc
     for compiled in (False, True):
         order.clear()
         second.clear()
-        have = {"integrate", "integrate_with_memory"} if compiled else {"integrate"}
+        have = {"integrate", "follow"} if compiled else {"integrate"}
         monkeypatch.setattr(module.cache, "compiled", lambda name="integrate", h=have: name in h)
         again(executor=None, model="microscale", fresh=True)
         assert order[0] == "a given"

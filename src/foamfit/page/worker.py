@@ -34,7 +34,7 @@ PACKAGE = Path(__file__).parent.parent
 COMPILING = "compiling the solver, once after installation"
 # Compiled in this order, for springs without and with memory: model, number of relaxation terms,
 # and the function that is cached last.
-COMPILED = (("bistable", 0, "integrate"), ("microscale", 1, "relaxed_along"))
+COMPILED = (("bistable", 0, "integrate"), ("microscale", 1, "follow"))
 COMPILE = """from foamfit.solve.precompile import at_first_use
 with at_first_use({!r}, {}, lambda: None) as compile_rest:
     compile_rest()"""

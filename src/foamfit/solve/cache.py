@@ -16,19 +16,10 @@ FOLDERS = ("springs", "solve")  # subfolders with compiled loops
 
 def _caches() -> set[Path]:
     """Return numba's cache folders of this package, one for each folder with compiled loops."""
-    from foamfit.solve import polynomial, rates
-    from foamfit.solve.explicit import taylor
-    from foamfit.springs import kernels
-    from foamfit.springs.laws import followed
+    from foamfit.solve import loop
+    from foamfit.springs.compiled import bistable
 
-    law: Any = followed.functions_of("linear").begin
-    loops: tuple[Any, ...] = (
-        kernels.fault,
-        law,
-        polynomial.first_crossing,
-        taylor.integrate,
-        rates.fastest_rates,
-    )
+    loops: tuple[Any, ...] = (loop.integrate, bistable.fill)
     return {Path(loop.stats.cache_path or ".") for loop in loops}
 
 

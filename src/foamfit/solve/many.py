@@ -19,10 +19,12 @@ polynomial. It is regular at the turning point of the motion and with any dampin
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 
+from foamfit.arrays import Array
 from foamfit.solve import scene as scenes
 from foamfit.solve.polynomial import (
     LEAST_TRUNCATION,
@@ -31,28 +33,14 @@ from foamfit.solve.polynomial import (
     order_for,
     value_at,
 )
-from foamfit.solve.scene import Scene, SceneTuple, before_contact, first_past, fly, log_switch
-from foamfit.springs.kernels import (
-    ETA,
-    K0,
-    KC,
-    KH_MINUS,
-    KH_PLUS,
-    KIND,
-    OF_STRESS,
-    Array,
-    Branches,
-    above,
-    below,
-    branch_shape,
-    compiled,
-    first_branch,
-    inner,
-    interval,
-    maker,
-)
-from foamfit.springs.law import BISTABLE, UNILATERAL
+from foamfit.springs.compiled.bistable import A, C, D, E
 
+# With arrays that are made inside, which count references.
+_OPTIONS = {"error_model": "numpy", "fastmath": {"contract"}}
+inner = njit(**_OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+# Columns of the shape of a branch: 1 if curved, slope k, origins of strain and stress, stresses at
+# its ends.
+CURVED, SLOPE, ORIGIN, OFFSET, FIRST, LAST, SHAPE = range(7)
 DEGREE = 16  # of the polynomial of the elongation
 # Range of the polynomial about its anchor, as a share of the distance to the nearest pole. The
 # relative truncation error of the elongation is below 0.125**17 < 1e-15.
@@ -70,9 +58,9 @@ class Group(NamedTuple):
     before is the lesser of its two children, and entry 1 is the least of all.
     """
 
-    rows: Array
+    shapes: Array  #: of the four branches, (springs, 4, SHAPE)
     heights: Array
-    branches: Branches  #: current branches
+    branches: Array  #: current branches
     upper: Array  #: stresses at which the springs leave their branches upwards
     lower: Array  #: negative stresses at which they leave them downwards
     sum: Array  #: elongation as a polynomial of (S - anchor)/unit, (DEGREE + 1,)
@@ -89,15 +77,58 @@ class Step(NamedTuple):
     shifted: Array  #: polynomial of the elongation about S(0), (DEGREE + 1,)
 
 
-@compiled
-def holds(rows: Array) -> bool:
-    """Whether an aggregate can represent the springs: no dashpot, and no flat branch or gap."""
-    for i in range(rows.shape[0]):
-        if rows[i, ETA] > 0.0 or rows[i, KIND] == UNILATERAL:
-            return False
-        if rows[i, KIND] == BISTABLE and not (rows[i, KH_PLUS] > 0.0 and rows[i, KH_MINUS] > 0.0):
-            return False
-    return True
+def shapes_of(plan: Any, rows: Array) -> Array | None:
+    """Return the shapes of the branches, (springs, 4, SHAPE); None if an aggregate cannot hold.
+
+    It holds undamped bistable and linear springs without flat branches and gaps.
+    """
+    from foamfit.springs.compiled.bistable import (
+        EPS_A,
+        EPS_C,
+        EPS_HAT_A,
+        EPS_HAT_C,
+        TABLE,
+        TO_STRESS,
+        WIDE,
+    )  # fmt: skip
+
+    own, out = rows[:, 1 + 2 * plan.terms :], np.zeros((len(rows), 4, SHAPE))
+    out[:, :, FIRST], out[:, :, LAST] = -math.inf, math.inf
+    bistable = np.array([len(one.slopes) == 3 for one in plan.laws.made])
+    known = np.array([one.columns == 2 for one in plan.laws.made]) | bistable
+    if not known.all() or rows[:, 0].any() or plan.laws.loose or plan.terms:
+        return None
+    out[~bistable, :, SLOPE] = own[~bistable, :1]
+    for branch in range(4):
+        lines = own[bistable, TABLE + branch * WIDE :]
+        out[bistable, branch, CURVED] = float(branch in (A, C))
+        out[bistable, branch, SLOPE : OFFSET + 1] = lines[:, :3]
+    ends = {A: (None, EPS_A), D: (EPS_A, EPS_HAT_C), C: (EPS_C, None), E: (EPS_HAT_A, EPS_C)}
+    for branch, (low, high) in ends.items():
+        for column, end in ((FIRST, low), (LAST, high)):
+            if end is not None:
+                out[bistable, branch, column] = own[bistable, TO_STRESS + end]
+    return out if (out[:, :, SLOPE] > 0.0).all() else None
+
+
+@inner
+def above(branch):  # type: ignore[no-untyped-def]
+    """Return the branch that a spring enters when it leaves `branch` upwards."""
+    return D if branch == A else C
+
+
+@inner
+def below(branch):  # type: ignore[no-untyped-def]
+    """Return the branch that a spring enters when it leaves `branch` downwards."""
+    return E if branch == C else A
+
+
+@inner
+def first_past(t, first, end, last):  # type: ignore[no-untyped-def]
+    """Return the first sample from `first` on at or after `end`; strictly after it if `last`."""
+    while first < t.size and (t[first] < end or (last and t[first] == end)):
+        first += 1
+    return first
 
 
 # ---------------------------------------------------------------- the aggregate
@@ -117,7 +148,7 @@ def _set(tree: Array, i: int, value: float) -> None:
 def _enter(group: Group, i: int, branch: int) -> None:
     """Put a spring on a branch."""
     group.branches[i] = branch
-    low, high = interval(group.rows[i], branch, OF_STRESS)
+    low, high = group.shapes[i, branch, FIRST], group.shapes[i, branch, LAST]
     _set(group.upper, i, high)
     _set(group.lower, i, -low)
 
@@ -128,7 +159,8 @@ def _add(group: Group, i: int, share: float) -> None:
 
     On a curved branch ε = x0 + 1 - k/(k + S), a geometric series.
     """
-    curved, k, x0, s0 = branch_shape(group.rows[i], group.branches[i])
+    shape = group.shapes[i, group.branches[i]]
+    curved, k, x0, s0 = shape[CURVED] > 0.0, shape[SLOPE], shape[ORIGIN], shape[OFFSET]
     anchor, unit, height = group.place[ANCHOR], group.place[UNIT], share * group.heights[i]
     if not curved:
         group.sum[0] += height * (x0 + (anchor - s0) / k)
@@ -155,22 +187,22 @@ def _anchor(group: Group, stress: float, rising: bool) -> None:
         _add(group, i, 1.0)
 
 
-@maker
-def _make_group(rows: Array, heights: Array) -> Group:
+@inner
+def _make_group(shapes: Array, heights: Array) -> Group:
     """Return the group of springs at zero stress, each on its first branch."""
     count, leaves = heights.size, 1
     while leaves < count:
         leaves *= 2
     group = Group(
-        rows, heights, np.zeros(count, np.int64), np.full(2 * leaves, math.inf),
+        shapes, heights, np.zeros(count, np.int64), np.full(2 * leaves, math.inf),
         np.full(2 * leaves, math.inf), np.zeros(DEGREE + 1), np.zeros(N_PLACE),
     )  # fmt: skip
     least = math.inf
-    for i in range(rows.shape[0]):
-        _enter(group, i, first_branch(rows[i]))
-        least = min(least, rows[i, K0])
-        if rows[i, KIND] == BISTABLE:
-            least = min(least, rows[i, KC])
+    for i in range(count):
+        _enter(group, i, A)
+        for branch in range(4):
+            if shapes[i, branch, CURVED] > 0.0 or shapes[i, branch, LAST] == math.inf:
+                least = min(least, shapes[i, branch, SLOPE])
     group.place[LEAST] = least
     _anchor(group, 0.0, least > 0.0)  # a literal would be another type
     return group
@@ -179,7 +211,8 @@ def _make_group(rows: Array, heights: Array) -> Group:
 @inner
 def _strain(group: Group, i: int, stress: float) -> float:
     """Return the strain of a spring on its branch."""
-    curved, k, x0, s0 = branch_shape(group.rows[i], group.branches[i])
+    shape = group.shapes[i, group.branches[i]]
+    curved, k, x0, s0 = shape[CURVED] > 0.0, shape[SLOPE], shape[ORIGIN], shape[OFFSET]
     return x0 + (stress / (k + stress) if curved else (stress - s0) / k)
 
 
@@ -198,7 +231,10 @@ def _switch(
         left = group.branches[i]
         entered = above(left) if rising else below(left)
         strain = _strain(group, i, stress)
-        switches = log_switch(log, switches, now, i, left, entered, strain)
+        if switches < log.shape[0]:
+            log[switches, 0], log[switches, 1], log[switches, 2] = now, i, left
+            log[switches, 3], log[switches, 4] = entered, strain
+        switches += 1
         _add(group, i, -1.0)
         _enter(group, i, entered)
         _add(group, i, 1.0)
@@ -300,19 +336,17 @@ def _shape(group: Group, stress: float, nodes: Array) -> None:
         nodes[min(i, nodes.size - 1)] = place
 
 
-@compiled
-def integrate_aggregate(
-    given: SceneTuple, tol: float, max_steps: int, curves: Array, log: Array, effort: Branches
-) -> tuple[int, float, int, int]:
-    """Integrate an impact on springs that satisfy `holds`, without masses between them.
+@njit(**_OPTIONS, no_cfunc_wrapper=True, cache=True)
+def integrate_aggregate(shapes, heights, numbers, t, max_steps, curves, log, effort):  # type: ignore[no-untyped-def]
+    """Integrate an impact on springs of these shapes, without masses between them.
 
-    Arguments and results are those of `explicit.taylor.integrate`. The numbers of sums over all
+    `numbers`: areal mass, drag, speed, tolerance. `curves` (1 + nodes, n) become base stress and
+    displacements. Return outcome, end of contact, steps and switches. The numbers of sums over all
     springs and of orders of all steps are added to `effort` (2,).
     """
-    scene = Scene(*given)
-    heights, mass, drag, speed, t = scene.heights, scene.mass[0], scene.drag, scene.speed, scene.t
+    mass, drag, speed, tol = numbers[0], numbers[1], numbers[2], numbers[3]
     tol = max(tol, LEAST_TRUNCATION)
-    count, group, order = heights.size, _make_group(scene.rows, heights), order_for(tol, DEGREE)
+    count, group, order = heights.size, _make_group(shapes, heights), order_for(tol, DEGREE)
     now = Step(
         np.zeros(order + 1), np.zeros(order + 1), np.zeros(order + 1),
         np.zeros((order + 1, order + 1)), np.zeros(DEGREE + 1),
@@ -324,7 +358,11 @@ def integrate_aggregate(
     s_scale = min(w_scale / compliance, group.upper[1])
     w_scale = s_scale * compliance
     effort[0] += 1
-    done = before_contact(curves, t, speed, 0.0)
+    done = first_past(t, 0, 0.0, False)
+    for j in range(done):
+        for i in range(curves.shape[0]):
+            curves[i, j] = 0.0
+        curves[curves.shape[0] - 1, j] = speed * t[j]
     begin, switches, stalled, horizon = 0.0, 0, 0, t[t.size - 1]
     now.v[0] = speed
     for step in range(max_steps):
@@ -357,7 +395,10 @@ def integrate_aggregate(
         if side < 0 and stress <= 0.0:
             w_end = np.zeros(curves.shape[0] - 1)
             _shape(group, 0.0, w_end)
-            fly(curves, t, done, begin, w_end, velocity, 0.0)
+            for j in range(done, t.size):
+                curves[0, j] = 0.0
+                for i in range(w_end.size):
+                    curves[1 + i, j] = w_end[i] + velocity * (t[j] - begin)
             return scenes.DONE, begin, step + 1, switches
         s_scale = max(s_scale, stress)
         w_scale = max(w_scale, now.w[0])

@@ -3,102 +3,104 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
-from foamfit.errors import InputError, SimulationError
-from foamfit.solve import cache, many, rates, relaxation
+from foamfit.errors import InputError
+from foamfit.solve import along, cache, loop, rates, static
 from foamfit.solve import scene as scenes
-from foamfit.solve.any_law import AnyLawPlan, plan_of
-from foamfit.solve.explicit import taylor
-from foamfit.solve.implicit import steps
+from foamfit.solve.layout import Layout, Shape, lay_out
+from foamfit.solve.run import POINTS
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
 from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
-from foamfit.springs import equilibrium, kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-from foamfit.springs.law import BISTABLE, LINEAR
-from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
-from foamfit.springs.sensitivities import equilibrium_tangents
+from foamfit.springs.compiled import compiled
+from foamfit.springs.compiled.contract import INTERNAL, TINY, Compiled
+from foamfit.springs.laws.record import Law
+from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 from foamfit.springs.spring import as_samples
 
 Directions = NDArray[np.int64]
 
 FIRST_ORDER, SECOND_ORDER = "first order", "second order"
-TAYLOR, RADAU, AGGREGATE = "Taylor series", "Radau IIA", "aggregate"
+EXPLICIT_STEPS, RADAU, AGGREGATE = "Dormand-Prince", "Radau IIA", "aggregate"
+LEAST_AGGREGATE, AS_ONE = (
+    9,
+    1e-4,
+)  # springs that an impact treats as one; error over rtol and springs
 MAX_STEPS = 2_000_000
 # Implicit steps replace explicit ones above these limits.
-MOST_RELAXATION = 1e4  # relaxation times in the duration of the scene
-MOST_VIBRATION = 3e5  # radians of the fastest vibration in the duration
-MOST_EXPLICIT = 200_000  # steps
-MOST_EXPLICIT_WORK = 500_000  # steps times springs
+MOST_RELAXATION = 3e3  # relaxation times in the duration of the scene
+MOST_VIBRATION = 1e5  # radians of the fastest vibration in the duration
+FASTEST = 1e10  # radians above which a step that shrinks to nothing is said to be too fast
+MOST_EXPLICIT_WORK, MOST_IMPLICIT_WORK = 1_200_000, 1_500_000  # steps times springs
 # Bounds on steps times springs of any solver keep runs to seconds.
-MOST_WORK = 1_500_000  # in addition to the samples of a drive
+MOST_WORK = 6_000_000  # in addition to the samples of a drive
 MOST_SAMPLED = 10_000_000  # in total
-# Truncation of a step over the requested error. For explicit steps a small value is cheap: it only
-# raises the order.
-OF_MASSES = 1e-4  # with masses inside: switches amplify errors (500-fold over 56 switches)
-OF_IMPACT = 1e-3  # other impacts
-ALONG_DRIVE = 1e-4  # other drives
-# Implicit steps.
-OF_MASSES_IMPLICIT = 3e-2  # with masses inside
-IMPLICIT = 3e-4  # without
-# Aggregates.
-AS_ONE = 1e-4  # divided by the number of springs, whose errors add up
-LEAST_IMPLICIT = 1e-14  # least truncation of implicit steps, about the rounding error
-MOST_IMPLICIT = 250_000  # implicit steps, at 0.5 ms each
-LEAST_AGGREGATE = 9  # an impact treats at least this number of springs under one stress as one
-LOGGED = 1024  # switches in the log of a first run; with more it is repeated
-
-_TOO_FAST = (
-    "springs with memory are followed by explicit steps, for which {culprit} is too fast: the "
-    "scene lasts {rate:.2g} of its radians or relaxation times, too many for {steps} steps"
+# Error of a step over the requested error.
+ALONE, IN_SERIES, OF_MASSES = 1e-3, 2e-3, 1e-3
+OF_IMPLICIT, OF_IMPLICIT_MASSES = 3e-4, 2e-2  # of an implicit step
+SHORT = (
+    5e-4  # length of a short implicit step, as a share of the duration, for a truncation of 3e-8
 )
-RADIANS = 3.0  # or relaxation times, that one explicit step covers at most
-FEW_EXPLICIT = 20_000  # steps after which the total is estimated
+# Least error of a step; of vibrating masses, whose steps would not exceed rounding errors below it.
+LEAST_TOL, LEAST_OF_MASSES, LEAST_VIBRATING = 2e-14, 5e-13, 5e-12  # the last of implicit steps
+# Outcomes of explicit steps after which implicit ones are tried.
+_STIFF = scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW
+LOGGED = 1024  # switches in the log of a first run; with more it is repeated
+AT_MOST = 1e-9  # error of an elongation over the height
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
-_NOTHING = np.zeros(1)
-# Tops under which springs start from rest, and that start.
-_RESTING, _AT_REST = (scenes.FREE, scenes.VISCOUS), np.zeros((1, 0))
-# Outcomes of explicit steps after which implicit ones are tried.
-_STIFF = (scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW)
+_NOTHING, _NO_LOG = np.zeros(1), np.empty((0, 5))
+
+
+class Laws(NamedTuple):
+    """The laws of a chain as the solver takes them."""
+
+    records: tuple[Law, ...]
+    made: tuple[Compiled, ...]
+    loose: tuple[int, ...]  #: numbers of the unilateral springs
+
+
+def _laws(chain: Chain) -> Laws:
+    loose = tuple(i + 1 for i, law in enumerate(chain.laws) if law.kind == "unilateral")
+    return Laws(chain.laws, tuple(compiled(law) for law in chain.laws), loose)
 
 
 class Plan(NamedTuple):
     """A scene prepared to run many times with different springs.
 
-    `ends`, `mass`, `drag`, `top`, `values`, `speed` and `time` are those of a `solve.scene.Scene`.
+    Above each group of springs lies a node with a mass, or the top.
     """
 
     solver: str  #: the simplest that suffices
+    laws: Laws
+    terms: int  #: number of relaxation terms in a row
     height: float  #: H, m
-    ends: NDArray[np.int64]
-    mass: Array
-    drag: float
-    top: int
+    ends: tuple[int, ...]  #: one past the last spring of each group
+    mass: Array  #: areal masses of the nodes, m/A, kg/m², (groups,)
+    drag: float  #: onsite damping of the top, η_site/H, Pa·s/m
+    top: int  #: FREE, VISCOUS, STRESS or MOTION
+    #: stress (Pa) or, for MOTION, displacement (m) of the top at t, (n,); for an impact the weight
+    #: of the striker over the area, Pa, (1,)
     values: Array
-    time: Array
-    speed: float
-    margin: float  #: truncation of an explicit step over the requested error
+    time: Array  #: sample times, s, (n,)
+    speed: float  #: velocity of a striker at time 0, m/s; 0 for other drives, which start at t[0]
+    margin: float  #: error of a step over the requested error
     max_steps: int
     max_explicit: int  #: explicit steps before implicit ones are tried
-    plain: bool = False  #: whether one mass bounces on springs, without any damping
+    least: float = LEAST_VIBRATING  #: least error of an implicit step of undamped springs
     implicit: bool | None = None  #: whether steps are implicit; None: only in stiff scenes
-    memory: bool = False  #: whether a spring remembers more than its branch
-    #: unit of time, s, in which strains with memory change by about 1, so that the coefficients of
-    #: their series neither over- nor underflow; a power of 2, which rounds nothing
-    unit: float = 1.0
 
     @property
     def moves_one(self) -> bool:
-        """Whether responses have a derivative by the prescribed motion: one spring with memory."""
-        closed = self.solver == CLOSED_FORM and self.top == scenes.MOTION
-        return closed and self.memory and self.mass.size == 1
+        """Whether responses have a derivative by the prescribed motion: one spring, no dashpot."""
+        alone = self.solver == CLOSED_FORM and self.top == scenes.MOTION and self.mass.size == 1
+        return alone and int(self.ends[-1]) == 1
 
     def run(
         self,
@@ -119,235 +121,300 @@ class Plan(NamedTuple):
         if self.solver == CLOSED_FORM:
             return self._closed_form(rows, heights, rtol, everything, directions)
         drag = self.drag if drag is None else drag
-        given = rows, heights, rtol, drag, directions
-        motion = self._integrated(*given, np.empty((LOGGED, 5)) if everything else NO_SWITCHES)
-        if motion.method != AGGREGATE and len(motion.switches) > LOGGED:
-            motion = self._integrated(*given, motion.switches)
+        given = rows, heights, rtol, drag, directions, everything
+        motion = self._integrated(*given, LOGGED if everything else 0)
+        if everything and len(motion.switches) > LOGGED:
+            motion = self._integrated(*given, len(motion.switches))
         return motion
+
+    # ------------------------------------------------------------------ arrays of the solver
+
+    def _layout(
+        self, rows: Array, directions: Directions, degree: int = 0, integrated: bool = True
+    ) -> Layout:
+        """Return where everything of a run lies."""
+        damped, terms = (rows[:, 0] > 0.0).tobytes(), self.terms
+        if terms and not rows[:, 1 : 1 + 2 * terms : 2].any():  # no strength: as without terms
+            terms = terms if (directions[:, 1] >= OWN_RELAXATION).any() else 0
+        solved = degree > 0 or not integrated
+        shape = Shape(
+            self.laws.records, terms, self.ends, self.top, damped, directions.tobytes(),
+            self.speed > 0.0, degree, solved,
+        )  # fmt: skip
+        return lay_out(shape, integrated)
+
+    def slopes_of(self, rows: Array) -> tuple[Array, Array]:
+        """Return the slopes dσ/dε (Pa) of the springs at rest, and the steepest at zero stress."""
+        at, first, steep = 1 + 2 * self.terms, [], []
+        for i, one in enumerate(self.laws.made):
+            found = [rows.item(i, at + column) for column in one.slopes] or [1.0]
+            first.append(found[0])
+            steep.append(max(found))
+        return np.array(first), np.array(steep)
+
+    def _scales(self, rows: Array, heights: Array) -> tuple[float, float, float, float]:
+        """Return least scales of displacement, velocity, strain and stress."""
+        if self.speed > 0.0:
+            return 0.0, self.speed, 0.0, 0.0
+        first, total = float(self.slopes_of(rows)[0].min()), float(heights.sum())
+        most = float(np.abs(self.values).max())
+        if self.top == scenes.MOTION:
+            rate = np.abs(np.diff(self.values) / np.diff(self.time)).max(initial=0.0)
+            return most, rate, most / total, 1e-3 * first * most / total
+        return 1e-3 * most * total / first, 0.0, 1e-3 * most / first, most
+
+    # ------------------------------------------------------------------ integration in time
 
     def _integrated(
         self, rows: Array, heights: Array, rtol: float, drag: float, directions: Directions,
-        log: Array,
+        everything: bool, logged: int,
     ) -> Motion:  # fmt: skip
-        """Integrate in time and log the switches; without room, only the top is followed.
-
-        If the log is too short, the switches are an array of the right length, not filled.
-        """
-        p, time, values = len(directions), self.time, self.values
-        everything = log is not NO_SWITCHES
-        out = np.empty((1 + p, 1 + len(heights) if everything else 2, time.size))
-        if self.memory:
-            return self._with_memory(self.packed(rows, heights, drag), rtol, directions, out, log)
+        """Integrate in time and log the switches, if there is room."""
         stiff = bool(self.implicit)
-        if self.implicit is None and (drag or not self.plain):
+        if self.implicit is None and (drag or len(self.ends) > 1 or rows[:, 0].any()):
             vibrates, relaxes = self.fastest_rates(rows, heights, drag)
             stiff = vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION
-        one = self.speed > 0.0 and len(self.ends) == 1 and p == 0 and not stiff
-        one = one and values[0] == 0.0  # the aggregate ignores gravity
-        if one and len(heights) >= LEAST_AGGREGATE and many.holds(rows):
-            cache.announce(many.integrate_aggregate, "the solver of many springs")
-            tol, log = AS_ONE * rtol / len(rows), np.empty((4 * len(rows) + 64, 5))
-            arguments = self.packed(rows, heights, drag), tol, self.max_steps, out[0], log
-            ending = many.integrate_aggregate(*arguments, np.zeros(2, np.int64))
-            return self._motion(rows, AGGREGATE, ending, out, log)
-        start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
-        if not stiff:
-            cache.announce(taylor.integrate, "the solver")
-            most = self.max_explicit if self.implicit is None else self.max_steps
-            numbers = np.array((drag, self.top, self.speed, self.margin * rtol, most))
-            ends, mass = self.ends, self.mass
-            ending = taylor.integrate(
-                rows, heights, ends, mass, numbers, values, time, directions, start, out, log
-            )
-            if self.implicit is False or ending[0] not in _STIFF:
-                return self._motion(rows, TAYLOR, ending, out, log)
-        margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
-        scene = scenes.Scene(*self.packed(rows, heights, drag))
-        tol = max(margin * rtol, LEAST_IMPLICIT)
-        most = min(self.max_steps, MOST_IMPLICIT)
-        samples = scenes.Samples(time, out[0], out[1:])
-        *result, lost = steps.integrate_implicit(scene, tol, most, directions, start, samples, log)
-        return self._motion(rows, RADAU, result, out, log, lost)
+        shown = len(heights) if everything else 1
+        out = np.empty((1 + len(directions), 1 + shown, self.time.size))
+        if (
+            not stiff
+            and not len(directions)
+            and (found := self._as_one(rows, heights, rtol, drag, out))
+        ):
+            return found
+        log, endings = np.empty((logged, 5)), np.empty(loop.ENDINGS + len(directions))
+        given = rows, heights, directions, out, log, endings
+        for degree in self._methods(stiff):
+            reals = self._reals(rows, heights, rtol, drag, degree)
+            self._integrate(*given, reals, degree)
+            if endings[loop.OUTCOME] not in _STIFF:
+                break
+        if endings[loop.OUTCOME] == scenes.STEP_UNDERFLOW:
+            fastest = max(self.fastest_rates(rows, heights, drag))
+            endings[loop.OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
+        lost = _lost(endings) if degree else 0.0
+        return self._motion(out, RADAU if degree else EXPLICIT_STEPS, endings, log, rows, lost)
 
-    def _with_memory(
-        self, scene: scenes.SceneTuple, rtol: float, directions: Directions, out: Array, log: Array
+    def _methods(self, stiff: bool) -> tuple[int, ...]:
+        """Return the degrees of the methods to try: 0 for explicit steps.
+
+        Where explicit steps may take as many as all, implicit ones are not tried after them.
+        """
+        if self.time.size == 1:
+            return (0,)
+        if self.implicit is not None:
+            return (POINTS,) if self.implicit else (0,)
+        if stiff:
+            return POINTS, 0
+        return (0, POINTS) if self.max_explicit < self.max_steps else (0,)
+
+    def _reals(self, rows: Array, heights: Array, rtol: float, drag: float, degree: int) -> Array:
+        """Return the numbers that the loop over time is given; see `loop`."""
+        least = LEAST_OF_MASSES if len(self.ends) > 1 else LEAST_TOL
+        tol, most, brief = max(self.margin * rtol, least), self.max_steps, 0.0
+        if degree:
+            damped = bool(rows[:, 0].any())
+            factor = OF_IMPLICIT if len(self.ends) == 1 else OF_IMPLICIT_MASSES
+            tol = max(factor * rtol, LEAST_TOL if damped else self.least)
+            most = min(most, MOST_IMPLICIT_WORK // len(heights))
+            brief = self._brief(rows, heights, drag, tol)
+        elif self.implicit is None:
+            most = self.max_explicit
+        over = False
+        if degree and self.speed > 0.0:
+            first = self.slopes_of(rows)[0]
+            over = rates.is_overdamped(first, rows[:, 0], heights, float(self.mass[-1]))
+        scales = self._scales(rows, heights)
+        return np.array((drag, 1.0, self.speed, tol, most, brief, over, *scales))
+
+    def _integrate(
+        self, rows: Array, heights: Array, directions: Directions, out: Array, log: Array,
+        endings: Array, reals: Array, degree: int,
+    ) -> None:  # fmt: skip
+        """Run the loop over time, with implicit steps if `degree` is that of their polynomial."""
+        cache.announce(loop.integrate, "the solver")
+        layout = self._layout(rows, directions, degree)
+        drive = self.mass, reals, self.values, self.time
+        loop.integrate(*_memory(layout), rows, heights, *drive, out, log, endings)
+
+    def _as_one(
+        self, rows: Array, heights: Array, rtol: float, drag: float, out: Array
+    ) -> Motion | None:
+        """Treat many springs under one stress as one spring in an impact, if that is possible."""
+        many = len(heights) >= LEAST_AGGREGATE and len(self.ends) == 1 and self.speed > 0.0
+        if not many or self.values[0] != 0.0:
+            return None
+        from foamfit.solve.many import integrate_aggregate, shapes_of
+
+        shapes = shapes_of(self, rows)
+        if shapes is None:
+            return None
+        cache.announce(integrate_aggregate, "the solver of many springs")
+        log = np.empty((4 * len(rows) + 64, 5))
+        numbers = np.array((self.mass[0], drag, self.speed, AS_ONE * rtol / len(rows)))
+        given = shapes, heights, numbers, self.time, self.max_steps, out[0], log, np.zeros(2, int)
+        outcome, end, steps, switches = integrate_aggregate(*given)
+        endings = np.array((outcome, end, steps, switches), dtype=float)
+        return self._motion(out, AGGREGATE, endings, log, rows, 0.0)
+
+    def _brief(self, rows: Array, heights: Array, drag: float, tol: float) -> float:
+        """Return the length of a short implicit step, s."""
+        duration = self._duration
+        if self.speed > 0.0:
+            first = self.slopes_of(rows)[0]
+            lasts = rates.contact_time(first, rows[:, 0], heights, float(self.mass[-1]), drag)
+            duration = min(duration, 5.0 * lasts)
+        short: float = SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0)
+        return short
+
+    def _motion(
+        self, out: Array, method: str, endings: Array, log: Array, rows: Array, lost: float
     ) -> Motion:
-        """Run springs with memory by explicit steps, which must follow even the fastest process."""
-        start = _AT_REST
-        if self.top not in _RESTING:
-            start = self._start(scene[0], scene[1], directions)
-        one_sided = np.zeros(len(directions))
-        cache.announce(taylor.integrate_with_memory, "the solver of springs with memory")
-        for most in (min(FEW_EXPLICIT, self.max_steps), self.max_steps):
-            ending: Sequence[Any] = taylor.integrate_with_memory(
-                scene, self.unit, self.margin * rtol, most, directions, start, out, log, one_sided
-            )
-            if ending[0] not in _STIFF:
-                break
-            rate, culprit = self._fastest(scene)
-            too_fast = rate > RADIANS * self.max_steps
-            if most == self.max_steps and ending[0] == scenes.TOO_MANY_STEPS:
-                too_fast = RADIANS * rate > self.max_steps
-            if too_fast:
-                message = _TOO_FAST.format(culprit=culprit, rate=rate, steps=self.max_steps)
-                raise SimulationError(message)
-            if ending[0] == scenes.STEP_UNDERFLOW:  # more steps would not help
-                break
-        return self._motion(scene[0], TAYLOR, ending, out, log, one_sided=one_sided)
+        """Return the result of a run as a Motion; raise SimulationError if it failed."""
+        outcome, time, steps, switches = endings[:4].tolist()
+        loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
+        finite = outcome == scenes.DONE and bool(np.isfinite(out[0]).all())
+        if not finite:
+            outcome = int(outcome) if outcome != scenes.DONE else scenes.NOT_FINITE
+            raise scenes.failure(outcome, self.top, self.values, loose, steps=int(steps), time=time)
+        slopes = Slopes(out[1:, 1:], out[1:, 0], endings[loop.ENDINGS :]) if len(out) > 1 else None
+        if len(log):
+            log = log[: int(switches)] if switches <= len(log) else np.empty((int(switches), 5))
+        else:
+            log = NO_SWITCHES
+        return Motion(out[0, 1:], out[0, 0], time, log, int(steps), method, slopes, lost)
 
-    def _fastest(self, scene: scenes.SceneTuple) -> tuple[float, str]:
-        """Return the radians of the fastest process over the scene's duration, and its name."""
-        rows, heights, drag, k = scene[0], scene[1], scene[4], kernels
-        elastic, terms = np.zeros((len(rows), k.N_COLUMNS)), rows[:, k.N_COLUMNS :]
-        bistable = rows[:, k.KIND] == BISTABLE
-        steep = np.where(bistable, np.maximum(rows[:, k.KH_PLUS], rows[:, k.KC]), rows[:, k.KC])
-        elastic[:, k.KIND], elastic[:, k.ETA] = LINEAR, rows[:, k.ETA]
-        elastic[:, k.K0] = np.maximum(rows[:, k.K0], steep) * (1.0 + terms[:, ::2].sum(axis=1))
-        swings, decays = self.fastest_rates(elastic, heights, drag)
-        processes = [(swings, "a light mass"), (decays, "a light mass or a dashpot")]
-        for i, term in zip(*np.nonzero(terms[:, ::2]), strict=True):
-            tau = terms[i, 2 * term + 1]
-            name = f"the relaxation of spring {i + 1} (s{i + 1}_tau{term + 1} = {tau:g} s)"
-            processes.append((self._duration / tau, name))
-        return max(processes)
+    # ------------------------------------------------------------------ without integration
 
     def _closed_form(
         self, rows: Array, heights: Array, rtol: float, everything: bool, directions: Directions
     ) -> Motion:
         """Solve springs in static equilibrium under one stress, or one spring in known motion."""
-        moved, wanted, n = self.top == scenes.MOTION, len(directions) > 0, self.time.size
-        alone, top, fine = moved and len(heights) == 1, np.array(self.values), True
-        slopes: Slopes | None = None
+        count, wanted, n = len(heights), len(directions) > 0, self.time.size
+        alone = self.top == scenes.MOTION and count == 1
+        shown = count if everything else 1
+        out, branches = (
+            np.empty((1 + len(directions), 1 + shown, n)),
+            np.empty((count, n), np.int64),
+        )
+        reals = np.array((0.0, 1.0, 0.0, rtol))
+        layout = self._layout(rows, directions, integrated=False)
         if alone:
             strain = (self.values / heights)[None, :]
-            if self.memory or wanted:
-                history = strain[0], self.time, heights[0], rtol, directions
-                stress, branch, tangents = relaxation.stress_along(rows[0], *history)
-                slopes = Slopes(np.zeros((len(directions), 1, n)), tangents) if wanted else None
-            else:
-                stress, branch = kernels.stress_along(rows[0], strain[0])
-            branches = branch[None, :]
+            moved = bool((directions[:, 1] == MOVED).any())
+            along.follow(
+                *_memory(layout), rows, heights, self.mass, reals, strain[0], self.time, out,
+                _NO_LOG, seeds(strain[0], moved), branches[0], np.empty(n),
+            )  # fmt: skip
+            out[0, 1], out[1:, 1] = self.values, 0.0
+            self._add_dashpot(out, strain[0], rows[0, 0], heights, directions)
         else:
-            kept = len(heights) if moved or everything or wanted else 0
-            strain, branches = np.empty((kept, n)), np.empty((kept, n), np.int64)
-            if moved:
-                stress = np.empty(n)
-                equilibrium.equilibrium_along(rows, heights, top, stress, strain, branches)
-                miss = np.abs(heights @ strain - top).max()
-                fine = miss <= 1e-9 * (self.height + np.abs(top).max())
-            else:
-                stress, top = top, np.empty(n)
-                fine = equilibrium.strains_along(rows, heights, stress, top, strain, branches)
-            if wanted and fine:
-                along = rows, heights, stress, strain, branches
-                slopes = Slopes(*equilibrium_tangents(*along, moved, directions))
-                if moved:
-                    one_sided = _on_one_plateau(rows, branches, directions)
-                    slopes = slopes._replace(one_sided=one_sided)
-        eta = rows[0, kernels.ETA]
-        by_dashpot = wanted and not {OWN_ETA, OWN_HEIGHT}.isdisjoint(directions[:, 1].tolist())
-        if alone and n > 1 and (by_dashpot or eta > 0.0):
-            rate = np.gradient(strain[0], self.time)
-            stress = stress + eta * rate
-            for p, (_, what) in enumerate(directions):
-                if slopes is not None and what == OWN_ETA:
-                    slopes.base_stress[p] += rate
-                elif slopes is not None and what == OWN_HEIGHT:
-                    slopes.base_stress[p] -= eta * rate / heights[0]
-        if not (fine and math.isfinite(kernels.total(stress))):
-            raise scenes.failure(scenes.NOT_FINITE, self.top, self.values, rows)
-        if not everything:
-            if slopes is not None:
-                slopes = slopes._replace(displacement=slopes.displacement[:, -1:])
-            return Motion(top[None, :], stress, math.nan, NO_SWITCHES, 0, CLOSED_FORM, slopes)
-        nodes = heights[:, None] * strain
-        for i in range(1, len(nodes)):  # np.cumsum takes six times as long
-            nodes[i] += nodes[i - 1]
-        switches = kernels.list_switches(self.time, strain, branches)
-        return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
+            strain = np.empty((count, n))
+            static.balance(
+                *_memory(layout), rows, heights, self.mass, reals, self.values, self.time, out,
+                _NO_LOG, strain, branches,
+            )  # fmt: skip
+        fine = bool(np.isfinite(out[0]).all())
+        if fine and self.top == scenes.MOTION and not alone:
+            miss = np.abs(out[0, -1] - self.values).max()
+            fine = miss <= AT_MOST * (self.height + np.abs(self.values).max())
+            out[0, -1] = self.values
+        if not fine:
+            loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
+            raise scenes.failure(scenes.NOT_FINITE, self.top, self.values, loose)
+        slopes = Slopes(out[1:, 1:], out[1:, 0]) if wanted else None
+        if slopes is not None and self.top == scenes.MOTION and count > 1:
+            slopes = slopes._replace(one_sided=self._on_one_plateau(rows, branches, directions))
+        switches = list_switches(self.time, strain, branches) if everything else NO_SWITCHES
+        return Motion(out[0, 1:], out[0, 0], math.nan, switches, 0, CLOSED_FORM, slopes)
 
-    def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
-        """Return strains in equilibrium with the first sample, and derivatives, (1 + p, springs).
+    def _add_dashpot(
+        self, out: Array, strain: Array, eta: float, heights: Array, directions: Directions
+    ) -> None:
+        """Add the stress of the dashpot of one spring along its motion, and its derivatives."""
+        by_dashpot = np.isin(directions[:, 1], (OWN_ETA, OWN_HEIGHT)).any()
+        if self.time.size == 1 or not (by_dashpot or eta > 0.0):
+            return
+        rate = np.gradient(strain, self.time)
+        out[0, 0] += eta * rate
+        for p, (_, what) in enumerate(directions):
+            if what == OWN_ETA:
+                out[1 + p, 0] += rate
+            elif what == OWN_HEIGHT:
+                out[1 + p, 0] -= eta * rate / heights[0]
 
-        Under a prescribed stress, springs with a dashpot start from rest.
-        """
-        start = np.zeros((1 + len(directions), len(heights)))
-        first = self.ends[-2] if len(self.ends) > 1 else 0
-        rows, heights, moved = rows[first:], heights[first:], self.top == scenes.MOTION
-        stress, count = self.values[:1].copy(), len(heights)
-        strain, branches = np.empty((count, 1)), np.empty((count, 1), np.int64)
-        held = (rows[:, kernels.ETA] > 0.0) & (not moved)  # by a dashpot
-        if moved:
-            equilibrium.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
-        else:
-            equilibrium.strains_along(rows, heights, stress, np.empty(1), strain, branches)
-            strain[held] = 0.0
-        if not np.isfinite(strain).all():
-            raise scenes.failure(scenes.NOT_FINITE, self.top, self.values, rows)
-        start[0, first:] = strain[:, 0]
-        own = np.flatnonzero(directions[:, 0] >= first)
-        if len(own):
-            local = directions[own] - np.array([first, 0])
-            above, _ = equilibrium_tangents(rows, heights, stress, strain, branches, moved, local)
-            longer = np.diff(above[:, :, 0], axis=1, prepend=0.0)
-            for p, (spring, what) in enumerate(local):
-                longer[p, spring] -= strain[spring, 0] if what == OWN_HEIGHT else 0.0
-            start[1 + own, first:] = np.where(held, 0.0, longer / heights)
-        return start
-
-    def _motion(
-        self,
-        rows: Array,
-        method: str,
-        ending: Sequence[Any],
-        out: Array,
-        log: Array,
-        lost: float = 0.0,
-        one_sided: Array = _NOTHING[:0],
-    ) -> Motion:
-        """Return the result of an integrator as a Motion; raise SimulationError if it failed."""
-        outcome, time, steps, switches = ending
-        if outcome != scenes.DONE:
-            raise scenes.failure(outcome, self.top, self.values, rows, steps=steps, time=time)
-        slopes = Slopes(out[1:, 1:], out[1:, 0], one_sided) if len(out) > 1 else None
-        if log is not NO_SWITCHES:
-            log = log[:switches] if switches <= len(log) else np.empty((switches, 5))
-        return Motion(out[0, 1:], out[0, 0], time, log, steps, method, slopes, lost)
+    def _on_one_plateau(
+        self, rows: Array, branches: NDArray[np.int64], directions: Directions
+    ) -> Array:
+        """Mark directions of springs that were on flat branches together: either may move first."""
+        flat = np.zeros(branches.shape, dtype=bool)
+        for i, one in enumerate(self.laws.made):
+            if len(one.slopes) == 3:  # bistable: slopes of its branches, by number
+                first, own = one.slopes[0], rows[i, 1 + 2 * self.terms :]
+                flat[i] = own[first + (one.slopes[2] - first) * branches[i]] == 0.0
+        together = (flat & (flat.sum(axis=0) > 1)).any(axis=1)
+        marked = np.isin(directions[:, 1], (0, 2, 3)) & (directions[:, 0] >= 0)  # k0, dsigma, eps_a
+        return np.where(marked, together[directions[:, 0]], 0.0)
 
     @property
     def _duration(self) -> float:
         return float(self.time[-1] - (0.0 if self.speed > 0.0 else self.time[0]))
 
-    def packed(self, rows: Array, heights: Array, drag: float | None = None) -> scenes.SceneTuple:
-        """Return the scene with these springs (and onsite damping) for compiled integrators."""
-        drag = self.drag if drag is None else drag
-        motion = self.top, self.values, self.speed, self.time
-        return (rows, heights, self.ends, self.mass, drag, *motion)
-
     def fastest_rates(self, rows: Array, heights: Array, drag: float) -> tuple[float, float]:
         """Return the radians of vibration and relaxation that explicit steps would cover."""
-        chain = rows, heights, self.ends, self.mass, drag, self.top
+        first, steep = self.slopes_of(rows)
+        gain = 1.0 + rows[:, 1 : 1 + 2 * self.terms : 2].sum(axis=1)
+        eta = np.where(rows[:, 0] > TINY, rows[:, 0], 0.0)
+        ends = np.array(self.ends)
+        chain = gain * first, gain * steep, eta, heights, ends, self.mass, drag, self.top
         return rates.fastest_rates(*chain, self.speed > 0.0, self._duration)
 
 
-AnyPlan = Plan | AnyLawPlan
+def _memory(layout: Layout) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Return the words of a run, and memory for its integers and floats."""
+    return layout.words, np.empty_like(layout.words), np.zeros(layout.floats)
 
 
-def _on_one_plateau(rows: Array, branches: NDArray[np.int64], directions: Directions) -> Array:
-    """Mark directions of springs that were on flat branches together: either may move first."""
-    flat = (branches == kernels.D) & (rows[:, kernels.KH_PLUS] == 0.0)[:, None]
-    flat |= (branches == kernels.E) & (rows[:, kernels.KH_MINUS] == 0.0)[:, None]
-    together = (flat & (flat.sum(axis=0) > 1)).any(axis=1)
-    marked = np.isin(directions[:, 1], (0, 2, 3)) & (directions[:, 0] >= 0)  # k0, dsigma, eps_a
-    return np.where(marked, together[directions[:, 0]], 0.0)
+def _lost(endings: Array) -> float:
+    """Return the size of the vibrations that implicit steps damped out, relative to the ranges."""
+    lost, moved = float(endings[loop.DAMPED_OUT]), float(endings[loop.FARTHEST])
+    motion, stress = endings[loop.MOTION_LOST : loop.STRESS_LOST + 1].tolist()
+    if motion > 0.0:
+        share = motion / moved if moved > 0.0 else 0.0
+        lost += max(share, stress / float(endings[loop.STRONGEST]))
+    return lost
+
+
+def seeds(strain: Array, moved: bool) -> Array:
+    """Return the derivatives of a motion, (n, 2): seed · (1, ε) by a shift of it in contact.
+
+    `moved` is whether they are asked for.
+    """
+    out = np.zeros((strain.size, 2))
+    if not moved:
+        return out
+    contact = (strain > 0.0).astype(float)
+    out[:, 0] = contact
+    for j in np.flatnonzero(np.diff(contact)) + 1:  # contact begins or ends before this sample
+        out[j] = 0.0, 1.0 / (strain[j] - strain[j - 1]) * (contact[j] - contact[j - 1])
+    return out
+
+
+def list_switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
+    """Return the changes of branch between samples, at the later sample."""
+    at, spring = np.nonzero(np.diff(branches, axis=1).T)
+    left, entered = branches[spring, at], branches[spring, at + 1]
+    return np.column_stack([time[at + 1], spring, left, entered, strain[spring, at + 1]])
 
 
 def _time(t: ArrayLike) -> Array:
     time = as_samples(t, "t")  # a writable copy, for which the loops are compiled
     if time.ndim != 1 or time.size == 0:
         raise InputError("t must be a one-dimensional array with at least one sample")
-    at = kernels.fault(time)
-    if at >= 0:
+    if not (np.isfinite(time[[0, -1]]).all() and (time[1:] > time[:-1]).all()):
+        wrong = ~np.isfinite(time)
+        wrong[1:] |= ~(time[1:] > time[:-1])
+        at = int(wrong.argmax())
         what = "later than the one before it" if math.isfinite(time[at]) else "finite"
         raise InputError(f"t must be finite and increase; sample {at} is not {what}")
     return time
@@ -361,14 +428,14 @@ def plan(
     dashpots: bool = False,
     relaxing: bool = False,
     max_steps: int = MAX_STEPS,
-) -> AnyPlan:
+) -> Plan:
     """Prepare a scene: find the nodes that have a state, and the simplest solver.
 
     The plan depends on the heights, area, masses and site damping of the chain, and on which
-    springs have a dashpot, relaxation terms or a memory. `t` (n_t,) are the sample times, s.
-    `dashpots` allows for a dashpot in every spring and `relaxing` for the relaxation terms, even if
-    they are zero. Steps are bounded by `max_steps`, and steps times springs by `MOST_WORK`. Raise
-    InputError if times do not increase or do not match the drive.
+    springs have a dashpot or relaxation terms. `t` (n_t,) are the sample times, s. `dashpots`
+    allows for a dashpot in every spring and `relaxing` for the relaxation terms, even if they are
+    zero. Steps are bounded by `max_steps`, and steps times springs by `MOST_WORK`. Raise InputError
+    if times do not increase or do not match the drive.
     """
     time = _time(t)
     speed, values, top, above = 0.0, _NOTHING, scenes.FREE, chain.masses[-1]
@@ -388,45 +455,28 @@ def plan(
             above, top = 0.0, scenes.MOTION
         elif above == 0.0:
             top = scenes.VISCOUS if chain.site_damping > 0.0 else scenes.STRESS
-    if chain.is_registered:
-        return plan_of(chain, time, top, values, speed, above)
-    arrays, count = chain.arrays, len(chain.springs)
-    ends, masses = arrays.top, np.array([above / chain.area])
+    arrays, count, laws = chain.arrays, len(chain.springs), _laws(chain)
+    ends: tuple[int, ...] = (count,)
+    masses = np.array([above / chain.area])
     if arrays.heavy:
         inside = np.flatnonzero(arrays.masses[:-1] > 0.0)
-        ends = np.append(inside + 1, ends)
+        ends = (*(inside + 1).tolist(), count)
         masses = np.append(arrays.masses[inside] / chain.area, masses)
-    relaxing |= chain.relaxes
-    memory = relaxing or chain.remembers
+    internal = any(one.kind == INTERNAL for one in laws.made)
     alone = top == scenes.MOTION and count == 1
-    damped = dashpots or arrays.damped or top == scenes.VISCOUS
+    damped = dashpots or arrays.damped or top == scenes.VISCOUS or internal
     if arrays.heavy or above > 0.0:
         solver = SECOND_ORDER
-    elif (damped or relaxing) and not alone:
+    elif ((damped or relaxing or chain.relaxes) and not alone) or internal:
         solver = FIRST_ORDER
     else:
         solver = CLOSED_FORM
-    margin = OF_MASSES if arrays.heavy else OF_IMPACT if speed > 0.0 else ALONG_DRIVE
+    margin = OF_MASSES if arrays.heavy else IN_SERIES if count > 1 else ALONE
     most = MOST_WORK // count + 2 * time.size + 8 * count
     most = max(1, min(max_steps, most, MOST_SAMPLED // count))
-    explicit = min(most, 20 * time.size + min(MOST_EXPLICIT, MOST_EXPLICIT_WORK // count))
-    plain = speed > 0.0 and not (arrays.heavy or damped or chain.site_damping > 0.0)
-    unit = _unit(chain, drive, time) if memory else 1.0
-    drag = chain.site_damping / chain.height
-    return Plan(  # positional, as keywords would take 10 % of the time
-        solver, chain.height, ends, masses, drag, top, values, time, speed,
-        margin, most, explicit, plain, None, memory, unit,
+    explicit = min(most, 20 * time.size + max(1000, MOST_EXPLICIT_WORK // count))
+    drag, terms = chain.site_damping / chain.height, max(chain.relaxation)
+    return Plan(
+        solver, laws, terms, chain.height, ends, masses, drag, top, values, time, speed, margin,
+        most, explicit,
     )  # fmt: skip
-
-
-def _unit(chain: Chain, drive: Drive, time: Array) -> float:
-    """Return the unit of time of a `Plan`, s."""
-    least, softest = min(chain.heights), min(spring.k0 for spring in chain.springs)
-    if isinstance(drive, Impact):
-        rate = drive.velocity / least
-    else:
-        values = (
-            drive.stress / softest if isinstance(drive, StressDrive) else drive.displacement / least
-        )
-        rate = float(np.abs(np.diff(values) / np.diff(time)).max(initial=0.0))
-    return 2.0 ** -round(math.log2(rate)) if 1e-100 < rate < 1e100 else 1.0

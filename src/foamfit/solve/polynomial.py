@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import math
 
-from foamfit.springs.kernels import Array, inner, piece
+from numba import njit
+
+from foamfit.arrays import Array
+
+inner = njit(error_model="numpy", fastmath={"contract"}, no_cpython_wrapper=True)
 
 LEAST_TRUNCATION = 1e-16  # of a step; rounding errors are larger
 
@@ -123,7 +127,7 @@ def _turn(c: Array, order: int, lo: float, hi: float) -> float:
     return 0.5 * (lo + hi)
 
 
-@piece
+@inner
 def first_crossing(c: Array, order: int, low: float, high: float, span: float) -> tuple[float, int]:
     """Return the first time in [0, span] at which a polynomial leaves [low, high], and the side.
 

@@ -4,45 +4,40 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from foamfit.arrays import Array
 from foamfit.solve.scene import FREE, VISCOUS
-from foamfit.springs.kernels import ETA, K0, KC, KH_PLUS, Array, Branches, compiled, inner
 
 # Ratio of the rates of stopping and of creep above which dashpots stop a striker long before the
 # springs throw it back.
 OVERDAMPED = 1e3
 
 
-@inner
-def contact_time(rows: Array, heights: Array, mass: float, drag: float) -> float:
+def contact_time(first: Array, eta: Array, heights: Array, mass: float, drag: float) -> float:
     """Return a rough estimate of the duration of contact of a striker with the chain, s."""
-    soft, slow = 0.0, 0.0
-    for i in range(heights.size):
-        soft += heights[i] / rows[i, K0]
-        slow = max(slow, rows[i, ETA] / rows[i, K0])
-    return math.sqrt(mass * soft) + drag * soft + slow
+    soft = float(np.sum(heights / first))
+    return math.sqrt(mass * soft) + drag * soft + float(np.max(eta / first))
 
 
-@inner
-def is_overdamped(rows: Array, heights: Array, mass: float) -> bool:
+def is_overdamped(first: Array, eta: Array, heights: Array, mass: float) -> bool:
     """Whether dashpots stop a striker of that mass long before the springs throw it back.
 
     With the rates a = k/c of creep and b = c/m of stopping, contact ends when the base stress has
     fallen to (a/b)² of its peak, which explicit steps, with errors relative to the peak, miss.
     """
-    soft, flow = 0.0, 0.0
-    for i in range(heights.size):
-        if rows[i, ETA] == 0.0:
-            return False
-        soft += heights[i] / rows[i, K0]
-        flow += heights[i] / rows[i, ETA]
+    if not eta.all():
+        return False
+    soft, flow = float(np.sum(heights / first)), float(np.sum(heights / eta))
     return soft > OVERDAMPED * flow * flow * mass
 
 
-@compiled
 def fastest_rates(
-    rows: Array,
+    first: Array,
+    steep: Array,
+    eta: Array,
     heights: Array,
-    ends: Branches,
+    ends: Array,
     mass: Array,
     drag: float,
     top: int,
@@ -51,44 +46,37 @@ def fastest_rates(
 ) -> tuple[float, float]:
     """Estimate the fastest vibration and relaxation of a scene, as rate times duration (radians).
 
-    The estimates use the masses, dashpots and slopes of the springs; both are infinite if the scene
-    `is_overdamped`.
+    `first` and `steep` are the slopes of the springs at rest and at most, `mass` that of the nodes;
+    both estimates are infinite if the scene `is_overdamped`.
     """
-    if struck and is_overdamped(rows, heights, mass[-1]):
+    if struck and is_overdamped(first, eta, heights, float(mass[-1])):
         return math.inf, math.inf
-    vibration, relaxation = 0.0, 0.0
-    below_stiff, below_damp = 0.0, 0.0
+    vibration = relaxation = below_stiff = below_damp = 0.0
     i0 = 0
-    for g in range(ends.size):
-        soft = 0.0  # compliance of the springs without dashpot; the others are rigid at first
-        flow = 0.0
-        for i in range(i0, ends[g]):
-            slope = max(rows[i, K0], rows[i, KC], rows[i, KH_PLUS])
-            if rows[i, ETA] == 0.0:
-                soft += heights[i] / slope
-            flow += heights[i] / rows[i, ETA] if rows[i, ETA] > 0.0 else math.inf
+    for g, end in enumerate(ends.tolist()):
+        own, loose = slice(i0, end), eta[i0:end] == 0.0
+        # compliance of the springs without dashpot; the others are rigid at first
+        soft = float(np.sum((heights[own] / steep[own])[loose]))
+        damp = 0.0 if loose.any() else 1.0 / float(np.sum(heights[own] / eta[own]))
         stiff = 1.0 / soft if soft > 0.0 else 0.0
-        damp = 0.0 if flow == math.inf else 1.0 / flow
-        for i in range(i0, ends[g]):
-            slope = max(rows[i, K0], rows[i, KC], rows[i, KH_PLUS])
-            if rows[i, ETA] == 0.0 or ends[g] - i0 == 1:
-                if soft == 0.0:
-                    stiff = slope / heights[i]
-                continue
-            rest = heights[i] * stiff
-            relaxation = max(relaxation, (slope + rest) / rows[i, ETA])
+        if soft == 0.0 and end - i0 == 1:
+            stiff = float(steep[i0] / heights[i0])
+        elif end - i0 > 1 and not loose.all():
+            rest = steep[own] + heights[own] * stiff
+            relaxation = max(
+                relaxation, float(np.max((rest / np.where(loose, 1.0, eta[own]))[~loose]))
+            )
         if g > 0:
-            relaxation = max(relaxation, (below_damp + damp) / mass[g - 1])
-            vibration = max(vibration, math.sqrt((below_stiff + stiff) / mass[g - 1]))
-        below_stiff, below_damp = stiff, damp
-        i0 = ends[g]
+            relaxation = max(relaxation, (below_damp + damp) / float(mass[g - 1]))
+            vibration = max(vibration, math.sqrt((below_stiff + stiff) / float(mass[g - 1])))
+        below_stiff, below_damp, i0 = stiff, damp, end
     if top == FREE:
-        relaxation = max(relaxation, (below_damp + drag) / mass[-1])
-        vibration = max(vibration, math.sqrt(below_stiff / mass[-1]))
+        relaxation = max(relaxation, (below_damp + drag) / float(mass[-1]))
+        vibration = max(vibration, math.sqrt(below_stiff / float(mass[-1])))
     elif top == VISCOUS:
         relaxation = max(relaxation, below_stiff / drag)
         if below_damp > 1e4 * drag:  # v = (push - Σ)/drag loses its digits
             relaxation = math.inf
     if struck:
-        duration = min(duration, contact_time(rows, heights, mass[-1], drag))
+        duration = min(duration, contact_time(first, eta, heights, float(mass[-1]), drag))
     return vibration * duration, relaxation * duration

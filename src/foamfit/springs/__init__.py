@@ -2,6 +2,5 @@
 
 `law` has the formulas, `laws` the springs and their records, `chain` chains and drives,
 `parameters` names and units, and `model` the flat vector of parameters of a fit. At first reading
-skip `kernels` and `microscale_kernels` (the compiled laws with their state) and `sensitivities`
-(derivatives of springs in equilibrium).
+skip `compiled`, the compiled laws and the contract between them and the solver.
 """

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
-from foamfit.springs import laws
 from foamfit.springs.laws.record import Law
 from foamfit.springs.spring import Spring, as_number, as_samples
 
@@ -47,12 +46,11 @@ def padded(rows: Sequence[Array]) -> Array:
 
 
 class ChainArrays(NamedTuple):
-    """A chain in the form that the kernels use.
+    """A chain in the form that the solver uses.
 
-    rows (n_springs, columns) are the springs, padded to the largest number of relaxation terms;
-    heights (m) and masses (kg) are (n_springs,), top (1,) is the number of springs. `heavy` is
-    whether there are interior masses, `damped` whether there are dashpots. `stiffness` is Σ h k_c,
-    J/m², and NaN for registered laws.
+    rows (n_springs, columns) are the springs (`compiled.solver_row`), padded with zeros; heights
+    (m) and masses (kg) are (n_springs,), top (1,) is the number of springs. `heavy` is whether
+    there are interior masses, `damped` whether there are dashpots.
     """
 
     rows: Array
@@ -61,7 +59,6 @@ class ChainArrays(NamedTuple):
     top: NDArray[np.int64]
     heavy: bool
     damped: bool
-    stiffness: float
 
 
 @dataclass(frozen=True, init=False)
@@ -137,19 +134,9 @@ class Chain:
         return tuple(spring.law for spring in self.springs)
 
     @cached_property
-    def is_registered(self) -> bool:
-        """Whether a spring has a registered law."""
-        return any(law.kind not in laws.PAPER for law in self.laws)
-
-    @cached_property
     def relaxes(self) -> bool:
         """Whether a spring has a nonzero relaxation term."""
         return any(g > 0.0 for spring in self.springs for g, _ in spring.relaxation)
-
-    @cached_property
-    def remembers(self) -> bool:
-        """Whether the state of a spring is more than its branch, apart from relaxation."""
-        return any(spring.law.remembers for spring in self.springs)
 
     @cached_property
     def relaxation(self) -> tuple[int, ...]:
@@ -158,25 +145,15 @@ class Chain:
 
     @cached_property
     def arrays(self) -> ChainArrays:
-        """The chain in the form that the kernels use."""
-        from foamfit.springs.kernels import KC
-
+        """The chain in the form that the solver uses."""
         room = max(self.relaxation)
-        if self.is_registered:
-            own = [
-                np.array([*spring.values, *np.ravel(spring.relaxation)]) for spring in self.springs
-            ]
-        else:
-            own = [one.solver_row(room) for one in self.springs]
-        rows, heights = padded(own), np.array(self.heights)
         return ChainArrays(
-            rows=rows,
-            heights=heights,
+            rows=padded([one.solver_row(room) for one in self.springs]),
+            heights=np.array(self.heights),
             masses=np.array(self.masses),
             top=np.array([len(self.springs)]),
             heavy=any(mass > 0.0 for mass in self.masses[:-1]),
             damped=any(spring.eta > 0.0 for spring in self.springs),
-            stiffness=math.nan if self.is_registered else float(heights @ rows[:, KC]),
         )
 
 

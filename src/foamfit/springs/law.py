@@ -1,15 +1,13 @@
 """Formulas of the seven-parameter law (eqs. 2, 4 and 5) and of the microscale law.
 
-They are plain Python functions of numbers, which are also compiled in `springs.kernels`.
+They are plain Python functions of numbers, which are also compiled in `springs.compiled`.
 """
 
 from __future__ import annotations
 
 import math
 
-# Kinds of spring in the kernels.
-BISTABLE, LINEAR, UNILATERAL, MICROSCALE = 0, 1, 2, 3
-# Names of the branches in the order of their numbers in `springs.kernels`.
+# Names of the branches in the order of their numbers in `springs.compiled`.
 BRANCH_NAMES = (
     "a", "d", "c", "e", "line", "open", "held", "snap-through", "snap-back", "reversible",
     "snap-through again",

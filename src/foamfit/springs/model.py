@@ -20,7 +20,7 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.springs import laws
 from foamfit.springs.chain import Chain, padded
-from foamfit.springs.laws import followed
+from foamfit.springs.compiled import solver_row
 from foamfit.springs.laws.record import Law, Param
 from foamfit.springs.parameters import direction, names_of, param_of
 from foamfit.springs.spring import Spring
@@ -95,11 +95,6 @@ class Model:
         """The law of each spring."""
         return tuple(laws.law(kind) for kind in self.kinds)
 
-    @cached_property
-    def is_registered(self) -> bool:
-        """Whether a spring has a registered law."""
-        return any(laws.is_registered(kind) for kind in self.kinds)
-
     def param(self, name: str) -> Param:
         """Return the record of a parameter."""
         return param_of(self.kinds, name)
@@ -144,12 +139,7 @@ class Model:
             own = self.own(i, values)
             last = self.own_places[i] + own.size + 2 * self.relaxation * law.hysteretic
             terms = values[self.own_places[i] + own.size : last]
-            if not self.is_registered:
-                row = followed.solver_row(law, own, terms, self.relaxation)
-            elif followed.row_of(law, own) is None or not own[-1] >= 0.0:
-                row = None
-            else:
-                row = np.append(own, terms)
+            row = solver_row(law, own, terms, self.relaxation)
             if row is None:
                 return None
             rows.append(row)

@@ -16,7 +16,6 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 
 if TYPE_CHECKING:
-    from foamfit.springs.kernels import Row
     from foamfit.springs.laws.record import Law
 
 FLOAT = np.dtype(np.float64)
@@ -107,16 +106,16 @@ class Spring(ABC):
         """The record of its law."""
 
     @cached_property
-    def row(self) -> Row:
-        """The row of the spring for the kernels, without relaxation."""
+    def row(self) -> Array:
+        """The row of the spring for the solver, without relaxation."""
         return self.solver_row(0)
 
-    def solver_row(self, room: int) -> Row:
+    def solver_row(self, room: int) -> Array:
         """Return the row with `room` relaxation terms."""
-        from foamfit.springs.laws import followed
+        from foamfit.springs.compiled import solver_row
 
         terms = self.relaxation if room else ()
-        row = followed.solver_row(self.law, np.array(self.values), terms, room)
+        row = solver_row(self.law, np.array(self.values), terms, room)
         assert row is not None  # checked when the spring was made
         return row
 
@@ -189,24 +188,21 @@ class Spring(ABC):
 
     def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
         """Return stresses and branch numbers along a strain history."""
-        from foamfit.springs import kernels
+        from foamfit.solve import histories
 
-        return kernels.stress_along(self.row, strain)
+        return histories.stress_along(self, strain)
 
     def _strain_along(self, stress: Array) -> Array:
         """Return strains along a stress history; not finite where no strain exists."""
-        from foamfit.springs import equilibrium
+        from foamfit.solve import histories
 
-        strain, none = np.empty(stress.size), np.empty((0, stress.size))
-        row = self.row[None, :]  # with height 1 the elongation is the strain
-        equilibrium.strains_along(row, np.ones(1), stress, strain, none, none.astype(np.int64))
-        return strain
+        return histories.strain_along(self, stress)
 
     def _slope_along(self, strain: Array) -> Array:
         """Return slopes along a strain history."""
-        from foamfit.springs import kernels
+        from foamfit.solve import histories
 
-        return kernels.tangent_along(self.row, strain, self._stress_along(strain)[1])
+        return histories.slope_along(self, strain)
 
     def _along(self, strain: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
         """Return strains, stresses and branches along a strain history."""
@@ -246,7 +242,7 @@ class LawSpring(Spring):
 
     def __init__(self, law: Law, values: Sequence[float], relaxation: Relaxation = ()) -> None:
         """Check the arguments and make the spring immutable."""
-        from foamfit.springs.laws import followed
+        from foamfit.springs.compiled import row_of
 
         put = object.__setattr__
         put(self, "record", law)
@@ -255,7 +251,7 @@ class LawSpring(Spring):
         freeze_numbers(self, law)
         freeze_terms(self, relaxation)
         put(self, "numbers", tuple(getattr(self, name) for name in law.names))
-        if followed.row_of(law, self.numbers) is None:
+        if row_of(law, self.numbers) is None:
             given = ", ".join(f"{n} = {v:g}" for n, v in zip(law.names, self.numbers, strict=True))
             raise InputError(f"{given} is not admissible: the law '{law.kind}' refuses it")
 
@@ -263,18 +259,3 @@ class LawSpring(Spring):
     def law(self) -> Law:
         """The record of its law."""
         return self.record
-
-    def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
-        from foamfit.springs.laws import followed
-
-        return followed.stress_along(self.record, self.numbers, strain)
-
-    def _strain_along(self, stress: Array) -> Array:
-        from foamfit.springs.laws import followed
-
-        return followed.strain_along(self.record, self.numbers, stress)
-
-    def _slope_along(self, strain: Array) -> Array:
-        from foamfit.springs.laws import followed
-
-        return followed.slope_along(self.record, self.numbers, strain)

@@ -126,7 +126,7 @@ class Batch:
         model = self.recipe.model
         memory = model == "auto" or self.recipe.options["relaxation"] > 0
         memory = memory or any(law.remembers for law in Model.parse(model).laws)
-        return memory and not cache.compiled("integrate_with_memory")
+        return memory and not cache.compiled("follow")
 
     def _begin(self, executor: Executor, name: str, path: Path) -> None:
         """Use the stored rows of a test, or submit its fit."""
@@ -343,8 +343,7 @@ def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator
         yield given
         return
     if not cache.compiled():
-        _LOG.warning("foamfit: compiling the solver, once after installation")
-        with precompile.side_by_side() as finish:
+        with precompile.at_first_use() as finish:
             finish()
     count = min(jobs or cores(), max(len(made.tests), 1))
     try:

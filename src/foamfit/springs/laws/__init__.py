@@ -29,7 +29,7 @@ ENTRY_POINTS = "foamfit.laws"
 _PAPER = (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)
 _OPTIONAL = (microscale.STIFFENING_LAW, microscale.MULLINS_LAW, microscale.MEMORY_LAW)
 _LAWS = {law.kind: law for law in (*_PAPER, *_OPTIONAL)}
-PAPER = tuple(_LAWS)  # built-in laws, which the kernels implement
+PAPER = tuple(_LAWS)  # built-in laws
 _TEXTS: dict[str, str] = {}  # text of each loaded law file, by path
 _asked_packages: list[bool] = []
 
@@ -70,7 +70,7 @@ def with_options(kind: str, options: tuple[str, ...]) -> str:
 
 
 def is_registered(kind: str) -> bool:
-    """Return whether a law is registered, and followed by the functions of its record."""
+    """Return whether a law is registered, not built in."""
     return kind in _LAWS and kind not in PAPER
 
 

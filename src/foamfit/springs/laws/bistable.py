@@ -19,7 +19,6 @@ from foamfit.springs.laws.shared import (
     COMPARED_K0,
     K0,
     KC,
-    functions_of,
     steeper,
 )
 from foamfit.springs.loop import Loop
@@ -292,7 +291,7 @@ LAW = Law(
         ),
     ),
     numbered=BRANCH_NAMES,
-    functions=functions_of("bistable"),
+    functions="bistable",
     branches={"a": "elastic", "d": "snap-buckling", "c": "densified", "e": "snap-back"},
     spring=BistableSpring,
     searched=("k0", "kc", "eps_a", "eps_c", "dsigma", "kh_plus", "kh_minus"),

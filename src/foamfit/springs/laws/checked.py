@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
-from foamfit.springs.laws import followed
-from foamfit.springs.laws.record import ADMISSIBLE, COMMON, EPS, Functions, Law, Param
+from foamfit.solve.histories import stress_along
+from foamfit.springs.compiled import row_of
+from foamfit.springs.compiled.contract import MOST_INTERNAL
+from foamfit.springs.laws.record import ADMISSIBLE, COMMON, Functions, Law, Param
+from foamfit.springs.spring import LawSpring
 
 SCALES = {"one": 1.0, "strain": 0.5, "stress": 1e6, "slope": 2e6, "damping": 1e3, "duration": 1e-3}
 _UP = np.linspace(0.0, 0.5, 101)
@@ -59,45 +63,56 @@ def start_values(law: Law) -> Array:
 
 def _missing(law: Law) -> str | None:
     """Return what is wrong with the functions of a record, or None."""
-    given = law.loaded_functions()
+    given: Any = law.functions
     if not isinstance(given, Functions):
-        return "functions must be foamfit.Functions(fill, begin, leaves, switch, settle)"
-    needed = given if given.viscous is not None else given._replace(viscous=bool)
-    absent = [name for name, one in needed._asdict().items() if not callable(one)]
-    return f"the function {absent[0]} is missing" if absent else None
+        return "functions must be foamfit.Functions(stress, …)"
+    if not isinstance(law.internal, int) or not 0 <= law.internal <= MOST_INTERNAL:
+        return f"internal must be a number of internal variables from 0 to {MOST_INTERNAL}"
+    own = given._asdict()
+    if given.stress is None:
+        return "the function stress is missing"
+    if wrong := [name for name, one in own.items() if not (one is None or callable(one))]:
+        return f"{wrong[0]} is not a function"
+    if (given.along or given.decay) and not law.internal:
+        name = "along" if given.along else "decay"
+        return f"{name} fills the rates of internal variables, but internal is 0"
+    if law.internal and not (given.along or given.decay or given.switch):
+        return "the function along is missing: nothing changes the internal variables"
+    if given.ends and not given.switch:
+        return "the function switch is missing: branches end, but none follows"
+    return None
 
 
 def _overrun(law: Law, values: Array) -> str | None:
-    """Return what is wrong with the lengths of row and state, or None.
+    """Return what is wrong with the indices in the functions, or None.
 
-    Compiled functions do not check indices and could write outside an array. The law is therefore
-    first followed by the uncompiled functions.
+    Compiled functions do not check indices and could write outside an array. The functions are
+    therefore first run as they are, on every branch.
     """
-    given = law.loaded_functions()
-    written: list[Any] = [getattr(one, "py_func", one) for one in given]
-    plain = Functions(*written)
-    if any(one and one.__module__.startswith("foamfit.") for one in written):
-        return None  # built-in laws call compiled functions
-    columns, states = followed.sizes_of(law)
-    row, state = np.zeros(columns), np.zeros(states)
-    try:
-        with np.errstate(all="ignore"):
-            plain.fill(values, row)
-            plain.begin(row, state)
-            for strain in TRIED[:: TRIED.size // 8]:
-                for _ in range(len(law.branches)):
-                    if plain.leaves(row, state, strain):
-                        plain.switch(row, state, strain > state[EPS])
-                plain.settle(row, state, strain)
-                if plain.viscous is not None:
-                    plain.viscous(row, state, 1.0, 0.1)
-    except IndexError:
-        return (
-            f"a function goes beyond the {columns} numbers of row or the {states} of state; give "
-            "the law as many columns and states as it uses"
-        )
-    except Exception:
-        return None  # the trial of the compiled functions reports it
+    given: Any = law.functions
+    own = {name: getattr(one, "py_func", one) for name, one in given._asdict().items() if one}
+    p, rate = tuple(values.astype(complex).tolist()), 1.0 + 0j
+    for branch, strain, held in product(
+        range(len(law.numbered or law.branches)), (-0.1 + 0j, 0.1 + 0j, 0.4 + 0j), (0.0, 0.1, -0.1)
+    ):
+        x = np.full(law.internal, held, complex)
+        at, out = (p, x, strain, branch), np.zeros(law.internal, complex)
+        calls: dict[str, tuple[Any, ...]] = {
+            "stress": at, "along": (*at, out), "decay": (*at, out),
+            "ends": (*at, np.zeros(3, complex)), "viscous": (p, x, strain, rate, branch),
+            "switch": (*at, True),
+        }  # fmt: skip
+        for name in own.keys() & calls.keys():
+            try:
+                with np.errstate(all="ignore"):
+                    own[name](*calls[name])
+            except IndexError:
+                return (
+                    f"the function {name} goes beyond the {len(p)} numbers of p, the "
+                    f"{law.internal} of x or those of out; set internal to the length of x"
+                )
+            except Exception:
+                continue  # the trial of the compiled functions reports it
     return None
 
 
@@ -108,13 +123,11 @@ def _trial(law: Law) -> str | None:
         return wrong
     shown = ", ".join(f"{n} = {v:g}" for n, v in zip(law.own, values, strict=True))
     try:
-        if followed.row_of(law, values) is None:
-            return f"fill refuses its own start values ({shown}); give others"
-        stress, branches = followed.stress_along(law, values, TRIED)
-        followed.compile_delayed(law)
+        if row_of(law, values) is None:
+            return f"admissible refuses its own start values ({shown}); give others"
+        stress, branches = stress_along(LawSpring(law, [*values, 0.0]), TRIED)
     except Exception as error:  # any error of the compiler in a user's function
-        told = " ".join(str(error).split())[:300]
-        return f"its functions cannot be compiled or run ({type(error).__name__}: {told})"
+        return f"its functions cannot be compiled or run ({type(error).__name__}: {_told(error)})"
     if not np.all(np.isfinite(stress)):
         at = int(np.argmin(np.isfinite(stress)))
         return f"the stress is not finite at the strain {TRIED[at]:g} ({shown})"
@@ -129,6 +142,11 @@ def _trial(law: Law) -> str | None:
             f"({shown}); a branch must rise with the strain"
         )
     return None
+
+
+def _told(error: Exception) -> str:
+    """Return the message of an error on one line, without the compiler's colours."""
+    return " ".join(re.sub("\x1b\\[[0-9;]*m", "", str(error)).split())[:300]
 
 
 def check(law: Law, taken: Sequence[str]) -> None:

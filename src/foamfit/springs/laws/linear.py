@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from foamfit.springs.law import BRANCH_NAMES
 from foamfit.springs.laws.record import Law
-from foamfit.springs.laws.shared import COMPARED_ETA, COMPARED_HEIGHT, COMPARED_K0, K0, functions_of
+from foamfit.springs.laws.shared import COMPARED_ETA, COMPARED_HEIGHT, COMPARED_K0, K0
 from foamfit.springs.spring import Relaxation, Spring, freeze_numbers
 
 
@@ -57,7 +57,7 @@ LAW = Law(
     title="linear spring",
     params=(replace(K0, what="slope", branch="", example="60 MPa"),),
     numbered=BRANCH_NAMES,
-    functions=functions_of("linear"),
+    functions="linear",
     branches={"line": "linear"},
     hysteretic=False,
     spring=LinearSpring,
@@ -72,6 +72,6 @@ LAW = Law(
 )  # fmt: skip
 UNILATERAL_LAW = replace(
     LAW, kind="unilateral", title="linear spring without tension", spring=_unilateral,
-    functions=functions_of("unilateral"),
+    functions="unilateral",
     branches={"line": "linear", "open": "out of contact"},
 )  # fmt: skip

@@ -9,7 +9,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from foamfit.arrays import Array
 from foamfit.springs.law import BRANCH_NAMES, most_beyond
@@ -20,7 +20,6 @@ from foamfit.springs.laws.shared import (
     COMPARED_K0,
     K0,
     KC,
-    functions_of,
     steeper,
 )
 from foamfit.springs.loop import Loop
@@ -126,20 +125,23 @@ class MicroscaleSpring(Spring):
         """Return the snapped fractions p and P along a stress history (Pa), from rest."""
         from scipy.special import ndtr
 
-        from foamfit.springs import microscale_kernels
-
         history = np.atleast_1d(as_samples(stress, "stress"))
-        snapped = ndtr(microscale_kernels.strain_along(self.row, history)[1][0])
-        return snapped, np.maximum.accumulate(snapped)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log = np.log(np.maximum(history, 0.0))
+        first = ndtr((log - math.log(self.sigma_plus)) / self.spread_plus)
+        again = ndtr((log - math.log(self.sigma_plus) + self.weakening) / self.spread_plus)
+        back = ndtr((log - math.log(self.sigma_minus)) / self.spread_minus)
+        p, most, out = 0.0, 0.0, np.empty((2, history.size))
+        for j, (one, two, three) in enumerate(zip(first, again, back, strict=True)):
+            least = max(one, min(two, most))
+            p = min(max(p, least), max(least, three))
+            most = max(most, p)
+            out[:, j] = p, most
+        return out[0], out[1]
 
     def snapped_along(self, strain: ArrayLike) -> Array:
         """Return the snapped fraction along a strain history, (n,), from rest."""
-        from scipy.special import ndtr
-
-        from foamfit.springs import microscale_kernels
-
-        ranks = microscale_kernels.stress_along(self.row, self._along(strain)[0])[1]
-        return np.asarray(ndtr(ranks[0]))
+        return self.fraction_along(self._along(strain)[1])
 
     def elastic_branches(self, stress: Array) -> dict[str, Array]:
         """Return the strains of branches a (p = 0) and c (p = 1) at these stresses (Pa).
@@ -163,18 +165,6 @@ class MicroscaleSpring(Spring):
             ("+", "through", self.sigma_plus, self.spread_plus),
             ("−", "back", self.sigma_minus, self.spread_minus),
         )
-
-    def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
-        from foamfit.springs import microscale_kernels
-
-        stress, _, branches = microscale_kernels.stress_along(self.row, strain)
-        return stress, branches
-
-    def _slope_along(self, strain: Array) -> Array:
-        from foamfit.springs import microscale_kernels
-
-        path = microscale_kernels.stress_along(self.row, strain)
-        return microscale_kernels.stress_tangents_along(self.row, strain, *path)[1]
 
 
 @lru_cache(maxsize=256)
@@ -328,9 +318,9 @@ def _law(*options: str) -> Law:
         word="microscale" if options else "",
         title="microscale spring",
         params=(*_PARAMS[:2], replace(_PARAMS[2], coordinate=beyond), *_PARAMS[3:], *extra),
-        places={"stiffening": 8, "softening": 9, "weakening": 10} if options else {},
+        places={"stiffening": 7, "softening": 8, "weakening": 9} if options else {},
         numbered=BRANCH_NAMES,
-        functions=functions_of(kind),
+        functions="microscale",
         branches=_BRANCHES | again,
         spring=make,
         searched=(

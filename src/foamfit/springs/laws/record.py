@@ -19,9 +19,6 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.springs.loop import Loop
 
-# The state of a spring begins with strain, stress (Pa) and the number of its branch; further
-# numbers of a law follow.
-EPS, SIGMA, BRANCH, OWN = 0, 1, 2, 3
 LAST_STRAIN = 0.999
 
 # Conditions on the value of a parameter, by their wording in messages.
@@ -101,19 +98,23 @@ class Param:
 
 
 class Functions(NamedTuple):
-    """Functions that follow a spring along its strain; numba compiles them.
+    """The formulas of a registered law; "Your own law" in the documentation specifies them.
 
-    "Your own law" in the documentation specifies each of them.
+    p is the tuple of the parameters, x the array of the internal variables, `strain` and `rate` are
+    numbers, all complex; `branch` is the number of the branch.
     """
 
-    fill: Callable[..., bool]  #: fill(values, row): write parameters; False if not admissible
-    begin: Callable[..., None]  #: begin(row, state): set the state of a spring at rest
-    leaves: Callable[..., bool]  #: leaves(row, state, strain): whether the branch ends before it
-    switch: Callable[..., None]  #: switch(row, state, up): to the end of the branch, and the next
-    settle: Callable[..., None]  #: settle(row, state, strain): to a strain on the branch
-    #: viscous(row, state, rate, h): stress (Pa) that depends on time, for the strain rate (1/s) and
-    #: length (s) of the last step
-    viscous: Callable[..., float] | None = None
+    stress: Callable[..., Any]  #: stress(p, x, strain, branch) -> σ, Pa
+    along: Callable[..., None] | None = None  #: along(p, x, strain, branch, out): fill dx/dε
+    decay: Callable[..., None] | None = None  #: decay(p, x, strain, branch, out): fill dx/dt, 1/s
+    #: ends(p, x, strain, branch, out): fill strains at the lower and upper end of the branch, and
+    #: 1 (-1) if it ends where the strain stops rising (falling)
+    ends: Callable[..., None] | None = None
+    #: switch(p, x, strain, branch, up) -> next branch; it may change x
+    switch: Callable[..., int] | None = None
+    #: viscous(p, x, strain, rate, branch): a stress (Pa) that depends on the strain rate (1/s)
+    viscous: Callable[..., Any] | None = None
+    admissible: Callable[[Array], bool] | None = None  #: admissible(p) -> bool, of real numbers
 
 
 class PointOf(NamedTuple):
@@ -143,11 +144,10 @@ class Law:
     """A kind of spring."""
 
     kind: str  #: name in models: "bistable", "linear+bistable"
-    #: parameters in the order of `Functions.fill`, without dashpot, relaxation terms and height
+    #: parameters, without dashpot, relaxation terms and height
     params: tuple[Param, ...]
-    functions: Functions | Callable[[], Functions]  #: or a callable that returns them
-    columns: int = 0  #: length of a row; by default one number per parameter
-    states: int = OWN  #: length of a state; by default strain, stress and branch
+    functions: Functions | str  #: or the name of a built-in law
+    internal: int = 0  #: number of internal variables
     #: branches in the order of their numbers, the first at rest: name and description
     branches: Mapping[str, str] = field(default_factory=lambda: {"line": "the law"})
     title: str = ""  #: name in words, "bistable spring"
@@ -225,14 +225,11 @@ class Law:
             raise InputError(f"law '{self.kind}' is not known yet: register it first")
         return self.spring(*values, **({"relaxation": relaxation} if self.hysteretic else {}))
 
-    def loaded_functions(self) -> Functions:
-        """The functions of the law."""
-        return self.functions if isinstance(self.functions, Functions) else self.functions()
-
-    @cached_property
+    @property
     def is_viscous(self) -> bool:
         """Whether the stress depends on time."""
-        return self.loaded_functions().viscous is not None
+        given = self.functions
+        return isinstance(given, Functions) and bool(given.viscous or given.decay)
 
     def assembled(self, chosen: Callable[[Param], float]) -> Array:
         """Return parameters from a choice for each: its position between its ends, or its value."""
@@ -245,10 +242,10 @@ class Law:
                 values[name] = first + values[name] * (last - first)
         return np.array([values[name] for name in self.own])
 
-    def any_spring(self) -> Any:
-        """Return a spring of the law with arbitrary parameters."""
+    def any_spring(self, terms: int = 0) -> Any:
+        """Return a spring of the law with arbitrary parameters and relaxation terms."""
         own = self.assembled(lambda param: 0.2 if param.of else abs(param.start[0]) or 1.0)
-        return self.make([*own, 0.0], ())
+        return self.make([*own, 0.0], ((0.0, 1.0),) * terms)
 
     def derivative(self, short: str) -> int:
         """Return the index of the derivative by a parameter."""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.springs.laws.record import Compared, Functions, Param
+from foamfit.springs.laws.record import Compared, Param
 
 _INNER = (math.log(0.3), math.log(300.0))  # of stiffness divided by largest stress
 K0 = Param(
@@ -24,17 +24,6 @@ COMPARED_ETA = Compared("η", "Pa·s", ("eta",), lambda eta: eta)
 COMPARED_HEIGHT = Compared("h", "mm", ("height",), lambda height: height / 1e-3)
 # k_c of further start points, divided by the largest stress.
 STEEP = np.geomspace(1.0, 1000.0, 7)
-
-
-def functions_of(kind: str) -> Callable[[], Functions]:
-    """Return a callable that loads the functions of a built-in law."""
-
-    def load() -> Functions:
-        from foamfit.springs.laws import followed
-
-        return followed.functions_of(kind)
-
-    return load
 
 
 def steeper(values: Array, kc: int, start: int, top: float, low: float) -> Iterator[Array]:

@@ -1,0 +1,258 @@
+"""One spring under a known motion, without integration of the motion.
+
+The strain is linear between samples, so the stress needs no integration. Relaxation terms z = q/g -
+σ with dz/dt = -(z + σ)/τ are integrated exactly for the quartic through the stress at both ends and
+the middle of a step and its slopes at the ends; what the middle adds to the cubic is the error
+estimate. Derivatives follow from those of the stress at the same three points.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from foamfit.solve.events import change_branch
+from foamfit.solve.motion import evaluate
+from foamfit.solve.run import KIND, begin_run
+from foamfit.solve.samples import row_of
+from foamfit.springs.compiled.contract import (
+    BRANCH,
+    BY,
+    BY_HELD,
+    BY_STRESS,
+    EPS,
+    HIGH,
+    LOW,
+    OF_LAW,
+    OPTIONS,
+    PER_HEIGHT,
+    RELAX,
+    SETTLE,
+    SLOPE,
+    TURNS,
+    X,
+    call_number,
+    inner,
+    past,
+    start,
+)
+from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
+
+MOMENTS, OF_STEP, TABLE = 0, 6, 8  # columns of the table of a relaxation term
+LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the middle adds
+
+
+@inner
+def bring_to(c, eps):  # type: ignore[no-untyped-def]
+    """Bring the spring to a strain on its branch; return the stress."""
+    s, n = c.springs, c.numbers
+    call_number(n[SETTLE], past(s, c.row), s, eps)
+    evaluate(c, c.none, int(c.p > 0))
+    return s[c.results + OF_LAW]
+
+
+@inner
+def derive(c, seed, y):  # type: ignore[no-untyped-def]
+    """Fill the derivatives of the stress now in `part`, and those of the strain."""
+    s, n, p = c.springs, c.numbers, c.p
+    out, held, part, strain = past(s, c.results), c.held, c.part, c.strain
+    for j in range(p):
+        own = c.directions[2 * j + 1]
+        strain[j] = s[PER_HEIGHT] * (seed[0] + seed[1] * s[EPS]) if own == MOVED else 0.0
+        if own == OWN_HEIGHT:
+            strain[j] = -s[EPS] * s[PER_HEIGHT]
+        part[j] = out[BY + own] if 0 <= own < OWN_ETA else 0.0
+        if n[KIND] == BY_STRESS:
+            part[j] += out[BY_HELD] * held[j] + out[BY_HELD + 1] * held[p + j]
+        c.common[j] = part[j] + out[SLOPE] * strain[j]
+
+
+@inner
+def tabulate(x, h, table):  # type: ignore[no-untyped-def]
+    """Fill the moments ∫₀¹ exp(-x (1-r)) r^m dr, m = 0 … 5, for steps of length h."""
+    table[OF_STEP] = h
+    if x > 1.0:
+        table[0] = -math.expm1(-x) / x
+        for m in range(1, 6):
+            table[m] = (1.0 - m * table[m - 1]) / x
+        return
+    term = total = 1.0 / 6.0
+    for k in range(1, 30):
+        term *= -x / (6.0 + k)
+        total += term
+        if abs(term) < 1e-17:
+            break
+    table[5] = total
+    for m in range(5, 0, -1):
+        table[m - 1] = (1.0 - x * table[m]) / m
+
+
+@inner
+def relax(c, h, tables, y, first, low, high, last, bump, d_first, d_middle):  # type: ignore[no-untyped-def]
+    """Advance the relaxation terms and their derivatives over a step.
+
+    The stress goes from `first` to `last` with the slopes `low` and `high` at the ends, and `bump`
+    times 16 r² (1-r)². y contains the terms, then their derivatives.
+    """
+    s, p = c.springs, c.p
+    rise = last - first
+    square, cube = 3.0 * rise - 2.0 * low - high, low + high - 2.0 * rise
+    square, cube, fourth = square + 16.0 * bump, cube - 32.0 * bump, 16.0 * bump
+    for k in range(c.terms):
+        tau, a, dz = s[RELAX + 2 * k + 1], past(tables, k * TABLE), past(y, c.terms + k * p)
+        x = h / tau
+        decay = math.exp(-x)
+        total = first * a[0] + low * a[1] + square * a[2] + cube * a[3] + fourth * a[4]
+        change = first * (a[1] - a[0]) + low * (a[2] - a[1]) + square * (a[3] - a[2])
+        change += cube * (a[4] - a[3]) + fourth * (a[5] - a[4])
+        by_tau = (decay * y[k] + total + x * change) * x / tau
+        one, two, three = a[0] - 3.0 * a[1] + 2.0 * a[2], 4.0 * (a[1] - a[2]), 2.0 * a[2] - a[1]
+        for j in range(p):
+            step = one * d_first[j] + two * d_middle[j] + three * c.common[j]
+            dz[j] = decay * dz[j] - x * step
+            if c.directions[2 * j + 1] == OWN_RELAXATION + 2 * k + 1:
+                dz[j] += by_tau
+        y[k] = decay * y[k] - x * total
+
+
+@inner
+def sum_up(c, y, j):  # type: ignore[no-untyped-def]
+    """Write stress and derivatives of a sample, with all terms."""
+    s, p = c.springs, c.p
+    sigma = s[c.results + OF_LAW]
+    total = sigma
+    for q in range(p):
+        slope = c.common[q]
+        for k in range(c.terms):
+            slope += s[RELAX + 2 * k] * (c.common[q] + y[c.terms + k * p + q])
+            if c.directions[2 * q + 1] == OWN_RELAXATION + 2 * k:
+                slope += sigma + y[k]
+        row_of(c, 1 + q, c.none)[j] = slope
+    for k in range(c.terms):
+        total += s[RELAX + 2 * k] * (sigma + y[k])
+    row_of(c, c.none, c.none)[j] = total
+
+
+@inner
+def step_to(c, part, h, m, seed, y, tol, weight):  # type: ignore[no-untyped-def]
+    """Step to a strain of the branch within h; false, unchanged, if the step is too long.
+
+    m: largest stress, tables, and room for the derivatives at the start and in the middle.
+    """
+    s, p = c.springs, c.p
+    tables, d_first, d_middle = (
+        past(m, 2),
+        past(m, 2 + c.terms * TABLE),
+        past(m, 2 + c.terms * TABLE + p),
+    )
+    out = past(s, c.results)
+    origin, first, slope, x = s[EPS], out[OF_LAW], out[SLOPE], s[X]
+    step = part - origin
+    for j in range(p):
+        d_first[j] = c.common[j]
+    if c.terms == 0 or h <= 0.0:
+        m[0] = max(m[0], abs(bring_to(c, part)))
+        derive(c, seed, y)
+        return True
+    half = bring_to(c, origin + 0.5 * step)
+    derive(c, seed, y)
+    for j in range(p):
+        d_middle[j] = c.common[j]
+    last = bring_to(c, part)
+    low, high = slope * step, out[SLOPE] * step
+    bump = half - (0.5 * (first + last) + 0.125 * (low - high))
+    size = max(m[0], abs(last))
+    if FOLLOWED * weight * abs(bump) > tol * size and m[1] > LEAST_STEP:
+        s[EPS], s[X] = origin, x
+        bring_to(c, origin)
+        for j in range(p):
+            c.common[j] = d_first[j]
+        return False
+    m[0] = size
+    derive(c, seed, y)
+    for k in range(c.terms):
+        if abs(h - tables[k * TABLE + OF_STEP]) > 1e-13 * h:
+            tabulate(h / s[RELAX + 2 * k + 1], h, past(tables, k * TABLE))
+    relax(c, h, tables, y, first, low, high, last, bump, d_first, d_middle)
+    return True
+
+
+@inner
+def go_to(c, eps, between, m, seed, y, tol, weight):  # type: ignore[no-untyped-def]
+    """Go to the strain of the next sample, `between` later, from branch to branch."""
+    s, begun, left, pace = c.springs, c.springs[EPS], 1.0, 1.0
+    while left > 0.0 or s[EPS] != eps:
+        up = eps > s[EPS]
+        if s[EPS] != eps and s[TURNS] * (1.0 if up else -1.0) < 0.0:
+            change_branch(c, c.none, int(up), y)
+            bring_to(c, s[EPS])
+            derive(c, seed, y)
+        goal, until, leaving = eps, 0.0, False
+        if up and eps > s[HIGH]:
+            goal, leaving = s[HIGH], True
+        elif not up and eps < s[LOW]:
+            goal, leaving = s[LOW], True
+        if leaving:
+            until = min(max((eps - goal) / (eps - begun), 0.0), left)
+        share, part, whole = left - until, goal, True
+        if pace < share:
+            part, whole = s[EPS] + pace / share * (goal - s[EPS]), False
+            share = pace
+        m[1] = share
+        if not step_to(c, part, share * between, m, seed, y, tol, weight):
+            pace = 0.5 * share
+            continue
+        if not m[0] < math.inf:
+            return
+        left = max(left - share, 0.0)
+        pace = 1.0 if whole else 2.0 * share
+        if leaving and whole:
+            change_branch(c, c.none, int(up), y)
+            bring_to(c, s[EPS])
+            derive(c, seed, y)
+        elif whole and left == 0.0 and s[EPS] == eps:
+            return
+
+
+@inner
+def _first(c, eps, m, seed, y, tol, weight):  # type: ignore[no-untyped-def]
+    """Go to the strain of the first sample, where relaxation terms carry nothing."""
+    go_to(c, eps, 0.0, m, seed, y, tol, weight)
+    for k in range(c.terms):
+        y[k] = -c.springs[c.results + OF_LAW]
+        for q in range(c.p):
+            y[c.terms + k * c.p + q] = -c.common[q]
+
+
+@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
+def follow(  # type: ignore[no-untyped-def]
+    template, ints, floats, rows, heights, mass, reals, strains, time, out, log, seeds, branches,
+    slopes,
+):  # fmt: skip
+    """Follow one spring, without its dashpot, along strains from rest.
+
+    `branches` and `slopes` become those of the samples; `seeds` (n, 2) are derivatives of a shift
+    of the motion, see `plan.seeds`.
+    """
+    c = begin_run(template, ints, floats, time, strains, out, log, rows, heights, mass, reals)
+    s, t, tol, n, weight, m = c.springs, c.time, reals[3], c.samples, 0.0, c.batch
+    y = past(m, 2 + c.terms * TABLE + 2 * c.p)
+    lasts = t[n - 1] - t[0]
+    for k in range(c.terms):
+        weight += s[RELAX + 2 * k] * min(1.0, lasts / s[RELAX + 2 * k + 1])
+        m[2 + k * TABLE + OF_STEP] = -1.0
+    bring_to(c, 0.0)
+    derive(c, start(seeds), y)
+    for j in range(n):
+        seed, eps = past(start(seeds), 2 * j), c.values[j]
+        if j == 0:
+            _first(c, eps, m, seed, y, tol, weight)
+        else:
+            go_to(c, eps, t[j] - t[j - 1], m, seed, y, tol, weight)
+        sum_up(c, y, j)
+        branches[j], slopes[j] = int(s[BRANCH]), s[c.results + SLOPE]
+        if not m[0] < math.inf:
+            for k in range(j, n):
+                out[0, 0, k], branches[k] = math.inf, int(s[BRANCH])
+            return

@@ -1,0 +1,188 @@
+"""Prescribed stress or motion of the top: its pieces between samples, and the start from rest."""
+
+from __future__ import annotations
+
+from numba import cfunc, types
+
+from foamfit.solve.motion import (
+    BEGIN_RAMP,
+    END_RAMP,
+    ONLY_DERIVATIVES,
+    call_inside,
+    evaluate,
+    rates,
+    rates_of,
+)
+from foamfit.solve.run import (
+    BEGUN,
+    EPS_AT,
+    HORIZON,
+    KIND,
+    NOW,
+    NUMBERS,
+    PIECE,
+    VALUE,
+    VALUE_RATE,
+    X_AT,
+    Z_AT,
+    unpack,
+)
+from foamfit.solve.samples import row_of, write
+from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
+from foamfit.solve.static import bring, push_to, strain_to
+from foamfit.springs.compiled.contract import (
+    BY_STRESS,
+    EPS,
+    ETA,
+    GAIN,
+    HEIGHT,
+    INTERNAL,
+    OF_LAW,
+    OFFSET,
+    OPTIONS,
+    RELAX,
+    SLOPE,
+    TANGENT,
+    TOTAL,
+    X,
+    inner,
+    past,
+)  # fmt: skip
+
+_I, _IP = types.int64, types.CPointer(types.int64)
+
+
+@inner
+def _begin_piece(c, k):  # type: ignore[no-untyped-def]
+    """Prescribe the drive between samples k and k + 1."""
+    r, drive, t, values = c.now, c.drive, c.time, c.values
+    r[NOW], r[BEGUN], drive[VALUE], drive[VALUE_RATE] = 0.0, t[k], values[k], 0.0
+    r[HORIZON] = 0.0
+    if k + 1 < c.samples:
+        r[HORIZON] = t[k + 1] - t[k]
+        drive[VALUE_RATE] = (values[k + 1] - values[k]) / (t[k + 1] - t[k])
+
+
+@inner
+def _starts_on_ramp(c):  # type: ignore[no-untyped-def]
+    """Whether internal variables change up to the first sample of a drive."""
+    if c.values[0] == 0.0 or not (c.top == MOTION or c.top == STRESS):
+        return False
+    for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
+        if c.numbers[i * NUMBERS + KIND] == INTERNAL:
+            return True
+    return False
+
+
+@inner
+def _start(c):  # type: ignore[no-untyped-def]
+    """Bring the springs above the last mass into equilibrium with the first sample of a drive.
+
+    Under a prescribed stress, springs with a dashpot start from rest.
+    """
+    g, y = c.groups - 1, c.y
+    i0, i1 = (c.ends[g - 1] if g > 0 else c.none), c.ends[g]
+    _begin_piece(c, c.none)
+    first = c.drive[VALUE]
+    if c.top == FREE or c.top == VISCOUS:
+        return
+    for i in range(i0, i1):
+        c.springs[i * c.width + GAIN] = 1.0  # relaxation terms carry nothing yet
+    if c.top == STRESS:
+        for i in range(i0, i1):
+            if c.springs[i * c.width + ETA] == 0.0:
+                push_to(c, i, first, 0.0, y)
+    elif i1 - i0 == 1:
+        strain_to(c, i0, first / c.springs[i0 * c.width + HEIGHT], y)
+    else:
+        first = bring(c, i0, i1, first, 0.0, y)
+    for i in range(i0, i1):
+        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+        evaluate(c, i, int(c.p > 0))
+        s[TANGENT], s[TOTAL] = s[c.results + SLOPE], s[c.results + OF_LAW]
+        if n[EPS_AT] >= 0:
+            y[n[EPS_AT]] = s[EPS]
+        if n[KIND] == BY_STRESS and n[X_AT] >= 0:
+            y[n[X_AT]] = s[X]
+        for k in range(c.terms):
+            y[n[Z_AT] + k] = -s[TOTAL]
+    if c.p > 0:
+        _derive_start(c, g, i0, i1, first)
+    for i in range(i0, i1):
+        s = past(c.springs, i * c.width)
+        for k in range(c.terms):
+            s[GAIN] += s[RELAX + 2 * k]
+
+
+@inner
+def _derive_start(c, g, i0, i1, common):  # type: ignore[no-untyped-def]
+    """Fill the derivatives of the state at rest, where relaxation terms carry nothing.
+
+    A prescribed motion has moved the springs before their dashpots carry anything.
+    """
+    y, p, base = c.y, c.p, c.base
+    c.carried[g] = common
+    for i in range(i0, i1):
+        s = past(c.springs, i * c.width)
+        s[OFFSET] = s[ETA]
+        s[ETA] = 0.0 if c.top == MOTION else s[ETA]
+    rates_of(c, g, y, c.f, ONLY_DERIVATIVES, 0.0)
+    for i in range(i0, i1):
+        s, n, strain = (
+            past(c.springs, i * c.width),
+            past(c.numbers, i * NUMBERS),
+            past(c.strain, i * p),
+        )
+        s[ETA], s[OFFSET] = s[OFFSET], 0.0
+        slope, part, at = s[c.results + SLOPE], past(c.part, i * p), base + n[EPS_AT] * p
+        if s[ETA] > 0.0 and n[EPS_AT] >= 0:
+            for j in range(p):
+                strain[j] = y[at + j] = strain[j] if c.top == MOTION else 0.0
+        for k in range(c.terms):
+            z = past(y, base + (n[Z_AT] + k) * p)
+            for j in range(p):
+                z[j] = -(slope * strain[j] + part[j])
+
+
+@inner
+def _next_piece(c, want):  # type: ignore[no-untyped-def]
+    """Write the sample at the end of a piece, and begin the next; return whether it was the last.
+
+    Dashpots have the mean rate at a sample where the prescribed rate jumps.
+    """
+    r, k, t = c.now, int(c.now[PIECE]) + 1, c.time
+    if k == 0:  # after a ramp
+        call_inside(c, END_RAMP, c.none, want, c.y, c.stage, c.y, c.y)
+        _begin_piece(c, k)
+    write(c, c.y, r[NOW], k, want)
+    r[PIECE] = k
+    if k == c.samples - 1:
+        return 1
+    if k > 0:
+        _begin_piece(c, k)
+    rates(c, c.y, c.stage, want, 0.0)
+    if c.top == MOTION and c.groups == 1 and k > 0:
+        share, out = (t[k] - t[k - 1]) / (t[k + 1] - t[k - 1]), row_of(c, c.none, c.none)
+        out[k] += share * (c.carried[0] - out[k])
+        for j in range(c.p):
+            out = row_of(c, 1 + j, c.none)
+            out[k] += share * (c.common[j] - out[k])
+    return c.none
+
+
+@cfunc(_I(_IP, _I, _I), **OPTIONS, cache=True)
+def _drive(words, starts, want):  # type: ignore[no-untyped-def]
+    """Start from rest, or begin the next piece; return whether all samples are written."""
+    c = unpack(words)
+    if not starts:
+        return _next_piece(c, want)
+    if _starts_on_ramp(c):
+        call_inside(c, BEGIN_RAMP, c.none, want, c.y, c.stage, c.y, c.y)
+        return c.none
+    _start(c)
+    rates(c, c.y, c.stage, want, 0.0)
+    write(c, c.y, 0.0, c.none, want)
+    return int(c.samples == 1)
+
+
+DRIVE = _drive.address

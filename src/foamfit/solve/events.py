@@ -1,0 +1,298 @@
+"""Steps in time, and the events within them: changes of branch and the end of contact.
+
+Events are found on the dense output of a step.
+"""
+
+from __future__ import annotations
+
+from numba import cfunc, types
+from numba.extending import intrinsic
+
+from foamfit.solve.motion import JUMP, call_inside, rates
+from foamfit.solve.run import (
+    DRAGGED,
+    KIND,
+    LARGEST,
+    NOW,
+    NUMBERS,
+    OVERDAMPED,
+    PARAMETERS,
+    PRESSED,
+    RECORD,
+    STEP,
+    VALUE,
+    X_AT,
+    unpack,
+)
+from foamfit.springs.compiled.contract import (
+    BY,
+    EPS,
+    EXPLICIT,
+    HIGH,
+    INTERNAL,
+    LOW,
+    OF_HELD,
+    OF_PARAMETER,
+    OF_STRESS,
+    OLD_EPS,
+    OLD_RATE,
+    OPTIONS,
+    RATE,
+    SLOPE,
+    SWITCH,
+    TOTAL,
+    TURNS,
+    X,
+    by_address,
+    call_switch,
+    inlined,
+    inner,
+    past,
+)  # fmt: skip
+from foamfit.springs.parameters import OWN_ETA
+
+ROUNDED = 1e-12  # strain past an end that rounding explains, of a spring that moves away from it
+RISEN = 1e-9  # base stress over the largest stress above which its return to zero ends the contact
+# Kinds of events: a branch ends at its upper or lower strain, a spring turns, contact ends. Then a
+# greatest and a least strain.
+TOP_END, LOW_END, TURN, RELEASE, TOP_TURN, LOW_TURN = range(6)
+PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
+_F, _I, _P, _IP = (
+    types.float64,
+    types.int64,
+    types.CPointer(types.float64),
+    types.CPointer(types.int64),
+)
+#: record, whether with derivatives, tolerance, time of the next sample, bound on steps
+STEPPING = _I(_IP, _I, _F, _F, _F)
+
+
+@intrinsic
+def _call_step(typing, where, c, want, tol, upto, most):  # type: ignore[no-untyped-def]
+    return _I(_I, RECORD, _I, _F, _F, _F), by_address
+
+
+@inlined
+def take_step(c, want, tol, upto, most):  # type: ignore[no-untyped-def]
+    """Take one step, explicit or implicit; return how it ended."""
+    return _call_step(c.step_at, c, want, tol, upto, most)
+
+
+@cfunc(types.void(_IP, _I, _I, _P), **OPTIONS, cache=True)
+def _change_branch(words, i, up, y):  # type: ignore[no-untyped-def]
+    c = unpack(words)
+    s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
+    out, kind, directions = past(s, c.results), n[KIND], c.directions
+    slope = out[SLOPE]
+    changes = past(out, BY + n[PARAMETERS])  # no derivatives of a BY_STRESS law
+    if kind == INTERNAL:
+        call_inside(c, JUMP, i, up, y, y, y, y)
+        return
+    call_switch(n[SWITCH], past(s, c.row), s, up, changes)
+    if kind == EXPLICIT:
+        return
+    if not c.solved and n[X_AT] >= 0:
+        y[n[X_AT]] = s[X]
+    held, change = past(c.held, 2 * i * p), OF_PARAMETER + n[PARAMETERS]
+    for j in range(p):
+        d_sigma = slope * c.strain[i * p + j] + c.part[i * p + j]
+        first, second, own = held[j], held[p + j], directions[2 * j + 1]
+        for h in range(2):
+            by = past(changes, h * change)
+            value = by[OF_STRESS] * d_sigma + by[OF_HELD] * first + by[OF_HELD + 1] * second
+            if directions[2 * j] == i and 0 <= own < OWN_ETA:
+                value += by[OF_PARAMETER + own]
+            held[h * p + j] = value
+
+
+CHANGE = _change_branch.address
+
+
+@intrinsic
+def _call_change(typing, where, c, i, up, y):  # type: ignore[no-untyped-def]
+    return types.void(_I, RECORD, _I, _I, _P), by_address
+
+
+@inlined
+def change_branch(c, i, up, y):  # type: ignore[no-untyped-def]
+    """Change the branch of a spring, and the derivatives of its held numbers."""
+    _call_change(c.change_at, c, i, up, y)
+
+
+# ---------------------------------------------------------------- along a step
+
+
+@inner
+def dense(c, n, x, out):  # type: ignore[no-untyped-def]
+    """Fill the state at the share x of the step."""
+    z, line, wide, y = 1.0 - x, c.line, c.wide, c.y
+    if c.degree:
+        for i in range(n):
+            value = 0.0
+            for q in range(c.degree - 1, -1, -1):
+                value = (value + line[q * wide + i]) * x
+            out[i] = y[i] + value
+        return
+    for i in range(n):
+        value = line[4 * wide + i] + z * (line[5 * wide + i] + x * line[6 * wide + i])
+        value = line[2 * wide + i] + z * (line[3 * wide + i] + x * value)
+        out[i] = y[i] + x * (line[i] + z * (line[wide + i] + x * value))
+
+
+@inner
+def _stress_of_momentum(c, x):  # type: ignore[no-untyped-def]
+    """Return the stress from the acceleration of the striker by an implicit step.
+
+    Where an overdamped contact ends, spring and dashpot carry opposite stresses whose sum has lost
+    its digits.
+    """
+    line, wide, rate = c.line, c.wide, 0.0
+    for q in range(c.degree - 1, -1, -1):
+        rate = rate * x + (q + 1) * line[q * wide + 1]
+    return c.drive[VALUE] - c.drive[DRAGGED] * c.state[1] - rate / c.now[STEP] / c.per_mass[0]
+
+
+@inner
+def look(c, x):  # type: ignore[no-untyped-def]
+    """Fill the values of all springs at the share x of the step."""
+    dense(c, c.base, x, c.state)
+    rates(c, c.state, c.f, c.none, c.now[NOW] + x * c.now[STEP])
+    if c.drive[OVERDAMPED] > 0.0 and c.groups == 1:
+        c.carried[0] = _stress_of_momentum(c, x)
+
+
+@inner
+def _excess(c, i, kind):  # type: ignore[no-untyped-def]
+    """Return how far a spring is past the end of its branch, or the contact past its own."""
+    s = past(c.springs, i * c.width)
+    if kind == RELEASE:
+        return -c.carried[0]
+    if kind >= TURN:
+        return -s[RATE] * (s[TURNS] if kind == TURN else 1.0 if kind == TOP_TURN else -1.0)
+    return s[EPS] - s[HIGH] if kind == TOP_END else s[LOW] - s[EPS]
+
+
+@inner
+def _happened(c, i, kind):  # type: ignore[no-untyped-def]
+    """Whether a spring is past an end or has turned, and not by rounding while it moves away."""
+    over, rate = _excess(c, i, kind), c.springs[i * c.width + RATE]
+    leaves = kind < TURN and over < ROUNDED and (rate < 0.0) == (kind == TOP_END)
+    return over > 0.0 and not leaves
+
+
+@inner
+def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
+    """Return where an excess becomes positive between two shares, by Illinois' method."""
+    look(c, low)
+    f_low = _excess(c, i, kind)
+    look(c, high)
+    f_high, side = _excess(c, i, kind), 0
+    if f_low >= 0.0:
+        return low
+    s, value, dt, middle = past(c.springs, i * c.width), f_high, c.now[STEP], high
+    for _ in range(60):
+        if kind < TURN:  # Newton's method
+            middle -= value / ((s[RATE] if kind == TOP_END else -s[RATE]) * dt)
+        if kind >= TURN or not low < middle < high:
+            middle = high - f_high * (high - low) / (f_high - f_low)
+        if high - low <= 4e-16 or not low < middle < high:
+            break
+        look(c, middle)
+        value = _excess(c, i, kind)
+        if kind < TURN and abs(value) < 1e-15:
+            return middle
+        if value >= 0.0:
+            f_low *= 0.5 if side == 1 else 1.0
+            high, f_high, side = middle, value, 1
+        else:
+            f_high *= 0.5 if side == -1 else 1.0
+            low, f_low, side = middle, value, -1
+    return low if middle <= low else high
+
+
+@inner
+def _earliest(c, before, share):  # type: ignore[no-untyped-def]
+    """Return the first of the events in (before, share] whose effect is seen at the end."""
+    found, who, what = share, -1 + c.none, -1 + c.none
+    look(c, found)
+    if c.now[PRESSED] > 0.0 and c.carried[0] <= 0.0:
+        found, who, what = (
+            _locate(c, before, found, c.none, RELEASE + c.none),
+            c.none,
+            RELEASE + c.none,
+        )
+        look(c, found)
+    for i in range(c.count):
+        for kind in range(RELEASE):
+            if _happened(c, i, kind):
+                there = _locate(c, before, found, i, kind)
+                if who < 0 or there < found:
+                    found, who, what = there, i, kind
+                look(c, found)
+    if who >= 0 and what != RELEASE and c.now[PRESSED] > 0.0:  # the contact ends as well
+        look(c, min(found + 1e-9, 1.0))
+        what = RELEASE + c.none if c.carried[0] <= 0.0 else what
+    return found, who, what
+
+
+@inner
+def first_event(c):  # type: ignore[no-untyped-def]
+    """Return share, spring and kind of the first event in a step; spring -1 if there is none.
+
+    A spring may go past the end of its branch and return within the step. So the strains are also
+    judged at their extrema.
+    """
+    nobody, before, pieces = -1 + c.none, 0.0, 1
+    look(c, 1.0)
+    for i in range(c.count):
+        if c.springs[i * c.width + OLD_RATE] * c.springs[i * c.width + RATE] <= 0.0:
+            pieces = 4
+    for piece in range(1, pieces + 1):
+        share = piece / pieces
+        found, who, what = _earliest(c, before, share)
+        if who >= 0:
+            return found, who, what
+        for i in range(c.count if pieces > 1 else 0):
+            s = past(c.springs, i * c.width)
+            look(c, share)
+            if s[OLD_RATE] * s[RATE] < 0.0:
+                turn = _locate(c, before, share, i, TOP_TURN if s[RATE] < 0.0 else LOW_TURN)
+                found, who, what = _earliest(c, before, turn)
+                if who >= 0:
+                    return found, who, what
+        look(c, share)
+        for i in range(c.count):
+            s = past(c.springs, i * c.width)
+            s[OLD_RATE] = s[RATE]
+        before = share
+    return 1.0, nobody, nobody
+
+
+@inner
+def suspicious(c, dt):  # type: ignore[no-untyped-def]
+    """Whether a step may contain an event, by the values at both ends."""
+    if c.now[PRESSED] > 0.0 and c.carried[0] <= 0.0:
+        return True
+    for i in range(c.count):
+        s = past(c.springs, i * c.width)
+        eps, old, low, high = s[EPS], s[OLD_EPS], s[LOW], s[HIGH]
+        if eps > high or eps < low or s[TURNS] * s[RATE] < 0.0:
+            return True
+        if s[OLD_RATE] * s[RATE] < 0.0:  # an extremum is at most this far away
+            most = 0.5 * dt * max(abs(s[OLD_RATE]), abs(s[RATE]))
+            if max(eps, old) + most > high or min(eps, old) - most < low:
+                return True
+    return False
+
+
+@inner
+def keep_values(c):  # type: ignore[no-untyped-def]
+    """Keep strains and rates of the beginning of a step, and the largest stress."""
+    largest = c.now[LARGEST]
+    for i in range(c.count):
+        s = past(c.springs, i * c.width)
+        s[OLD_EPS], s[OLD_RATE] = s[EPS], s[RATE]
+        largest = max(largest, abs(s[TOTAL]))
+    for g in range(c.groups):  # with dashpots
+        largest = max(largest, abs(c.carried[g]))
+    c.now[LARGEST] = largest

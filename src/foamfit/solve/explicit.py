@@ -1,0 +1,173 @@
+"""Explicit steps of a chain: the pair of Dormand and Prince of order 8(5,3) with dense output.
+
+Switches of branch and the end of contact are roots on the dense output, of order 7. Its stages are
+computed only in steps that contain a sample or, by a look at both ends, may contain a switch. The
+error norm leaves the derivatives by parameters out.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import cfunc
+from scipy.integrate._ivp import dop853_coefficients as pair
+
+from foamfit.solve.events import DOUBTFUL, FAILED, PLAIN, SAMPLED, STEPPING, suspicious
+from foamfit.solve.motion import rates
+from foamfit.solve.run import GROW, HORIZON, LAST, NOW, STEP, STEPPED, TAKEN, unpack
+from foamfit.springs.compiled.contract import OPTIONS, inner, past
+
+ALL_STAGES = 16  # those of a step and of the dense output
+_A = np.zeros((ALL_STAGES, ALL_STAGES))
+_A[:, : pair.A.shape[1]] = pair.A
+_A[STEPPED, :STEPPED] = pair.B
+# Coefficients without zeros: stage s is the sum of WEIGHT[k] K[FROM[k]] for FIRST[s] <= k <
+# FIRST[s+1]; after the stages come the four higher terms of the dense output, and the errors of
+# order 5 and 3.
+_FULL = np.zeros((22, ALL_STAGES))
+_FULL[:16], _FULL[16:20], _FULL[20, :13], _FULL[21, :13] = _A, pair.D, pair.E5, pair.E3
+_ROWS = [np.flatnonzero(row) for row in _FULL]
+NONE = np.array([-row.size % 4 for row in _ROWS])  # zeros at the end of a row
+_ROWS = [
+    np.append(row, [row[-1] if row.size else 0] * (-row.size % 4)).astype(int) for row in _ROWS
+]
+FIRST = np.cumsum([0] + [len(row) for row in _ROWS])
+FROM = np.concatenate(_ROWS)
+WEIGHT = np.concatenate(
+    [np.where(np.arange(row.size) < row.size - more, full[row], 0.0)
+     for full, row, more in zip(_FULL, _ROWS, NONE, strict=True)]
+)  # fmt: skip
+TIMES = pair.C[:ALL_STAGES]
+
+LAST_TERM = 1e-3  # share of the last term of the dense output that counts as its error
+
+
+@inner
+def combine(c, n, row, scale, begin, out):  # type: ignore[no-untyped-def]
+    """Fill out = begin + scale Σ WEIGHT[k] stage[FROM[k]] of a row of coefficients."""
+    first, last, stage, wide = FIRST[row], FIRST[row + 1], c.stage, c.wide
+    if n <= 8:
+        for i in range(0, n, 4):
+            one = two = three = four = 0.0
+            for k in range(first, last - NONE[row]):
+                weight, at = WEIGHT[k], FROM[k] * wide + i
+                one += weight * stage[at]
+                two += weight * stage[at + 1]
+                three += weight * stage[at + 2]
+                four += weight * stage[at + 3]
+            out[i] = begin[i] + scale * one
+            out[i + 1] = begin[i + 1] + scale * two
+            out[i + 2] = begin[i + 2] + scale * three
+            out[i + 3] = begin[i + 3] + scale * four
+        return
+    source = begin
+    for k in range(first, last, 4):  # loops that are vectorised; rows are filled up with zeros
+        one, two = scale * WEIGHT[k], scale * WEIGHT[k + 1]
+        three, four = scale * WEIGHT[k + 2], scale * WEIGHT[k + 3]
+        a, b = past(stage, FROM[k] * wide), past(stage, FROM[k + 1] * wide)
+        d, e = past(stage, FROM[k + 2] * wide), past(stage, FROM[k + 3] * wide)
+        for i in range(n):
+            out[i] = source[i] + (one * a[i] + two * b[i] + (three * d[i] + four * e[i]))
+        source = out
+
+
+@inner
+def take(c, n, dt, at, want):  # type: ignore[no-untyped-def]
+    """Fill the stages of a step from the first, and the state and rates at its end."""
+    for s in range(1, STEPPED + 1):
+        target = c.new if s == STEPPED else c.state
+        combine(c, n, s, dt, c.y, target)
+        rates(
+            c,
+            target,
+            past(c.stage, s * c.wide),
+            want,
+            at + TIMES[s] * dt if s < STEPPED else at + dt,
+        )
+
+
+@inner
+def error_of(c, dt, tol):  # type: ignore[no-untyped-def]
+    """Return the error of a step over the tolerance."""
+    y, new, kinds, scales, errors, wide = c.y, c.new, c.kinds, c.scales, c.errors, c.wide
+    for q in range(2):
+        combine(c, c.base, 20 + q, dt, c.nil, past(errors, q * wide))
+    five = three = 0.0
+    for i in range(c.base):
+        size = max(scales[kinds[i]], max(abs(y[i]), abs(new[i])))
+        if size > 0.0:
+            scale = 1.0 / (tol * size)
+            one, other = errors[i] * scale, errors[wide + i] * scale
+            five, three = five + one * one, three + other * other
+    if five == 0.0:
+        return 0.0
+    return five / math.sqrt(c.base * (five + 0.01 * three))
+
+
+@inner
+def make_dense(c, n, dt, at, tol, want):  # type: ignore[no-untyped-def]
+    """Fill the dense output of a step; return the size of its last term over the tolerance.
+
+    Where fast processes have died out, that exceeds the error at the end of the step by far.
+    """
+    wide, line, stage, y, new = c.wide, c.line, c.stage, c.y, c.new
+    for s in range(STEPPED + 1, ALL_STAGES):
+        combine(c, n, s, dt, y, c.state)
+        rates(c, c.state, past(stage, s * wide), want, at + TIMES[s] * dt)
+    for i in range(n):
+        rise, last = new[i] - y[i], stage[STEPPED * wide + i]
+        line[i], line[wide + i] = rise, dt * stage[i] - rise
+        line[2 * wide + i] = 2.0 * rise - dt * (last + stage[i])
+    for q in range(4):
+        combine(c, n, ALL_STAGES + q, dt, c.nil, past(line, (3 + q) * wide))
+    size, kinds, scales = 0.0, c.kinds, c.scales
+    for i in range(c.base):
+        most = max(scales[kinds[i]], abs(new[i]))
+        if most > 0.0:
+            size = max(size, abs(line[6 * wide + i]) / most)
+    return LAST_TERM / tol * size
+
+
+@cfunc(STEPPING, **OPTIONS, cache=True)
+def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
+    """Take one step, shorter ones until it is accurate; return how it ended.
+
+    `upto` is the time of the next sample inside the piece. A step that may contain a switch or
+    contains a sample has its dense output.
+    """
+    c = unpack(words)
+    r, again, n = c.now, False, c.base + c.carries * c.p
+    while True:
+        dt, at = r[STEP], r[NOW]
+        if r[NOW] + dt == r[NOW] or not dt > 0.0:
+            return FAILED
+        take(c, n, dt, at, want)
+        r[TAKEN] += 1.0
+        error = error_of(c, dt, tol)
+        if not error <= 1.0:
+            again = True
+            r[STEP] = dt * (max(0.2, 0.9 * error**-0.125) if error < math.inf else 0.2)
+            if r[TAKEN] >= most:
+                return FAILED
+            continue
+        grow = 6.0
+        if error > 1e-8:
+            grow = min(6.0, max(0.3, 0.9 * error**-0.115 * r[LAST] ** 0.02))
+        r[GROW] = min(grow, 1.0) if again else grow
+        doubtful = suspicious(c, dt)
+        if not doubtful and upto > r[NOW] + dt:
+            r[LAST] = max(error, 1e-4)
+            return PLAIN
+        size = make_dense(c, n, dt, at, tol, want)
+        if size > 1.0 and dt > 1e-12 * abs(r[HORIZON]):
+            again = True
+            r[STEP] = dt * max(0.3, 0.9 * size**-0.143)
+            continue
+        r[LAST] = max(error, 1e-4)
+        if size > 0.0:
+            r[GROW] = min(r[GROW], 0.9 * size**-0.143)
+        return DOUBTFUL if doubtful else SAMPLED
+
+
+EXPLICIT_STEP = _step.address

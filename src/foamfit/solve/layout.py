@@ -1,0 +1,225 @@
+"""Where everything of a run lies in memory, once for each kind of scene."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.solve.run import (
+    BATCH,
+    DRIVES,
+    EPS_AT,
+    FIXED,
+    FLOATS,
+    GIVEN,
+    INTERNALS,
+    KIND,
+    LINE,
+    NUMBERS,
+    OF_SIGMA,
+    RUN,
+    SCALES,
+    STAGES,
+    SYSTEMS,
+    WORDS,
+    X_AT,
+    Z_AT,
+)
+from foamfit.solve.scene import FREE, STRESS, VISCOUS
+from foamfit.springs.compiled import compiled
+from foamfit.springs.compiled.contract import (
+    BY,
+    BY_STRESS,
+    INTERNAL,
+    MOST_TERMS,
+    RESULTS,
+    results_of,
+)
+from foamfit.springs.laws.record import Law
+from foamfit.springs.parameters import OWN_ETA
+
+
+class Layout(NamedTuple):
+    """Where everything of a run lies."""
+
+    words: NDArray[np.int64]  #: integers of a run, with places instead of addresses
+    floats: int  #: number of floats
+
+
+class Shape(NamedTuple):
+    """What decides the layout of a run."""
+
+    laws: tuple[Law, ...]
+    terms: int  #: of relaxation
+    ends: tuple[int, ...]  #: one past the last spring of each group
+    top: int
+    damped: bytes  #: whether each spring has a dashpot, booleans
+    directions: bytes  #: of the derivatives, integers (p, 2)
+    struck: bool  #: whether the drive is an impact
+    degree: int  #: of implicit steps; 0 for explicit ones
+    solved: bool  #: whether the rest of the state is computed, or nothing is integrated
+
+
+def _groups(shape: Shape) -> list[range]:
+    """Return the springs of each group."""
+    return [range(i, j) for i, j in pairwise((0, *shape.ends))]
+
+
+def place_state(shape: Shape, numbers: NDArray[np.int64], nodes: int) -> tuple[list[int], int]:
+    """Give every component its place; return the kinds, and how many have derivatives."""
+    damped = np.frombuffer(shape.damped, bool)
+    more, count = SCALES + len(shape.laws) + 2 * nodes, len(shape.laws)
+    kinds = list(range(more - 2 * nodes, more))
+    several = [False] * count
+    for g, springs in enumerate(_groups(shape)):
+        alone = len(springs) == 1 and not (
+            g == len(shape.ends) - 1 and shape.top in (STRESS, VISCOUS)
+        )
+        for i in springs:
+            several[i] = not alone
+    for i, own in enumerate(numbers):
+        own[EPS_AT] = own[X_AT] = -1
+        own[FIXED] = several[i] and not damped[i]
+        if several[i] and damped[i]:
+            own[EPS_AT] = len(kinds)
+            kinds.append(SCALES + i)
+        own[Z_AT] = len(kinds)
+        kinds += [OF_SIGMA] * shape.terms
+        if own[KIND] == INTERNAL:
+            own[X_AT], inside = len(kinds), int(own[INTERNALS])
+            kinds += range(more, more + inside)
+            more += inside
+    carries = len(kinds)
+    for i, own in enumerate(numbers):
+        if not shape.solved and several[i] and own[EPS_AT] < 0:
+            own[EPS_AT] = len(kinds)
+            kinds.append(SCALES + i)
+        if not shape.solved and own[KIND] == BY_STRESS:
+            own[X_AT] = len(kinds)
+            kinds.append(OF_SIGMA)
+    return kinds, carries
+
+
+def order(shape: Shape, numbers: NDArray[np.int64], nodes: int) -> tuple[list[int], list[int], int]:
+    """Order the components by groups: return place and group of each, and the reach.
+
+    Components couple with those of the neighbouring groups: at places closer than the reach.
+    """
+    damped = np.frombuffer(shape.damped, bool)
+    found: list[tuple[int, int]] = []  # component and group, in order
+    sizes = [0]
+    for g, springs in enumerate(_groups(shape)):
+        one = [2 * g, 2 * g + 1] if g < nodes else []
+        for i in springs:
+            own = numbers[i]
+            if own[EPS_AT] >= 0 and damped[i]:
+                one.append(int(own[EPS_AT]))
+            one += range(int(own[Z_AT]), int(own[Z_AT]) + shape.terms)
+            if own[KIND] == INTERNAL:
+                one += range(int(own[X_AT]), int(own[X_AT] + own[INTERNALS]))
+        found += [(k, g) for k in one]
+        sizes.append(len(one))
+    places, groups = [0] * len(found), [0] * len(found)
+    for place, (k, g) in enumerate(found):
+        places[k], groups[k] = place, g
+    return places, groups, max(a + b for a, b in pairwise(sizes)) - 1
+
+
+def _owned(count: int, directions: list[list[int]]) -> list[int]:
+    """Return where the directions of each spring by its own parameters begin, and these."""
+    first: list[int] = []
+    listed: list[int] = []
+    for i in range(count):
+        first.append(count + 1 + len(listed))
+        listed += [j for j, (k, own) in enumerate(directions) if k == i and 0 <= own < OWN_ETA]
+    return [*first, count + 1 + len(listed), *listed]
+
+
+def _functions(shape: Shape, integrated: bool, several: bool, internal: bool) -> tuple[int, ...]:
+    """Return the addresses of the functions that a run needs, 0 for others (see run.ADDRESSES).
+
+    A function is compiled when its module is first imported.
+    """
+    from foamfit.solve import events, motion
+
+    group = inside = step = drive = write = 0
+    if several:
+        from foamfit.solve import groups
+
+        group = groups.GROUP_AT
+    if internal:
+        from foamfit.solve import internal as inner
+
+        inside = inner.INSIDE_AT
+    if integrated:
+        from foamfit.solve import samples
+
+        write = samples.WRITE
+        if shape.degree:
+            from foamfit.solve import implicit
+
+            step = implicit.IMPLICIT_STEP
+        else:
+            from foamfit.solve import explicit
+
+            step = explicit.EXPLICIT_STEP
+    if integrated and not shape.struck:
+        from foamfit.solve import drive as driven
+
+        drive = driven.DRIVE
+    return motion.RATES, group, inside, events.CHANGE, step, drive, write
+
+
+@lru_cache(maxsize=1024)
+def lay_out(shape: Shape, integrated: bool = True) -> Layout:
+    """Lay out a run; `integrated` is whether it takes steps in time."""
+    made = [compiled(law) for law in shape.laws]
+    directions = np.frombuffer(shape.directions, np.int64).reshape(-1, 2).tolist()
+    count, groups, p = len(made), len(shape.ends), len(directions)
+    nodes = groups if shape.top in (FREE, VISCOUS) else groups - 1
+    numbers = np.zeros((count, NUMBERS), np.int64)
+    for own, one in zip(numbers, made, strict=True):
+        own[: KIND + 3] = *one.addresses, one.kind, one.derivatives, one.internal
+    kinds, carries = place_state(shape, numbers, nodes)
+    base, internals = len(kinds), sum(one.internal for one in made)
+    n = base + carries * p
+    wide, results = -4 * (-n // 4), max(results_of(one.derivatives, one.internal) for one in made)
+    row = RESULTS + results
+    width = row + max(one.columns for one in made)
+    places, groups_of, reach = order(shape, numbers, nodes) if shape.degree else ([], [], 0)
+    size = carries if shape.degree else 0
+    parameters = max(one.derivatives for one in made)
+    internal = any(one.kind == INTERNAL for one in made)
+    lengths = {
+        "springs": count * width, "per_mass": groups, "drive": DRIVES, "carried": groups,
+        "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
+        "common": (groups + 3) * p, "strain": count * p,
+        "scales": SCALES + count + 2 * nodes + internals,
+        "now": RUN, "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide, "new": wide,
+        "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
+        "batch": BATCH * (6 + BY + parameters) + 3 * p + MOST_TERMS * (9 + p),
+        "aside": count * (1 + shape.terms) + groups + 1 if internal else 0,
+        "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
+        "largest": p if size else 0, "kept": count * width + groups if size and p else 0,
+        "systems": 2 * SYSTEMS * size * (3 * reach + 1),
+        "right": 2 * SYSTEMS * size,
+    }  # fmt: skip
+    arrays = (
+        numbers.ravel().tolist(), list(shape.ends), [k for pair in directions for k in pair],
+        _owned(count, directions), kinds, [0] * (SYSTEMS * size), places, groups_of,
+    )  # fmt: skip
+    at = np.cumsum([0, *(lengths[name] for name in FLOATS)])
+    whole = np.cumsum([WORDS, *map(len, arrays)])
+    several = any(len(springs) > 1 for springs in _groups(shape))
+    several = several or shape.top in (STRESS, VISCOUS)
+    words = [
+        *at[:-1], *whole[:-1], *([0] * len(GIVEN)),
+        *_functions(shape, integrated, several, internal),
+        RESULTS, row, width, count, groups, nodes, p, base, carries, shape.terms, shape.top,
+        int(shape.solved), wide, shape.degree, reach, 0, 0, 0, 0,
+    ]  # fmt: skip
+    return Layout(np.array([*words, *(k for one in arrays for k in one)], np.int64), int(at[-1]))

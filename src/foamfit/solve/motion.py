@@ -1,0 +1,339 @@
+"""The equations of motion of a chain: rates of its state, and of the derivatives of the state.
+
+Springs without mass between them form a group, which carries one stress. Of one spring between two
+nodes the strain follows from the nodes; `groups` has the other cases. A mass m accelerates by the
+difference of the stresses S of the groups above and below it, A (S₊ - S₋)/m (eqs. 6-7).
+"""
+
+from __future__ import annotations
+
+from numba import cfunc, types
+from numba.extending import intrinsic
+
+from foamfit.solve.run import (
+    DRAGGED,
+    FIXED,
+    INTERNALS,
+    KIND,
+    NUMBERS,
+    PACE,
+    PARAMETERS,
+    RECORD,
+    TOP_SPEED,
+    VALUE,
+    VALUE_RATE,
+    X_AT,
+    Z_AT,
+    unpack,
+)
+from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
+from foamfit.springs.compiled.contract import (
+    BY,
+    BY_HELD,
+    BY_STRESS,
+    DRIFT,
+    EPS,
+    ETA,
+    EVALUATE,
+    EXPLICIT,
+    GAIN,
+    INTERNAL,
+    OF_LAW,
+    OPTIONS,
+    PER_HEIGHT,
+    RATE,
+    RELAX,
+    SETTLE,
+    SLOPE,
+    STEEP,
+    TANGENT,
+    TOTAL,
+    X,
+    by_address,
+    call_evaluate,
+    call_number,
+    inlined,
+    inner,
+    past,
+)  # fmt: skip
+from foamfit.springs.parameters import OWN_RELAXATION
+
+_F, _I, _P, _IP = (
+    types.float64,
+    types.int64,
+    types.CPointer(types.float64),
+    types.CPointer(types.int64),
+)
+#: record, group, state, rates, whether with derivatives, time since the piece began; returns S
+GROUP = _F(_IP, _I, _P, _P, _I, _F)
+#: record, task (below), spring or group, up or whether with derivatives, state, rates, derivatives
+#: of the strain rate, results
+INSIDE = types.void(_IP, _I, _I, _I, _P, _P, _P, _P)
+PART, FLOW, FRICTION, JUMP, PATH, LOSE, SHARE, LOSSES, BEGIN_RAMP, END_RAMP = range(10)
+ONLY_DERIVATIVES = 2  # instead of 0 or 1 for `want`, where the values are known
+
+
+@intrinsic
+def _call_group(typing, where, c, g, y, f, want, at):  # type: ignore[no-untyped-def]
+    return _F(_I, RECORD, _I, _P, _P, _I, _F), by_address
+
+
+@intrinsic
+def _call_inside(typing, where, c, task, i, up, y, f, quicker, out):  # type: ignore[no-untyped-def]
+    return types.void(_I, RECORD, _I, _I, _I, _P, _P, _P, _P), by_address
+
+
+@inlined
+def call_inside(c, task, i, up, y, f, quicker, out):  # type: ignore[no-untyped-def]
+    """Do a task of `internal` for a spring of an INTERNAL law."""
+    _call_inside(c.inside_at, c, task, i, up, y, f, quicker, out)
+
+
+# ---------------------------------------------------------------- springs
+
+
+@inner
+def evaluate(c, i, want):  # type: ignore[no-untyped-def]
+    """Fill the results of the law of a spring at its strain and internal variables."""
+    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+    row, out = past(s, c.row), past(s, c.results)
+    call_evaluate(n[EVALUATE], row, s, past(s, EPS), past(s, X), 1, want, out)
+
+
+@inner
+def follow_spring(c, i, eps, y, f, want):  # type: ignore[no-untyped-def]
+    """Fill the values of a spring at a strain, and the rates of its relaxation terms; return T."""
+    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+    kind, out = n[KIND], past(s, c.results)
+    if kind == BY_STRESS and c.solved:
+        call_number(n[SETTLE], past(s, c.row), s, eps)
+    elif kind != EXPLICIT:
+        for k in range(n[INTERNALS]):
+            s[X + k] = y[n[X_AT] + k]
+    s[EPS] = eps
+    evaluate(c, i, want if kind != INTERNAL or want else 2 * n[FIXED])
+    sigma, tangent, drift = out[OF_LAW], out[SLOPE], 0.0
+    if kind == INTERNAL and n[FIXED]:
+        call_inside(c, PATH, i, c.none, y, f, y, y)
+        tangent, drift = s[TANGENT], s[DRIFT]
+    stress = s[GAIN] * sigma
+    for k in range(c.terms):
+        z, at = y[n[Z_AT] + k], RELAX + 2 * k
+        dz = -(z + sigma) / s[at + 1]
+        f[n[Z_AT] + k] = dz
+        stress += s[at] * z
+        drift += s[at] * dz
+    s[TOTAL], s[DRIFT], s[TANGENT] = stress, drift, tangent
+    return stress
+
+
+@inner
+def move_inside(c, i, f):  # type: ignore[no-untyped-def]
+    """Fill the rates of the internal variables of a spring."""
+    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+    if n[KIND] == BY_STRESS and not c.solved:
+        f[n[X_AT]] = s[c.results + SLOPE] * s[RATE]
+    elif n[KIND] == INTERNAL:
+        x, values = n[INTERNALS], past(s, c.results + BY + n[PARAMETERS])
+        for k in range(x):
+            f[n[X_AT] + k] = values[2 + k] * s[RATE] + c.drive[PACE] * values[2 + x + k]
+
+
+@inner
+def derive_spring(c, i, y):  # type: ignore[no-untyped-def]
+    """Fill the derivatives of the stress of a spring at fixed strain, and of T at fixed strain."""
+    s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
+    part, total = past(c.part, i * p), past(c.part, (c.count + i) * p)
+    out, owned, directions = past(s, c.results), c.owned, c.directions
+    s[STEEP] = s[TANGENT] if n[FIXED] else out[SLOPE]
+    for j in range(p):
+        part[j] = 0.0
+    if n[KIND] == BY_STRESS:
+        a, b, held = out[BY_HELD], out[BY_HELD + 1], past(c.held, 2 * i * p)
+        for j in range(p):
+            part[j] = a * held[j] + b * held[p + j]
+    elif n[KIND] == INTERNAL:
+        call_inside(c, PART, i, c.none, y, y, y, part)
+    for k in range(owned[i], owned[i + 1]):
+        part[owned[k]] += out[BY + directions[2 * owned[k] + 1]]
+    gain = s[GAIN]
+    for j in range(p):
+        total[j] = gain * part[j]
+    for k in range(c.terms):
+        g, dz, of_g = s[RELAX + 2 * k], past(y, c.base + (n[Z_AT] + k) * p), OWN_RELAXATION + 2 * k
+        for j in range(p):
+            total[j] += g * dz[j]
+            if directions[2 * j] == i and directions[2 * j + 1] == of_g:
+                total[j] += out[OF_LAW] + y[n[Z_AT] + k]
+
+
+@inner
+def derive_inside(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
+    """Fill the rates of the derivatives of relaxation terms and of internal variables.
+
+    `quicker` are the derivatives of the strain rate, for INTERNAL laws; not read if unknown.
+    """
+    s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
+    part, strain, out = past(c.part, i * p), past(c.strain, i * p), past(s, c.results)
+    directions, slope = c.directions, s[STEEP]
+    for k in range(c.terms):
+        at, per = c.base + (n[Z_AT] + k) * p, 1.0 / s[RELAX + 2 * k + 1]
+        more, of_tau = (y[n[Z_AT] + k] + out[OF_LAW]) * per * per, OWN_RELAXATION + 2 * k + 1
+        for j in range(p):
+            f[at + j] = -per * (y[at + j] + slope * strain[j] + part[j])
+            if directions[2 * j] == i and directions[2 * j + 1] == of_tau:
+                f[at + j] += more
+    if n[KIND] == INTERNAL:
+        call_inside(c, FLOW, i, c.none, y, f, quicker, f)
+
+
+# ---------------------------------------------------------------- one spring between two nodes
+
+
+@inner
+def span_of(c, g, y, at):  # type: ignore[no-untyped-def]
+    """Return elongation and its rate of a group, as far as its nodes tell."""
+    last = g == c.groups - 1
+    if last and c.top == MOTION:
+        reach, rate = c.drive[VALUE] + c.drive[VALUE_RATE] * at, c.drive[VALUE_RATE]
+    elif last and c.top == STRESS:
+        reach = rate = 0.0
+    else:
+        reach, rate = y[2 * g], y[2 * g + 1]
+        if last and c.top == VISCOUS:
+            rate = 0.0
+    if g > 0:
+        reach, rate = reach - y[2 * g - 2], rate - y[2 * g - 1]
+    return reach, rate
+
+
+@inner
+def is_alone(c, g):  # type: ignore[no-untyped-def]
+    """Whether the strain of a group follows from its nodes: one spring, and no massless top."""
+    first = c.ends[g - 1] if g > 0 else 0
+    return c.ends[g] - first == 1 and (g < c.groups - 1 or c.top == FREE or c.top == MOTION)
+
+
+@inner
+def span_tangents(c, g, y, reach, rate):  # type: ignore[no-untyped-def]
+    """Fill the derivatives of elongation and rate of a group, as far as its nodes tell."""
+    p, last = c.p, g == c.groups - 1
+    for j in range(p):
+        reach[j] = rate[j] = 0.0
+    if not last or c.top == FREE or c.top == VISCOUS:
+        dw = past(y, c.base + 2 * g * p)
+        for j in range(p):
+            reach[j] = dw[j]
+        if not last or c.top == FREE:
+            for j in range(p):
+                rate[j] = dw[p + j]
+    if g > 0:
+        dw = past(y, c.base + 2 * (g - 1) * p)
+        for j in range(p):
+            reach[j] -= dw[j]
+            rate[j] -= dw[p + j]
+
+
+@inner
+def _follow_one(c, g, i, y, f, want, at):  # type: ignore[no-untyped-def]
+    """Fill the values of a spring between two nodes, and their part of the rates; return S."""
+    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+    reach, rate = span_of(c, g, y, at)
+    s[RATE] = rate = rate * s[PER_HEIGHT]
+    common = follow_spring(c, i, reach * s[PER_HEIGHT], y, f, want) + s[ETA] * rate
+    move_inside(c, i, f)
+    if n[KIND] == INTERNAL:
+        common += c.drive[PACE] * s[c.results + BY + n[PARAMETERS] + 1]
+    c.carried[g] = common
+    return common
+
+
+@inner
+def _derive_one(c, g, i, y, f):  # type: ignore[no-untyped-def]
+    """Fill the derivatives of the stress of a spring between two nodes, and of its rates."""
+    p = c.p
+    out = past(c.common, g * p)
+    reach, rate = past(c.common, (c.groups + 1) * p), past(c.common, (c.groups + 2) * p)
+    span_tangents(c, g, y, reach, rate)
+    derive_spring(c, i, y)
+    s, own, strain = past(c.springs, i * c.width), past(c.own, 2 * i * p), past(c.strain, i * p)
+    per, eta, total = s[PER_HEIGHT], s[ETA], past(c.part, (c.count + i) * p)
+    slope, eps, faster = s[c.results + SLOPE] * s[GAIN], s[EPS], s[RATE]
+    for j in range(p):
+        strain[j] = (reach[j] - eps * own[j]) * per
+        rate[j] = (rate[j] - faster * own[j]) * per
+        out[j] = slope * strain[j] + total[j] + own[p + j] * faster + eta * rate[j]
+    derive_inside(c, i, y, f, rate)
+    if c.numbers[i * NUMBERS + KIND] == INTERNAL:
+        call_inside(c, FRICTION, i, c.none, y, f, rate, out)
+
+
+# ---------------------------------------------------------------- the chain
+
+
+@inner
+def _accelerate(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
+    """Fill the rates of a node, and of their derivatives."""
+    p, last = c.p, g == c.groups - 1
+    v, per, drag = y[2 * g + 1], c.per_mass[g], 0.0
+    if last:
+        drag = c.drive[DRAGGED]
+        force = c.drive[VALUE] + c.drive[VALUE_RATE] * at - c.carried[g] - drag * v
+    else:
+        force = c.carried[g + 1] - c.carried[g]
+    f[2 * g], f[2 * g + 1] = v, force * per
+    if not want:
+        return
+    dv, df = past(y, c.base + (2 * g + 1) * p), past(f, c.base + 2 * g * p)
+    here, above = past(c.common, g * p), past(c.common, (g + 1) * p)  # zeros above the last
+    for j in range(p):
+        df[j] = dv[j]
+        df[p + j] = (above[j] - here[j] - drag * dv[j]) * per
+    if last:
+        of_drag = past(c.own, 2 * c.count * p)
+        for j in range(p):
+            df[p + j] -= of_drag[j] * v * per
+
+
+@cfunc(types.void(_IP, _P, _P, _I, _F, _I), **OPTIONS, cache=True)
+def _rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
+    """Fill the rates f of a state y, or only the values of one group."""
+    c = unpack(words)
+    for g in range(c.groups):
+        if only >= 0 and g != only:
+            continue
+        if is_alone(c, g):
+            i = c.ends[g] - 1
+            if want != ONLY_DERIVATIVES:
+                _follow_one(c, g, i, y, f, want, at)
+            if want:
+                _derive_one(c, g, i, y, f)
+        else:
+            _call_group(c.group_at, c, g, y, f, want, at)
+    if only >= 0:
+        return
+    for g in range(c.nodes):
+        if g == c.groups - 1 and c.top == VISCOUS:
+            f[2 * g], f[2 * g + 1] = c.drive[TOP_SPEED], 0.0
+        else:
+            _accelerate(c, g, y, f, want, at)
+
+
+RATES = _rates.address
+
+
+@intrinsic
+def _call_rates(typing, where, c, y, f, want, at, only):  # type: ignore[no-untyped-def]
+    return types.void(_I, RECORD, _P, _P, _I, _F, _I), by_address
+
+
+@inlined
+def rates(c, y, f, want, at):  # type: ignore[no-untyped-def]
+    """Fill the rates f of a state y (with derivatives if `want`), `at` a time since the piece."""
+    _call_rates(c.rates_at, c, y, f, want, at, -1)
+
+
+@inlined
+def rates_of(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
+    """Fill the values of one group, as `rates` does."""
+    _call_rates(c.rates_at, c, y, f, want, at, g)

@@ -1,0 +1,201 @@
+"""A run in memory: the one record that all compiled functions of the solver take.
+
+`layout.lay_out` gives every array of a run its place, once per kind of scene. The record is a row
+of integers: addresses of arrays and functions, then sizes. Compiled functions read it by name:
+`c.springs` is a pointer, `c.count` a number.
+
+The state is one array. First come displacement w and velocity v of each node that has a state, then
+of each spring its strain if it has a dashpot and other springs lie between the same nodes, its
+relaxation terms z_k = q_k/g_k - σ with dz_k/dt = -(z_k + σ)/τ_k, and the internal variables of an
+INTERNAL law. The derivatives by parameter of all these follow. The rest of the state follows from
+them on a branch, but explicit steps integrate it as well, which costs less than to solve for it:
+strains of springs without a dashpot, and the stress of BY_STRESS laws. Its derivatives are
+computed.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import infer_getattr, intrinsic, lower_getattr_generic, models, register_model
+
+from foamfit.springs.compiled.contract import (
+    BEGIN,
+    ETA,
+    GAIN,
+    HEIGHT,
+    LOSS,
+    PER_HEIGHT,
+    RELAX,
+    address,
+    call_begin,
+    inner,
+    past,
+    start,
+)
+from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
+
+# Arrays of floats: blocks of `width` numbers of the springs (see `compiled.contract`); area over
+# mass of the nodes; the drive now; stress of each group; derivatives of height and eta of each
+# spring and of drag; of the held numbers of each spring; of the stress of each spring at fixed
+# strain, then of its T at fixed strain; of the stress of each group, then zeros and two rows to
+# work with; of the strains; scales of the kinds of components; numbers that change during a run;
+# whether derivatives from above and below differ; rates at the stages of a step; its dense output;
+# the state, that at the end of a step, and one between with its rates; zeros; errors; samples that
+# are computed together; what is set aside during a ramp, see `internal`. Those of implicit
+# steps: Jacobian, n rows of 2 reach + 1; vibrations, see `implicit.remember`, and the largest
+# motion and stress at a sample; values of the derivatives over the scales; a copy of `springs` and
+# `carried`; factored systems, complex, SYSTEMS of n rows of 3 reach + 1, and their right sides.
+FLOATS = (
+    "springs", "per_mass", "drive", "carried", "own", "held", "part", "common", "strain", "scales",
+    "now", "sided", "stage", "line", "y", "new", "state", "f", "nil", "errors", "batch", "aside",
+    "jacobian", "alive", "worst", "largest", "kept", "systems", "right",
+)  # fmt: skip
+# Arrays of integers: rows of NUMBERS of the springs; one past the last spring of each group;
+# directions of the derivatives, (p, 2); where the directions of each spring begin and end, and
+# these directions; kinds of the components. Those of implicit steps: pivots, SYSTEMS of n; places
+# of the components in the systems, and their groups.
+INTEGERS = ("numbers", "ends", "directions", "owned", "kinds", "pivots", "places", "groups_of")
+GIVEN = ("time", "values", "out", "log")  # arrays of the caller
+ADDRESSES = ("rates_at", "group_at", "inside_at", "change_at", "step_at", "drive_at", "write_at")
+# Place of the results of a law in a block, and of its row; width of a block; springs; groups; nodes
+# with a state; derivatives; components of the state before the derivatives, if all are integrated,
+# and those that have derivatives; relaxation terms; top, see `solve.scene`; whether the rest of the
+# state is computed, not integrated; width of a row of stages; degree of the dense output if it is
+# the polynomial of an implicit step, else 0; see `order`; samples; rows of `out`; rows of `log`;
+# and 0, as a literal is of another type, for which functions would be compiled again.
+SIZES = (
+    "results", "row", "width", "count", "groups", "nodes", "p", "base", "carries", "terms", "top",
+    "solved", "wide", "degree", "reach", "samples", "shown", "room", "none",
+)  # fmt: skip
+FIELDS = (*FLOATS, *INTEGERS, *GIVEN, *ADDRESSES, *SIZES)
+AT = {name: place for place, name in enumerate(FIELDS)}
+WORDS = len(FIELDS)
+_F, _I, _P = types.float64, types.int64, types.CPointer(types.float64)
+_IP = types.CPointer(types.int64)
+TIME, VALUES, OUT, LOG = (AT[name] for name in GIVEN)
+SAMPLES, SHOWN, ROOM = AT["samples"], AT["shown"], AT["room"]
+_FLOATS_END, _INTEGERS_END = len(FLOATS), len(FLOATS) + len(INTEGERS)
+
+# Integers of a spring: the addresses of its law, kind, number of parameters and of internal
+# variables; the places of strain, internal variables and relaxation terms in the state (-1: none);
+# and whether the derivatives of its internal variables are those at a fixed strain, see `internal`.
+KIND, PARAMETERS, INTERNALS, EPS_AT, X_AT, Z_AT, FIXED, NUMBERS = 5, 6, 7, 8, 9, 10, 11, 12
+# Kinds of components of the state, which share a scale: displacement, velocity, strain, stress.
+# Then follow the strain of each spring, displacement and velocity of each node, and each internal
+# variable, which have scales of their own.
+OF_W, OF_V, OF_EPS, OF_SIGMA, SCALES = range(5)
+# The drive now: stress or displacement at the start of the piece and its rate; velocity of a
+# viscous top; 1 if a stress acts on a flat branch; onsite damping of the top, Pa s/m; 0 if time
+# stands still for the laws, else 1; acceleration of the striker by gravity; 1 if dashpots stop a
+# striker long before the springs, see `rates.is_overdamped`; base stress at the start of an
+# implicit step; stress on the top, and rate of the elongation of the group whose stress `internal`
+# solves for.
+VALUE, VALUE_RATE, TOP_SPEED, FLAT, DRAGGED, PACE, GRAVITY, OVERDAMPED, BEGINNING = range(9)
+PUSH, SPREAD, DRIVES = range(9, 12)
+# Numbers that change during a run: time since the piece began, time at which it begins, step,
+# length of the piece, steps, growth of the next step, largest stress, whether the base stress has
+# risen, last error, next sample, number of the piece, switches; of implicit steps: length of the
+# one before, least length that the error can enforce, length of a short step, short steps in a row,
+# size of all vibrations that were damped out, and of those in the last steps.
+NOW, BEGUN, STEP, HORIZON, TAKEN, GROW, LARGEST, PRESSED, LAST, SAMPLE, PIECE, LOGGED = range(12)
+BEFORE, FLOOR, BRIEF, IN_ROW, DAMPED, DAMPING, RUN = range(12, 19)
+BATCH = 64  # samples that are computed together
+# Rows of the stages; the row with the rates at the end of a step; rows of the dense output.
+STAGES, STEPPED, LINE = 16, 12, 7
+POINTS, SYSTEMS = 5, 3  # of an implicit step; linear systems, one for a pair of eigenvalues
+
+
+class Run(types.Type):  # type: ignore[misc]
+    """The type of the record in compiled functions."""
+
+    def __init__(self) -> None:
+        """Give the type its name."""
+        super().__init__("foamfit.Run")
+
+
+RECORD = Run()
+register_model(Run)(models.OpaqueModel)
+
+
+def _type_of(name: str) -> Any:
+    """Return the type of a field of the record."""
+    if name in FLOATS or name in GIVEN:
+        return types.CPointer(types.complex128) if name in ("systems", "right") else _P
+    return _IP if name in INTEGERS or name == "words" else _I
+
+
+@infer_getattr
+class _Fields(AttributeTemplate):  # type: ignore[misc]
+    """Types of the fields of a record; `words` is the record itself."""
+
+    key = Run
+
+    def generic_resolve(self, run: Any, name: str) -> Any:
+        """Return the type of a field, None if there is none."""
+        return _type_of(name) if name in AT or name == "words" else None
+
+
+@lower_getattr_generic(Run)
+def _field(context, builder, typ, value, name):  # type: ignore[no-untyped-def]
+    """Load a field."""
+    if name == "words":
+        return builder.bitcast(value, ir.IntType(64).as_pointer())
+    kind = context.get_value_type(_type_of(name))
+    first = builder.bitcast(value, kind.as_pointer())
+    return builder.load(builder.gep(first, [ir.Constant(ir.IntType(64), AT[name])]))
+
+
+@intrinsic
+def unpack(typing, words):  # type: ignore[no-untyped-def]
+    """Return the record at an address."""
+
+    def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.bitcast(args[0], context.get_value_type(RECORD))
+
+    return RECORD(_IP), emit
+
+
+@inner
+def begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals):  # type: ignore[no-untyped-def]
+    """Fill the record of a run, set all springs at rest, and return the record.
+
+    `floats` are zeros. reals[0] is the onsite damping, reals[1] the pace of time.
+    """
+    words = start(ints)
+    for k in range(template.size):
+        words[k] = template[k]
+    for k in range(_INTEGERS_END):
+        first = address(start(floats)) if k < _FLOATS_END else address(words)
+        words[k] = first + 8 * template[k]
+    words[TIME], words[VALUES] = address(start(time)), address(start(values))
+    words[OUT], words[LOG] = address(start(out)), address(start(log))
+    words[SAMPLES], words[SHOWN], words[ROOM] = time.size, out.shape[1], log.shape[0]
+    c = unpack(words)
+    terms, own = c.terms, rows.shape[1] - (c.width - c.row)  # first column of the laws
+    for i in range(c.count):
+        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+        s[HEIGHT], s[PER_HEIGHT], s[ETA], s[GAIN] = heights[i], 1.0 / heights[i], rows[i, 0], 1.0
+        s[LOSS] = s[ETA]
+        for k in range(terms):
+            s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = rows[i, 1 + 2 * k], rows[i, 2 + 2 * k]
+            s[GAIN] += rows[i, 1 + 2 * k]
+        row = past(s, c.row)
+        for k in range(own, rows.shape[1]):
+            row[k - own] = rows[i, k]
+        call_begin(n[BEGIN], row, s)
+    for g in range(c.groups):
+        c.per_mass[g] = 1.0 / mass[g]
+    c.drive[DRAGGED], c.drive[PACE] = reals[0], reals[1]
+    for j in range(c.p):
+        i, what = c.directions[2 * j], c.directions[2 * j + 1]
+        if what == OWN_HEIGHT:
+            c.own[2 * i * c.p + j] = 1.0
+        elif what == OWN_ETA:
+            c.own[(2 * i + 1) * c.p + j] = 1.0
+        elif what == DRAG:
+            c.own[2 * c.count * c.p + j] = 1.0
+    return c

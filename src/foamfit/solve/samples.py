@@ -1,0 +1,322 @@
+"""Samples of a run: base stress, displacements of the nodes, and their derivatives.
+
+`out` contains, for the response and for each of its derivatives, a row of the base stress and rows
+of displacements: of all nodes, or of the top only.
+"""
+
+from __future__ import annotations
+
+from numba import cfunc, types
+from numba.extending import intrinsic
+
+from foamfit.solve.events import dense
+from foamfit.solve.motion import rates_of
+from foamfit.solve.run import (
+    BATCH,
+    GRAVITY,
+    KIND,
+    NOW,
+    RECORD,
+    SAMPLE,
+    STEP,
+    VALUE,
+    VALUE_RATE,
+    X_AT,
+    Z_AT,
+    unpack,
+)
+from foamfit.solve.scene import FREE, MOTION
+from foamfit.springs.compiled.contract import (
+    BY,
+    BY_HELD,
+    BY_STRESS,
+    EPS,
+    ETA,
+    EVALUATE,
+    GAIN,
+    HEIGHT,
+    INTERNAL,
+    OF_LAW,
+    OPTIONS,
+    PER_HEIGHT,
+    RATE,
+    RELAX,
+    SLOPE,
+    by_address,
+    call_evaluate,
+    inlined,
+    inner,
+    past,
+)  # fmt: skip
+from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
+
+INSIDE, FLIGHT, APPROACH = -1, -2, -3  # instead of the number of a sample
+_F, _I, _P, _IP = (
+    types.float64,
+    types.int64,
+    types.CPointer(types.float64),
+    types.CPointer(types.int64),
+)
+
+
+@inlined
+def row_of(c, q, node):  # type: ignore[no-untyped-def]
+    """Return the samples of the response (q = 0) or of a derivative; node 0 is the base stress."""
+    return past(c.out, (q * c.shown + node) * c.samples)
+
+
+@inner
+def place_nodes(c, g, y, reach):  # type: ignore[no-untyped-def]
+    """Fill displacement and derivatives `reach` of the node below a group; return the first."""
+    for j in range(c.p):
+        reach[j] = y[c.base + 2 * (g - 1) * c.p + j] if g > 0 else 0.0
+    return y[2 * (g - 1)] if g > 0 else 0.0
+
+
+@inner
+def _rise(c, i, reach):  # type: ignore[no-untyped-def]
+    """Add the elongation of a spring to derivatives of a displacement; return the elongation."""
+    s, p = past(c.springs, i * c.width), c.p
+    strain, own, height, eps = past(c.strain, i * p), past(c.own, 2 * i * p), s[HEIGHT], s[EPS]
+    for j in range(p):
+        reach[j] += height * strain[j] + eps * own[j]
+    return height * eps
+
+
+@inner
+def _put(c, node, k, value, slopes):  # type: ignore[no-untyped-def]
+    """Write a sample of a row and its derivatives."""
+    row_of(c, c.none, node)[k] = value
+    for j in range(c.p):
+        row_of(c, 1 + j, node)[k] = slopes[j]
+
+
+@inner
+def _write(c, y, at, k, want):  # type: ignore[no-untyped-def]
+    """Write sample k from a state at a time since the piece began."""
+    every, p, last = c.shown > 2, c.p, c.groups - 1
+    reach = past(c.common, (c.groups + 1) * p)
+    rates_of(c, c.none, y, c.f, want, at)
+    _put(c, c.none, k, c.carried[0], c.common)
+    for g in range(c.none if every else last, c.groups):
+        solved = g < c.nodes
+        top = c.ends[g] if every else c.shown - 1
+        if every or not (solved or c.top == MOTION):
+            if g > 0:
+                rates_of(c, g, y, c.f, want, at)
+            place = place_nodes(c, g, y, reach)
+            for i in range(c.ends[g - 1] if g > 0 else c.none, c.ends[g]):
+                place += _rise(c, i, reach)
+                _put(c, 1 + i if every else top, k, place, reach)
+        if solved:
+            _put(c, top, k, y[2 * g], past(y, c.base + 2 * g * p))
+        elif c.top == MOTION:
+            _put(c, top, k, c.drive[VALUE] + c.drive[VALUE_RATE] * at, past(c.common, c.groups * p))
+
+
+# ---------------------------------------------------------------- many samples of one step
+
+
+@inner
+def polynomial(c, i, n, out):  # type: ignore[no-untyped-def]
+    """Fill component i of the state at the n shares in `batch` of an explicit step."""
+    line, wide, shares = c.line, c.wide, c.batch
+    a, b, d, e = line[i], line[wide + i], line[2 * wide + i], line[3 * wide + i]
+    g, h, q, first = line[4 * wide + i], line[5 * wide + i], line[6 * wide + i], c.y[i]
+    for k in range(n):
+        x = shares[k]
+        z = 1.0 - x
+        out[k] = first + x * (a + z * (b + x * (d + z * (e + x * (g + z * (h + x * q))))))
+
+
+@inner
+def _write_batch(c, at, n):  # type: ignore[no-untyped-def]
+    """Write n samples from `at` on: base stress of one spring, which is alone, and the top."""
+    s, own, top = past(c.springs, c.none), past(c.numbers, c.none), 2 * c.groups - 2
+    shares, time = c.batch, c.time
+    eps, x, work = past(shares, BATCH), past(shares, 2 * BATCH), past(shares, 3 * BATCH)
+    w, v, found = past(shares, 4 * BATCH), past(shares, 5 * BATCH), past(shares, 6 * BATCH)
+    per, eta, gain, dt, now = s[PER_HEIGHT], s[ETA], s[GAIN], c.now[STEP], c.now[NOW]
+    for k in range(n):
+        shares[k] = (time[at + k] - now) / dt
+    polynomial(c, c.none, n, w)
+    polynomial(c, c.none + 1, n, v)
+    for k in range(n):
+        eps[k] = w[k] * per
+    if own[X_AT] >= 0:
+        polynomial(c, own[X_AT], n, x)
+    call_evaluate(own[EVALUATE], past(s, c.row), s, eps, x, n, int(c.p > 0), found)
+    sigma, stress = past(found, OF_LAW * n), past(row_of(c, c.none, c.none), at)
+    for k in range(n):
+        stress[k] = gain * sigma[k] + eta * per * v[k]
+    for q in range(c.terms):
+        polynomial(c, own[Z_AT] + q, n, work)
+        for k in range(n):
+            stress[k] += s[RELAX + 2 * q] * work[k]
+    if top > 0:
+        polynomial(c, top, n, w)
+    motion = past(row_of(c, c.none, c.none + 1), at)
+    for k in range(n):
+        motion[k] = w[k]
+    for j in range(c.p):
+        _write_slope(c, j, at, n)
+
+
+@inner
+def _write_slope(c, j, at, n):  # type: ignore[no-untyped-def]
+    """Write derivative j of the samples of `_write_batch`."""
+    s, own, p, top = past(c.springs, c.none), past(c.numbers, c.none), c.p, 2 * c.groups - 2
+    shares = c.batch
+    eps, work, v = past(shares, BATCH), past(shares, 3 * BATCH), past(shares, 5 * BATCH)
+    found = past(shares, 6 * BATCH)
+    slope, sigma = past(found, SLOPE * n), past(found, OF_LAW * n)
+    stress, motion = past(row_of(c, 1 + j, c.none), at), past(row_of(c, 1 + j, c.none + 1), at)
+    per, eta, gain, what = s[PER_HEIGHT], s[ETA], s[GAIN], c.directions[2 * j + 1]
+    mine, of_height, of_eta = c.directions[2 * j] == 0, c.own[j], c.own[p + j]
+    polynomial(c, c.base + j, n, work)
+    for k in range(n):
+        motion[k] = work[k]
+        stress[k] = gain * slope[k] * per * (work[k] - of_height * eps[k])
+    if mine and 0 <= what < OWN_ETA:
+        by = past(found, (BY + what) * n)
+        for k in range(n):
+            stress[k] += gain * by[k]
+    if own[KIND] == BY_STRESS:
+        held, ever, by = gain * c.held[j], gain * c.held[p + j], past(found, BY_HELD * n)
+        for k in range(n):
+            stress[k] += held * by[k] + ever * by[n + k]
+    if eta > 0.0 or of_eta > 0.0:
+        polynomial(c, c.none + 1, n, v)
+        polynomial(c, c.base + p + j, n, work)
+        for k in range(n):
+            stress[k] += per * (of_eta * v[k] + eta * (work[k] - of_height * per * v[k]))
+    for q in range(c.terms):
+        polynomial(c, c.base + (own[Z_AT] + q) * p + j, n, work)
+        for k in range(n):
+            stress[k] += s[RELAX + 2 * q] * work[k]
+        if mine and what == OWN_RELAXATION + 2 * q:
+            polynomial(c, own[Z_AT] + q, n, work)
+            for k in range(n):
+                stress[k] += sigma[k] + work[k]
+    if top > 0:
+        polynomial(c, c.base + top * p + j, n, motion)
+
+
+@inner
+def _write_inside(c, reached, want):  # type: ignore[no-untyped-def]
+    """Write the samples of an impact up to a time inside the step."""
+    r, t, n = c.now, c.time, c.base + c.carries * c.p
+    k, quick = int(r[SAMPLE]), c.shown == 2 and c.ends[0] == 1 and c.top == FREE and c.degree == 0
+    if quick and c.numbers[KIND] != INTERNAL:
+        while k < c.samples and t[k] <= reached:
+            last = k + 1
+            while last < c.samples and last - k < BATCH and t[last] <= reached:
+                last += 1
+            _write_batch(c, k, last - k)
+            k = last
+    while k < c.samples and t[k] <= reached:
+        dense(c, n, (t[k] - r[NOW]) / r[STEP], c.state)
+        _write(c, c.state, t[k], k, want)
+        k += 1
+    r[SAMPLE] = k
+
+
+# ---------------------------------------------------------------- without contact
+
+
+@inner
+def _approach(c, speed):  # type: ignore[no-untyped-def]
+    """Write the samples before contact, when only the striker moves."""
+    done, motion, t, gravity = c.none, row_of(c, c.none, c.shown - 1), c.time, c.drive[GRAVITY]
+    while done < c.samples and t[done] < 0.0:
+        for row in range((1 + c.p) * c.shown):
+            c.out[row * c.samples + done] = 0.0
+        motion[done] = (speed + 0.5 * gravity * t[done]) * t[done]
+        done += 1
+    c.now[SAMPLE] = done
+
+
+@inner
+def _fly(c, slope):  # type: ignore[no-untyped-def]
+    """Write the samples after the end of contact; `slope` is dS/dt there.
+
+    The chain moves with the striker. Derivatives include the shift of the end of contact.
+    """
+    p, y, now, t, top = c.p, c.y, c.now[NOW], c.time, c.groups - 1
+    gravity = c.drive[GRAVITY]
+    speed, pull, first = y[2 * top + 1], c.stage[2 * top + 1], int(c.now[SAMPLE])
+    for j in range(1 + p):
+        stress = row_of(c, j, c.none)
+        for k in range(first, c.samples):
+            stress[k] = 0.0
+    reach = past(c.common, (c.groups + 1) * p)
+    for g in range(c.groups):
+        place, quick = place_nodes(c, g, y, reach), y[2 * g - 1] if g > 0 else 0.0
+        for i in range(c.ends[g - 1] if g > 0 else c.none, c.ends[g]):
+            place += _rise(c, i, reach)
+            quick += past(c.springs, i * c.width)[HEIGHT] * past(c.springs, i * c.width)[RATE]
+            if i == c.ends[g] - 1:
+                place, quick = y[2 * g], y[2 * g + 1]
+                for j in range(p):
+                    reach[j] = y[c.base + 2 * g * p + j]
+            if c.shown == 2 and i < c.count - 1:
+                continue
+            node = 1 + i if c.shown > 2 else 1
+            motion = row_of(c, c.none, node)
+            for k in range(first, c.samples):
+                motion[k] = place + (speed + 0.5 * gravity * (t[k] - now)) * (t[k] - now)
+            for j in range(p):
+                late = -c.common[j] / slope if slope != 0.0 else 0.0
+                dv = y[c.base + (2 * top + 1) * p + j] + (pull - gravity) * late
+                at, motion = reach[j] + (quick - speed) * late, row_of(c, 1 + j, node)
+                for k in range(first, c.samples):
+                    motion[k] = at + dv * (t[k] - now)
+
+
+# ---------------------------------------------------------------- called by address
+
+
+@cfunc(types.void(_IP, _P, _F, _I, _I), **OPTIONS, cache=True)
+def _samples(words, y, at, k, want):  # type: ignore[no-untyped-def]
+    """Write sample k from a state at a time, or do one of the tasks below zero."""
+    c = unpack(words)
+    if k == INSIDE:
+        _write_inside(c, at, want)
+    elif k == FLIGHT:
+        _fly(c, at)
+    elif k == APPROACH:
+        _approach(c, at)
+    else:
+        _write(c, y, at, k, want)
+
+
+WRITE = _samples.address
+
+
+@intrinsic
+def _call_samples(typing, where, c, y, at, k, want):  # type: ignore[no-untyped-def]
+    return types.void(_I, RECORD, _P, _F, _I, _I), by_address
+
+
+@inlined
+def write(c, y, at, k, want):  # type: ignore[no-untyped-def]
+    """Write sample k from a state at a time since the piece began."""
+    _call_samples(c.write_at, c, y, at, k, want)
+
+
+@inlined
+def approach(c, speed):  # type: ignore[no-untyped-def]
+    """Write the samples before contact, when only the striker moves."""
+    _call_samples(c.write_at, c, c.y, speed, APPROACH, 0)
+
+
+@inlined
+def fly(c, slope):  # type: ignore[no-untyped-def]
+    """Write the samples after the end of contact; `slope` is dS/dt there."""
+    _call_samples(c.write_at, c, c.y, slope, FLIGHT, 0)
+
+
+@inlined
+def write_inside(c, reached, want):  # type: ignore[no-untyped-def]
+    """Write the samples of an impact up to a time inside the step."""
+    _call_samples(c.write_at, c, c.y, reached, INSIDE, want)

@@ -1,0 +1,198 @@
+"""Undamped, massless springs in series: a common stress, along a motion or a stress history.
+
+Along a monotone part of the motion the strain of each spring is a monotone function of the common
+stress. The springs are followed from one end of a branch to the next; between them the sum of their
+elongations has one root, and no integration in time is needed.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from foamfit.solve.equilibrium import elongation_at, put, root, strain_at
+from foamfit.solve.events import change_branch
+from foamfit.solve.motion import ONLY_DERIVATIVES, evaluate, rates_of
+from foamfit.solve.run import NUMBERS, begin_run
+from foamfit.solve.samples import row_of
+from foamfit.solve.scene import STRESS
+from foamfit.springs.compiled.contract import (
+    BRANCH,
+    EPS,
+    HEIGHT,
+    HIGH,
+    LOW,
+    OF_LAW,
+    OPTIONS,
+    SETTLE,
+    SIGMA_HIGH,
+    SIGMA_LOW,
+    SLOPE,
+    TANGENT,
+    TOTAL,
+    TURNS,
+    call_number,
+    inner,
+    past,
+)
+
+MOST_SWITCHES = 100_000  # of all springs between two samples
+
+
+@inner
+def push_to(c, i, sigma, before, y):  # type: ignore[no-untyped-def]
+    """Bring a spring to a stress, from the stress `before`."""
+    s, way = past(c.springs, i * c.width), 1.0 if sigma > before else -1.0
+    for _ in range(MOST_SWITCHES):
+        if sigma != before and s[TURNS] * way < 0.0:
+            change_branch(c, i, int(way > 0.0), y)
+        elif sigma > s[SIGMA_HIGH] and s[HIGH] < math.inf:
+            change_branch(c, i, 1, y)
+        elif sigma < s[SIGMA_LOW] and s[LOW] > -math.inf:
+            change_branch(c, i, int(c.none), y)
+        else:
+            break
+    put(c, i, strain_at(c, i, sigma), sigma)
+
+
+@inner
+def strain_to(c, i, eps, y):  # type: ignore[no-untyped-def]
+    """Bring a spring to a strain."""
+    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+    for _ in range(MOST_SWITCHES):
+        up = eps > s[EPS]
+        if eps != s[EPS] and s[TURNS] * (1.0 if up else -1.0) < 0.0:
+            change_branch(c, i, int(up), y)
+        elif eps > s[HIGH] or eps < s[LOW]:
+            change_branch(c, i, int(eps > s[HIGH]), y)
+        else:
+            break
+    call_number(n[SETTLE], past(s, c.row), s, eps)
+
+
+@inner
+def elongation(c, i0, i1):  # type: ignore[no-untyped-def]
+    """Return the elongation of springs at their present strains."""
+    total = 0.0
+    for i in range(i0, i1):
+        s = past(c.springs, i * c.width)
+        total += s[HEIGHT] * s[EPS]
+    return total
+
+
+@inner
+def _yield_flat(c, i0, i1, rest, y):  # type: ignore[no-untyped-def]
+    """Let springs on flat branches take an elongation, from the base up; return what is left.
+
+    One that reaches the end of its branch leaves it; the second value says so.
+    """
+    up = rest > 0.0
+    for i in range(i0, i1):
+        s = past(c.springs, i * c.width)
+        if s[SIGMA_LOW] != s[SIGMA_HIGH] or rest == 0.0:
+            continue
+        room = s[HEIGHT] * ((s[HIGH] if up else s[LOW]) - s[EPS])
+        if abs(rest) <= abs(room):
+            s[EPS] += rest / s[HEIGHT]
+            return 0.0, False
+        change_branch(c, i, int(up), y)
+        return rest, True
+    return rest, False
+
+
+@inner
+def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
+    """Bring springs in series to an elongation, from a common stress; return that stress."""
+    for _ in range(MOST_SWITCHES):
+        rest = target - elongation(c, i0, i1)
+        if rest == 0.0:
+            break
+        up, turned = rest > 0.0, False
+        for i in range(i0, i1):
+            if past(c.springs, i * c.width)[TURNS] * (1.0 if up else -1.0) < 0.0:
+                change_branch(c, i, int(up), y)
+                turned = True
+        if turned:
+            continue
+        rest, left = _yield_flat(c, i0, i1, rest, y)
+        if left:
+            continue
+        if rest == 0.0:
+            break
+        limit = math.inf if up else -math.inf
+        for i in range(i0, i1):
+            s = past(c.springs, i * c.width)
+            limit = min(limit, s[SIGMA_HIGH]) if up else max(limit, s[SIGMA_LOW])
+        limit = max(limit, common) if up else min(limit, common)
+        if abs(limit) < math.inf:
+            beyond = target - elongation_at(c, i0, i1, limit, c.none)[0]
+            if (beyond > 0.0) if up else (beyond < 0.0):
+                common = limit
+                for i in range(i0, i1):
+                    put(c, i, strain_at(c, i, limit), limit)
+                for i in range(i0, i1):
+                    s = past(c.springs, i * c.width)
+                    if (s[SIGMA_HIGH] <= limit) if up else (s[SIGMA_LOW] >= limit):
+                        change_branch(c, i, int(up), y)
+                continue
+        return root(c, i0, i1, target, common, min(common, limit), max(common, limit), c.none)
+    return common
+
+
+@inner
+def _bring_all(c, k, before):  # type: ignore[no-untyped-def]
+    """Bring the chain to sample k of its drive, from a common stress; return that stress."""
+    now = c.values[k]
+    if c.top == STRESS:
+        for i in range(c.count):
+            push_to(c, i, now, before, c.y)
+    else:
+        now = bring(c, c.none, c.count, now, before, c.y)
+    return now
+
+
+@inner
+def _write(c, k, now):  # type: ignore[no-untyped-def]
+    """Write sample k: the common stress, displacements, and their derivatives."""
+    p, place, reach = c.p, 0.0, past(c.common, 3 * c.p)  # with one group, the last of the rows
+    if p > 0:
+        for i in range(c.count):
+            s = past(c.springs, i * c.width)
+            evaluate(c, i, 1 + c.none)
+            s[TANGENT], s[TOTAL] = s[c.results + SLOPE], s[c.results + OF_LAW]
+        c.carried[0] = now
+        rates_of(c, c.none, c.y, c.f, ONLY_DERIVATIVES, 0.0)
+    row_of(c, c.none, c.none)[k] = now
+    for j in range(p):
+        row_of(c, 1 + j, c.none)[k], reach[j] = c.common[j], 0.0
+    for i in range(c.count):
+        s, strain, own = past(c.springs, i * c.width), past(c.strain, i * p), past(c.own, 2 * i * p)
+        place += s[HEIGHT] * s[EPS]
+        for j in range(p):
+            reach[j] += s[HEIGHT] * strain[j] + s[EPS] * own[j]
+        if c.shown > 2 or i == c.count - 1:
+            node = 1 + i if c.shown > 2 else c.shown - 1
+            row_of(c, c.none, node)[k] = place
+            for j in range(p):
+                row_of(c, 1 + j, node)[k] = reach[j]
+
+
+@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
+def balance(  # type: ignore[no-untyped-def]
+    template, ints, floats, rows, heights, mass, reals, values, time, out, log, strains, history
+):  # fmt: skip
+    """Follow undamped, massless springs in series along a motion or stress of the top.
+
+    `strains` (springs, n) and `history` become strains and branches.
+    """
+    c = begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals)
+    before = 0.0
+    for i in range(c.count):
+        evaluate(c, i, int(c.p > 0))
+    for k in range(c.samples):
+        before = _bring_all(c, k, before)
+        _write(c, k, before)
+        for i in range(c.count):
+            s = past(c.springs, i * c.width)
+            strains[i, k], history[i, k] = s[EPS], int(s[BRANCH])

@@ -1,0 +1,242 @@
+"""The compiled functions of the bistable spring (eqs. 1-5) and of the linear ones."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from foamfit.springs.compiled.contract import (
+    BRANCH,
+    BY,
+    EPS,
+    EXPLICIT,
+    HIGH,
+    LOW,
+    MISS,
+    OF_LAW,
+    OPTIONS,
+    SIGMA_HIGH,
+    SIGMA_LOW,
+    SLOPE,
+    SOFT,
+    TURNS,
+    Compiled,
+    beginning,
+    evaluating,
+    inner,
+    inverting,
+    past,
+    settling,
+    switching,
+)  # fmt: skip
+from foamfit.springs.law import admissible, derived_points
+
+# Branches; LINE and OPEN of linear springs. OPEN is that of a unilateral one out of contact.
+A, D, C, E, LINE, OPEN = range(6)
+# Columns of the row: strains and stresses at A1, C2, A2, C1; then of each branch slope k, origins
+# x0 and s0, and their derivatives by the seven parameters. On a and c σ = k x/(1-x) with
+# x = ε - x0, on d and e σ = s0 + k x.
+EPS_A, EPS_C, EPS_HAT_A, EPS_HAT_C, TO_STRESS, TABLE, WIDE = 0, 1, 2, 3, 4, 8, 24
+COLUMNS = TABLE + 4 * WIDE
+
+_admissible, _derived_points = inner(admissible), inner(derived_points)
+
+
+@njit(**OPTIONS, cache=True)
+def fill(values, row):  # type: ignore[no-untyped-def]
+    """Write the row of the seven parameters."""
+    k0, kc, dsigma, eps_a = values[0], values[1], values[2], values[3]
+    eps_c, plus, minus = values[4], values[5], values[6]
+    if not _admissible(k0, kc, dsigma, eps_a, eps_c, plus, minus):
+        return False
+    points = _derived_points(k0, kc, dsigma, eps_a, eps_c, plus, minus)
+    sigma_a, sigma_c, star, hat_a, hat_c = points
+    row[EPS_A], row[EPS_C], row[EPS_HAT_A], row[EPS_HAT_C] = eps_a, eps_c, hat_a, hat_c
+    row[TO_STRESS + EPS_A], row[TO_STRESS + EPS_C] = sigma_a, sigma_c
+    row[TO_STRESS + EPS_HAT_A] = -math.inf if hat_a == -math.inf else k0 * hat_a / (1.0 - hat_a)
+    if minus == 0.0 and hat_a > -math.inf:  # a flat branch, without rounding
+        row[TO_STRESS + EPS_HAT_A] = sigma_c
+    row[TO_STRESS + EPS_HAT_C] = sigma_a + plus * (hat_c - eps_a)
+    for c in range(TABLE, COLUMNS):
+        row[c] = 0.0
+    v, stiff = 1.0 - eps_a, kc + sigma_c
+    by_k0, by_eps_a = eps_a / v, k0 / (v * v)  # of σ_a
+    one = TABLE + A * WIDE
+    row[one], row[one + 3] = k0, 1.0
+    one = TABLE + D * WIDE
+    row[one], row[one + 1], row[one + 2] = plus, eps_a, sigma_a
+    row[one + 3 + 5], row[one + 10 + 3] = 1.0, 1.0
+    row[one + 17], row[one + 17 + 3] = by_k0, by_eps_a
+    one = TABLE + C * WIDE
+    row[one], row[one + 1], row[one + 3 + 1] = kc, star, 1.0
+    share = kc / (stiff * stiff)  # ε_* = ε_c - σ̄_c/(k_c + σ̄_c)
+    row[one + 10], row[one + 10 + 2] = -share * by_k0, -share
+    row[one + 10 + 1], row[one + 10 + 3] = sigma_c / (stiff * stiff), -share * by_eps_a
+    row[one + 10 + 4] = 1.0
+    one = TABLE + E * WIDE
+    row[one], row[one + 1], row[one + 2] = minus, eps_c, sigma_c
+    row[one + 3 + 6], row[one + 10 + 4] = 1.0, 1.0
+    row[one + 17], row[one + 17 + 2], row[one + 17 + 3] = by_k0, 1.0, by_eps_a
+    return True
+
+
+@evaluating
+def evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
+    branch = s[BRANCH]
+    line = past(row, TABLE + int(branch) * WIDE)
+    sigma, slope = past(out, OF_LAW * count), past(out, SLOPE * count)
+    factor = past(out, MISS * count)  # of the derivative by k; an explicit law has no miss
+    k, origin, offset = line[0], line[1], line[2]
+    if branch == A or branch == C:
+        for j in range(count):
+            r = eps[j] - origin
+            q = 1.0 / (1.0 - r)
+            sigma[j] = k * r * q if r < 1.0 else math.inf
+            slope[j], factor[j] = k * q * q, r * q
+    else:
+        for j in range(count):
+            r = eps[j] - origin
+            sigma[j], slope[j], factor[j] = offset + k * r, k, r
+    if want:
+        for j in range(count):
+            for c in range(7):
+                by = line[3 + c] * factor[j] - line[10 + c] * slope[j] + line[17 + c]
+                out[(BY + c) * count + j] = by
+    return 0.0
+
+
+@inner
+def _enter(row, s, branch):  # type: ignore[no-untyped-def]
+    """Enter a branch."""
+    s[BRANCH] = branch
+    s[LOW], s[HIGH], s[SIGMA_LOW], s[SIGMA_HIGH] = -math.inf, math.inf, -math.inf, math.inf
+    low = EPS_A if branch == D else EPS_C if branch == C else EPS_HAT_A
+    high = EPS_HAT_C if branch == D else EPS_C if branch == E else EPS_A
+    if branch != A:
+        s[LOW], s[SIGMA_LOW] = row[low], row[TO_STRESS + low]
+    if branch != C:
+        s[HIGH], s[SIGMA_HIGH] = row[high], row[TO_STRESS + high]
+
+
+@switching
+def switch(row, s, up, out):  # type: ignore[no-untyped-def]
+    s[EPS] = s[HIGH] if up else s[LOW]
+    if up:
+        _enter(row, s, D if s[BRANCH] == A else C)
+    else:
+        _enter(row, s, E if s[BRANCH] == C else A)
+    return 0.0
+
+
+@beginning
+def begin(row, s):  # type: ignore[no-untyped-def]
+    s[TURNS] = 0.0
+    _enter(row, s, A)
+    return 0.0
+
+
+@settling
+def settle(row, s, eps):  # type: ignore[no-untyped-def]
+    s[EPS] = eps
+    return 0.0
+
+
+@inverting
+def strain(row, s, sigma):  # type: ignore[no-untyped-def]
+    branch = s[BRANCH]
+    line = past(row, TABLE + int(branch) * WIDE)
+    k, origin = line[0], line[1]
+    if branch == A or branch == C:
+        if not sigma > -k:
+            s[SOFT] = 0.0
+            return -math.inf
+        per = 1.0 / (k + sigma)
+        s[SOFT] = k * per * per
+        return origin + sigma * per
+    s[SOFT] = 1.0 / k if k > 0.0 else math.inf
+    return origin + (sigma - line[2]) / k if k > 0.0 else s[LOW]
+
+
+COMPILED = Compiled(
+    fill,
+    EXPLICIT,
+    COLUMNS,
+    7,
+    0,
+    (begin.address, evaluate.address, switch.address, settle.address, strain.address),
+    (TABLE + A * WIDE, TABLE + C * WIDE, TABLE + D * WIDE),
+    TABLE + C * WIDE + 1,
+)
+
+
+# ---------------------------------------------------------------- linear springs
+
+
+@njit(**OPTIONS, cache=True)
+def fill_linear(values, row):  # type: ignore[no-untyped-def]
+    """Write k0, and 0: the spring carries tension."""
+    row[0], row[1] = values[0], 0.0
+    return 0.0 < values[0] < math.inf
+
+
+@njit(**OPTIONS, cache=True)
+def fill_unilateral(values, row):  # type: ignore[no-untyped-def]
+    """Write k0, and 1: the spring carries no tension."""
+    row[0], row[1] = values[0], 1.0
+    return 0.0 < values[0] < math.inf
+
+
+@evaluating
+def evaluate_linear(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
+    touches = 1.0 if s[BRANCH] == LINE else 0.0
+    for j in range(count):
+        out[OF_LAW * count + j], out[SLOPE * count + j] = (
+            touches * row[0] * eps[j],
+            touches * row[0],
+        )
+        out[MISS * count + j], out[BY * count + j] = 0.0, touches * eps[j]
+    return 0.0
+
+
+@inner
+def _enter_line(row, s, branch):  # type: ignore[no-untyped-def]
+    """Enter a branch of a linear spring."""
+    s[BRANCH], s[LOW], s[SIGMA_LOW], s[HIGH], s[SIGMA_HIGH] = (
+        branch, -math.inf, -math.inf, math.inf, math.inf,
+    )  # fmt: skip
+    if branch == OPEN:
+        s[HIGH], s[SIGMA_HIGH], s[SIGMA_LOW] = 0.0, 0.0, 0.0
+    elif row[1] > 0.0:
+        s[LOW], s[SIGMA_LOW] = 0.0, 0.0
+
+
+@switching
+def switch_linear(row, s, up, out):  # type: ignore[no-untyped-def]
+    s[EPS] = 0.0
+    _enter_line(row, s, LINE if up else OPEN)
+    return 0.0
+
+
+@beginning
+def begin_linear(row, s):  # type: ignore[no-untyped-def]
+    s[TURNS] = 0.0
+    _enter_line(row, s, LINE)
+    return 0.0
+
+
+@inverting
+def strain_linear(row, s, sigma):  # type: ignore[no-untyped-def]
+    if s[BRANCH] == OPEN:
+        s[SOFT] = math.inf
+        return 0.0 if sigma >= 0.0 else -math.inf
+    s[SOFT] = 1.0 / row[0]
+    return sigma / row[0]
+
+
+_LINEAR = (
+    begin_linear.address, evaluate_linear.address, switch_linear.address, settle.address,
+    strain_linear.address,
+)  # fmt: skip
+LINEAR = Compiled(fill_linear, EXPLICIT, 2, 1, 0, _LINEAR, (0,))
+UNILATERAL = Compiled(fill_unilateral, EXPLICIT, 2, 1, 0, _LINEAR, (0,))

@@ -1,0 +1,446 @@
+"""A registered law, compiled to the contract of the solvers.
+
+Its functions are plain formulas, compiled for complex numbers. Every derivative is the imaginary
+part of a formula with an imaginary step in one of its arguments, exact to rounding (Squire & Trapp
+1998). Only one function is compiled for each law; those below are compiled once, and call it by the
+address that its spring keeps in memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from llvmlite import ir
+from numba import carray, cfunc, njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from foamfit.arrays import Array
+from foamfit.springs.compiled.contract import (
+    BRANCH,
+    BY,
+    BY_HELD,
+    EPS,
+    EVALUATE,
+    EXPLICIT,
+    HIGH,
+    INTERNAL,
+    LOSSY,
+    LOW,
+    MISS,
+    OF_LAW,
+    OPTIONS,
+    OWN,
+    RATE,
+    RESULTS,
+    SIGMA_HIGH,
+    SIGMA_LOW,
+    SLOPE,
+    SOFT,
+    TURNS,
+    Compiled,
+    X,
+    address,
+    beginning,
+    call_begin,
+    call_evaluate,
+    complexes_at,
+    evaluating,
+    inner,
+    inverting,
+    outer,
+    past,
+    results_of,
+    settling,
+    start,
+    switching,
+)
+
+if TYPE_CHECKING:
+    from foamfit.springs.laws.record import Functions, Law
+
+STEP = 1e-40  # imaginary step
+# What the function of a law fills: σ, V, A and B; the ends of the branch; or the internal variables
+# on the next branch, whose number it returns.
+VALUES, ENDS, DOWN, UP = range(4)
+# What a spring of a registered law keeps in memory: the address of its function, kind, numbers of
+# parameters and of internal variables, whether its branches end, and whether V depends on the rate.
+FORMULAS, KIND, COUNT, INSIDE, BOUNDED, DAMPS = range(OWN, OWN + 6)
+_F, _I, _P = types.float64, types.int64, types.CPointer(types.float64)
+_CP = types.CPointer(types.complex128)
+_FORMULAS = _I(_CP, _I, _I, _CP)
+_ALONE: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_WITHIN: dict[str, Any] = {**_ALONE, "_nrt": False}
+FURTHEST, TRIALS = 1e12, 200  # largest strain, and trials, in the search for a strain
+
+
+@intrinsic
+def call_formulas(typing, where, point, branch, what, out):  # type: ignore[no-untyped-def]
+    """Call the function of a law, by numba's own convention.
+
+    An exception, such as that of a division by zero, is not raised: the results keep what they were
+    before.
+    """
+
+    def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        long, told = ir.IntType(64), ir.IntType(8).as_pointer()
+        result = cgutils.alloca_once_value(builder, ir.Constant(long, 0))
+        given = [result, cgutils.alloca_once(builder, told), *args[1:]]
+        kind = ir.FunctionType(ir.IntType(32), [value.type for value in given])
+        builder.call(builder.inttoptr(args[0], kind.as_pointer()), given)
+        return builder.load(result)
+
+    return _I(_I, _CP, _I, _I, _CP), emit
+
+
+# ---------------------------------------------------------------- for all laws
+
+
+@inner
+def room_of(row, s):  # type: ignore[no-untyped-def]
+    """Return where a row has room for the arguments of the formulas: strain, rate, x and p."""
+    return complexes_at(address(past(row, int(s[COUNT]) + 1)))
+
+
+@inner
+def gather(row, s, eps, x, n, j):  # type: ignore[no-untyped-def]
+    """Gather the arguments of the formulas at a point; return them, and room for results."""
+    point, inside, count = room_of(row, s), int(s[INSIDE]), int(s[COUNT])
+    point[0], point[1] = complex(eps, 0.0), complex(s[RATE], 0.0)
+    for k in range(inside):
+        point[2 + k] = complex(x[k * n + j], 0.0)
+    for k in range(count):
+        point[2 + inside + k] = complex(row[k], 0.0)
+    return point, past(point, 2 + inside + count)
+
+
+@inner
+def stress_of(row, s, point, found):  # type: ignore[no-untyped-def]
+    """Return stress and slope at the arguments `point`, whose strain has the imaginary step."""
+    call_formulas(int(s[FORMULAS]), point, int(s[BRANCH]), VALUES, found)
+    return found[0].real, found[0].imag / STEP
+
+
+@inner
+def bound(row, s, point, found):  # type: ignore[no-untyped-def]
+    """Set the ends of the branch."""
+    found[0], found[1], found[2] = complex(-math.inf, 0.0), complex(math.inf, 0.0), 0j
+    call_formulas(int(s[FORMULAS]), point, int(s[BRANCH]), ENDS, found)
+    s[LOW], s[HIGH], s[TURNS] = found[0].real, found[1].real, found[2].real
+
+
+@inner
+def bound_stress(row, s, point, found):  # type: ignore[no-untyped-def]
+    """Set the stresses at the ends of the branch of an EXPLICIT law."""
+    low, high, flat, size = -math.inf, math.inf, True, 0.0
+    if s[LOW] > -math.inf:
+        point[0] = complex(s[LOW], STEP)
+        low, slope = stress_of(row, s, point, found)
+        flat, size = flat and slope == 0.0, abs(low)
+    if s[HIGH] < math.inf:
+        point[0] = complex(s[HIGH], STEP)
+        high, slope = stress_of(row, s, point, found)
+        flat, size = flat and slope == 0.0, max(size, abs(high))
+    if flat and abs(high - low) <= 1e-14 * size:  # without rounding
+        high = low
+    s[SIGMA_LOW], s[SIGMA_HIGH] = low, high
+
+
+@inner
+def enter(row, s):  # type: ignore[no-untyped-def]
+    """Set the ends of a branch at its beginning."""
+    point, found = gather(row, s, s[EPS], past(s, X), 1, 0)
+    bound(row, s, point, found)
+    s[SIGMA_LOW], s[SIGMA_HIGH] = -math.inf, math.inf
+    if s[KIND] == EXPLICIT:
+        bound_stress(row, s, point, found)
+
+
+@beginning
+def _begin(row, s):  # type: ignore[no-untyped-def]
+    s[EPS] = s[BRANCH] = s[RATE] = 0.0
+    s[LOSSY] = s[DAMPS]
+    for k in range(int(s[INSIDE])):
+        s[X + k] = 0.0
+    enter(row, s)
+    return 0.0
+
+
+@inner
+def evaluate_explicit(row, s, eps, n, want, out):  # type: ignore[no-untyped-def]
+    """Fill the results of an EXPLICIT law."""
+    where, count, branch = int(s[FORMULAS]), int(s[COUNT]), int(s[BRANCH])
+    point, found = gather(row, s, 0.0, s, 1, 0)
+    for j in range(n):
+        point[0] = complex(eps[j], STEP)
+        call_formulas(where, point, branch, VALUES, found)
+        out[OF_LAW * n + j], out[SLOPE * n + j] = found[0].real, found[0].imag / STEP
+        out[MISS * n + j] = out[BY_HELD * n + j] = out[(BY_HELD + 1) * n + j] = 0.0
+        if want == 0:
+            continue
+        point[0] = complex(eps[j], 0.0)
+        for c in range(count):
+            point[2 + c] = complex(row[c], STEP)
+            call_formulas(where, point, branch, VALUES, found)
+            point[2 + c] = complex(row[c], 0.0)
+            out[(BY + c) * n + j] = found[0].imag / STEP
+
+
+@inner
+def evaluate_internal(row, s, eps, x, n, want, out):  # type: ignore[no-untyped-def]
+    """Fill the results of an INTERNAL law."""
+    where, count, branch = int(s[FORMULAS]), int(s[COUNT]), int(s[BRANCH])
+    inside = int(s[INSIDE])
+    size, at = 2 + 2 * inside, BY + count
+    for j in range(n):
+        point, found = gather(row, s, eps[j], x, n, j)
+        for q in range(2 + inside + count):
+            if q > 0 and (want == 0 or (want == 2 and q >= 2 + inside)):
+                continue
+            if q == 1 and s[DAMPS] == 0.0:
+                for f in range(size):
+                    out[(at + 2 * size + f) * n + j] = 0.0
+                continue
+            kept = point[q]
+            point[q] = complex(kept.real, STEP)
+            call_formulas(where, point, branch, VALUES, found)
+            point[q] = kept
+            if q == 0:
+                for f in range(size):
+                    out[(at + f) * n + j] = found[f].real
+            by = past(out, (at + size + q * size) * n + j)
+            for f in range(size):
+                by[f * n] = found[f].imag / STEP
+        out[OF_LAW * n + j], out[SLOPE * n + j] = out[at * n + j], out[(at + size) * n + j]
+        out[MISS * n + j] = out[BY_HELD * n + j] = out[(BY_HELD + 1) * n + j] = 0.0
+        for c in range(count if want == 1 else 0):
+            out[(BY + c) * n + j] = out[(at + size + (2 + inside + c) * size) * n + j]
+        if s[BOUNDED] > 0.0:  # the ends may depend on the internal variables
+            bound(row, s, point, found)
+
+
+@evaluating
+def _evaluate(row, s, eps, x, n, want, out):  # type: ignore[no-untyped-def]
+    if s[KIND] == EXPLICIT:
+        evaluate_explicit(row, s, eps, n, want, out)
+    else:
+        evaluate_internal(row, s, eps, x, n, want, out)
+    return 0.0
+
+
+@inner
+def derive_switch(row, s, turns, up, out):  # type: ignore[no-untyped-def]
+    """Fill the derivatives of internal variables on the next branch, and of the end, by ε, x, p."""
+    where, count, branch = int(s[FORMULAS]), int(s[COUNT]), int(s[BRANCH])
+    inside = int(s[INSIDE])
+    wide = 1 + inside + count
+    for q in range(wide):
+        point, found = gather(row, s, s[EPS], past(s, X), 1, 0)
+        at = q if q == 0 else q + 1
+        kept = point[at].real
+        point[at] = complex(kept, STEP)
+        found[0] = found[1] = found[2] = 0j
+        call_formulas(where, point, branch, ENDS, found)
+        end = found[1 if up else 0].imag / STEP
+        out[inside * wide + q] = end if not turns else 1.0 if q == 0 else 0.0
+        call_formulas(where, point, branch, UP if up else DOWN, found)
+        for k in range(inside):
+            out[k * wide + q] = point[2 + k].imag / STEP
+
+
+@switching
+def _switch(row, s, up, out):  # type: ignore[no-untyped-def]
+    turns = s[TURNS] * (1.0 if up else -1.0) < 0.0
+    if not turns:
+        s[EPS] = s[HIGH] if up else s[LOW]
+    if s[KIND] == INTERNAL:
+        derive_switch(row, s, turns, up, out)
+    point, found = gather(row, s, s[EPS], past(s, X), 1, 0)
+    what = UP if up else DOWN
+    s[BRANCH] = call_formulas(int(s[FORMULAS]), point, int(s[BRANCH]), what, found)
+    for k in range(int(s[INSIDE])):
+        s[X + k] = point[2 + k].real
+    enter(row, s)
+    return 0.0
+
+
+@settling
+def _settle(row, s, eps):  # type: ignore[no-untyped-def]
+    s[EPS] = eps
+    return 0.0
+
+
+@inverting
+def _strain(row, s, sigma):  # type: ignore[no-untyped-def]
+    """Search by Newton's method inside a bracket."""
+    point, found = gather(row, s, 0.0, past(s, X), 1, 0)
+    if s[SIGMA_LOW] == s[SIGMA_HIGH]:
+        s[SOFT] = math.inf
+        return s[LOW]
+    eps, low, high = min(max(s[EPS], s[LOW]), s[HIGH]), -math.inf, math.inf
+    for trial in range(TRIALS):
+        point[0] = complex(eps, STEP)
+        value, slope = stress_of(row, s, point, found)
+        miss = value - sigma
+        if abs(eps) > FURTHEST:
+            s[SOFT] = 0.0
+            return math.inf if eps > 0.0 else -math.inf
+        if not abs(miss) < math.inf:  # beyond the strains that the law admits
+            miss = math.inf if eps > 0.0 else -math.inf
+        s[SOFT] = 1.0 / slope if slope > 0.0 else math.inf
+        if miss > 0.0:
+            high = eps
+        elif miss < 0.0:
+            low = eps
+        else:
+            break
+        new = eps - miss * s[SOFT]
+        if abs(new - eps) <= 2e-16 * abs(eps):
+            break
+        if not low < new < high or trial % 8 == 7:
+            if low > -math.inf and high < math.inf:
+                new = 0.5 * (low + high)
+            elif not low < new < high:
+                new = eps + (1.0 if miss < 0.0 else -1.0) * max(abs(eps), 1e-3)
+            if new in (low, high):  # neighbouring floating-point numbers
+                break
+        eps = new
+    return eps
+
+
+@outer
+def _slope_at_rest(where, row, s):  # type: ignore[no-untyped-def]
+    """Return dσ/dε at rest along the path of the internal variables."""
+    block, own = start(s), start(row)
+    call_begin(where[0], own, block)
+    inside, count, out = int(block[INSIDE]), int(block[COUNT]), past(block, RESULTS)
+    call_evaluate(where[EVALUATE], own, block, past(block, EPS), past(block, X), 1, 2, out)
+    slope = out[SLOPE]
+    if block[KIND] == INTERNAL:
+        size, values = 2 + 2 * inside, past(out, BY + count)
+        for k in range(inside):
+            slope += values[size + (2 + k) * size] * values[2 + k]
+    return slope
+
+
+# ---------------------------------------------------------------- one law
+
+
+@njit(**_WITHIN)
+def _nothing(p, x, strain, branch, out):  # type: ignore[no-untyped-def]
+    """Leave rates at zero, and the branch without ends."""
+
+
+@njit(**_WITHIN)
+def _same(p, x, strain, branch, up):  # type: ignore[no-untyped-def]
+    """Stay on the branch."""
+    return branch
+
+
+@njit(**_WITHIN)
+def _no_stress(p, x, strain, rate, branch):  # type: ignore[no-untyped-def]
+    return 0j
+
+
+@cache
+def _inside(function: Any, otherwise: Any = None) -> Any:
+    """Return a function of a law, to be compiled into that of the law."""
+    if function is None:
+        return otherwise
+    return njit(**_WITHIN)(getattr(function, "py_func", function))
+
+
+def _tuple_at(count: int) -> Any:
+    """Return a function that loads numbers as a tuple."""
+    kind = types.UniTuple(types.complex128, count)
+
+    @intrinsic
+    def load(typing, pointer):  # type: ignore[no-untyped-def]
+        def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
+            at = [builder.gep(args[0], [ir.Constant(ir.IntType(64), k)]) for k in range(count)]
+            return context.make_tuple(builder, kind, [builder.load(one) for one in at])
+
+        return kind(_CP), emit
+
+    return load
+
+
+def _formulas(given: Functions, count: int, inside: int) -> Any:
+    """Compile the functions of a law into one."""
+    stress, viscous = _inside(given.stress), _inside(given.viscous, _no_stress)
+    along, decay = _inside(given.along, _nothing), _inside(given.decay, _nothing)
+    ends, change = _inside(given.ends, _nothing), _inside(given.switch, _same)
+    load = _tuple_at(count)
+
+    @njit(_FORMULAS, **_ALONE)
+    def formulas(point, branch, what, out):  # type: ignore[no-untyped-def]
+        p, x = load(past(point, 2 + inside)), carray(past(point, 2), (inside,))
+        strain = point[0]
+        if what == VALUES:
+            out[0] = complex(math.nan, 0.0)  # of a formula that divides by zero
+            out[0], out[1] = stress(p, x, strain, branch), viscous(p, x, strain, point[1], branch)
+            one, two = carray(past(out, 2), (inside,)), carray(past(out, 2 + inside), (inside,))
+            for k in range(2 * inside):
+                out[2 + k] = 0j
+            along(p, x, strain, branch, one)
+            decay(p, x, strain, branch, two)
+        elif what == ENDS:
+            ends(p, x, strain, branch, carray(out, (3,)))
+        else:
+            return int(change(p, x, strain, branch, what == UP))
+        return branch
+
+    return formulas
+
+
+def compile_law(law: Law) -> Compiled:
+    """Compile a registered law."""
+    given: Any = law.functions
+    count, inside = len(law.params), law.internal
+    simple = inside == 0 and given.viscous is None
+    kind, bounded = EXPLICIT if simple else INTERNAL, float(given.ends is not None)
+    damps = float(given.viscous is not None)
+    formulas = _formulas(given, count, inside)
+    made = formulas.overloads[_FORMULAS.args]
+    where = float(made.library.get_pointer_to_function(made.fndesc.llvm_func_name))  # below 2^53
+    begin_any = _begin.address
+
+    @cfunc(_F(_P, _P), **OPTIONS)
+    def begin(row, s):  # type: ignore[no-untyped-def]
+        s[FORMULAS], s[KIND], s[COUNT], s[INSIDE] = where, kind, count, inside
+        s[BOUNDED], s[DAMPS] = bounded, damps
+        call_begin(begin_any, row, s)
+        return 0.0
+
+    addresses: Any = (
+        begin.address, _evaluate.address, _switch.address, _settle.address, _strain.address
+    )  # fmt: skip
+    kept.append((formulas, begin))  # the addresses stay valid
+    # parameters, slope at rest, then room for complex numbers
+    columns = count + 1 + 2 * (2 + inside + count + max(3, 2 + 2 * inside))
+    fill = _fill(given.admissible, count, addresses, RESULTS + results_of(count, inside))
+    return Compiled(fill, kind, columns, count, inside, addresses, (count,), -1, damps > 0.0)
+
+
+def _fill(
+    admissible: Callable[[Array], bool] | None, count: int, addresses: tuple[int, ...], size: int
+) -> Callable[[Array, Array], bool]:
+    """Return the function that writes a row."""
+    where, work = np.array(addresses), np.zeros(size)
+
+    def fill(values: Array, row: Array) -> bool:
+        row[:count] = values
+        if not np.isfinite(values).all() or not (admissible is None or admissible(values)):
+            return False
+        slope = float(_slope_at_rest(where, row, work))
+        row[count] = slope if 0.0 < slope < math.inf else 1.0
+        return True
+
+    return fill
+
+
+kept: list[Any] = []
