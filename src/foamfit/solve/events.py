@@ -224,7 +224,7 @@ def _earliest(c, before, share):  # type: ignore[no-untyped-def]
         look(c, found)
     for i in range(c.count):
         for kind in range(RELEASE):
-            if _happened(c, i, kind):
+            if found > before and _happened(c, i, kind):
                 there = _locate(c, before, found, i, kind)
                 if who < 0 or there < found:
                     found, who, what = there, i, kind
@@ -248,14 +248,16 @@ def first_event(c):  # type: ignore[no-untyped-def]
         if c.springs[i * c.width + OLD_RATE] * c.springs[i * c.width + RATE] <= 0.0:
             pieces = 4
     for piece in range(1, pieces + 1):
-        share = piece / pieces
+        share, known = piece / pieces, True
         found, who, what = _earliest(c, before, share)
         if who >= 0:
             return found, who, what
-        for i in range(c.count if pieces > 1 else 0):
+        for i in range(c.count):
             s = past(c.springs, i * c.width)
-            look(c, share)
-            if s[OLD_RATE] * s[RATE] < 0.0:
+            if not known:
+                look(c, share)
+            known = not _may_pass(s, (share - before) * c.now[STEP])
+            if not known:
                 turn = _locate(c, before, share, i, TOP_TURN if s[RATE] < 0.0 else LOW_TURN)
                 found, who, what = _earliest(c, before, turn)
                 if who >= 0:
@@ -263,9 +265,18 @@ def first_event(c):  # type: ignore[no-untyped-def]
         look(c, share)
         for i in range(c.count):
             s = past(c.springs, i * c.width)
-            s[OLD_RATE] = s[RATE]
+            s[OLD_EPS], s[OLD_RATE] = s[EPS], s[RATE]
         before = share
     return 1.0, nobody, nobody
+
+
+@inner
+def _may_pass(s, dt):  # type: ignore[no-untyped-def]
+    """Whether an extremum since the old strain may lie past an end of the branch."""
+    if not s[OLD_RATE] * s[RATE] < 0.0:
+        return False
+    most = 0.5 * dt * max(abs(s[OLD_RATE]), abs(s[RATE]))  # it is at most this far away
+    return max(s[EPS], s[OLD_EPS]) + most > s[HIGH] or min(s[EPS], s[OLD_EPS]) - most < s[LOW]
 
 
 @inner
@@ -275,13 +286,10 @@ def suspicious(c, dt):  # type: ignore[no-untyped-def]
         return True
     for i in range(c.count):
         s = past(c.springs, i * c.width)
-        eps, old, low, high = s[EPS], s[OLD_EPS], s[LOW], s[HIGH]
-        if eps > high or eps < low or s[TURNS] * s[RATE] < 0.0:
+        if s[EPS] > s[HIGH] or s[EPS] < s[LOW] or s[TURNS] * s[RATE] < 0.0:
             return True
-        if s[OLD_RATE] * s[RATE] < 0.0:  # an extremum is at most this far away
-            most = 0.5 * dt * max(abs(s[OLD_RATE]), abs(s[RATE]))
-            if max(eps, old) + most > high or min(eps, old) - most < low:
-                return True
+        if _may_pass(s, dt):
+            return True
     return False
 
 
