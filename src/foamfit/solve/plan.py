@@ -411,7 +411,8 @@ def _time(t: ArrayLike) -> Array:
     time = as_samples(t, "t")  # a writable copy, for which the loops are compiled
     if time.ndim != 1 or time.size == 0:
         raise InputError("t must be a one-dimensional array with at least one sample")
-    if not (np.isfinite(time[[0, -1]]).all() and (time[1:] > time[:-1]).all()):
+    ends = math.isfinite(time.item(0)) and math.isfinite(time.item(-1))
+    if not (ends and (time[1:] > time[:-1]).all()):
         wrong = ~np.isfinite(time)
         wrong[1:] |= ~(time[1:] > time[:-1])
         at = int(wrong.argmax())

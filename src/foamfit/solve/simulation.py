@@ -119,6 +119,16 @@ def _verified(
     long = (long and scene.solver == SECOND_ORDER) or sharp
     if not (long or motion.method == RADAU) or rtol < 1e-12:  # a finer run would only round
         return motion
+    return _compared(scene, motion, rtol, lost, run)
+
+
+def _compared(
+    scene: Plan, motion: Motion, rtol: float, lost: float, run: Callable[[Plan, float], Motion]
+) -> Motion:
+    """Compare a motion with runs of shorter steps, until two agree.
+
+    `lost` is the size of the vibrations that its implicit steps damped out.
+    """
     miss = math.inf
     for factor in (1e-2, 1e-4, 1e-6):
         if rtol * factor < 1e-14:
