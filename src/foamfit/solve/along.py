@@ -39,7 +39,7 @@ from foamfit.springs.compiled.contract import (
 )
 from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
-MOMENTS, OF_STEP, TABLE = 0, 6, 8  # columns of the table of a relaxation term
+OF_STEP, TABLE = 6, 8  # columns of the table of a relaxation term, which begins with moments
 LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the middle adds
 
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-_LOG = logging.getLogger(__name__)
+LOG = logging.getLogger(__name__)
 PACKAGE = Path(__file__).parents[1]
 FOLDERS = ("springs", "solve")  # subfolders with compiled loops
 
@@ -33,7 +33,7 @@ def announce(function: Any, what: str) -> None:
 
 def warn(what: str) -> None:
     """Log the message of `compiling`."""
-    _LOG.warning("foamfit: %s", compiling(what))
+    LOG.warning("foamfit: %s", compiling(what))
 
 
 @functools.cache

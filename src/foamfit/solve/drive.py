@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from numba import cfunc, types
+from numba import cfunc
 
 from foamfit.solve.motion import (
     BEGIN_RAMP,
@@ -44,12 +44,12 @@ from foamfit.springs.compiled.contract import (
     SLOPE,
     TANGENT,
     TOTAL,
+    WHOLE,
+    WHOLES_AT,
     X,
     inner,
     past,
 )  # fmt: skip
-
-_I, _IP = types.int64, types.CPointer(types.int64)
 
 
 @inner
@@ -170,7 +170,7 @@ def _next_piece(c, want):  # type: ignore[no-untyped-def]
     return c.none
 
 
-@cfunc(_I(_IP, _I, _I), **OPTIONS, cache=True)
+@cfunc(WHOLE(WHOLES_AT, WHOLE, WHOLE), **OPTIONS, cache=True)
 def _drive(words, starts, want):  # type: ignore[no-untyped-def]
     """Start from rest, or begin the next piece; return whether all samples are written."""
     c = unpack(words)

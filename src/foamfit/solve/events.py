@@ -38,10 +38,14 @@ from foamfit.springs.compiled.contract import (
     OLD_RATE,
     OPTIONS,
     RATE,
+    REAL,
+    REALS_AT,
     SLOPE,
     SWITCH,
     TOTAL,
     TURNS,
+    WHOLE,
+    WHOLES_AT,
     X,
     by_address,
     call_switch,
@@ -57,19 +61,13 @@ RISEN = 1e-9  # base stress over the largest stress above which its return to ze
 # greatest and a least strain.
 TOP_END, LOW_END, TURN, RELEASE, TOP_TURN, LOW_TURN = range(6)
 PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
-_F, _I, _P, _IP = (
-    types.float64,
-    types.int64,
-    types.CPointer(types.float64),
-    types.CPointer(types.int64),
-)
 #: record, whether with derivatives, tolerance, time of the next sample, bound on steps
-STEPPING = _I(_IP, _I, _F, _F, _F)
+STEPPING = WHOLE(WHOLES_AT, WHOLE, REAL, REAL, REAL)
 
 
 @intrinsic
 def _call_step(typing, where, c, want, tol, upto, most):  # type: ignore[no-untyped-def]
-    return _I(_I, RECORD, _I, _F, _F, _F), by_address
+    return WHOLE(WHOLE, RECORD, WHOLE, REAL, REAL, REAL), by_address
 
 
 @inlined
@@ -78,7 +76,7 @@ def take_step(c, want, tol, upto, most):  # type: ignore[no-untyped-def]
     return _call_step(c.step_at, c, want, tol, upto, most)
 
 
-@cfunc(types.void(_IP, _I, _I, _P), **OPTIONS, cache=True)
+@cfunc(types.void(WHOLES_AT, WHOLE, WHOLE, REALS_AT), **OPTIONS, cache=True)
 def _change_branch(words, i, up, y):  # type: ignore[no-untyped-def]
     c = unpack(words)
     s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
@@ -110,7 +108,7 @@ CHANGE = _change_branch.address
 
 @intrinsic
 def _call_change(typing, where, c, i, up, y):  # type: ignore[no-untyped-def]
-    return types.void(_I, RECORD, _I, _I, _P), by_address
+    return types.void(WHOLE, RECORD, WHOLE, WHOLE, REALS_AT), by_address
 
 
 @inlined
@@ -237,7 +235,7 @@ def _earliest(c, before, share):  # type: ignore[no-untyped-def]
 
 @inner
 def first_event(c):  # type: ignore[no-untyped-def]
-    """Return share, spring and kind of the first event in a step; spring -1 if there is none.
+    """Return where in a step its first event is, of which spring (-1: no event) and of which kind.
 
     A spring may go past the end of its branch and return within the step. So the strains are also
     judged at their extrema.

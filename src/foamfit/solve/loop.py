@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit, types
+from numba import njit
 from numba.extending import intrinsic
 
 from foamfit.solve.events import (
@@ -79,6 +79,7 @@ from foamfit.springs.compiled.contract import (
     TANGENT,
     TOTAL,
     TURNS,
+    WHOLE,
     by_address,
     inlined,
     inner,
@@ -88,7 +89,7 @@ from foamfit.springs.compiled.contract import (
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
 # bound on steps, length of a short implicit step, whether the contact is overdamped, least scales
 # of displacement, velocity, strain and stress.
-SPEED, TOL, MOST, BRIEFLY, OVER, LEAST, REALS = 2, 3, 4, 5, 6, 7, 11
+SPEED, TOL, MOST, BRIEFLY, OVER, LEAST = range(2, 8)
 FIRST = 40.0  # first implicit step over a short one
 STOPPED = 0.1  # most of the velocity that a first step takes
 # Results of a run; after them, for each derivative, whether it is one-sided.
@@ -98,12 +99,11 @@ OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, S
 ENDINGS = 9
 LEAST_SHARE = 1e-6  # of the largest scale of nodes, see `_fresh_scales`
 SWITCHED, RELEASED, STALLED = 1, 2, 3  # what happened in a step
-_I = types.int64
 
 
 @intrinsic
 def _call_drive(typing, where, c, starts, want):  # type: ignore[no-untyped-def]
-    return _I(_I, RECORD, _I, _I), by_address
+    return WHOLE(WHOLE, RECORD, WHOLE, WHOLE), by_address
 
 
 @inlined

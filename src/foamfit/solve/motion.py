@@ -2,7 +2,8 @@
 
 Springs without mass between them form a group, which carries one stress. Of one spring between two
 nodes the strain follows from the nodes; `groups` has the other cases. A mass m accelerates by the
-difference of the stresses S of the groups above and below it, A (S₊ - S₋)/m (eqs. 6-7).
+difference of the stresses S of the groups above and below it, A (S₊ - S₋)/m (docs/theory.md, "The
+chain").
 """
 
 from __future__ import annotations
@@ -42,12 +43,16 @@ from foamfit.springs.compiled.contract import (
     OPTIONS,
     PER_HEIGHT,
     RATE,
+    REAL,
+    REALS_AT,
     RELAX,
     SETTLE,
     SLOPE,
     STEEP,
     TANGENT,
     TOTAL,
+    WHOLE,
+    WHOLES_AT,
     X,
     by_address,
     call_evaluate,
@@ -58,29 +63,25 @@ from foamfit.springs.compiled.contract import (
 )  # fmt: skip
 from foamfit.springs.parameters import OWN_RELAXATION
 
-_F, _I, _P, _IP = (
-    types.float64,
-    types.int64,
-    types.CPointer(types.float64),
-    types.CPointer(types.int64),
-)
 #: record, group, state, rates, whether with derivatives, time since the piece began; returns S
-GROUP = _F(_IP, _I, _P, _P, _I, _F)
+GROUP = REAL(WHOLES_AT, WHOLE, REALS_AT, REALS_AT, WHOLE, REAL)
 #: record, task (below), spring or group, up or whether with derivatives, state, rates, derivatives
 #: of the strain rate, results
-INSIDE = types.void(_IP, _I, _I, _I, _P, _P, _P, _P)
+INSIDE = types.void(WHOLES_AT, WHOLE, WHOLE, WHOLE, REALS_AT, REALS_AT, REALS_AT, REALS_AT)
 PART, FLOW, FRICTION, JUMP, PATH, LOSE, SHARE, LOSSES, BEGIN_RAMP, END_RAMP = range(10)
 ONLY_DERIVATIVES = 2  # instead of 0 or 1 for `want`, where the values are known
 
 
 @intrinsic
 def _call_group(typing, where, c, g, y, f, want, at):  # type: ignore[no-untyped-def]
-    return _F(_I, RECORD, _I, _P, _P, _I, _F), by_address
+    return REAL(WHOLE, RECORD, WHOLE, REALS_AT, REALS_AT, WHOLE, REAL), by_address
 
 
 @intrinsic
 def _call_inside(typing, where, c, task, i, up, y, f, quicker, out):  # type: ignore[no-untyped-def]
-    return types.void(_I, RECORD, _I, _I, _I, _P, _P, _P, _P), by_address
+    return types.void(
+        WHOLE, RECORD, WHOLE, WHOLE, WHOLE, REALS_AT, REALS_AT, REALS_AT, REALS_AT
+    ), by_address
 
 
 @inlined
@@ -295,7 +296,7 @@ def _accelerate(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
             df[p + j] -= of_drag[j] * v * per
 
 
-@cfunc(types.void(_IP, _P, _P, _I, _F, _I), **OPTIONS, cache=True)
+@cfunc(types.void(WHOLES_AT, REALS_AT, REALS_AT, WHOLE, REAL, WHOLE), **OPTIONS, cache=True)
 def _rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
     """Fill the rates f of a state y, or only the values of one group."""
     c = unpack(words)
@@ -324,7 +325,7 @@ RATES = _rates.address
 
 @intrinsic
 def _call_rates(typing, where, c, y, f, want, at, only):  # type: ignore[no-untyped-def]
-    return types.void(_I, RECORD, _P, _P, _I, _F, _I), by_address
+    return types.void(WHOLE, RECORD, REALS_AT, REALS_AT, WHOLE, REAL, WHOLE), by_address
 
 
 @inlined

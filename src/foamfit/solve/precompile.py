@@ -52,11 +52,13 @@ def at_first_use(
     def finish() -> None:
         if not missing:
             return
+        cache.LOG.disabled = True  # it has been said that the solver is compiled
         gc.disable()  # a fifth of the time
         try:
             while missing:
                 run(missing.pop(0), model if model != "auto" else "bistable+microscale")
         finally:
             gc.enable()
+            cache.LOG.disabled = False
 
     yield finish

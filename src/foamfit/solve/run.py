@@ -29,7 +29,10 @@ from foamfit.springs.compiled.contract import (
     HEIGHT,
     LOSS,
     PER_HEIGHT,
+    REALS_AT,
     RELAX,
+    WHOLE,
+    WHOLES_AT,
     address,
     call_begin,
     inner,
@@ -74,8 +77,6 @@ SIZES = (
 FIELDS = (*FLOATS, *INTEGERS, *GIVEN, *ADDRESSES, *SIZES)
 AT = {name: place for place, name in enumerate(FIELDS)}
 WORDS = len(FIELDS)
-_F, _I, _P = types.float64, types.int64, types.CPointer(types.float64)
-_IP = types.CPointer(types.int64)
 TIME, VALUES, OUT, LOG = (AT[name] for name in GIVEN)
 SAMPLES, SHOWN, ROOM = AT["samples"], AT["shown"], AT["room"]
 _FLOATS_END, _INTEGERS_END = len(FLOATS), len(FLOATS) + len(INTEGERS)
@@ -124,8 +125,8 @@ register_model(Run)(models.OpaqueModel)
 def _type_of(name: str) -> Any:
     """Return the type of a field of the record."""
     if name in FLOATS or name in GIVEN:
-        return types.CPointer(types.complex128) if name in ("systems", "right") else _P
-    return _IP if name in INTEGERS or name == "words" else _I
+        return types.CPointer(types.complex128) if name in ("systems", "right") else REALS_AT
+    return WHOLES_AT if name in INTEGERS or name == "words" else WHOLE
 
 
 @infer_getattr
@@ -135,7 +136,7 @@ class _Fields(AttributeTemplate):  # type: ignore[misc]
     key = Run
 
     def generic_resolve(self, run: Any, name: str) -> Any:
-        """Return the type of a field, None if there is none."""
+        """Return the type of a field, or None if the record has no such field."""
         return _type_of(name) if name in AT or name == "words" else None
 
 
@@ -156,7 +157,7 @@ def unpack(typing, words):  # type: ignore[no-untyped-def]
     def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
         return builder.bitcast(args[0], context.get_value_type(RECORD))
 
-    return RECORD(_IP), emit
+    return RECORD(WHOLES_AT), emit
 
 
 @inner

@@ -40,8 +40,12 @@ from foamfit.springs.compiled.contract import (
     OPTIONS,
     PER_HEIGHT,
     RATE,
+    REAL,
+    REALS_AT,
     RELAX,
     SLOPE,
+    WHOLE,
+    WHOLES_AT,
     by_address,
     call_evaluate,
     inlined,
@@ -51,12 +55,6 @@ from foamfit.springs.compiled.contract import (
 from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 
 INSIDE, FLIGHT, APPROACH = -1, -2, -3  # instead of the number of a sample
-_F, _I, _P, _IP = (
-    types.float64,
-    types.int64,
-    types.CPointer(types.float64),
-    types.CPointer(types.int64),
-)
 
 
 @inlined
@@ -276,7 +274,7 @@ def _fly(c, slope):  # type: ignore[no-untyped-def]
 # ---------------------------------------------------------------- called by address
 
 
-@cfunc(types.void(_IP, _P, _F, _I, _I), **OPTIONS, cache=True)
+@cfunc(types.void(WHOLES_AT, REALS_AT, REAL, WHOLE, WHOLE), **OPTIONS, cache=True)
 def _samples(words, y, at, k, want):  # type: ignore[no-untyped-def]
     """Write sample k from a state at a time, or do one of the tasks below zero."""
     c = unpack(words)
@@ -295,7 +293,7 @@ WRITE = _samples.address
 
 @intrinsic
 def _call_samples(typing, where, c, y, at, k, want):  # type: ignore[no-untyped-def]
-    return types.void(_I, RECORD, _P, _F, _I, _I), by_address
+    return types.void(WHOLE, RECORD, REALS_AT, REAL, WHOLE, WHOLE), by_address
 
 
 @inlined

@@ -71,12 +71,15 @@ inlined = njit(**_INSIDE, _nrt=False, forceinline=True)
 # Called from Python.
 outer = njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 
-_F, _I, _P = types.float64, types.int64, types.CPointer(types.float64)
-evaluating = cfunc(_F(_P, _P, _P, _P, _I, _I, _P), **OPTIONS, cache=True)
-switching = cfunc(_F(_P, _P, _I, _P), **OPTIONS, cache=True)
-beginning = cfunc(_F(_P, _P), **OPTIONS, cache=True)
-settling = cfunc(_F(_P, _P, _F), **OPTIONS, cache=True)
-inverting = cfunc(_F(_P, _P, _F), **OPTIONS, cache=True)
+REAL, WHOLE = types.float64, types.int64
+REALS_AT, WHOLES_AT = types.CPointer(REAL), types.CPointer(WHOLE)
+evaluating = cfunc(
+    REAL(REALS_AT, REALS_AT, REALS_AT, REALS_AT, WHOLE, WHOLE, REALS_AT), **OPTIONS, cache=True
+)
+switching = cfunc(REAL(REALS_AT, REALS_AT, WHOLE, REALS_AT), **OPTIONS, cache=True)
+beginning = cfunc(REAL(REALS_AT, REALS_AT), **OPTIONS, cache=True)
+settling = cfunc(REAL(REALS_AT, REALS_AT, REAL), **OPTIONS, cache=True)
+inverting = cfunc(REAL(REALS_AT, REALS_AT, REAL), **OPTIONS, cache=True)
 
 
 class Compiled(NamedTuple):
@@ -120,7 +123,7 @@ def past(typing, pointer, count):  # type: ignore[no-untyped-def]
     def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
         return builder.gep(args[0], [args[1]])
 
-    return pointer(pointer, _I), emit
+    return pointer(pointer, WHOLE), emit
 
 
 @intrinsic
@@ -130,7 +133,7 @@ def address(typing, pointer):  # type: ignore[no-untyped-def]
     def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
         return builder.ptrtoint(args[0], ir.IntType(64))
 
-    return _I(pointer), emit
+    return WHOLE(pointer), emit
 
 
 def _pointer(kind: Any, width: Any) -> Any:
@@ -139,13 +142,13 @@ def _pointer(kind: Any, width: Any) -> Any:
         def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
             return builder.inttoptr(args[0], width.as_pointer())
 
-        return types.CPointer(kind)(_I), emit
+        return types.CPointer(kind)(WHOLE), emit
 
     return at
 
 
 _COMPLEX = ir.LiteralStructType([ir.DoubleType(), ir.DoubleType()])
-floats_at, integers_at = _pointer(_F, ir.DoubleType()), _pointer(_I, ir.IntType(64))
+floats_at, integers_at = _pointer(REAL, ir.DoubleType()), _pointer(WHOLE, ir.IntType(64))
 complexes_at = _pointer(types.complex128, _COMPLEX)
 
 
@@ -161,22 +164,22 @@ def by_address(context, builder, signature, args):  # type: ignore[no-untyped-de
 @intrinsic
 def call_begin(typing, where, row, s):  # type: ignore[no-untyped-def]
     """Call `begin` of a law."""
-    return _F(_I, _P, _P), by_address
+    return REAL(WHOLE, REALS_AT, REALS_AT), by_address
 
 
 @intrinsic
 def call_evaluate(typing, where, row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
     """Call `evaluate` of a law."""
-    return _F(_I, _P, _P, _P, _P, _I, _I, _P), by_address
+    return REAL(WHOLE, REALS_AT, REALS_AT, REALS_AT, REALS_AT, WHOLE, WHOLE, REALS_AT), by_address
 
 
 @intrinsic
 def call_switch(typing, where, row, s, up, out):  # type: ignore[no-untyped-def]
     """Call `switch` of a law."""
-    return _F(_I, _P, _P, _I, _P), by_address
+    return REAL(WHOLE, REALS_AT, REALS_AT, WHOLE, REALS_AT), by_address
 
 
 @intrinsic
 def call_number(typing, where, row, s, number):  # type: ignore[no-untyped-def]
     """Call `settle` or `strain` of a law."""
-    return _F(_I, _P, _P, _F), by_address
+    return REAL(WHOLE, REALS_AT, REALS_AT, REAL), by_address

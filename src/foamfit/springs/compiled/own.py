@@ -36,12 +36,15 @@ from foamfit.springs.compiled.contract import (
     OPTIONS,
     OWN,
     RATE,
+    REAL,
+    REALS_AT,
     RESULTS,
     SIGMA_HIGH,
     SIGMA_LOW,
     SLOPE,
     SOFT,
     TURNS,
+    WHOLE,
     Compiled,
     X,
     address,
@@ -70,9 +73,8 @@ VALUES, ENDS, DOWN, UP = range(4)
 # What a spring of a registered law keeps in memory: the address of its function, kind, numbers of
 # parameters and of internal variables, whether its branches end, and whether V depends on the rate.
 FORMULAS, KIND, COUNT, INSIDE, BOUNDED, DAMPS = range(OWN, OWN + 6)
-_F, _I, _P = types.float64, types.int64, types.CPointer(types.float64)
 _CP = types.CPointer(types.complex128)
-_FORMULAS = _I(_CP, _I, _I, _CP)
+_FORMULAS = WHOLE(_CP, WHOLE, WHOLE, _CP)
 _ALONE: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _WITHIN: dict[str, Any] = {**_ALONE, "_nrt": False}
 FURTHEST, TRIALS = 1e12, 200  # largest strain, and trials, in the search for a strain
@@ -94,7 +96,7 @@ def call_formulas(typing, where, point, branch, what, out):  # type: ignore[no-u
         builder.call(builder.inttoptr(args[0], kind.as_pointer()), given)
         return builder.load(result)
 
-    return _I(_I, _CP, _I, _I, _CP), emit
+    return WHOLE(WHOLE, _CP, WHOLE, WHOLE, _CP), emit
 
 
 # ---------------------------------------------------------------- for all laws
@@ -409,7 +411,7 @@ def compile_law(law: Law) -> Compiled:
     where = float(made.library.get_pointer_to_function(made.fndesc.llvm_func_name))  # below 2^53
     begin_any = _begin.address
 
-    @cfunc(_F(_P, _P), **OPTIONS)
+    @cfunc(REAL(REALS_AT, REALS_AT), **OPTIONS)
     def begin(row, s):  # type: ignore[no-untyped-def]
         s[FORMULAS], s[KIND], s[COUNT], s[INSIDE] = where, kind, count, inside
         s[BOUNDED], s[DAMPS] = bounded, damps
