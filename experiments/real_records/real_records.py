@@ -227,7 +227,7 @@ def microscale(values: Array, strain: Array, instants: Array) -> Array:
     return np.asarray(ff.simulate(ff.Chain([spring], [1.0], 1.0), drive, instants).base_stress)
 
 
-def plain(test: ff.Measurement, model: str, zero: float) -> float:
+def plain(test: ff.Measurement, model: str, zero: float, *, starts: int = STARTS) -> float:
     """Return the misfit of plain least squares from random starts: RMS over range of the stress."""
     assert test.stress is not None
     assert test.displacement is not None
@@ -258,7 +258,7 @@ def plain(test: ff.Measurement, model: str, zero: float) -> float:
             return np.full(int(kept.sum()), 10.0)
 
     rng, best = np.random.default_rng(1), math.inf
-    for _ in range(STARTS):
+    for _ in range(starts):
         points = rng.uniform(low, high, (40, low.size))
         start = min(points, key=lambda one: float(np.sum(residual(one) ** 2)))
         found = least_squares(residual, start, bounds=(low, high), max_nfev=100)

@@ -388,35 +388,44 @@ def _search(
     them to a fraction of a sample.
     """
     rng, early = np.random.default_rng(record.seed), list[Array]()
+    rough = problem.thinned()
+    scout = Tracker(rough.objective, tracker.deadline, tracker.better, looked=tracker.looked)
+    driven = problem.objective.drive != "impact"
 
-    def search_in(space: Space) -> list[tuple[float, int]]:
-        return search(tracker, space, starts=record.starts, rng=rng, progress=progress)
+    def scouted(problem: Problem) -> list[tuple[float, int]]:
+        """Search on the thinned record; the ends are those of the tracker."""
+        space = problem.space()
+        costs = search(scout, space, starts=record.starts, rng=rng, progress=progress)
+        exchange_springs(scout, space)
+        scan_places(scout, space)
+        best = [] if scout.best_values is None else [scout.best_values]
+        tracker.ends += [*best, *scout.ends]
+        return costs
 
-    def search_held(space: Space) -> None:
+    def search_held(_: Space) -> None:
         """Search with contact and zeros held, unless the first search did that."""
         if early:
             tracker.ends += early
         else:
-            search_in(space)
+            scout.best_values, scout.best_cost, scout.ends = None, np.inf, []
+            scouted(held_by_record(rough, asked))
 
     try:
-        held = held_by_record(problem, asked) if problem.objective.drive != "impact" else problem
-        record = replace(record, costs=tuple(search_in(held.space())))
+        costs = scouted(held_by_record(rough, asked) if driven else rough)
+        record = replace(record, costs=tuple(costs))
+        early += tracker.ends if driven else []
         progress(REFINED, "refinement")
-        if held is problem:
-            refine(problem, tracker)
-        else:
-            early += tracker.ends
-            descend_again(problem, tracker)
-        moved = bool(exchange_springs(tracker, problem.space()))
-        if scan_places(tracker, problem.space()) or moved:
-            refine(problem, tracker)
+        descend_again(problem, tracker)
         problem, freed = keep_to_record(problem, tracker, asked, search_held)
         problem, record = follow_samples(problem, tracker), replace(record, freed=freed)
         weigh_motion(problem, tracker)
         settle_ends(tracker, problem.space())
     except STOPPING as error:
+        if tracker.best_values is None and scout.best_values is not None:
+            tracker.consider(scout.best_values)
         ensure_feasible(tracker, problem.space(), np.random.default_rng(record.seed))
         return problem, replace(record, stopped=what_stopped(error))
+    finally:
+        problem.objective.add_counts(rough.objective)
     progress(1.0, "done")
     return problem, record

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -15,7 +15,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.units import LARGEST, parse_uncertain
 from foamfit.errors import InputError
 from foamfit.fitting import nuisance
-from foamfit.fitting.box import Scales, Space, others
+from foamfit.fitting.box import Expressions, LastHeight, Scales, Space, Tied, others
 from foamfit.fitting.curves import (
     check_interior,
     choose_drive,
@@ -236,6 +236,10 @@ class Problem:
         values = (self.params if params is None else params).valuesdict()
         return np.array([values[name] for name in self.names])
 
+    def thinned(self) -> Problem:
+        """Return the problem on a few hundred samples, for the search."""
+        return replace(self, objective=self.objective.thinned())
+
     def told(self) -> lmfit.Parameters:
         """Return the parameters for the user: nuisance parameters in the numbers of the file."""
         return _counted_from(self.params.copy(), self.measurement.origins, 1.0)
@@ -279,14 +283,15 @@ class Problem:
             params[name].set(value=one.mean, vary=False)
         return replace(self, params=params, kept=free)
 
-    def tied(self) -> Callable[[Array], Array] | None:
-        """Return a function that evaluates the expressions in a vector; None without any."""
+    def tied(self) -> Tied | None:
+        """Return the parameters that depend on others through expressions; None without any."""
         tied = [name for name in self.names if self.params[name].expr is not None]
         if not tied:
             return None
         rest = _rest_of_height(self.measurement, self.model)
         if [self.params[name].expr for name in tied] == [rest]:
-            return self._last_height
+            first, last = self.model.index["s1_height"], len(self.model.kinds) - 1
+            return LastHeight(self.measurement.specimen.height, first, first + last)
         places, scratch = [self.index[name] for name in tied], self.params.copy()
 
         def complete(values: Array) -> Array:
@@ -297,14 +302,7 @@ class Problem:
                 values[place] = scratch[name].value
             return values
 
-        return complete
-
-    def _last_height(self, values: Array) -> Array:
-        """Set the last height to the rest of the specimen; a fast form of the expression."""
-        first, last = self.model.index["s1_height"], len(self.model.kinds) - 1
-        others = values[first : first + last]
-        values[first + last] = self.measurement.specimen.height - others.sum()
-        return values
+        return Expressions(complete)
 
     def space(self) -> Space:
         """Return the box of the search."""

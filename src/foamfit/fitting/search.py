@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
+from foamfit.data.measurement import Measurement
 from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.starts import CURVE_STARTS, box_starts, curve_starts, smooth_loop
+from foamfit.fitting.starts import CURVE_STARTS, box_starts, curve_starts, thinned
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, family, relaxation_names
 
@@ -414,14 +415,8 @@ def _search_loop(
     the tracker even if the search is stopped.
     """
     objective = tracker.objective
-    followed = None
-    if _is_noisy(objective) and objective.motion is not None:
-        followed = objective.motion.at(objective.time)
-    loop = smooth_loop(objective.measurement, followed)
-    along = Objective(
-        loop, objective.model, "displacement", {"stress_strain": 1.0},
-        time_shift=objective.time_shift, nuisance=objective.nuisance,
-    )  # fmt: skip
+    loop = _loop_of(objective)
+    along = objective if objective.driven else _along(objective, loop)
     inner = Tracker(along, tracker.deadline, tracker.better)
     own = space
     if objective.drive == "impact":  # contact and zeros do not affect its loop
@@ -444,6 +439,22 @@ def _search_loop(
         if inner.best_values is not None:
             tracker.consider(inner.best_values)
     return ends
+
+
+def _loop_of(objective: Objective) -> Measurement:
+    """Return the smooth loop of a test, off which start values are read."""
+    followed = None
+    if _is_noisy(objective) and objective.motion is not None:
+        followed = objective.motion.at(objective.time)
+    return thinned(objective.measurement, followed, loop=True)
+
+
+def _along(objective: Objective, loop: Measurement) -> Objective:
+    """Return the objective of the stress along the motion of a loop."""
+    return Objective(
+        loop, objective.model, "displacement", {"stress_strain": 1.0},
+        time_shift=objective.time_shift, nuisance=objective.nuisance,
+    )  # fmt: skip
 
 
 def _is_noisy(objective: Objective) -> bool:

@@ -23,29 +23,38 @@ OWN_MARKS = 5  # random numbers per spring; further ones that a law needs are ap
 NEAR_USUAL, LATE = (-0.05, 0.05), (-0.3, 0.3)
 
 
-def smooth_loop(measurement: Measurement, followed: Array | None = None) -> Measurement:
-    """Return the measured loop, smoothed and with fewer samples, for the first descents.
+def thinned(
+    measurement: Measurement, followed: Array | None = None, *, loop: bool = False
+) -> Measurement:
+    """Return a test with a few hundred of its samples, on which starts are ranked and descend.
 
-    `followed` is the motion without its noise, m, if it is known.
+    The peaks of stress and motion and the turning points are among them. `followed` is the motion
+    without its noise, m, if it is known; otherwise the motion of a `loop` is smoothed. A `loop` is
+    compared along the motion alone and begins at the contact.
     """
     motion, stress, time = measurement.displacement, measurement.stress, measurement.time
-    assert motion is not None
     assert stress is not None
     if followed is not None:
         motion = followed
-    else:
+    elif loop and motion is not None:
         window = max(motion.size // 60, 1) * 2 + 1
         motion = smoothed(motion, window) if window > 3 else motion
-    first = 0 if time is None else int(np.searchsorted(time, 0.0))  # no loop before contact
+    first = int(np.searchsorted(time, 0.0)) if loop and time is not None else 0
     cycles = 1 if measurement.last_cycle is None else 2  # twice the samples for a history
-    count = min(motion.size - first, cycles * LOOP_SAMPLES)
-    keep = np.linspace(first, motion.size - 1, count).astype(int)
-    keep = np.unique(np.append(keep, find_turns(motion))) if cycles > 1 else np.unique(keep)
-    thinned = None if time is None else time[keep]
+    count = min(stress.size - first, cycles * LOOP_SAMPLES)
+    keep = np.linspace(first, stress.size - 1, count).astype(int)
+    marks = [int(np.argmax(stress))]
+    if motion is not None:
+        marks += [int(np.argmax(motion)), *(find_turns(motion) if cycles > 1 else ())]
+    keep = np.unique([*keep, *(mark for mark in marks if mark >= first)])
+    masks = {name: ~one.left_out[keep] for name, one in measurement.outliers.items()}
+    level = replace(measurement.noise, displacement=0.0) if loop else measurement.noise
+    acceleration = measurement.acceleration
     return replace(
-        measurement, displacement=motion[keep], stress=stress[keep], time=thinned,
-        outliers={}, sampled={}, interior={},  # already interpolated and smoothed
-        acceleration=None, block=1, noise=replace(measurement.noise, displacement=0.0),
+        measurement, displacement=None if motion is None else motion[keep], stress=stress[keep],
+        time=None if time is None else time[keep], outliers={}, sampled=masks, block=1, noise=level,
+        interior={} if loop else {n: one[keep] for n, one in measurement.interior.items()},
+        acceleration=None if loop or acceleration is None else acceleration[keep],
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import Tracker, rank
-from foamfit.fitting.starts import curve_starts, smooth_loop
+from foamfit.fitting.starts import curve_starts, thinned
 from foamfit.one_model import Keywords, Options
 from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
@@ -119,8 +119,7 @@ class Turning:
             if name in problem.index and math.isfinite(value):
                 place = problem.index[name]
                 values[place] = value - problem.origins[place]
-        complete = problem.tied()
-        return values if complete is None else complete(values)
+        return problem.space().complete(values)
 
     def turn(self, moves: Mapping[str, float]) -> Drawn:
         """Change some parameters (SI) and return the curves."""
@@ -179,7 +178,7 @@ class Turning:
         if problem.measurement.displacement is None:
             return problem.vector()
         rng = np.random.default_rng(0)
-        starts = curve_starts(space, smooth_loop(problem.measurement), rng)
+        starts = curve_starts(space, thinned(problem.measurement, loop=True), rng)
         tracker = Tracker(problem.objective)
         rank(tracker, space, starts)
         found = problem.vector() if tracker.best_values is None else tracker.best_values

@@ -301,7 +301,7 @@ class Plan(NamedTuple):
         layout = self._layout(rows, directions, integrated=False)
         if alone:
             strain = (self.values / heights)[None, :]
-            moved = bool((directions[:, 1] == MOVED).any())
+            moved = MOVED in directions[:, 1].tolist()
             along.follow(
                 *_memory(layout), rows, heights, self.mass, reals, strain[0], self.time, out,
                 _NO_LOG, seeds(strain[0], moved), branches[0], np.empty(n),
@@ -314,7 +314,7 @@ class Plan(NamedTuple):
                 *_memory(layout), rows, heights, self.mass, reals, self.values, self.time, out,
                 _NO_LOG, strain, branches,
             )  # fmt: skip
-        fine = bool(np.isfinite(out[0]).all())
+        fine = math.isfinite(out[0].sum())
         if fine and self.top == scenes.MOTION and not alone:
             miss = np.abs(out[0, -1] - self.values).max()
             fine = miss <= AT_MOST * (self.height + np.abs(self.values).max())
@@ -332,12 +332,12 @@ class Plan(NamedTuple):
         self, out: Array, strain: Array, eta: float, heights: Array, directions: Directions
     ) -> None:
         """Add the stress of the dashpot of one spring along its motion, and its derivatives."""
-        by_dashpot = np.isin(directions[:, 1], (OWN_ETA, OWN_HEIGHT)).any()
-        if self.time.size == 1 or not (by_dashpot or eta > 0.0):
+        own = directions[:, 1].tolist()
+        if self.time.size == 1 or not (eta > 0.0 or OWN_ETA in own):
             return
         rate = np.gradient(strain, self.time)
         out[0, 0] += eta * rate
-        for p, (_, what) in enumerate(directions):
+        for p, what in enumerate(own):
             if what == OWN_ETA:
                 out[1 + p, 0] += rate
             elif what == OWN_HEIGHT:
@@ -349,9 +349,11 @@ class Plan(NamedTuple):
         """Mark directions of springs that were on flat branches together: either may move first."""
         flat = np.zeros(branches.shape, dtype=bool)
         for i, one in enumerate(self.laws.made):
-            if len(one.slopes) == 3:  # bistable: slopes of its branches, by number
-                first, own = one.slopes[0], rows[i, 1 + 2 * self.terms :]
-                flat[i] = own[first + (one.slopes[2] - first) * branches[i]] == 0.0
+            first, own = one.slopes[:1], rows[i, 1 + 2 * self.terms :]
+            if len(one.slopes) == 3 and 0.0 in own[[*one.slopes]]:  # bistable: those of branches
+                flat[i] = own[first[0] + (one.slopes[2] - first[0]) * branches[i]] == 0.0
+        if not flat.any():
+            return np.zeros(len(directions))
         together = (flat & (flat.sum(axis=0) > 1)).any(axis=1)
         marked = np.isin(directions[:, 1], (0, 2, 3)) & (directions[:, 0] >= 0)  # k0, dsigma, eps_a
         return np.where(marked, together[directions[:, 0]], 0.0)

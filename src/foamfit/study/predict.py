@@ -18,6 +18,7 @@ from foamfit.data.rate import loading_rate
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.curves import check_drive, check_time_shift, choose_drive, driving_motion
 from foamfit.fitting.problem import Problem, make_problem
+from foamfit.fitting.scenes import channel_of
 from foamfit.fitting.search import Tracker, descend
 from foamfit.report import render
 from foamfit.report.studies.prediction import (
@@ -216,7 +217,7 @@ def _before(problem: Problem, source: Source) -> Problem:
     if not ends or ends[-1] == objective.time.size:
         return problem
     before = np.arange(objective.time.size) < ends[-1]
-    channels = map(objective.channel, objective.counted)
+    channels = map(channel_of, objective.counted)
     sampled = {channel: before & test.sampled.get(channel, True) for channel in channels}
     test = replace(test, sampled=test.sampled | sampled)
     followed = (objective.motion,)
@@ -342,7 +343,7 @@ def _curve(
 ) -> PredictedCurve:
     """Return one curve with its band: quantiles of the draws, and other parts in quadrature."""
     objective = problem.objective
-    channel, n = objective.channel(name), predicted.size
+    channel, n = channel_of(name), predicted.size
     parts = {part: np.zeros(n) for part in COLOURS if part != "motion"} | halves
     low = middle = high = predicted
     if drawn:

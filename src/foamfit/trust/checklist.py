@@ -335,7 +335,7 @@ def _shift_hint(best: BestPoint, with_error: Sequence[str]) -> float | None:
     """
     objective, simulated = best.problem.objective, best.simulated
     gap = float(np.median(np.diff(objective.time)))
-    shifted = (objective.shifted(simulated, side * gap) for side in (-0.5, 0.5))
+    shifted = (objective.scenes.shifted(simulated.curves, side * gap) for side in (-0.5, 0.5))
     early, late = (
         objective.compare(replace(simulated, curves=curves), best.values) for curves in shifted
     )

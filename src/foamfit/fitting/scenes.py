@@ -1,0 +1,432 @@
+"""The curves that a test would show: its scenes, and the readings of its channels.
+
+Everything that does not change during a fit is prepared once. `Scenes.rows` then maps the
+parameters of springs and channels to the curves, each stacked on its derivatives.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.arrays import Array
+from foamfit.data.measurement import Measurement
+from foamfit.data.motion import SmoothMotion
+from foamfit.errors import InputError, SimulationError
+from foamfit.fitting import nuisance as nuisances
+from foamfit.fitting.curves import (
+    ACCELERATION,
+    driven_instants,
+    driving_motion,
+    driving_stress,
+    instants,
+    later,
+    moved_at,
+    without_tension,
+)
+from foamfit.solve.plan import Motion, Plan
+from foamfit.solve.plan import plan as make_plan
+from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
+from foamfit.springs.model import Model
+from foamfit.springs.parameters import MOVED
+
+Places = NDArray[np.int64]
+
+NOWHERE: Places = np.empty(0, np.int64)
+# Curves of the measured stress, which is the simulated one over the scale of the force.
+STRESSES = ("stress_time", "stress_strain")
+MAX_STEPS = 20_000  # a trial that needs more steps is too stiff and counts as failed
+FINEST = 8  # most instants simulated per sample that averages rows of the file
+# Steps of difference quotients: velocity and mass, relative; times, in sampling intervals; and the
+# zero of a motion, as a fraction of its range.
+RELATIVE_STEP, STEP_OF_TIME, STEP_OF_ZERO = 1e-3, 0.02, 1e-4
+
+
+class Wanted(NamedTuple):
+    """Derivatives to return, by the places of their parameters in the flat vector."""
+
+    size: int
+    own: Places  # rows of the derivatives by parameters of springs
+    directions: Places  # of the solver; the last one by a shift of the motion, if `moved`
+    others: tuple[tuple[int, str], ...]  # rows and names of nuisance parameters
+    damped: bool  # whether one is by a dashpot
+    by_site: tuple[int, ...]  # rows of the derivative by site_eta
+    moved: bool
+
+
+def _stacked(motion: Motion, node: int | None = None) -> Array:
+    """Return the base stress, or the displacement of a node, stacked on its derivatives."""
+
+    def of(base_stress: Array, displacement: Array) -> Array:
+        return base_stress if node is None else displacement[..., node, :]
+
+    rows = of(motion.base_stress, motion.displacement)[None]
+    if (slopes := motion.slopes) is None:
+        return rows
+    return np.concatenate([rows, of(slopes.base_stress, slopes.displacement)])
+
+
+@dataclass(eq=False)
+class Scenes:
+    """The scenes of a test with a model under a drive; `Objective` describes the fields."""
+
+    measurement: Measurement
+    model: Model
+    drive: str
+    curves: tuple[str, ...]  # all of the test
+    interior: dict[str, int]  # node of each curve of an interior mass
+    nuisance: tuple[str, ...]
+    rtol: float
+    interior_mass: bool
+    followed: tuple[SmoothMotion | None, ...] = ()
+    _asked: dict[bytes, Wanted] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        """Prepare the instants, the plans and the steps of difference quotients."""
+        test = self.measurement
+        assert test.stress is not None  # checked by check_drive
+        self.driven = self.drive == "displacement"
+        self.time = np.arange(test.stress.size, dtype=float) if test.time is None else test.time
+        self._fine = min(test.block, FINEST) if self.drive != "stress" else 1
+        self.clock, self._own = instants(self.time, self._fine), None
+        if self.driven:
+            own = self.clock
+            self.clock = driven_instants(test, own, self.motion)
+            self._own = np.searchsorted(self.clock, own) if self.clock.size > own.size else None
+        driving = {"stress": ["stress_time"], "displacement": ["displacement_time"]}
+        absent = driving.get(self.drive, []) + ["stress_time"] * (test.time is None)
+        self.present = tuple(name for name in self.curves if name not in absent)
+        self._largest = 0.0 if test.displacement is None else float(test.displacement.max())  # m
+        self._gravity = (test.striker.gravity if test.striker else None) or 0.0
+        self.usual = nuisances.values_of(test)
+        self._dashpots = [
+            i for i, name in enumerate(self.model.names[:-1]) if name.endswith("eta")
+        ]
+        # Whether all samples share one clock and no reading is averaged.
+        self._plain = self._fine == 1 and self._own is None
+        self._one = np.array([test.specimen.height])
+        self.plans = self._make(self._loading())
+
+    @cached_property
+    def motion(self) -> SmoothMotion | None:
+        """The measured motion without its noise, or None; see `driving_motion`."""
+        return self.followed[0] if self.followed else driving_motion(self.measurement, self.time)
+
+    @cached_property
+    def _moved(self) -> Array:
+        """The measured motion at the simulated instants, m."""
+        assert self.measurement.displacement is not None
+        return moved_at(self.clock, self.time, self.measurement.displacement, self.motion)
+
+    @cached_property
+    def _along(self) -> dict[bool, Plan]:
+        """Scenes of the springs along the measured motion; empty without a motion."""
+        is_measured = self.measurement.displacement is not None
+        return self._make(DisplacementDrive(self._moved)) if is_measured else {}
+
+    @cached_property
+    def _zeros(self) -> dict[str, str]:
+        """The nuisance parameter that is added to each curve, if there is one."""
+        channels = {channel: zero for zero, channel in nuisances.ZEROS.items()}
+        zeros = {curve: channels.get(channel_of(curve), "") for curve in self.curves}
+        return {curve: zero for curve, zero in zeros.items() if zero in self.nuisance}
+
+    @cached_property
+    def _steps(self) -> dict[str, float]:
+        """Steps of difference quotients by nuisance parameters."""
+        gap = float(np.median(np.diff(self.clock)))
+        steps = dict.fromkeys(self.nuisance, STEP_OF_TIME * gap)
+        steps |= {name: RELATIVE_STEP * self.usual[name] for name in nuisances.STRIKER}
+        if self.measurement.displacement is not None:
+            span = float(np.ptp(self.measurement.displacement))
+            steps["displacement_zero"] = STEP_OF_ZERO * span
+        return steps
+
+    def moved_by(self, change: Array | float) -> Scenes:
+        """Return the scenes with a changed driving motion."""
+        other = copy(self)
+        other.plans = {
+            damped: plan._replace(values=plan.values + change)
+            for damped, plan in self.plans.items()
+        }
+        return other
+
+    def _loading(self) -> Drive:
+        if self.drive == "impact":
+            usual = self.usual
+            return Impact(usual[nuisances.STRIKER_MASS], usual[nuisances.VELOCITY], self._gravity)
+        if self.drive == "stress":
+            assert self.measurement.stress is not None
+            return StressDrive(driving_stress(self.measurement.stress, self.model))
+        return DisplacementDrive(self._moved)
+
+    def _make(self, loading: Drive) -> dict[bool, Plan]:
+        """Prepare scenes without and with dashpots; they do not depend on the spring parameters.
+
+        Interior masses are included in impacts only; along a prescribed motion the springs are in
+        equilibrium.
+        """
+        specimen, count = self.measurement.specimen, len(self.model.kinds)
+        heights, masses = [specimen.height / count] * count, [0.0] * count
+        if self.interior_mass and count > 1 and isinstance(loading, Impact):
+            if specimen.mass is None:
+                raise InputError(
+                    f"{self.measurement.name}: interior masses need [specimen] mass, "
+                    'like mass = "5.56 mg"'
+                )
+            masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
+        springs = [law.any_spring(self.model.relaxation) for law in self.model.laws]
+        chain = Chain(springs, heights, specimen.area, masses)
+        make = partial(make_plan, chain, loading, self.clock, max_steps=MAX_STEPS)
+        relaxing = self.model.relaxation > 0
+        return {damped: make(dashpots=damped, relaxing=relaxing) for damped in (False, True)}
+
+    # ------------------------------------------------------------------ curves and derivatives
+
+    def wanted(self, places: Places) -> Wanted:
+        """Return the derivatives by the parameters at `places`, prepared once."""
+        key = places.tobytes()
+        if (found := self._asked.get(key)) is None:
+            names, count = self.model.names, len(self.model.names)
+            own = np.flatnonzero(places < count)
+            rows = ((row, place - count) for row, place in enumerate(places.tolist()))
+            others = tuple((row, self.nuisance[i]) for row, i in rows if i >= 0)
+            damped = any(place in self._dashpots for place in places.tolist())
+            zero = any(name == "displacement_zero" for _, name in others)
+            moved = zero and not damped and self.plans[False].moves_one
+            directions = self.model.directions[places[own]]
+            if moved:
+                directions = np.append(directions, [(0, MOVED)], axis=0)
+            site = tuple(r for r, p in enumerate(places[own].tolist()) if p == len(names) - 1)
+            found = Wanted(places.size, own, directions, others, damped, site, moved)
+            self._asked[key] = found
+        return found
+
+    def rows(
+        self, values: Array, places: Places, counted: tuple[str, ...], everything: bool
+    ) -> tuple[dict[str, Array], Motion]:
+        """Return curves (1 + p, n) stacked on their derivatives, and the simulated motion.
+
+        These are the readings of the channels: the `counted` ones, or all with `everything`. Raise
+        SimulationError if the parameters are not admissible or the scene has no finite answer.
+        """
+        count = len(self.model.names)
+        springs, given = values[:count], values[count:].tolist()
+        at = dict(zip(self.nuisance, given, strict=True))
+        wanted = self.wanted(places)
+        moved = wanted.moved and not self._is_damped(springs)
+        curves, motion = self._curves(springs, at, wanted, counted, everything)
+        if not wanted.others:
+            return curves, motion
+        out = {name: np.empty((1 + wanted.size, rows.shape[1])) for name, rows in curves.items()}
+        own = wanted.own.size
+        for name, rows in curves.items():
+            out[name][0], out[name][1 + wanted.own] = rows[0], rows[1 : 1 + own]
+        for row, name in wanted.others:
+            if moved and name == "displacement_zero":  # a larger zero means a smaller motion
+                by = {curve: -rows[-1] for curve, rows in curves.items()}
+            elif name == nuisances.FORCE_SCALE:
+                by = self._by_scale({curve: rows[0] for curve, rows in curves.items()}, at)
+            else:
+                by = self._by_nuisance(springs, at, name, counted, everything)
+            for curve in out:
+                out[curve][1 + row] = by[curve]
+        return out, motion
+
+    def _is_damped(self, springs: Array) -> bool:
+        """Return whether a spring has a dashpot."""
+        return any(springs.item(i) != 0.0 for i in self._dashpots)
+
+    def _by_scale(self, curves: dict[str, Array], at: dict[str, float]) -> dict[str, Array]:
+        """Return the derivative of the curves by the scale of the force."""
+        return {
+            name: (at.get(self._zeros.get(name, ""), 0.0) - curve) / at[nuisances.FORCE_SCALE]
+            if name in STRESSES
+            else np.zeros(curve.size)
+            for name, curve in curves.items()
+        }
+
+    def _by_nuisance(
+        self, springs: Array, at: dict[str, float], name: str, counted: tuple[str, ...],
+        everything: bool,
+    ) -> dict[str, Array]:  # fmt: skip
+        """Return the derivative of the curves by one nuisance parameter.
+
+        The zero of a channel is simply added to it. Other derivatives are central difference
+        quotients of two simulations, including the zero of a motion that the stress follows.
+        """
+        n, step, zero = self.time.size, self._steps[name], "displacement_zero"
+        followed = self.driven or "stress_strain" in counted or everything
+        if name in nuisances.ZEROS and not (followed and name == zero):
+            return {
+                curve: np.full(n, float(self._zeros.get(curve) == name)) for curve in self.curves
+            }
+        if self.drive != "impact" and name not in (nuisances.TIME_SHIFT, zero):
+            return {curve: np.zeros(n) for curve in self.curves}
+        nothing = self.wanted(NOWHERE)
+        before, after = (
+            self._curves(springs, at | {name: at[name] + side * step}, nothing, counted, everything)
+            for side in (-0.5, 0.5)
+        )
+        slopes = {curve: (after[0][curve][0] - before[0][curve][0]) / step for curve in after[0]}
+        if name == nuisances.CONTACT_TIME:  # where the stress jumps if there is a dashpot
+            jumped = np.abs(self.clock - at[name]) <= step
+            for slope in slopes.values():
+                slope[np.any(jumped.reshape(n, -1), axis=1)] = 0.0
+        return slopes
+
+    def _curves(
+        self, springs: Array, at: dict[str, float], wanted: Wanted, counted: tuple[str, ...],
+        everything: bool,
+    ) -> tuple[dict[str, Array], Motion]:  # fmt: skip
+        """Return the curves with derivatives by parameters of the springs."""
+        height, drag = self.measurement.specimen.height, springs.item(-1)
+        rows, heights = self.model.rows(springs), self._one
+        if len(self.model.kinds) > 1:
+            heights = springs[-1 - len(self.model.kinds) : -1].copy()
+        if rows is None or not (heights.min() > 0.0 and drag >= 0.0):
+            raise SimulationError("the parameters are not admissible")
+        if self._largest - at.get("displacement_zero", 0.0) >= height:
+            raise SimulationError("the measured strain would reach one with this displacement_zero")
+        damped = wanted.damped or self._is_damped(springs)  # dashpots at zero are omitted
+        directions = wanted.directions[:-1] if wanted.moved and damped else wanted.directions
+        drag /= height
+
+        def run(plan: Plan, shown: bool) -> Motion:
+            more: Any = {"drag": drag, "everything": shown, "directions": directions}
+            return plan.run(rows, heights, self.rtol, **more)
+
+        inside = everything or any(name in self.interior for name in counted)
+        plan, late = self._placed(self.plans[damped], at), at.get(nuisances.TIME_SHIFT, 0.0)
+        motion = run(plan, inside)
+        if self.driven and self.measurement.last_cycle is not None:
+            motion = without_tension(motion)
+        shown = motion
+        if late != 0.0 and self.drive == "impact":
+            shown = run(plan._replace(time=plan.time - late), inside)
+        along = motion if self.driven else None
+        if along is None and (everything or "stress_strain" in counted) and self._along:
+            along = without_tension(run(self._followed(self._along[damped], at), False))
+        runs = {"stress_time": (motion, None), "displacement_time": (shown, -1)}
+        runs |= {name: (shown, node - 1) for name, node in self.interior.items()}
+        if along is not None:
+            runs["stress_strain"] = along, None
+        asked = self.present if everything else counted
+        parts = {name: _stacked(*runs[name]) for name in asked if name in runs}
+        if ACCELERATION in asked:
+            parts[ACCELERATION] = self._acceleration(shown, drag, at, wanted.by_site)
+        out = {name: self._read(name, rows, at, wanted) for name, rows in parts.items()}
+        if everything:
+            motion = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
+        return out, motion
+
+    def _read(self, name: str, rows: Array, at: dict[str, float], wanted: Wanted) -> Array:
+        """Return the reading of a channel: scaled, averaged, late, and with its zero; in place."""
+        scale, late = at.get(nuisances.FORCE_SCALE, 1.0), at.get(nuisances.TIME_SHIFT, 0.0)
+        if scale != 1.0 and name in STRESSES:
+            rows = rows / scale
+        rows = rows if self._plain else self._sampled(rows)
+        rows = self._late(name, rows, late) if late else rows
+        if zero := at.get(self._zeros.get(name, ""), 0.0):
+            rows = np.concatenate([rows[:1] + zero, rows[1:]])
+        if wanted.by_site:
+            rows = rows.copy()
+            rows[1 + wanted.by_site[0]] /= self.measurement.specimen.height  # acts through η_site/H
+        return rows
+
+    # ------------------------------------------------------------------ times and zeros
+
+    def _placed(self, plan: Plan, at: dict[str, float]) -> Plan:
+        """Return the plan with contact time, striker and zero of the driving motion applied."""
+        zero = at.get("displacement_zero", 0.0)
+        if self.driven and (zero != 0.0 or self.measurement.contact != "file"):
+            return plan._replace(values=np.maximum(plan.values - zero, 0.0))  # no contact below
+        if self.drive != "impact":
+            return plan
+        mass = plan.mass.copy()
+        mass[-1] = at[nuisances.STRIKER_MASS] / self.measurement.specimen.area
+        time, weight = self.clock - at[nuisances.CONTACT_TIME], plan.values * mass[-1:]
+        return plan._replace(
+            time=time, speed=at[nuisances.VELOCITY], mass=mass, values=weight / plan.mass[-1]
+        )
+
+    def _followed(self, plan: Plan, at: dict[str, float]) -> Plan:
+        """Return the plan along the measured motion of an impact, zero without contact."""
+        if self.drive != "impact":
+            return plan
+        values = np.maximum(plan.values - at["displacement_zero"], 0.0)
+        before = self.clock < at[nuisances.CONTACT_TIME]
+        return plan._replace(values=np.where(before, 0.0, values))
+
+    def _sampled(self, values: Array) -> Array:
+        """Return the mean over the instants that each sample averages, along the last axis."""
+        values = values if self._own is None else values[..., self._own]
+        if self._fine == 1:
+            return values
+        parts = [values[..., i :: self._fine] for i in range(self._fine)]  # faster than .mean()
+        return np.asarray(sum(parts[1:], parts[0]) / self._fine)
+
+    def _averaged(self, motion: Motion, contact: float) -> Motion:
+        """Return a simulated motion at the times of the samples."""
+        if not self._plain:
+            motion = motion._replace(
+                displacement=self._sampled(motion.displacement),
+                base_stress=self._sampled(motion.base_stress),
+            )
+        if contact == 0.0:
+            return motion
+        switches = motion.switches.copy()
+        switches[:, 0] += contact
+        return motion._replace(switches=switches, contact_end=motion.contact_end + contact)
+
+    def _late(self, name: str, rows: Array, late: float) -> Array:
+        """Return curves on the clock of the file, whose motion is `late` seconds late."""
+        if self.drive == "impact" and name != "stress_strain":
+            return rows
+        if self.drive == "stress":
+            return later(self.time, rows, late) if name.startswith("displacement") else rows
+        if name.startswith("displacement"):
+            return rows
+        when = self.time + late
+        return np.array([np.interp(when, self.time, row) for row in rows])
+
+    def shifted(self, curves: dict[str, Array], late: float) -> dict[str, Array]:
+        """Return the curves that channels with a motion `late` seconds late would show."""
+        moved = "displacement" if self.drive == "impact" else " "
+        return {
+            name: later(self.time, curve, late)
+            if name.startswith(moved)
+            else self._late(name, curve[None], late)[0]
+            for name, curve in curves.items()
+        }
+
+    def _acceleration(
+        self, motion: Motion, drag: float, at: dict[str, float], by_site: tuple[int, ...]
+    ) -> Array:
+        """Return the deceleration of the striker, m/s², and its derivatives.
+
+        By the equation of motion it is A (Σ_N + η_site/H dw/dt)/m; with interior masses it is the
+        second derivative of the motion. An accelerometer does not measure gravity in free fall.
+        """
+        speed = np.gradient(_stacked(motion, -1), self.clock, axis=-1)
+        if self.interior_mass:
+            felt = -np.gradient(speed, self.clock, axis=-1)
+            felt[0] += self._gravity
+            return felt
+        per_mass = self.measurement.specimen.area / at[nuisances.STRIKER_MASS]
+        braked = np.where(self.clock < at[nuisances.CONTACT_TIME], 0.0, speed)
+        pushed: Array = per_mass * (_stacked(motion) + drag * braked)
+        for row in by_site:
+            pushed[1 + row] += per_mass * braked[0]
+        return pushed
+
+
+def channel_of(name: str) -> str:
+    """Return the channel that a curve is compared with."""
+    own = name.startswith("displacement") or name == ACCELERATION
+    return name.removesuffix("_time") if own else "stress"
