@@ -208,7 +208,7 @@ class Coordinate(NamedTuple):
     def ends_at(self, values: Array) -> tuple[float, float]:
         """Return the values of the parameter at the coordinates 0 and 1 (if not logarithmic)."""
         if isinstance(self.ends, Between):
-            return self.ends.ends(*(float(values[place]) for place in self.of))
+            return self.ends.ends(*[values.item(place) for place in self.of])
         return self.ends
 
     def value(self, u: float, values: Array) -> float:
@@ -310,8 +310,9 @@ class Space:
         found[by_log] = np.exp(u[by_log]) * last[by_log]
         values[places] = np.minimum(np.maximum(found, self.low[places]), self.high[places])
         for j, one in self._between:
-            value = one.value(point[j], values)
-            values[one.place] = min(max(value, self.low[one.place]), self.high[one.place])
+            start, end = one.ends_at(values)
+            at, value = one.place, start + point.item(j) * (end - start)
+            values[at] = min(max(value, self.low.item(at)), self.high.item(at))
         return self.complete(values)
 
     def admit(self, values: Array, held: Collection[int] = ()) -> Array:

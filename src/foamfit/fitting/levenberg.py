@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 from foamfit.arrays import Array
 
@@ -54,6 +55,7 @@ class Iterate:
     point: Array
     residual: Array
     jacobian: Any  # (n, k), or the Blocks of several tests
+    damping: float | None = None  # with which a descent from here goes on
 
     @property
     def cost(self) -> float:
@@ -85,7 +87,8 @@ class Iterate:
         """
         step = point - self.point
         shown = residual - self.residual - self.jacobian @ step
-        return Iterate(point, residual, self.jacobian + np.outer(shown, step / float(step @ step)))
+        jacobian = self.jacobian + np.outer(shown, step / float(step @ step))
+        return replace(self, point=point, residual=residual, jacobian=jacobian)
 
 
 def damped_step(gradient: Array, normal: Array, damping: float, held: NDArray[np.bool_]) -> Array:
@@ -93,14 +96,18 @@ def damped_step(gradient: Array, normal: Array, damping: float, held: NDArray[np
 
     `damping` multiplies the diagonal of the normal matrix.
     """
-    moving = np.flatnonzero(~held)
-    step = np.zeros(gradient.size)
-    if moving.size:
-        own = normal[np.ix_(moving, moving)]  # a copy
-        diagonal = np.einsum("ii->i", own)  # a view
-        diagonal += damping * np.maximum(diagonal, 1e-12 * max(float(diagonal.sum()), 1e-300))
-        step[moving] = np.linalg.solve(own, -gradient[moving])
-    return step
+    if held.any():
+        step, moving = np.zeros(gradient.size), np.flatnonzero(~held)
+        if moving.size:
+            free = np.zeros(moving.size, dtype=bool)
+            own = normal[np.ix_(moving, moving)]
+            step[moving] = damped_step(gradient[moving], own, damping, free)
+        return step
+    own = normal.copy()
+    diagonal = own.ravel()[:: gradient.size + 1]  # a view
+    diagonal += damping * np.maximum(diagonal, 1e-12 * max(float(diagonal.sum()), 1e-300))
+    _, found, failed = dposv(own, -gradient)
+    return np.asarray(np.linalg.solve(own, -gradient) if failed else found)
 
 
 def following(at: Iterate, shift: Array, held: NDArray[np.bool_]) -> list[Array]:
@@ -116,7 +123,7 @@ def following(at: Iterate, shift: Array, held: NDArray[np.bool_]) -> list[Array]
 def descend(
     residual: Callable[[Array], Array],
     jacobian: Callable[[Array], Array | Blocks],
-    start: Array,
+    start: Array | Iterate,
     box: tuple[Array, Array] | Array,
     iterations: int,
     *,
@@ -124,7 +131,7 @@ def descend(
     least: float = 0.0,
     damping: float = 1e-3,
 ) -> Iterate:
-    """Minimise a sum of squares inside a box.
+    """Minimise a sum of squares inside a box; an Iterate continues a descent.
 
     A coordinate at a limit whose gradient points outwards is fixed for the step. The damping
     follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). The descent ends after two consecutive
@@ -134,11 +141,15 @@ def descend(
     a descent ends with an exact Jacobian unless it runs out of `iterations`.
     """
     low, high = box
-    at = Iterate(start, residual(start), jacobian(start))
+    fixed = low == high
+    if isinstance(start, Iterate):
+        at, damping = start, start.damping or damping
+    else:
+        at = Iterate(start, residual(start), jacobian(start))
     growth, small, updates = 2.0, 0, 0
     for _ in range(iterations):
         held = ((at.point <= low) & (at.gradient > 0)) | ((at.point >= high) & (at.gradient < 0))
-        step = damped_step(at.gradient, at.normal, damping, held | (low == high))
+        step = damped_step(at.gradient, at.normal, damping, held | fixed)
         ended = not step.any() or at.expected(step) < least
         if not ended:
             trial = np.clip(at.point + step, low, high)
@@ -151,7 +162,7 @@ def descend(
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3)
                 growth = 2.0
                 if small >= 2 and not updates:
-                    return replace(at, point=trial, residual=found)
+                    return replace(at, point=trial, residual=found, damping=damping)
                 close = abs(ratio - 1.0) < PREDICTED and updates < UPDATES and small < 2
                 if close and not isinstance(at.jacobian, Blocks):
                     updates += 1
@@ -167,4 +178,4 @@ def descend(
             updates, at = 0, Iterate(at.point, at.residual, jacobian(at.point))
         elif ended:
             break
-    return at
+    return replace(at, damping=damping)

@@ -16,7 +16,7 @@ from foamfit.fitting.box import Space
 from foamfit.fitting.levenberg import Iterate, following
 from foamfit.fitting.nuisance import CONTACT_TIME
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.search import MISSING, Tracker, descend, has_several, rank, squares
+from foamfit.fitting.search import MISSING, Tracker, descend, has_several, race, rank, squares
 from foamfit.springs.laws.record import Law
 from foamfit.springs.model import exchanges
 from foamfit.springs.parameters import relaxation_names, split_name
@@ -116,8 +116,8 @@ def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
         met.append(space.encode(values))
         points = [space.encode(other) for other in exchanges(space.model, values)]
         most = len(points) if cost <= tracker.best_cost else EXCHANGED
-        for _, point in rank(tracker, space, points)[:most]:
-            cost, end = descend(tracker, space, point, 60)
+        chosen = [point for _, point in rank(tracker, space, points)[:most]]
+        for cost, end in race(tracker, space, chosen):
             values = in_order(space, objective, space.decode(end))
             costs.append((cost, 1))
             if not _among(met, space.encode(values)):

@@ -198,7 +198,7 @@ class Scenes:
             others = tuple((row, self.nuisance[i]) for row, i in rows if i >= 0)
             damped = any(place in self._dashpots for place in places.tolist())
             zero = any(name == "displacement_zero" for _, name in others)
-            moved = zero and not damped and self.plans[False].moves_one
+            moved = zero and self.plans[damped].moves_one
             directions = self.model.directions[places[own]]
             if moved:
                 directions = np.append(directions, [(0, MOVED)], axis=0)
@@ -219,7 +219,6 @@ class Scenes:
         springs, given = values[:count], values[count:].tolist()
         at = dict(zip(self.nuisance, given, strict=True))
         wanted = self.wanted(places)
-        moved = wanted.moved and not self._is_damped(springs)
         curves, motion = self._curves(springs, at, wanted, counted, everything)
         if not wanted.others:
             return curves, motion
@@ -228,7 +227,7 @@ class Scenes:
         for name, rows in curves.items():
             out[name][0], out[name][1 + wanted.own] = rows[0], rows[1 : 1 + own]
         for row, name in wanted.others:
-            if moved and name == "displacement_zero":  # a larger zero means a smaller motion
+            if wanted.moved and name == "displacement_zero":  # a larger zero means a smaller motion
                 by = {curve: -rows[-1] for curve, rows in curves.items()}
             elif name == nuisances.FORCE_SCALE:
                 by = self._by_scale({curve: rows[0] for curve, rows in curves.items()}, at)
@@ -294,11 +293,10 @@ class Scenes:
         if self._largest - at.get("displacement_zero", 0.0) >= height:
             raise SimulationError("the measured strain would reach one with this displacement_zero")
         damped = wanted.damped or self._is_damped(springs)  # dashpots at zero are omitted
-        directions = wanted.directions[:-1] if wanted.moved and damped else wanted.directions
         drag /= height
 
         def run(plan: Plan, shown: bool) -> Motion:
-            more: Any = {"drag": drag, "everything": shown, "directions": directions}
+            more: Any = {"drag": drag, "everything": shown, "directions": wanted.directions}
             return plan.run(rows, heights, self.rtol, **more)
 
         inside = everything or any(name in self.interior for name in counted)

@@ -6,10 +6,11 @@ stress along the measured motion, which is cheap to compute), then the curves of
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,12 @@ STIFFER = np.geomspace(1.0, 2.0, 71)[1:]
 
 class SearchStoppedError(Exception):
     """The time limit was reached; the best point so far is the result."""
+
+
+# Legs of a race: iterations, the share of the starts that then goes on, and that of the work.
+LEGS = ((8, 0.5, 0.5), (8, 0.25, 0.25), (40, 0.25, 0.25))
+HALFWAY = LEGS[0][2]
+LEAST = 6  # descents that go on in any case
 
 
 # Exceptions that stop a search, a profile or a Markov chain early; results so far are kept.
@@ -149,6 +156,30 @@ def descend(
     """Descend inside the box by Levenberg-Marquardt; return cost and coordinates of the end."""
     end = levenberg.descend(*squares(tracker, space), start, space.box, iterations, enough=enough)
     return end.cost, end.point
+
+
+def race(
+    tracker: Tracker,
+    space: Space,
+    starts: Sequence[Array],
+    step: Callable[[float], None] = lambda _: None,
+) -> list[tuple[float, Array]]:
+    """Descend from many starts; return costs and coordinates of the ends.
+
+    After each of the `LEGS` only the better part of the descents goes on (successive halving;
+    Jamieson & Talwalkar 2016, AISTATS 51, 240). `step` is called with the share that is done.
+    """
+    functions, at = squares(tracker, space), list[levenberg.Iterate | Array](starts)
+    done, out = 0.0, list[levenberg.Iterate]()
+    for iterations, share, work in LEGS:
+        out = []
+        for i, one in enumerate(at):
+            step(done + work * i / len(at))
+            out.append(levenberg.descend(*functions, one, space.box, iterations, enough=1e-5))
+        done += work
+        out.sort(key=attrgetter("cost"))
+        at = list(out[: max(math.ceil(share * len(starts)), min(LEAST, len(out)))])
+    return [(end.cost, end.point) for end in out]
 
 
 def squares(
@@ -426,14 +457,15 @@ def _search_loop(
         points = [own.encode(space.decode(point)) for point in points]
         ranked = rank(inner, own, points + curve_starts(own, loop, rng))
         points = [point for _, point in ranked]
-        ends = []
-        for i, point in enumerate(spread_out(own, points, starts)):
-            progress(DESCENTS + (ON_CURVES - DESCENTS) * i / starts, "loop")
-            if 2 * i == starts and objective.drive != "impact" and inner.best_values is not None:
-                tracker.consider(inner.best_values)  # after half of the descents
+
+        def step(share: float) -> None:
+            progress(DESCENTS + (ON_CURVES - DESCENTS) * share, "loop")
+            if share == HALFWAY and objective.drive != "impact" and inner.best_values is not None:
+                tracker.consider(inner.best_values)
                 tracker.look()
-            cost, end = descend(inner, own, point, 40)
-            ends.append((cost, space.encode(own.decode(end))))
+
+        ends = race(inner, own, spread_out(own, points, starts), step)
+        ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
     finally:
         objective.add_counts(inner.objective)
         if inner.best_values is not None:

@@ -98,7 +98,7 @@ class Plan(NamedTuple):
 
     @property
     def moves_one(self) -> bool:
-        """Whether responses have a derivative by the prescribed motion: one spring, no dashpot."""
+        """Whether responses have a derivative by the prescribed motion: those of one spring."""
         alone = self.solver == CLOSED_FORM and self.top == scenes.MOTION and self.mass.size == 1
         return alone and int(self.ends[-1]) == 1
 
@@ -301,13 +301,13 @@ class Plan(NamedTuple):
         layout = self._layout(rows, directions, integrated=False)
         if alone:
             strain = (self.values / heights)[None, :]
-            moved = MOVED in directions[:, 1].tolist()
+            moved = seeds(strain[0], MOVED in directions[:, 1].tolist())
             along.follow(
                 *_memory(layout), rows, heights, self.mass, reals, strain[0], self.time, out,
-                _NO_LOG, seeds(strain[0], moved), branches[0], np.empty(n),
+                _NO_LOG, moved, branches[0], np.empty(n),
             )  # fmt: skip
             out[0, 1], out[1:, 1] = self.values, 0.0
-            self._add_dashpot(out, strain[0], rows[0, 0], heights, directions)
+            self._add_dashpot(out, strain[0], rows[0, 0], heights.item(0), directions, moved)
         else:
             strain = np.empty((count, n))
             static.balance(
@@ -329,8 +329,9 @@ class Plan(NamedTuple):
         return Motion(out[0, 1:], out[0, 0], math.nan, switches, 0, CLOSED_FORM, slopes)
 
     def _add_dashpot(
-        self, out: Array, strain: Array, eta: float, heights: Array, directions: Directions
-    ) -> None:
+        self, out: Array, strain: Array, eta: float, height: float, directions: Directions,
+        moved: Array,
+    ) -> None:  # fmt: skip
         """Add the stress of the dashpot of one spring along its motion, and its derivatives."""
         own = directions[:, 1].tolist()
         if self.time.size == 1 or not (eta > 0.0 or OWN_ETA in own):
@@ -341,7 +342,10 @@ class Plan(NamedTuple):
             if what == OWN_ETA:
                 out[1 + p, 0] += rate
             elif what == OWN_HEIGHT:
-                out[1 + p, 0] -= eta * rate / heights[0]
+                out[1 + p, 0] -= eta * rate / height
+            elif what == MOVED:
+                shift = moved[:, 0] + moved[:, 1] * strain
+                out[1 + p, 0] += eta / height * np.gradient(shift, self.time)
 
     def _on_one_plateau(
         self, rows: Array, branches: NDArray[np.int64], directions: Directions

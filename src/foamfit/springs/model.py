@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,14 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.springs import laws
-from foamfit.springs.chain import Chain, padded
-from foamfit.springs.compiled import solver_row
+from foamfit.springs.chain import Chain
+from foamfit.springs.compiled import compiled, fill_row
 from foamfit.springs.laws.record import Law, Param
 from foamfit.springs.parameters import direction, names_of, param_of
 from foamfit.springs.spring import Spring
+
+if TYPE_CHECKING:
+    from foamfit.springs.compiled.contract import Compiled
 
 # Largest numbers of relaxation terms and of springs; no test can distinguish more.
 MOST_TERMS, MOST_SPRINGS = 10, 20
@@ -134,16 +137,23 @@ class Model:
 
     def rows(self, values: Array) -> Array | None:
         """Return the rows for the solver, (n_springs, columns); None if not admissible."""
-        rows = []
-        for i, law in enumerate(self.laws):
-            own = self.own(i, values)
-            last = self.own_places[i] + own.size + 2 * self.relaxation * law.hysteretic
-            terms = values[self.own_places[i] + own.size : last]
-            row = solver_row(law, own, terms, self.relaxation)
-            if row is None:
+        made, width = self._compiled
+        out = np.zeros((len(made), width))
+        for row, (law, own, terms) in zip(out, made, strict=True):
+            if not fill_row(law, values[own], values[terms], self.relaxation, row):
                 return None
-            rows.append(row)
-        return padded(rows)
+        return out
+
+    @cached_property
+    def _compiled(self) -> tuple[list[tuple[Compiled, slice, slice]], int]:
+        """The compiled law of each spring, and the places of its parameters and its terms."""
+        made = []
+        for law, first in zip(self.laws, self.own_places, strict=True):
+            end = first + len(law.names)
+            last = end + 2 * self.relaxation * law.hysteretic
+            made.append((compiled(law), slice(first, end), slice(end, last)))
+        width = max(one.columns for one, *_ in made)
+        return made, 1 + 2 * self.relaxation + width
 
     def heights(self, values: Array, total: float) -> Array:
         """Return the heights of the springs (m) in a specimen of height `total`."""

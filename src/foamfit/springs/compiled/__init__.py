@@ -53,15 +53,21 @@ def solver_row(law: Law, values: Array, terms: ArrayLike, room: int) -> Array | 
     `values` are the parameters and eta. The row contains eta, `room` relaxation terms (g, τ), and
     the row of the law.
     """
+    made = compiled(law)
+    row = np.zeros(1 + 2 * room + made.columns)
+    return row if fill_row(made, values, np.ravel(terms), room, row) else None
+
+
+def fill_row(made: Compiled, values: Array, terms: Array, room: int, row: Array) -> bool:
+    """Fill the row of a spring (see `solver_row`); return whether it is admissible."""
     from foamfit.springs.compiled.contract import TINY
 
-    made, pairs = compiled(law), np.ravel(terms)
-    row = np.zeros(1 + 2 * room + made.columns)
-    fine = made.fill(values[:-1], row[1 + 2 * room :]) and values[-1] >= 0.0
-    row[0], row[2 : 1 + 2 * room : 2] = values[-1], np.inf  # unused terms
-    if made.damps and values[-1] == 0.0:
-        row[0] = TINY
-    row[1 : 1 + pairs.size] = pairs
-    for g, tau in pairs.reshape(-1, 2).tolist():
-        fine = fine and 0.0 <= g < math.inf and 0.0 < tau < math.inf
-    return row if fine else None
+    own, eta = 1 + 2 * room, values.item(-1)
+    fine = made.fill(values[:-1], row[own : own + made.columns]) and eta >= 0.0
+    row[0] = TINY if made.damps and eta == 0.0 else eta
+    if room:
+        row[2:own:2] = np.inf  # unused terms
+        row[1 : 1 + terms.size] = terms
+        for g, tau in terms.reshape(-1, 2).tolist():
+            fine = fine and 0.0 <= g < math.inf and 0.0 < tau < math.inf
+    return bool(fine)
