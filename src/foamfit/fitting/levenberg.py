@@ -130,8 +130,11 @@ def descend(
     enough: float = 0.0,
     least: float = 0.0,
     damping: float = 1e-3,
+    stale: bool = False,
 ) -> Iterate:
     """Minimise a sum of squares inside a box; an Iterate continues a descent.
+
+    The Jacobian of a `stale` one is that of a nearby point.
 
     A coordinate at a limit whose gradient points outwards is fixed for the step. The damping
     follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). The descent ends after two consecutive
@@ -146,7 +149,7 @@ def descend(
         at, damping = start, start.damping or damping
     else:
         at = Iterate(start, residual(start), jacobian(start))
-    growth, small, updates = 2.0, 0, 0
+    growth, small, updates = 2.0, 0, int(stale)
     for _ in range(iterations):
         held = ((at.point <= low) & (at.gradient > 0)) | ((at.point >= high) & (at.gradient < 0))
         step = damped_step(at.gradient, at.normal, damping, held | fixed)

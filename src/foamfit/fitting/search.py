@@ -329,12 +329,9 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
 
 def _descended(tracker: Tracker, space: Space, starts: Iterable[Array]) -> list[float]:
     """Descend from each start; return the costs of the ends, which the tracker keeps."""
-    costs = []
-    for start in starts:
-        cost, end = descend(tracker, space, start, 60)
-        tracker.ends.append(space.decode(end))
-        costs.append(cost)
-    return costs
+    ends = race(tracker, space, list(starts))
+    tracker.ends += [space.decode(end) for _, end in ends]
+    return [cost for cost, _ in ends]
 
 
 def _apart(tracker: Tracker, space: Space) -> Iterator[Array]:

@@ -84,10 +84,12 @@ class Refit:
         *,
         weights: Array | float = 1.0,
         iterations: int = STEPS,
+        near: Iterate | None = None,
     ) -> Iterate | None:
         """Descend from a point; `hold` is the column and the value of a fixed parameter, if any.
 
-        `weights` (n_data,) multiply the squares. Returns None if the start cannot be simulated.
+        `weights` (n_data,) multiply the squares. The Jacobian of a point `near` the start saves one
+        of its own. Returns None if the start cannot be simulated.
         """
         best, sizes = self.best, self.best.sizes
         root, box = np.sqrt(weights), best.box.copy()
@@ -107,9 +109,11 @@ class Refit:
         first = self.residual(self.point(begin, box))
         if first is None:
             return None
+        at = begin if near is None else Iterate(begin, first, near.jacobian)
         end = descend(
-            residual, jacobian, begin, box / sizes, iterations, least=self.enough, damping=1e-6
-        )
+            residual, jacobian, at, box / sizes, iterations, least=self.enough, damping=1e-6,
+            stale=near is not None,
+        )  # fmt: skip
         return replace(end, point=self.point(end.point, box))
 
 
@@ -237,7 +241,7 @@ class _Side:
             if self.refit.rise(trial) < least:
                 start = trial
                 break
-        return self.refit.run(start, (self.column, value))
+        return self.refit.run(start, (self.column, value), near=near)
 
 
 class Tracing:
