@@ -121,9 +121,7 @@ class Objective:
         every = [size == self.time.size for size in self.sizes]
         self._parts = [  # curve, samples, factor, place in the residual
             (name, slice(None) if all_ else self.kept(name), self.factor(name), slice(first, end))
-            for name, all_, first, end in zip(
-                self.counted, every, ends[:-1], ends[1:], strict=True
-            )
+            for name, all_, first, end in zip(self.counted, every, ends[:-1], ends[1:], strict=True)
         ]
         self._target = np.concatenate(
             [self.measured[name][kept] * factor for name, kept, factor, _ in self._parts]

@@ -104,9 +104,7 @@ class Scenes:
         self._largest = 0.0 if test.displacement is None else float(test.displacement.max())  # m
         self._gravity = (test.striker.gravity if test.striker else None) or 0.0
         self.usual = nuisances.values_of(test)
-        self._dashpots = [
-            i for i, name in enumerate(self.model.names[:-1]) if name.endswith("eta")
-        ]
+        self._dashpots = [i for i, name in enumerate(self.model.names[:-1]) if name.endswith("eta")]
         # Whether all samples share one clock and no reading is averaged.
         self._plain = self._fine == 1 and self._own is None
         self._one = np.array([test.specimen.height])
