@@ -23,6 +23,7 @@ from foamfit.fitting.curves import check_time_shift, choose_drive
 from foamfit.fitting.minima import exchange_springs, in_order, scan_places, settle_ends
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
 from foamfit.fitting.search import (
+    NEWS,
     REFINED,
     STOPPING,
     SearchRecord,
@@ -30,6 +31,7 @@ from foamfit.fitting.search import (
     Tracker,
     ensure_feasible,
     has_several,
+    leave_minimum,
     search,
     what_stopped,
 )
@@ -396,8 +398,11 @@ def _search(
         """Search on the thinned record; the ends are those of the tracker."""
         space = problem.space()
         costs = search(scout, space, starts=record.starts, rng=rng, progress=progress)
+        reached = scout.best_cost
         exchange_springs(scout, space)
         scan_places(scout, space)
+        if scout.best_cost < (1.0 - NEWS) * reached:
+            leave_minimum(scout, space)
         best = [] if scout.best_values is None else [scout.best_values]
         tracker.ends += [*best, *scout.ends]
         return costs

@@ -123,9 +123,7 @@ class Objective:
             (name, slice(None) if all_ else self.kept(name), self.factor(name), slice(first, end))
             for name, all_, first, end in zip(self.counted, every, ends[:-1], ends[1:], strict=True)
         ]
-        self._target = np.concatenate(
-            [self.measured[name][kept] * factor for name, kept, factor, _ in self._parts]
-        )
+        self._target = np.concatenate([self.measured[name][kept] for name, kept, *_ in self._parts])
         known = nuisances.priors_of(self.measurement, self.drive)
         self.priors = (*self.given, *(known[name] for name in self.nuisance if name in known))
         names = (*self.model.names, *self.nuisance)
@@ -291,8 +289,9 @@ class Objective:
         """Return the residuals of the curves, stacked on their derivatives, (1 + p, n_data)."""
         out = np.empty((len(rows[self.counted[0]]), self.n_data))
         for name, kept, factor, at in self._parts:
-            np.multiply(rows[name][:, kept], factor, out=out[:, at])
-        out[0] -= self._target
+            out[:, at] = rows[name][:, kept]
+            out[0, at] -= self._target[at]
+            out[:, at] *= factor
         return out
 
     def _bounded(self, off: Array, values: Array) -> Array:

@@ -58,7 +58,7 @@ class SearchStoppedError(Exception):
 
 
 # Legs of a race: iterations, the share of the starts that then goes on, and that of the work.
-LEGS = ((8, 0.5, 0.5), (8, 0.25, 0.25), (40, 0.25, 0.25))
+LEGS = ((12, 0.5, 0.5), (12, 0.25, 0.25), (36, 0.25, 0.25))
 HALFWAY = LEGS[0][2]
 LEAST = 6  # descents that go on in any case
 
@@ -272,19 +272,35 @@ def search(
         if attempt == 0:
             tracker.look()
         if tracker.best_cost < (1.0 - NEWS) * left:  # otherwise these points were tried before
-            edges = _off_edges(tracker, space)
-            apart = _descended(tracker, space, _apart(tracker, space))
-            out += [(cost, 1) for cost in edges + apart]
-            reached = tracker.best_cost
-            _descended(tracker, space, _far_off(tracker, space))
-            if tracker.best_cost < reached:  # counts once, as these descents are not independent
-                out.append((tracker.best_cost, 1))
+            edges, more = leave_minimum(tracker, space)
+            out += more
             left = tracker.best_cost
         least = IN_SERIES if several else max(attempts // 2, 2 if edges else 1)
         if attempt + 1 == attempts or _settled(tracker, out, attempt, least):
             break
         points = box_starts(space, rng, CURVE_STARTS // 3) + _around_best(tracker, space, rng)
     return sorted(out)
+
+
+def leave_minimum(
+    tracker: Tracker, space: Space
+) -> tuple[list[float], list[tuple[float, int]]]:
+    """Descend from points beside the best one; return costs off the edges of the box, and all.
+
+    The costs are those of `search`.
+    """
+    edges = list[float]()
+    for _ in range(ATTEMPTS):
+        before = tracker.best_cost
+        edges += _off_edges(tracker, space)
+        if tracker.best_cost >= (1.0 - NEWS) * before:
+            break
+    apart = _descended(tracker, space, _apart(tracker, space))
+    out, reached = [(cost, 1) for cost in edges + apart], tracker.best_cost
+    _descended(tracker, space, _far_off(tracker, space))
+    if tracker.best_cost < reached:  # counts once, as these descents are not independent
+        out.append((tracker.best_cost, 1))
+    return edges, out
 
 
 def has_several(model: Model) -> bool:
