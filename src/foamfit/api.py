@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 import lmfit
+from lmfit import Minimizer
+from lmfit.minimizer import MinimizerResult
 
 from foamfit.arrays import single_threaded
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
+from foamfit.fitting.minimizer import minimizer_of, result_of
 from foamfit.one_model import SEARCHED, Keywords, Options, Progress, identify, judge
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
@@ -42,6 +45,19 @@ class FitResult(Shown, Fit):
         `what` is "stress-strain", "stress-time" or "displacement-time". Returns the axes.
         """
         return draw_panel(self, ax, what)
+
+    @property
+    def minimizer(self) -> Minimizer:
+        """The residual of the fit for `lmfit.conf_interval(result.minimizer, result.lmfit)`."""
+        return minimizer_of(self)
+
+    @property
+    def lmfit(self) -> MinimizerResult:
+        """The numbers of the fit as lmfit's, for `lmfit.fit_report(result.lmfit)`.
+
+        Parameters without a standard error are held.
+        """
+        return result_of(self)
 
     def table(self) -> pd.DataFrame:
         """Return one row per parameter, in SI units; the output of its `to_latex` compiles."""

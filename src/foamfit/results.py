@@ -403,6 +403,17 @@ class Fit:
     # Samples of a Markov chain, (walkers, steps) by parameter, SI; empty without a chain
     draws: dict[str, Array] = field(default_factory=dict)
     contradictions: tuple[Contradiction, ...] = ()  # of the record, which the fit does not settle
+    problem: Any = field(default=None, repr=False)  # of the fit; None if read from a folder
+
+    def __post_init__(self) -> None:
+        """Set the correlations of lmfit's parameters."""
+        if self.correlation is None:
+            return
+        names = self.correlation.names
+        for name, row in zip(names, self.correlation.matrix, strict=True):
+            pairs = zip(names, row.tolist(), strict=True)
+            shown = {other: c for other, c in pairs if other != name and math.isfinite(c)}
+            self.params[name].correl = shown if self.params[name].stderr is not None else None
 
     @property
     def springs(self) -> dict[str, Spring]:
@@ -580,7 +591,7 @@ class Fit:
 
 
 # Fields of a fit in fit.json and curves.csv; the samples of a chain have a file of their own.
-KEPT = tuple(name for name in Fit.__dataclass_fields__ if name != "draws")
+KEPT = tuple(name for name in Fit.__dataclass_fields__ if name not in ("draws", "problem"))
 
 
 def _without(content: Mapping[str, Any], fields: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.fitting.box import Space
+from foamfit.fitting.minimizer import functions_of
 from foamfit.fitting.nuisance import shown_by
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import STOPPING, Freed, Tracker, descend, distinct, rank
@@ -54,12 +55,7 @@ def refine(problem: Problem, tracker: Tracker) -> None:
             low, high = parameter.min + 1e-9 * span, parameter.max - 1e-9 * span
             parameter.value = min(max(parameter.value, low), high)
 
-    def residual(p: lmfit.Parameters) -> Array:
-        return tracker.residual(problem.vector(p))
-
-    def jacobian(p: lmfit.Parameters) -> Array:
-        return problem.slopes(problem.vector(p), names)
-
+    residual, jacobian = functions_of(problem, 0.0, tracker.residual)
     with warnings.catch_warnings():  # about lmfit's covariance, which is not used
         warnings.simplefilter("ignore", RuntimeWarning)
         ends = {"ftol": 1e-10, "xtol": 1e-10, "gtol": 1e-12, "max_nfev": 60}

@@ -415,7 +415,7 @@ def test_ctrl_c_in_a_compiled_loop_is_ctrl_c(monkeypatch, lost):
         raise SystemError("returned a result with an exception set") from lost
 
     problem = Options().problem(synthetic_impact()[1], "bistable")
-    monkeypatch.setattr(type(problem.objective), "_curves", interrupted)
+    monkeypatch.setattr(type(problem.objective.scenes), "rows", interrupted)
     signalled = isinstance(lost, KeyboardInterrupt | SystemError)
     expected = KeyboardInterrupt if signalled else SystemError
     with pytest.raises(expected):

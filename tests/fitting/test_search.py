@@ -14,7 +14,7 @@ import pytest
 import foamfit as ff
 from conftest import DATA, EXPERIMENTS, needs_data, synthetic_impact, synthetic_loop, thinned
 from foamfit.data.measurement import Measurement, Noise, Specimen
-from foamfit.fitting import search
+from foamfit.fitting import levenberg
 from foamfit.fitting.minima import in_order
 from foamfit.fitting.problem import make_params
 from foamfit.one_model import Keywords, Options
@@ -128,16 +128,16 @@ def test_the_best_point_survives_the_time_limit(model, max_time):
 def test_the_best_point_survives_ctrl_c(monkeypatch):
     _, measurement = synthetic_impact()
     calls = 0
-    original = search.descend
+    original = levenberg.descend
 
-    def interrupted(*args):
+    def interrupted(*args, **more):
         nonlocal calls
         calls += 1
         if calls == 12:
             raise KeyboardInterrupt
-        return original(*args)
+        return original(*args, **more)
 
-    monkeypatch.setattr(search, "descend", interrupted)
+    monkeypatch.setattr(levenberg, "descend", interrupted)
     result = ff.fit(measurement)
     assert "Ctrl-C" in result.warnings[0]
     assert result.stopped == "Ctrl-C"

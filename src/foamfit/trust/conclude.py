@@ -97,6 +97,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         intervals=replace(intervals, draws={}),
         budget=budget,
         priors={prior.name: (prior.mean, prior.sigma) for prior in objective.given},
+        problem=problem,
         draws={n: draw + measurement.origins.get(n, 0.0) for n, draw in intervals.draws.items()},
     )
 

@@ -1,0 +1,115 @@
+"""A fit as lmfit's objects: its residual as a Minimizer, its numbers as a MinimizerResult.
+
+`lmfit.fit_report`, `lmfit.conf_interval` and `lmfit.conf_interval2d` take them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import lmfit
+import numpy as np
+from lmfit.minimizer import MinimizerResult
+
+from foamfit.arrays import Array
+from foamfit.errors import InputError
+from foamfit.fitting.problem import Problem, make_problem
+
+if TYPE_CHECKING:
+    from foamfit.results import Fit
+
+METHOD = "foamfit: races of descents (Levenberg-Marquardt), lmfit's least_squares"
+# Largest relative difference between the χ² of a result and that of its own residual.
+SAME = 1e-6
+
+
+def functions_of(
+    problem: Problem, origins: Array | float, residual: Callable[[Array], Array] | None = None
+) -> tuple[Callable[[lmfit.Parameters], Array], Callable[[lmfit.Parameters], Array]]:
+    """Return the residual, and its derivative by the parameters that vary, for lmfit.
+
+    `origins` (n,) are subtracted from the values of the parameters.
+    """
+    misses = problem.objective.residual if residual is None else residual
+
+    def off(params: lmfit.Parameters) -> Array:
+        return misses(problem.vector(params) - origins)
+
+    def slopes(params: lmfit.Parameters) -> Array:
+        names = tuple(name for name, one in params.items() if one.vary)
+        return problem.slopes(problem.vector(params) - origins, names)
+
+    return off, slopes
+
+
+def problem_of(fit: Fit) -> Problem:
+    """Return the problem of a result, made again if the result was read from its folder.
+
+    Raises InputError if its residual was weighed in a way that the folder does not tell.
+    """
+    if fit.problem is not None:
+        made: Problem = fit.problem
+        return made
+    made = make_problem(
+        fit.measurement, fit.model, fit.drive, fit.params, fit.weights, fit.interior_mass,
+        time_shift="time_shift" in fit.params, relaxation=fit.relaxation, priors=fit.priors,
+    )  # fmt: skip
+    residual = made.objective.residual(made.vector())
+    was = float(fit.statistics["chisqr"] or 0.0)
+    if not math.isclose(float(residual @ residual), was, rel_tol=SAME, abs_tol=1e-9):
+        raise InputError(
+            f"{fit.measurement.name}: the folder does not tell how the samples of this fit were "
+            "weighed; fit the test again for lmfit's functions"
+        )
+    return made
+
+
+def minimizer_of(fit: Fit) -> lmfit.Minimizer:
+    """Return the minimizer of a result, for `lmfit.conf_interval`."""
+    problem = problem_of(fit)
+    off, slopes = functions_of(problem, problem.origins)
+    return lmfit.Minimizer(off, lmfit_params(fit), Dfun=slopes, nan_policy="raise")
+
+
+def lmfit_params(fit: Fit) -> lmfit.Parameters:
+    """Return the parameters of a result; those without a standard error are held."""
+    params = fit.params.copy()
+    for name, one in fit.params.items():
+        params[name].correl, params[name].init_value = one.correl, None
+        if one.vary and one.stderr is None:
+            params[name].vary = False
+    return params
+
+
+def result_of(fit: Fit) -> MinimizerResult:
+    """Return the numbers of a result as those of lmfit."""
+    params, numbers = lmfit_params(fit), fit.statistics
+    names = [name for name, one in params.items() if one.vary]
+    sizes = np.array([params[name].stderr for name in names], dtype=float)
+    correl = np.eye(len(names))
+    for i, name in enumerate(names):
+        for j, other in enumerate(names):
+            correl[i, j] = 1.0 if i == j else (params[name].correl or {}).get(other, 0.0)
+    values: dict[str, Any] = {
+        "params": params,
+        "var_names": names,
+        "covar": correl * np.outer(sizes, sizes),
+        "errorbars": bool(names),
+        "method": METHOD,
+        "ndata": numbers["n_data"],
+        "nvarys": numbers["n_vary"],
+        "nfree": int(numbers["n_data"] or 0) - int(numbers["n_vary"] or 0),
+        **{name: numbers[name] for name in ("chisqr", "redchi", "aic", "bic", "nfev")},
+        "success": fit.stopped is None,
+        "aborted": fit.stopped is not None,
+        "message": "; ".join(fit.warnings) or "Fit succeeded.",
+        "init_vals": [],
+        "init_values": {},
+    }
+    out = MinimizerResult(**values)
+    if fit.problem is not None:
+        problem = fit.problem
+        out.residual = problem.objective.residual(problem.vector(fit.params) - problem.origins)
+    return out
