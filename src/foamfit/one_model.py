@@ -45,6 +45,7 @@ from foamfit.settle import (
     refine,
     weigh_motion,
 )
+from foamfit.solve.cache import SPENT
 from foamfit.springs.model import Model, with_options
 from foamfit.springs.options import OPTIONS
 from foamfit.trust.best_point import BestPoint
@@ -298,7 +299,7 @@ def identify(
     better = None if options.watch is None else partial(options.watch, problem)
     tracker = Tracker(problem.objective, deadline, better)
     tracker.looked = None if look is None else partial(look, problem)
-    record = SearchRecord(options.seed, starts, began)
+    record = SearchRecord(options.seed, starts, began, SPENT.seconds)
     problem, record = _search(problem, tracker, record, options.vary, progress)
     if tracker.best_values is None:
         tried, why = problem.objective.evaluations, "check the drive, the heights and the bounds"

@@ -403,11 +403,13 @@ class Fit:
     # Samples of a Markov chain, (walkers, steps) by parameter, SI; empty without a chain
     draws: dict[str, Array] = field(default_factory=dict)
     contradictions: tuple[Contradiction, ...] = ()  # of the record, which the fit does not settle
-    problem: Any = field(default=None, repr=False)  # of the fit; None if read from a folder
+    # The problem of the fit, and what the fit cost (`fitting.objective.Effort`); not in its folder
+    problem: Any = field(default=None, repr=False)
+    effort: Any = None
 
     def __post_init__(self) -> None:
         """Set the correlations of lmfit's parameters."""
-        if self.correlation is None:
+        if self.correlation is None or self.params is None:  # the figures need no parameters
             return
         names = self.correlation.names
         for name, row in zip(names, self.correlation.matrix, strict=True):
@@ -590,8 +592,10 @@ class Fit:
         return derived
 
 
-# Fields of a fit in fit.json and curves.csv; the samples of a chain have a file of their own.
-KEPT = tuple(name for name in Fit.__dataclass_fields__ if name not in ("draws", "problem"))
+# Fields of a fit in fit.json and curves.csv: the samples of a chain have a file of their own, and
+# problem and effort are those of this process.
+BESIDE = ("draws", "problem", "effort")
+KEPT = tuple(name for name in Fit.__dataclass_fields__ if name not in BESIDE)
 
 
 def _without(content: Mapping[str, Any], fields: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,8 +6,10 @@ loop. Only curves with a weight above zero count, so that no measurement counts 
 
 from __future__ import annotations
 
+import time
 from copy import copy
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +57,26 @@ class Simulated:
     slopes: dict[str, Array] | None = None  # Derivatives of each curve, (p, n)
 
 
+class Effort(NamedTuple):
+    """What a fit cost: numbers of simulations, and seconds."""
+
+    simulations: int
+    with_derivatives: int  # of these
+    simulating: float  # s, compiled code and what prepares it
+    compiled: float  # s, of these
+    total: float  # s
+
+    def sentence(self) -> str:
+        """Say where the time went."""
+        each = 1e3 * self.simulating / max(self.simulations, 1)
+        share = self.compiled / max(self.simulating, 1e-12)
+        return (
+            f"{self.total:.2f} s: {self.simulations} simulations, {self.with_derivatives} of them "
+            f"with derivatives, took {self.simulating:.2f} s, {each:.2f} ms each, {share:.0%} of "
+            "this in compiled code; the rest is search and statistics."
+        )
+
+
 @dataclass(eq=False)
 class Objective:
     """Residuals of a model under a drive against a measurement.
@@ -79,6 +101,8 @@ class Objective:
     unexplained: float | None = field(default=None, init=False)
     evaluations: int = field(default=0, init=False)  # Number of simulated sets of parameters
     failures: int = field(default=0, init=False)  # Number of failed simulations
+    sloped: int = field(default=0, init=False)  # Number of simulations with derivatives
+    seconds: float = field(default=0.0, init=False)  # spent on simulations
 
     def __post_init__(self) -> None:
         """Prepare the scenes and the scale of each curve."""
@@ -239,13 +263,17 @@ class Objective:
         self, values: Array, places: Places, everything: bool = False
     ) -> tuple[dict[str, Array], Motion]:
         """Return curves stacked on their derivatives; count the evaluation and its failure."""
+        began = time.perf_counter()
         self.evaluations += 1
+        self.sloped += places.size > 0
         try:
             with as_signalled():
                 return self.scenes.rows(values, places, self.counted, everything)
         except SimulationError:
             self.failures += 1
             raise
+        finally:
+            self.seconds += time.perf_counter() - began
 
     def simulate(
         self, values: Array, *, everything: bool = False, places: Places = NOWHERE
@@ -265,6 +293,8 @@ class Objective:
         if other is not self:
             self.evaluations += other.evaluations
             self.failures += other.failures
+            self.sloped += other.sloped
+            self.seconds += other.seconds
 
     def residual(self, values: Array) -> Array:
         """Return the weighted residuals of all counted curves and of the priors, dimensionless.

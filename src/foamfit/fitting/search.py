@@ -93,6 +93,7 @@ class SearchRecord:
     seed: int
     starts: int  # Requested number of descents on the loop
     began: float  # `time.perf_counter` at its start, s
+    compiled: float = 0.0  # `cache.SPENT` at its start, s
     # Final costs of the descents on the curves, best first, and the number of descents on the loop
     # that led to each.
     costs: tuple[tuple[float, int], ...] = ()
@@ -282,9 +283,7 @@ def search(
     return sorted(out)
 
 
-def leave_minimum(
-    tracker: Tracker, space: Space
-) -> tuple[list[float], list[tuple[float, int]]]:
+def leave_minimum(tracker: Tracker, space: Space) -> tuple[list[float], list[tuple[float, int]]]:
     """Descend from points beside the best one; return costs off the edges of the box, and all.
 
     The costs are those of `search`.

@@ -61,8 +61,8 @@ def draw_all(
     ", pdf" after it, all figures except those for the screen are also made as PDF.
     """
     drawn: dict[str, Any] = {field.name: getattr(result, field.name) for field in fields(Fit)}
-    # No figure needs `params`, and unpickling it would import lmfit, the slowest import.
-    drawn["params"] = None
+    # No figure needs these, and unpickling them would import lmfit, the slowest import.
+    drawn |= dict.fromkeys(("params", "problem", "effort"))
     images = mapped(partial(_draw, Fit(**drawn), width), _NAMES)  # not in a generator: start now
     return zip(_NAMES, images, strict=True)
 

@@ -235,7 +235,8 @@ class Plan(NamedTuple):
         cache.announce(loop.integrate, "the solver")
         layout = self._layout(rows, directions, degree)
         drive = self.mass, reals, self.values, self.time
-        loop.integrate(*_memory(layout), rows, heights, *drive, out, log, endings)
+        given = *_memory(layout), rows, heights, *drive, out, log, endings
+        cache.timed(loop.integrate, *given)
 
     def _as_one(
         self, rows: Array, heights: Array, rtol: float, drag: float, out: Array
@@ -253,7 +254,7 @@ class Plan(NamedTuple):
         log = np.empty((4 * len(rows) + 64, 5))
         numbers = np.array((self.mass[0], drag, self.speed, AS_ONE * rtol / len(rows)))
         given = shapes, heights, numbers, self.time, self.max_steps, out[0], log, np.zeros(2, int)
-        outcome, end, steps, switches = integrate_aggregate(*given)
+        outcome, end, steps, switches = cache.timed(integrate_aggregate, *given)
         endings = np.array((outcome, end, steps, switches), dtype=float)
         return self._motion(out, AGGREGATE, endings, log, rows, 0.0)
 
@@ -302,17 +303,17 @@ class Plan(NamedTuple):
         if alone:
             strain = (self.values / heights)[None, :]
             moved = seeds(strain[0], MOVED in directions[:, 1].tolist())
-            along.follow(
-                *_memory(layout), rows, heights, self.mass, reals, strain[0], self.time, out,
-                _NO_LOG, moved, branches[0], np.empty(n),
+            cache.timed(
+                along.follow, *_memory(layout), rows, heights, self.mass, reals, strain[0],
+                self.time, out, _NO_LOG, moved, branches[0], np.empty(n),
             )  # fmt: skip
             out[0, 1], out[1:, 1] = self.values, 0.0
             self._add_dashpot(out, strain[0], rows[0, 0], heights.item(0), directions, moved)
         else:
             strain = np.empty((count, n))
-            static.balance(
-                *_memory(layout), rows, heights, self.mass, reals, self.values, self.time, out,
-                _NO_LOG, strain, branches,
+            cache.timed(
+                static.balance, *_memory(layout), rows, heights, self.mass, reals, self.values,
+                self.time, out, _NO_LOG, strain, branches,
             )  # fmt: skip
         fine = math.isfinite(out[0].sum())
         if fine and self.top == scenes.MOTION and not alone:

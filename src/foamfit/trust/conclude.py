@@ -17,9 +17,10 @@ from foamfit.data.measurement import INTEGRATED, interior_channel
 from foamfit.errors import SimulationError
 from foamfit.fitting.branches import visited
 from foamfit.fitting.curves import MOTION_CURVES
-from foamfit.fitting.objective import MODEL_ERROR
+from foamfit.fitting.objective import MODEL_ERROR, Effort
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstimate, Switch
+from foamfit.solve.cache import SPENT
 from foamfit.springs import laws
 from foamfit.springs.parameters import any_param, split_name, unit_of
 from foamfit.text import engineering, listed, percent
@@ -72,7 +73,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         weights=objective.weights,
         statistics=_statistics(best, record),
         energy=balance.as_dict() | {"sentences": balance.sentences()},
-        runtime_s=time.perf_counter() - record.began,
+        runtime_s=(total := time.perf_counter() - record.began),
         curves=Curves(
             time=measurement.time,
             measured_stress=measurement.stress,
@@ -98,6 +99,13 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         budget=budget,
         priors={prior.name: (prior.mean, prior.sigma) for prior in objective.given},
         problem=problem,
+        effort=Effort(
+            objective.evaluations,
+            objective.sloped,
+            objective.seconds,
+            SPENT.seconds - record.compiled,
+            total,
+        ),
         draws={n: draw + measurement.origins.get(n, 0.0) for n, draw in intervals.draws.items()},
     )
 
