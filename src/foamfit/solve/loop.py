@@ -186,7 +186,10 @@ def _switch(c, i, up, want):  # type: ignore[no-untyped-def]
 
 @inner
 def _turn(c, want):  # type: ignore[no-untyped-def]
-    """Let springs turn whose rate has changed its sign by a jump of the prescribed rate."""
+    """Let springs turn whose rate has changed its sign by a jump.
+
+    The prescribed rate jumps, or another spring of the group has become softer or stiffer.
+    """
     for _ in range(4 * c.count):
         turned = False
         for i in range(c.count):
@@ -219,6 +222,7 @@ def _pass_event(c, want, share, who, kind):  # type: ignore[no-untyped-def]
         return slope
     turns = c.springs[who * c.width + TURNS]
     _switch(c, who, int(turns < 0.0) if kind == TURN else int(kind == TOP_END), want)
+    _turn(c, want)
     return slope
 
 
