@@ -57,6 +57,7 @@ from foamfit.springs.compiled.contract import (
 from foamfit.springs.parameters import OWN_ETA
 
 ROUNDED = 1e-12  # strain past an end that rounding explains, of a spring that moves away from it
+AT_ONCE = 1e-9  # share of a step within which an event is at its start
 RISEN = 1e-9  # base stress over the largest stress above which its return to zero ends the contact
 MIDDLE = 0.6  # share of a step at which s[MIDWAY] is the strain rate; 0.58 of an implicit step
 DIP = 0.3  # least strain rate within a step, over its variation, below which the rate may vanish
@@ -183,7 +184,7 @@ def _happened(c, i, kind):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
+def _root(c, low, high, i, kind):  # type: ignore[no-untyped-def]
     """Return where an excess becomes positive between two shares, by Illinois' method."""
     look(c, low)
     f_low = _excess(c, i, kind)
@@ -210,6 +211,32 @@ def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
             f_high *= 0.5 if side == -1 else 1.0
             low, f_low, side = middle, value, -1
     return low if middle <= low else high
+
+
+@inner
+def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
+    """Return where an excess becomes positive between two shares.
+
+    A spring that begins at an end or a turn of its branch may be past it by rounding and yet move
+    away from it. Then the event is where it returns.
+    """
+    there = _root(c, low, high, i, kind)
+    if kind > TURN or there - low > AT_ONCE * (high - low):
+        return there
+    look(c, low)
+    first, inside = _excess(c, i, kind), 0.0
+    if kind < TURN:
+        first, inside = ROUNDED, -ROUNDED
+    part = AT_ONCE * (high - low)
+    while part < 0.5 * (high - low):
+        part *= 4.0
+        look(c, low + part)
+        value = _excess(c, i, kind)
+        if value < inside:
+            return _root(c, low + part, high, i, kind)
+        if value > 2.0 * first:
+            break
+    return there
 
 
 @inner

@@ -187,16 +187,17 @@ def _switch(c, i, up, want):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _turn(c, want):  # type: ignore[no-untyped-def]
+def _turn(c, want, changed):  # type: ignore[no-untyped-def]
     """Let springs turn whose rate has changed its sign by a jump.
 
-    The prescribed rate jumps, or another spring of the group has become softer or stiffer.
+    The prescribed rate jumps, or another spring of the group, `changed`, has become softer or
+    stiffer; its own rate keeps its sign.
     """
     for _ in range(4 * c.count):
         turned = False
         for i in range(c.count):
             s = past(c.springs, i * c.width)
-            if s[TURNS] * s[RATE] < 0.0:
+            if i != changed and s[TURNS] * s[RATE] < 0.0:
                 _switch(c, i, int(s[TURNS] < 0.0), want)
                 turned = True
         if not turned:
@@ -224,7 +225,7 @@ def _pass_event(c, want, share, who, kind):  # type: ignore[no-untyped-def]
         return slope
     turns = c.springs[who * c.width + TURNS]
     _switch(c, who, int(turns < 0.0) if kind == TURN else int(kind == TOP_END), want)
-    _turn(c, want)
+    _turn(c, want, who)
     return slope
 
 
@@ -373,7 +374,7 @@ def integrate(  # type: ignore[no-untyped-def]
             r[HORIZON] = math.nextafter(r[NOW], math.inf)
         elif r[NOW] >= r[HORIZON]:
             done = drive(c, c.none, want)
-            _turn(c, want)
+            _turn(c, want, -1 + c.none)
         r[STEP] = dt
     endings[OUTCOME], endings[ENDED] = outcome, ended
     endings[STEPS], endings[SWITCHES] = r[TAKEN], r[LOGGED]
