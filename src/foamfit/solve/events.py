@@ -217,24 +217,20 @@ def _root(c, low, high, i, kind):  # type: ignore[no-untyped-def]
 def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
     """Return where an excess becomes positive between two shares.
 
-    A spring that begins at an end or a turn of its branch may be past it by rounding and yet move
-    away from it. Then the event is where it returns.
+    A spring that begins at an end of its branch may be past it by rounding and yet move away from
+    it. Then the event is where it returns.
     """
     there = _root(c, low, high, i, kind)
-    if kind > TURN or there - low > AT_ONCE * (high - low):
+    if kind >= TURN or there - low > AT_ONCE * (high - low):
         return there
-    look(c, low)
-    first, inside = _excess(c, i, kind), 0.0
-    if kind < TURN:
-        first, inside = ROUNDED, -ROUNDED
     part = AT_ONCE * (high - low)
     while part < 0.5 * (high - low):
         part *= 4.0
         look(c, low + part)
         value = _excess(c, i, kind)
-        if value < inside:
+        if value < -ROUNDED:
             return _root(c, low + part, high, i, kind)
-        if value > 2.0 * first:
+        if value > ROUNDED:
             break
     return there
 

@@ -190,14 +190,15 @@ def _switch(c, i, up, want):  # type: ignore[no-untyped-def]
 def _turn(c, want, changed):  # type: ignore[no-untyped-def]
     """Let springs turn whose rate has changed its sign by a jump.
 
-    The prescribed rate jumps, or another spring of the group, `changed`, has become softer or
-    stiffer; its own rate keeps its sign.
+    The prescribed rate jumps, or the branch of a spring, `changed` (else -1), which makes it softer
+    or stiffer. Then its own rate keeps its sign, and those of springs with a dashpot do not jump.
     """
     for _ in range(4 * c.count):
         turned = False
         for i in range(c.count):
             s = past(c.springs, i * c.width)
-            if i != changed and s[TURNS] * s[RATE] < 0.0:
+            jumps = changed < 0 or (i != changed and s[ETA] == 0.0)
+            if jumps and s[TURNS] * s[RATE] < 0.0:
                 _switch(c, i, int(s[TURNS] < 0.0), want)
                 turned = True
         if not turned:
