@@ -308,7 +308,7 @@ def test_what_is_too_fast_for_explicit_steps_has_its_limit(
     ("given", "drive", "culprit"),
     [
         (chain([damped(MICRO, 1e-7), FOAM]), MOVED, "dashpot"),
-        (chain([MICRO, FOAM], [1e-18, 0.0]), IMPACT, "mass"),
+        (chain([MICRO, FOAM], [1e-16, 0.0]), IMPACT, "mass"),
     ],
 )
 def test_what_no_steps_can_follow_is_refused_by_name(

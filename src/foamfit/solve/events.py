@@ -31,6 +31,7 @@ from foamfit.springs.compiled.contract import (
     HIGH,
     INTERNAL,
     LOW,
+    MIDWAY,
     OF_HELD,
     OF_PARAMETER,
     OF_STRESS,
@@ -56,7 +57,11 @@ from foamfit.springs.compiled.contract import (
 from foamfit.springs.parameters import OWN_ETA
 
 ROUNDED = 1e-12  # strain past an end that rounding explains, of a spring that moves away from it
+AT_ONCE = 1e-9  # share of a step within which an event is at its start
 RISEN = 1e-9  # base stress over the largest stress above which its return to zero ends the contact
+MIDDLE = 0.6  # share of a step at which s[MIDWAY] is the strain rate; 0.58 of an implicit step
+DIP = 0.3  # least strain rate within a step, over its variation, below which the rate may vanish
+NOWHERE = 2.0  # instead of a share of a step
 # Kinds of events: a branch ends at its upper or lower strain, a spring turns, contact ends. Then a
 # greatest and a least strain.
 TOP_END, LOW_END, TURN, RELEASE, TOP_TURN, LOW_TURN = range(6)
@@ -179,7 +184,7 @@ def _happened(c, i, kind):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
+def _root(c, low, high, i, kind):  # type: ignore[no-untyped-def]
     """Return where an excess becomes positive between two shares, by Illinois' method."""
     look(c, low)
     f_low = _excess(c, i, kind)
@@ -206,6 +211,28 @@ def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
             f_high *= 0.5 if side == -1 else 1.0
             low, f_low, side = middle, value, -1
     return low if middle <= low else high
+
+
+@inner
+def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
+    """Return where an excess becomes positive between two shares.
+
+    A spring that begins at an end of its branch may be past it by rounding and yet move away from
+    it. Then the event is where it returns.
+    """
+    there = _root(c, low, high, i, kind)
+    if kind >= TURN or there - low > AT_ONCE * (high - low):
+        return there
+    part = AT_ONCE * (high - low)
+    while part < 0.5 * (high - low):
+        part *= 4.0
+        look(c, low + part)
+        value = _excess(c, i, kind)
+        if value < -ROUNDED:
+            return _root(c, low + part, high, i, kind)
+        if value > ROUNDED:
+            break
+    return there
 
 
 @inner
@@ -237,16 +264,25 @@ def _earliest(c, before, share):  # type: ignore[no-untyped-def]
 def first_event(c):  # type: ignore[no-untyped-def]
     """Return where in a step its first event is, of which spring (-1: no event) and of which kind.
 
-    A spring may go past the end of its branch and return within the step. So the strains are also
-    judged at their extrema.
+    A spring may go past the end of its branch and return within the step, or turn twice. So the
+    strains are also judged at their extrema, and the rates at their least.
     """
-    nobody, before, pieces = -1 + c.none, 0.0, 1
+    nobody, before, pieces, dip, piece = -1 + c.none, 0.0, 1, NOWHERE, 1
     look(c, 1.0)
     for i in range(c.count):
-        if c.springs[i * c.width + OLD_RATE] * c.springs[i * c.width + RATE] <= 0.0:
+        s = past(c.springs, i * c.width)
+        if s[OLD_RATE] * s[RATE] <= 0.0:
             pieces = 4
-    for piece in range(1, pieces + 1):
+        there = _may_dip(s)
+        if there < 1.0:
+            dip = min(dip, _turned(c, i, there))
+            look(c, 1.0)
+    while before < 1.0:
         share, known = piece / pieces, True
+        if before < dip < share:
+            share = dip
+        else:
+            piece += 1
         found, who, what = _earliest(c, before, share)
         if who >= 0:
             return found, who, what
@@ -278,6 +314,66 @@ def _may_pass(s, dt):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _vertex(low, f_low, middle, f_middle, high, f_high):  # type: ignore[no-untyped-def]
+    """Return where the parabola through three points is least, and its value there."""
+    first = (f_middle - f_low) / (middle - low)
+    bend = ((f_high - f_middle) / (high - middle) - first) / (high - low)
+    if not bend > 0.0:
+        return NOWHERE, 0.0
+    x = 0.5 * (low + middle - first / bend)
+    return x, f_low + (first + bend * (x - middle)) * (x - low)
+
+
+@inner
+def _may_dip(s):  # type: ignore[no-untyped-def]
+    """Return the share of a step at which a spring may move against its branch; else NOWHERE.
+
+    Its rate has the sign of the branch at both ends of the step.
+    """
+    start, end = s[TURNS] * s[OLD_RATE], s[TURNS] * s[RATE]
+    if not (start > 0.0 and end > 0.0):
+        return NOWHERE
+    x, least = _vertex(0.0, start, MIDDLE, s[TURNS] * s[MIDWAY], 1.0, end)
+    return x if 0.0 < x < 1.0 and least < DIP * (max(start, end) - least) else NOWHERE
+
+
+@inner
+def _turned(c, i, x):  # type: ignore[no-untyped-def]
+    """Return a share of the step at which a spring moves against its branch, from a guess x."""
+    s, low, high = past(c.springs, i * c.width), 0.0, 1.0
+    way = s[TURNS]
+    f_low, f_high, middle, least = way * s[OLD_RATE], way * s[RATE], NOWHERE, 0.0
+    for _ in range(8):
+        look(c, x)
+        value = way * s[RATE]
+        if value < 0.0:
+            return x
+        if middle == NOWHERE:
+            middle, least = x, value
+        elif (value < least) == (x < middle):
+            if value < least:
+                high, f_high, middle, least = middle, least, x, value
+            else:
+                high, f_high = x, value
+        elif value < least:
+            low, f_low, middle, least = middle, least, x, value
+        else:
+            low, f_low = x, value
+        x = _vertex(low, f_low, middle, least, high, f_high)[0]
+        if not low < x < high or abs(x - middle) < 1e-3:
+            break
+    return NOWHERE
+
+
+@inner
+def keep_midway(c):  # type: ignore[no-untyped-def]
+    """Keep the strain rates about the middle of a step."""
+    for i in range(c.count):
+        s = past(c.springs, i * c.width)
+        s[MIDWAY] = s[RATE]
+
+
+@inner
 def suspicious(c, dt):  # type: ignore[no-untyped-def]
     """Whether a step may contain an event, by the values at both ends."""
     if c.now[PRESSED] > 0.0 and c.carried[0] <= 0.0:
@@ -286,7 +382,7 @@ def suspicious(c, dt):  # type: ignore[no-untyped-def]
         s = past(c.springs, i * c.width)
         if s[EPS] > s[HIGH] or s[EPS] < s[LOW] or s[TURNS] * s[RATE] < 0.0:
             return True
-        if _may_pass(s, dt):
+        if _may_pass(s, dt) or (s[TURNS] != 0.0 and _may_dip(s) < 1.0):
             return True
     return False
 

@@ -13,7 +13,16 @@ import numpy as np
 from numba import cfunc
 from scipy.integrate._ivp import dop853_coefficients as pair
 
-from foamfit.solve.events import DOUBTFUL, FAILED, PLAIN, SAMPLED, STEPPING, suspicious
+from foamfit.solve.events import (
+    DOUBTFUL,
+    FAILED,
+    MIDDLE,
+    PLAIN,
+    SAMPLED,
+    STEPPING,
+    keep_midway,
+    suspicious,
+)
 from foamfit.solve.motion import rates
 from foamfit.solve.run import GROW, HORIZON, LAST, NOW, STEP, STEPPED, TAKEN, unpack
 from foamfit.springs.compiled.contract import OPTIONS, inner, past
@@ -39,6 +48,7 @@ WEIGHT = np.concatenate(
      for full, row, more in zip(_FULL, _ROWS, NONE, strict=True)]
 )  # fmt: skip
 TIMES = pair.C[:ALL_STAGES]
+MIDWAY_STAGE = int(np.flatnonzero(TIMES == MIDDLE)[0])
 
 LAST_TERM = 1e-3  # share of the last term of the dense output that counts as its error
 
@@ -85,6 +95,8 @@ def take(c, n, dt, at, want):  # type: ignore[no-untyped-def]
             want,
             at + TIMES[s] * dt if s < STEPPED else at + dt,
         )
+        if s == MIDWAY_STAGE:
+            keep_midway(c)
 
 
 @inner

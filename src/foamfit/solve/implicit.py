@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numba import cfunc
 
-from foamfit.solve.events import DOUBTFUL, FAILED, SAMPLED, STEPPING, suspicious
+from foamfit.solve.events import DOUBTFUL, FAILED, SAMPLED, STEPPING, keep_midway, suspicious
 from foamfit.solve.motion import rates
 from foamfit.solve.run import (
     BEFORE,
@@ -272,6 +272,8 @@ def _solve(c, h, at, tol, first, last):  # type: ignore[no-untyped-def]
             for k in range(total):
                 state[k] = y[k] + moves[i * wide + k]
             rates(c, state, past(c.stage, (1 + i) * wide), first, at + NODES[i] * h)
+            if i == POINTS // 2:
+                keep_midway(c)
         size = 0.0
         for column in range(first, last):
             size = max(size, _improve(c, h, column, tol))

@@ -75,6 +75,7 @@ from foamfit.springs.compiled.contract import (
     MISS,
     OPTIONS,
     RATE,
+    RELAX,
     SLOPE,
     TANGENT,
     TOTAL,
@@ -91,6 +92,7 @@ from foamfit.springs.compiled.contract import (
 # of displacement, velocity, strain and stress.
 SPEED, TOL, MOST, BRIEFLY, OVER, LEAST = range(2, 8)
 FIRST = 40.0  # first implicit step over a short one
+FADES = 5.0  # longest explicit step over a relaxation time; steps are stable up to 6.3
 STOPPED = 0.1  # most of the velocity that a first step takes
 # Results of a run; after them, for each derivative, whether it is one-sided.
 OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, STRESS_LOST = range(
@@ -185,13 +187,18 @@ def _switch(c, i, up, want):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _turn(c, want):  # type: ignore[no-untyped-def]
-    """Let springs turn whose rate has changed its sign by a jump of the prescribed rate."""
+def _turn(c, want, changed):  # type: ignore[no-untyped-def]
+    """Let springs turn whose rate has changed its sign by a jump.
+
+    The prescribed rate jumps, or the branch of a spring, `changed` (else -1), which makes it softer
+    or stiffer. Then its own rate keeps its sign, and those of springs with a dashpot do not jump.
+    """
     for _ in range(4 * c.count):
         turned = False
         for i in range(c.count):
             s = past(c.springs, i * c.width)
-            if s[TURNS] * s[RATE] < 0.0:
+            jumps = changed < 0 or (i != changed and s[ETA] == 0.0)
+            if jumps and s[TURNS] * s[RATE] < 0.0:
                 _switch(c, i, int(s[TURNS] < 0.0), want)
                 turned = True
         if not turned:
@@ -219,6 +226,7 @@ def _pass_event(c, want, share, who, kind):  # type: ignore[no-untyped-def]
         return slope
     turns = c.springs[who * c.width + TURNS]
     _switch(c, who, int(turns < 0.0) if kind == TURN else int(kind == TOP_END), want)
+    _turn(c, want, who)
     return slope
 
 
@@ -252,6 +260,23 @@ def _fresh_scales(c):  # type: ignore[no-untyped-def]
     for k in range(2 * c.nodes):
         shared = OF_V if k % 2 else OF_W
         scales[kinds[k]] = max(scales[kinds[k]], LEAST_SHARE * scales[shared])
+
+
+@inner
+def _longest(c, want):  # type: ignore[no-untyped-def]
+    """Return the longest step.
+
+    The error of a step keeps relaxation terms stable, but not their derivatives: near the limit of
+    stability these grow by many steps before that error is seen.
+    """
+    longest = math.inf
+    if want and c.degree == 0:
+        for i in range(c.count):
+            s = past(c.springs, i * c.width)
+            for k in range(c.terms):
+                if s[RELAX + 2 * k] > 0.0:
+                    longest = min(longest, FADES * s[RELAX + 2 * k + 1])
+    return longest
 
 
 @inner
@@ -330,11 +355,11 @@ def integrate(  # type: ignore[no-untyped-def]
     else:
         done = drive(c, 1, want)
         r[STEP] = r[HORIZON]
-    outcome, ended = DONE, math.nan
+    outcome, ended, longest = DONE, math.nan, _longest(c, want)
     while not (done or (struck and int(r[SAMPLE]) == c.samples)):
         _fresh_scales(c)
         keep_values(c)
-        r[STEP] = min(r[STEP], r[HORIZON] - r[NOW])
+        r[STEP] = min(r[STEP], r[HORIZON] - r[NOW], longest)
         upto = c.time[int(r[SAMPLE])] if struck else math.inf
         how = take_step(c, want, tol, upto, most)
         outcome = _failure(c, how, most)
@@ -350,7 +375,7 @@ def integrate(  # type: ignore[no-untyped-def]
             r[HORIZON] = math.nextafter(r[NOW], math.inf)
         elif r[NOW] >= r[HORIZON]:
             done = drive(c, c.none, want)
-            _turn(c, want)
+            _turn(c, want, -1 + c.none)
         r[STEP] = dt
     endings[OUTCOME], endings[ENDED] = outcome, ended
     endings[STEPS], endings[SWITCHES] = r[TAKEN], r[LOGGED]

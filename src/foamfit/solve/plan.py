@@ -193,7 +193,8 @@ class Plan(NamedTuple):
             fastest = max(self.fastest_rates(rows, heights, drag))
             endings[loop.OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
         lost = _lost(endings) if degree else 0.0
-        return self._motion(out, RADAU if degree else EXPLICIT_STEPS, endings, log, rows, lost)
+        method, strongest = RADAU if degree else EXPLICIT_STEPS, endings.item(loop.STRONGEST)
+        return self._motion(out, method, endings, log, rows, lost, strongest)
 
     def _methods(self, stiff: bool) -> tuple[int, ...]:
         """Return the degrees of the methods to try: 0 for explicit steps.
@@ -269,8 +270,9 @@ class Plan(NamedTuple):
         return short
 
     def _motion(
-        self, out: Array, method: str, endings: Array, log: Array, rows: Array, lost: float
-    ) -> Motion:
+        self, out: Array, method: str, endings: Array, log: Array, rows: Array, lost: float,
+        strongest: float = 0.0,
+    ) -> Motion:  # fmt: skip
         """Return the result of a run as a Motion; raise SimulationError if it failed."""
         outcome, time, steps, switches = endings[:4].tolist()
         loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
@@ -283,7 +285,8 @@ class Plan(NamedTuple):
             log = log[: int(switches)] if switches <= len(log) else np.empty((int(switches), 5))
         else:
             log = NO_SWITCHES
-        return Motion(out[0, 1:], out[0, 0], time, log, int(steps), method, slopes, lost)
+        motion = out[0, 1:], out[0, 0]
+        return Motion(*motion, time, log, int(steps), method, slopes, lost, strongest)
 
     # ------------------------------------------------------------------ without integration
 

@@ -51,6 +51,7 @@ class Motion(NamedTuple):
     method: str = CLOSED_FORM
     slopes: Slopes | None = None  #: None if no derivatives were requested
     unresolved: float = 0.0  #: size of damped-out vibrations, relative to the ranges
+    strongest: float = 0.0  #: largest stress at an end of a step, Pa
 
 
 def difference(one: Array, other: Array) -> float:

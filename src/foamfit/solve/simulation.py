@@ -115,7 +115,8 @@ def _verified(
             f"rounding errors exceed rtol = {rtol:g}"
         )
     forced = 0 if scene.speed > 0.0 else scene.time.size
-    long = _is_long(scene, motion, FEW_STEPS + 2 * forced) or inside or distance < CLOSE
+    long = _is_long(scene, motion, FEW_STEPS + 2 * forced) or inside
+    long = long or min(distance, _distance_by_stress(scene, arrays, motion)) < CLOSE
     long = (long and scene.solver == SECOND_ORDER) or sharp
     if not (long or motion.method == RADAU) or rtol < 1e-12:  # a finer run would only round
         return motion
@@ -208,6 +209,20 @@ def _distance(scene: Plan, arrays: ChainArrays, displacement: Array) -> float:
         if one.pole >= 0:
             star = float(arrays.rows[i, 1 + 2 * scene.terms + one.pole])
             least = min(least, 1.0 - (float(strain[i]) - max(star, 0.0)))
+    return least
+
+
+def _distance_by_stress(scene: Plan, arrays: ChainArrays, motion: Motion) -> float:
+    """Return a lower bound of the distance of any strain from 1 + ε_*, also between samples.
+
+    It is that at which branch c has the largest stress of any spring. A mass may rebound from the
+    end of a branch between two samples.
+    """
+    least, at = 1.0, 1 + 2 * scene.terms
+    for i, one in enumerate(scene.laws.made):
+        if one.pole >= 0:
+            kc = float(arrays.rows[i, at + one.slopes[1]])
+            least = min(least, kc / (kc + motion.strongest))
     return least
 
 

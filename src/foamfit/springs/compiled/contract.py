@@ -57,6 +57,7 @@ OFFSET, STEEP, LOSS, LOSSY = range(MEMORY + 12, MEMORY + 16)
 TINY = 1e-300
 X, MOST_INTERNAL = 64, 32  # internal variables
 RELAX, MOST_TERMS = 96, 10  # g and τ of relaxation terms
+MIDWAY = RELAX + 2 * MOST_TERMS  # strain rate about the middle of a step
 RESULTS = 128  # of `evaluate`
 OF_LAW, SLOPE, MISS, BY_HELD, BY = 0, 1, 2, 3, 5
 OF_STRESS, OF_HELD, OF_PARAMETER = 0, 1, 3  # columns of CHANGES
