@@ -16,6 +16,9 @@ from foamfit.arrays import Array
 # Largest number of consecutive Broyden updates of the Jacobian, and the largest relative difference
 # between actual and predicted gain for which it is updated.
 UPDATES, PREDICTED = 6, 0.5
+# A descent ends where a step fails whose predicted gain is below this multiple of `least`: it is of
+# the size of errors of the simulation.
+LITTLE = 100.0
 # Damping of the trial steps in `following`.
 FOLLOWING = (1e-9, 1e-6, 1e-3, 0.1)
 
@@ -139,7 +142,7 @@ def descend(
     A coordinate at a limit whose gradient points outwards is fixed for the step. The damping
     follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). The descent ends after two consecutive
     steps that lower the cost by less than the fraction `enough`, or when the predicted gain is
-    below `least`. Points with an infinite residual are rejected; the start must have a finite one.
+    below `least`, or a step that promises little fails. Points with an infinite residual are rejected; the start must have a finite one.
     The Jacobian of a single test, which is expensive, is updated while steps gain what it predicts;
     a descent ends with an exact Jacobian unless it runs out of `iterations`.
     """
@@ -176,7 +179,8 @@ def descend(
             if not updates:
                 damping *= growth
                 growth *= 2.0
-                ended = damping > 1e8 or float(np.max(np.abs(moved))) < 1e-9
+                little = at.expected(moved) < LITTLE * least
+                ended = little or damping > 1e8 or float(np.max(np.abs(moved))) < 1e-9
         if updates:
             updates, at = 0, Iterate(at.point, at.residual, jacobian(at.point))
         elif ended:
