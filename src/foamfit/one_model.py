@@ -299,7 +299,7 @@ def identify(
     better = None if options.watch is None else partial(options.watch, problem)
     tracker = Tracker(problem.objective, deadline, better)
     tracker.looked = None if look is None else partial(look, problem)
-    record = SearchRecord(options.seed, starts, began, SPENT.seconds)
+    record = SearchRecord(options.seed, starts, began, compiled=SPENT.seconds)
     problem, record = _search(problem, tracker, record, options.vary, progress)
     if tracker.best_values is None:
         tried, why = problem.objective.evaluations, "check the drive, the heights and the bounds"

@@ -415,7 +415,8 @@ class Fit:
         for name, row in zip(names, self.correlation.matrix, strict=True):
             pairs = zip(names, row.tolist(), strict=True)
             shown = {other: c for other, c in pairs if other != name and math.isfinite(c)}
-            self.params[name].correl = shown if self.params[name].stderr is not None else None
+            if (one := self.params.get(name)) is not None and one.stderr is not None:
+                one.correl = shown
 
     @property
     def springs(self) -> dict[str, Spring]:

@@ -99,12 +99,11 @@ def damped_step(gradient: Array, normal: Array, damping: float, held: NDArray[np
 
     `damping` multiplies the diagonal of the normal matrix.
     """
-    if held.any():
+    if held.any() or not held.size:
         step, moving = np.zeros(gradient.size), np.flatnonzero(~held)
         if moving.size:
-            free = np.zeros(moving.size, dtype=bool)
             own = normal[np.ix_(moving, moving)]
-            step[moving] = damped_step(gradient[moving], own, damping, free)
+            step[moving] = damped_step(gradient[moving], own, damping, held[moving])
         return step
     own = normal.copy()
     diagonal = own.ravel()[:: gradient.size + 1]  # a view
@@ -141,10 +140,11 @@ def descend(
 
     A coordinate at a limit whose gradient points outwards is fixed for the step. The damping
     follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). The descent ends after two consecutive
-    steps that lower the cost by less than the fraction `enough`, or when the predicted gain is
-    below `least`, or a step that promises little fails. Points with an infinite residual are rejected; the start must have a finite one.
-    The Jacobian of a single test, which is expensive, is updated while steps gain what it predicts;
-    a descent ends with an exact Jacobian unless it runs out of `iterations`.
+    steps that lower the cost by less than the fraction `enough`, when the predicted gain is below
+    `least`, or when a step fails that promised little more. Points with an infinite residual are
+    rejected; the start must have a finite one. The Jacobian of a single test, which is expensive,
+    is updated while steps gain what it predicts; a descent ends with an exact Jacobian unless it
+    runs out of `iterations`.
     """
     low, high = box
     fixed = low == high
@@ -179,7 +179,7 @@ def descend(
             if not updates:
                 damping *= growth
                 growth *= 2.0
-                little = at.expected(moved) < LITTLE * least
+                little = at.expected(step) < LITTLE * least
                 ended = little or damping > 1e8 or float(np.max(np.abs(moved))) < 1e-9
         if updates:
             updates, at = 0, Iterate(at.point, at.residual, jacobian(at.point))

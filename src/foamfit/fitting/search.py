@@ -93,12 +93,12 @@ class SearchRecord:
     seed: int
     starts: int  # Requested number of descents on the loop
     began: float  # `time.perf_counter` at its start, s
-    compiled: float = 0.0  # `cache.SPENT` at its start, s
     # Final costs of the descents on the curves, best first, and the number of descents on the loop
     # that led to each.
     costs: tuple[tuple[float, int], ...] = ()
     stopped: str | None = None  # Why it ended early: "the time limit", "Ctrl-C", "SIGTERM"
     freed: Freed | None = None  # What free contact time and zeros would gain where the law errs
+    compiled: float = 0.0  # `cache.SPENT` at its start, s
 
     @property
     def agreeing(self) -> int:
