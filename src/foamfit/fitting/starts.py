@@ -16,7 +16,7 @@ from foamfit.fitting.curves import smoothed
 from foamfit.springs.laws.record import Law, Param
 from foamfit.springs.loop import Loop
 
-LOOP_SAMPLES = 240
+LOOP_SAMPLES = 300
 CURVE_STARTS = 300
 OWN_MARKS = 5  # random numbers per spring; further ones that a law needs are appended
 # Range of random start values of nuisance parameters, and of the time shift.
