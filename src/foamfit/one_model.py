@@ -1,4 +1,4 @@
-"""The fit of one model: search, refinement by lmfit, intervals and result."""
+"""The fit of one model: search, refinement, intervals and result."""
 
 from __future__ import annotations
 

@@ -9,20 +9,18 @@ fit that then follows the record worse returns to that optimum (`weigh_motion`).
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Collection
 from copy import copy
 from dataclasses import replace
 
-import lmfit
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
-from foamfit.fitting.minimizer import functions_of
 from foamfit.fitting.nuisance import shown_by
 from foamfit.fitting.problem import Problem
-from foamfit.fitting.search import STOPPING, Freed, Tracker, descend, distinct, rank
+from foamfit.fitting.search import STOPPING, Freed, Tracker, descend, distinct, rank, squares
 from foamfit.springs.parameters import NUISANCE
 from foamfit.trust.best_point import BestPoint
 
@@ -31,36 +29,17 @@ from foamfit.trust.best_point import BestPoint
 OVER_NOISE, OVER_SCALE = 1.0, 0.2
 MINIMA = 12  # ends of the search from which a descent begins once parameters are held
 ITERATIONS = 60  # of such a descent
+LEFT = 1e-6  # predicted gain of the sum of squares at which a refinement ends
 # Largest RMS deviation from the record over that of plain least squares.
 WORSE = 1.05
 
 
 def refine(problem: Problem, tracker: Tracker) -> None:
-    """Refine the best point by lmfit's least_squares in the physical parameters.
-
-    Parameters of branches that the best point never reaches do not change the curves and are fixed.
-    """
-    if tracker.best_values is None:
-        return
-    best = BestPoint(problem, tracker.best_values)
-    problem.put(best.values)
-    params, names = problem.params.copy(), best.names
-    for name in best.unreached:
-        params[name].vary = False
-    if not names:
-        return
-    for name in names:  # least_squares needs a start inside the bounds
-        parameter = params[name]
-        if math.isfinite(span := parameter.max - parameter.min):
-            low, high = parameter.min + 1e-9 * span, parameter.max - 1e-9 * span
-            parameter.value = min(max(parameter.value, low), high)
-
-    residual, jacobian = functions_of(problem, 0.0, tracker.residual)
-    with warnings.catch_warnings():  # about lmfit's covariance, which is not used
-        warnings.simplefilter("ignore", RuntimeWarning)
-        ends = {"ftol": 1e-10, "xtol": 1e-10, "gtol": 1e-12, "max_nfev": 60}
-        more = {"jac": jacobian, "x_scale": best.sizes} | ends
-        lmfit.minimize(residual, params, method="least_squares", **more)
+    """Descend from the best point until nothing is left to gain."""
+    if tracker.best_values is not None:
+        space = problem.space()
+        start = space.encode(tracker.best_values)
+        levenberg.descend(*squares(tracker, space), start, space.box, ITERATIONS, least=LEFT)
 
 
 def held_by_record(problem: Problem, asked: Collection[str]) -> Problem:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import lmfit
@@ -20,28 +19,9 @@ from foamfit.fitting.problem import Problem, make_problem
 if TYPE_CHECKING:
     from foamfit.results import Fit
 
-METHOD = "foamfit: races of descents (Levenberg-Marquardt), lmfit's least_squares"
+METHOD = "foamfit: races of descents (Levenberg-Marquardt)"
 # Largest relative difference between the χ² of a result and that of its own residual.
 SAME = 1e-6
-
-
-def functions_of(
-    problem: Problem, origins: Array | float, residual: Callable[[Array], Array] | None = None
-) -> tuple[Callable[[lmfit.Parameters], Array], Callable[[lmfit.Parameters], Array]]:
-    """Return the residual, and its derivative by the parameters that vary, for lmfit.
-
-    `origins` (n,) are subtracted from the values of the parameters.
-    """
-    misses = problem.objective.residual if residual is None else residual
-
-    def off(params: lmfit.Parameters) -> Array:
-        return misses(problem.vector(params) - origins)
-
-    def slopes(params: lmfit.Parameters) -> Array:
-        names = tuple(name for name, one in params.items() if one.vary)
-        return problem.slopes(problem.vector(params) - origins, names)
-
-    return off, slopes
 
 
 def problem_of(fit: Fit) -> Problem:
@@ -69,7 +49,14 @@ def problem_of(fit: Fit) -> Problem:
 def minimizer_of(fit: Fit) -> lmfit.Minimizer:
     """Return the minimizer of a result, for `lmfit.conf_interval`."""
     problem = problem_of(fit)
-    off, slopes = functions_of(problem, problem.origins)
+
+    def off(params: lmfit.Parameters) -> Array:
+        return problem.objective.residual(problem.vector(params) - problem.origins)
+
+    def slopes(params: lmfit.Parameters) -> Array:
+        names = tuple(name for name, one in params.items() if one.vary)
+        return problem.slopes(problem.vector(params) - problem.origins, names)
+
     return lmfit.Minimizer(off, lmfit_params(fit), Dfun=slopes, nan_policy="raise")
 
 
