@@ -318,7 +318,7 @@ class Plan(NamedTuple):
                 static.balance, *_memory(layout), rows, heights, self.mass, reals, self.values,
                 self.time, out, _NO_LOG, strain, branches,
             )  # fmt: skip
-        fine = math.isfinite(out[0].sum())
+        fine = bool(np.isfinite(out[0]).all())
         if fine and self.top == scenes.MOTION and not alone:
             miss = np.abs(out[0, -1] - self.values).max()
             fine = miss <= AT_MOST * (self.height + np.abs(self.values).max())
