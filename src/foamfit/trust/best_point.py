@@ -25,7 +25,7 @@ from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together
 from foamfit.trust import covariance
-from foamfit.trust.covariance import Block, Covariance, Uncertainty
+from foamfit.trust.covariance import Block, Covariance, Ends, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.residuals.noise_process import basis_of
 
@@ -87,10 +87,19 @@ class BestPoint:
         """Scales of the k parameters, (k,)."""
         return self.problem.sizes(self.names, self.values)
 
-    def limits(self, name: str) -> tuple[float, float]:
+    def value(self, name: str) -> float:
+        """Value of a parameter, SI."""
+        return float(self.values[self.index[name]])
+
+    def limits(self, name: str) -> Ends:
         """Limits of a parameter, SI."""
         parameter = self.problem.params[name]
         return float(parameter.min), float(parameter.max)
+
+    def local(self, name: str) -> Ends:
+        """Ends of the local 95 % interval of one of the k parameters, not cut at its limits."""
+        value, half = self.value(name), float(self.halves[self.names.index(name)])
+        return value - half, value + half
 
     @cached_property
     def box(self) -> Array:
@@ -178,8 +187,8 @@ class BestPoint:
     @cached_property
     def known(self) -> list[str]:
         """Parameters that are determined or weak by their local interval."""
-        known = np.flatnonzero(self.halves <= covariance.NOTHING * self.sizes)
-        return [self.names[i] for i in known]
+        known = self.halves <= covariance.NOTHING * self.sizes
+        return [name for name, is_known in zip(self.names, known, strict=True) if is_known]
 
     def rises(self, residual: Array) -> Array:
         """Return the rise of the cost at another point as the χ² of each parameter, (k,)."""

@@ -150,7 +150,7 @@ def _notes(best: BestPoint) -> tuple[str, ...]:
         "all",
         objective=objective,
         loops=_inner_loops(best),
-        priors=[(p, unit_of(p.name), best.values[best.index[p.name]]) for p in objective.given],
+        priors=[(p, unit_of(p.name), best.value(p.name)) for p in objective.given],
         off=integrated,
         inside=list(map(interior_channel, sorted(test.interior))) if single else [],
         masses=None if single else _masses(best),
@@ -243,9 +243,8 @@ def _varied(
 ) -> ParameterEstimate:
     """Return the estimate of a varied parameter whose branch was reached."""
     (low, high), column = best.limits(name), best.names.index(name)
-    problem, value, unit = best.problem, float(best.values[best.index[name]]), unit_of(name)
-    half, method = float(best.halves[column]), intervals.methods.get(name, "local covariance")
-    local = (value - half, value + half)
+    problem, value, unit = best.problem, best.value(name), unit_of(name)
+    local, method = best.local(name), intervals.methods.get(name, "local covariance")
     # The percentiles of a Markov chain may all lie to one side of the best point.
     points = (*intervals.ends.get(name, local), value)
     ends = min(points), max(points)
@@ -284,7 +283,7 @@ def _state_of(
     combination. `span` is its range, if there is one; the wider of the two decides.
     """
     (ends, what), limits, unit = covariance.wider(ends, span), best.limits(name), unit_of(name)
-    value, size = float(best.values[best.index[name]]), float(best.sizes[best.names.index(name)])
+    value, size = best.value(name), float(best.sizes[best.names.index(name)])
     state, why = covariance.state(name, value, (ends, what), size, limits)
     if state == "not determined":
         reason = why if math.isfinite(ends[1] - ends[0]) else say("why", "independent")

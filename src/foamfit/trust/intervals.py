@@ -116,8 +116,7 @@ def assess(
     order = sorted(known, key=lambda name: -far[best.names.index(name)])
     bent = [name for name in order if far[best.names.index(name)] > BENT]
     # Where the range is wider, model error outweighs noise, and a local interval is enough.
-    halves = dict(zip(best.names, best.halves, strict=True))
-    local = [n for n in bent if n in ranges and np.ptp(ranges[n]) > 2.0 * halves[n]]
+    local = [n for n in bent if n in ranges and np.ptp(ranges[n]) > np.ptp(best.local(n))]
     made = _by_profiles(best, [n for n in bent if n not in local], minima, tracker, budget)
     made = _with_minima(best, replace(made, doubtful=(*made.doubtful, *local)), others)
     return made if best.misfits or made.better is not None else _with_far(best, made, tracker)
@@ -136,7 +135,7 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
     Values far outside their intervals, at minima hardly worse than the best, go to `elsewhere`.
     """
     ends, methods = dict(made.ends), dict(made.methods)
-    intervals = {name: _interval(best, made, name) for name in best.known}
+    intervals = {name: made.ends.get(name, best.local(name)) for name in best.known}
     for point, residual in minima:
         halves = _halves(best, point, residual)
         for name, (low, high) in intervals.items():
@@ -152,19 +151,13 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
     return replace(made, elsewhere=elsewhere)
 
 
-def _interval(best: BestPoint, made: Intervals, name: str) -> tuple[float, float]:
-    """Return the interval of a parameter, by default the local one."""
-    value, half = float(best.values[best.index[name]]), best.halves[best.names.index(name)]
-    return made.ends.get(name, (value - half, value + half))
-
-
 def _far_values(
     best: BestPoint, made: Intervals, point: Array, residual: Array
 ) -> dict[str, float]:
     """Return the values of a point far outside their intervals, if it is hardly worse."""
     near, far = best.rises(residual) <= (HARDLY_WORSE * best.quantiles) ** 2, dict[str, float]()
     for name in best.known:
-        value, (low, high) = float(point[best.index[name]]), _interval(best, made, name)
+        value, (low, high) = float(point[best.index[name]]), made.ends.get(name, best.local(name))
         outside = max(low - value, value - high)
         if near[best.names.index(name)] and outside > FAR * (high - low):
             far[name] = value
@@ -180,8 +173,8 @@ def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
     refit, elsewhere = Refit(best, tracker), dict(made.elsewhere)
     try:
         for name in best.known:
-            column, value = best.names.index(name), float(best.values[best.index[name]])
-            low, high = _interval(best, made, name)
+            column, value = best.names.index(name), best.value(name)
+            low, high = made.ends.get(name, best.local(name))
             if name in NUISANCE or high - low > 2.0 * WEAK * best.sizes[column]:
                 continue
             least, most = best.limits(name)
