@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -119,10 +120,10 @@ def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[st
     residuals.
     """
     objective, out = best.problem.objective, {}
-    error_of = dict(zip(objective.counted, errors, strict=True)) if errors else {}
-    for name, rms in objective.rms(best.residual).items():
+    pairs = zip(objective.rms(best.residual).items(), errors or repeat(None), strict=False)
+    for (name, rms), error in pairs:
         residual = best.simulated.curves[name] - objective.measured[name]
-        level, error = objective.noise(name), error_of.get(name)
+        level = objective.noise(name)
         out[name] = asdict(level) | {
             "scale": objective.scale[name],
             "range": float(np.ptp(objective.measured[name])),
@@ -283,7 +284,7 @@ def _state_of(
     combination. `span` is its range, if there is one; the wider of the two decides.
     """
     (ends, what), limits, unit = covariance.wider(ends, span), best.limits(name), unit_of(name)
-    value, size = best.value(name), float(best.sizes[best.names.index(name)])
+    value, size = best.value(name), best.size(name)
     state, why = covariance.state(name, value, (ends, what), size, limits)
     if state == "not determined":
         reason = why if math.isfinite(ends[1] - ends[0]) else say("why", "independent")

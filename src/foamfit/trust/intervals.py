@@ -257,8 +257,7 @@ def _by_profiles(
 
 def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]:
     """Return the points within its cut, met by profiles, with a parameter's extreme values."""
-    column, at = best.names.index(name), best.index[name]
-    highest = best.quantiles[column] ** 2 * best.spread.inflation[column]
+    highest, at = best.cuts[best.names.index(name)], best.index[name]
     refits = [refit for tracing in tracings for refit in tracing.refits]
     points = [refit.point for refit in refits if refit.cost - best.cost < highest]
     points.sort(key=lambda point: float(point[at]))
