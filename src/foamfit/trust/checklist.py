@@ -138,10 +138,7 @@ def _followed(best: BestPoint, misfit: Mapping[str, float | None]) -> Check:
 
 
 def _at_noise(best: BestPoint) -> Check:
-    """Check whether the residuals are noise, by their size, correlation and model error.
-
-    This is the only verdict on the noise; `Fit.at_noise` returns its answer.
-    """
+    """Check by size, correlation and model error whether residuals are noise (`Fit.at_noise`)."""
     objective, has_noise, longest = best.problem.objective, False, 1.0
     errors = best.errors if best.names else (None,) * len(objective.counted)
     rms = objective.rms(best.residual)

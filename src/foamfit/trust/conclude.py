@@ -24,7 +24,7 @@ from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstima
 from foamfit.solve.cache import SPENT
 from foamfit.springs import laws
 from foamfit.springs.parameters import any_param, split_name, unit_of
-from foamfit.text import engineering, listed, percent
+from foamfit.text import engineering, listed
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
 from foamfit.trust.budget import make_budget
@@ -163,10 +163,7 @@ def _notes(best: BestPoint) -> tuple[str, ...]:
 
 
 def _masses(best: BestPoint) -> dict[str, Any] | None:
-    """Return the effect of interior masses omitted from an impact; None if none were omitted.
-
-    "ended" is the error if the simulation with the masses fails.
-    """
+    """Return the effect of interior masses omitted from an impact, or why it is unknown, or None."""
     objective, mass = best.problem.objective, best.problem.measurement.specimen.mass
     if objective.drive != "impact" or objective.interior_mass:
         return None
@@ -177,13 +174,11 @@ def _masses(best: BestPoint) -> dict[str, Any] | None:
         with_mass = massive.simulate(best.values, everything=True).curves
     except SimulationError as error:
         return {"changes": [], "ended": error}
-    titles = {"stress_time": "the base stress", "displacement_time": "the displacement"}
-    changes = []
-    for name, curve in best.simulated.curves.items():
-        if name != "stress_strain" and name in with_mass:
-            change = float(np.sqrt(np.mean((curve - with_mass[name]) ** 2)) / np.ptp(curve))
-            size = "less than 0.01 %" if change < 1e-4 else percent(change)
-            changes.append(f"{titles.get(name, name.removesuffix('_time'))} by {size}")
+    changes = [
+        (name, float(np.sqrt(np.mean((curve - with_mass[name]) ** 2)) / np.ptp(curve)))
+        for name, curve in best.simulated.curves.items()
+        if name != "stress_strain" and name in with_mass
+    ]
     return {"mass": mass, "changes": changes}
 
 

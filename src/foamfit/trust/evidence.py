@@ -198,10 +198,7 @@ class Score:
         return self.predicted < other.predicted * (1.0 - SHARE) ** (self.varied - other.varied)
 
     def rules_out(self, other: Score) -> bool:
-        """Whether it follows the curves better with fewer parameters, or much better with as many.
-
-        Much better means a misfit smaller by a factor of `WORSE`.
-        """
+        """Whether it follows better with fewer parameters, or `WORSE` times better with as many."""
         factor = 1.0 if self.varied < other.varied else WORSE
         return self.varied <= other.varied and factor * self.misfit < other.misfit
 
@@ -221,7 +218,7 @@ def scores_of(tried: Sequence[Tried]) -> list[Score]:
     """Return the scores of all models; if any has no prediction, fitted misfits replace all."""
     complete = all(one.predicted is not None for one in tried)
     return [
-        Score(one.varied, one.misfit, one.predicted if complete and one.predicted else one.misfit)
+        Score(one.varied, one.misfit, (one.predicted if complete else None) or one.misfit)
         for one in tried
     ]
 
@@ -230,8 +227,7 @@ def decide(scores: Sequence[Score], criteria: Sequence[Criteria], by_prediction:
     """Compare the models in the order of their number of parameters; see `choose`."""
     before: list[int | None] = [None] * len(scores)
     rulers = [
-        next((j for j, other in enumerate(scores) if j != i and other.rules_out(one)), None)
-        for i, one in enumerate(scores)
+        next((j for j, other in enumerate(scores) if other.rules_out(one)), None) for one in scores
     ]
     best: int | None = None
     judged: Sequence[Any] = scores if by_prediction else criteria

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 PART = 0.05  # smallest component of a direction that counts
 NAMED = 0.3  # smallest component, relative to the largest, that is named in a sentence
+CLOSE = 0.9  # smallest correlation that is named
 MOST = 3  # largest number of parameters named in a joint change
 # Times and zeros have an arbitrary origin, so that powers of them are meaningless.
 OF_NO_POWER = set(NUISANCE) - set(POSITIVE)
@@ -142,27 +143,25 @@ class Insight:
         change[me] = 0.0
         order = np.argsort(-np.abs(change), kind="stable")
         parts = [i for i in order if abs(change[i]) > NAMED * abs(change[order[0]])]
-        text = ", ".join(f"{self.names[i]} ({change[i]:+.2g})" for i in parts[:MOST])
-        more = f" and {len(parts) - MOST} more" if len(parts) > MOST else ""
-        return say("why", "compensated", names=text.replace("-", "−") + more)
+        return say(
+            "why", "compensated", most=MOST, parts=[(self.names[i], change[i]) for i in parts]
+        )
 
-    def companion(self, name: str, least: float = 0.9) -> str:
-        """Name the most correlated parameter; "" if no correlation reaches `least`."""
+    def companion(self, name: str) -> str:
+        """Name the most correlated parameter; "" if no correlation reaches `CLOSE`."""
         me = self.names.index(name)
         row = np.nan_to_num(self.correlation[me])
         row[me] = 0.0
         at = int(np.argmax(np.abs(row)))
-        if abs(row[at]) < least:
-            return ""
-        return say("why", "correlated", name=self.names[at], r=row[at]).replace("-", "−")
+        return (
+            say("why", "correlated", name=self.names[at], r=row[at])
+            if abs(row[at]) >= CLOSE
+            else ""
+        )
 
 
 def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
-    """Compute the sensitivities at a point of the parameters, usually the best one.
-
-    `noise` is one standard deviation of each fitted curve, SI, times the root of the
-    autocorrelation time.
-    """
+    """Compute the sensitivities at a point; `noise` is σ√τ of each curve, SI, with τ of its noise."""
     problem, objective, k = best.problem, best.problem.objective, len(best.names)
     labels, at = np.array(sections(problem, best.simulated)), 0
     parts, triangles = list[tuple[str, str]](), list[Array]()

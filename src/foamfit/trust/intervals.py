@@ -265,11 +265,7 @@ def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]
 
 
 def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
-    """Return intervals between the 2.5th and 97.5th percentiles of a Markov chain.
-
-    A chain that is too short or was stopped gives a warning; with too few samples there are no
-    intervals.
-    """
+    """Return intervals between the 2.5th and 97.5th percentiles of a chain, if it is long enough."""
     chain = mcmc(best, choice.draws, choice.seed, tracker)
     few = len(chain.samples) < ENOUGH_DRAWS
     note = chain.sentence([name for name in best.names if name not in best.known], few)

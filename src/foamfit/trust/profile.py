@@ -163,10 +163,7 @@ class _Side:
         return self.value(inner) + share * (self.value(outer) - self.value(inner))
 
     def follow(self, minima: Sequence[Array]) -> None:
-        """Go outward until well beyond the cut, place the crossing, and go on beyond the minima.
-
-        A second call continues from the refits of the first.
-        """
+        """Go outward beyond the cut and the minima; a second call continues from the refits so far."""
         if len(self.refits) == 1:
             self._outward()
         met = list[Iterate]()
@@ -324,7 +321,7 @@ def departures(best: BestPoint) -> Array:
             residual = refit.residual(refit.along(i, shift if side else -shift))
             if residual is not None:
                 rise = least(residual, others) - least(best.residual, others)
-                root = math.sqrt(max(rise / best.spread.inflation[i], 0.0))
+                root = math.sqrt(max(rise / float(best.spread.inflation[i]), 0.0))
                 out[i, side] = root * float(best.spread.stderr[i]) / shift - 1.0
                 break
     return out

@@ -94,17 +94,13 @@ def left_open(
     values = np.array(points)[:, best.places] + 0.0  # turns -0 into 0
     values = np.concatenate([values, _with_other_zeros(best)])
     ends = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
-    cut = refit.enough / ENOUGH
-    lower = best.cost - tracker.best_cost > BETTER * cut
+    lower = best.cost - tracker.best_cost > BETTER * refit.enough / ENOUGH
     better = tracker.best_values if lower else None
     return Open(dict(zip(best.names, ends, strict=True)), tuple(further), better)
 
 
 def _with_other_zeros(best: BestPoint) -> Array:
-    """Return the parameters with each held contact time or zero off by ± its error, (2 m, k).
-
-    To first order, within the limits of the parameters.
-    """
+    """Return the parameters for ± the error of each held contact or zero, to first order, (2 m, k)."""
     moves = best.sizes[:, None] * (np.linalg.pinv(best.scaled, rcond=1e-10) @ best.shifts)
     sides = np.concatenate([moves, -moves], axis=1).T
     return np.asarray(np.clip(best.values[best.places] + sides, *best.box))

@@ -71,10 +71,7 @@ class NoiseProcess:
         return product[:n]
 
     def forms(self, columns: Array, mix: Array | None = None) -> Array:
-        """Return the variance lᵀΣl of the noise along each column l of `columns @ mix`, (m,).
-
-        `columns` is (n, k) and `mix` (k, m), by default the identity.
-        """
+        """Return the variance lᵀΣl along each column l of `columns @ mix` (n, k) (k, m), (m,)."""
         inner = columns.T @ self.times(columns)
         if mix is None:
             return np.diag(inner)
