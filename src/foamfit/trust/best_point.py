@@ -161,7 +161,10 @@ class BestPoint:
         return np.reshape([*out.values()], (-1, self.residual.size)).T
 
     def gradient(self, places: NDArray[np.intp], step: Array) -> Array:
-        """Return half the gradient after a step at `places` up to the limits, both scaled."""
+        """Return half the gradient of the cost after a step of the parameters at `places`.
+
+        Step and gradient are scaled; the step is cut at the limits of the parameters.
+        """
         at, sizes, (low, high) = self.places[places], self.sizes[places], self.box[:, places]
         values = self.values.copy()
         values[at] = np.clip(values[at] + step * sizes, low, high)
@@ -327,7 +330,10 @@ class JointPoint:
         return change * float(self._scales[at])
 
     def moved(self, name: str, change: float) -> list[Array]:
-        """Return the values of each test after a change of a shared value that the others follow."""
+        """Return the values of each test after a change of a shared value.
+
+        The other unknowns follow to minimise the linearised cost.
+        """
         at, out = self.names.index(name), list[Array]()
         along = self.uncertainty.inverse[:, at]
         step = change / self._scales[at] * along / along[at]
@@ -361,7 +367,7 @@ class JointPoint:
         return matrix * scales, inverse * scales
 
     def own_errors(self, test: int, names: Sequence[str]) -> Array:
-        """Return the covariance of own parameters from the data of a test alone, SI, 0 if unknown."""
+        """Return the covariance of own parameters from a test's data alone, SI; else 0."""
         out, own = np.zeros((len(names), len(names))), self._own[test]
         rows = [i for i, name in enumerate(names) if name in own]
         places = [own[names[i]] for i in rows]

@@ -85,7 +85,11 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
 
 
 def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array]:
-    """Return parameters (those that are the quantity itself change) and residual after a change."""
+    """Return the parameters and the residual after a relative change of a quantity.
+
+    Only parameters that are the quantity itself change. Raises SimulationError if the test cannot
+    be simulated.
+    """
     problem, values = best.problem, best.values.copy()
     test = changed(problem.measurement, quantity, share)
     if quantity.startswith("height"):  # a spring's own ± has precedence over that of the specimen

@@ -163,7 +163,10 @@ def _notes(best: BestPoint) -> tuple[str, ...]:
 
 
 def _masses(best: BestPoint) -> dict[str, Any] | None:
-    """Return the effect of interior masses omitted from an impact, or why it is unknown, or None."""
+    """Return the effect of interior masses omitted from an impact; None if none were omitted.
+
+    "ended" is the error if the simulation with the masses fails.
+    """
     objective, mass = best.problem.objective, best.problem.measurement.specimen.mass
     if objective.drive != "impact" or objective.interior_mass:
         return None

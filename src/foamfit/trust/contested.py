@@ -135,7 +135,7 @@ def _earlier(test: Measurement, late: float) -> tuple[Measurement, float]:
 
 
 def _refitted(best: BestPoint, way: Way, starts: int = 0) -> Array | None:
-    """Return the best point with changed quantities near this one, or of a search (`starts` > 0)."""
+    """Return the best point with changed quantities, found nearby or by a search of `starts`."""
     problem, values, test = best.problem, best.values.copy(), best.problem.measurement
     params, stresses = problem.params.copy(), way.get("stress_scale", 1.0)
     for name in problem.kept if way else ():  # held for an error that may be the contradiction's

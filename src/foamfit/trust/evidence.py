@@ -198,7 +198,7 @@ class Score:
         return self.predicted < other.predicted * (1.0 - SHARE) ** (self.varied - other.varied)
 
     def rules_out(self, other: Score) -> bool:
-        """Whether it follows better with fewer parameters, or `WORSE` times better with as many."""
+        """Whether it follows the curves better with fewer parameters, or `WORSE` times better."""
         factor = 1.0 if self.varied < other.varied else WORSE
         return self.varied <= other.varied and factor * self.misfit < other.misfit
 

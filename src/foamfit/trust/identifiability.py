@@ -161,7 +161,11 @@ class Insight:
 
 
 def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
-    """Compute the sensitivities at a point; `noise` is σ√τ of each curve, SI, with τ of its noise."""
+    """Compute the sensitivities at a point of the parameters, usually the best one.
+
+    `noise` is one standard deviation of each fitted curve, SI, times the root of the
+    autocorrelation time.
+    """
     problem, objective, k = best.problem, best.problem.objective, len(best.names)
     labels, at = np.array(sections(problem, best.simulated)), 0
     parts, triangles = list[tuple[str, str]](), list[Array]()

@@ -265,7 +265,7 @@ def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]
 
 
 def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
-    """Return intervals between the 2.5th and 97.5th percentiles of a chain, if it is long enough."""
+    """Return the 2.5th and 97.5th percentiles of a Markov chain, or a warning if it is short."""
     chain = mcmc(best, choice.draws, choice.seed, tracker)
     few = len(chain.samples) < ENOUGH_DRAWS
     note = chain.sentence([name for name in best.names if name not in best.known], few)

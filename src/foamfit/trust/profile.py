@@ -163,7 +163,10 @@ class _Side:
         return self.value(inner) + share * (self.value(outer) - self.value(inner))
 
     def follow(self, minima: Sequence[Array]) -> None:
-        """Go outward beyond the cut and the minima; a second call continues from the refits so far."""
+        """Go outward until well beyond the cut, place the crossing, and go on beyond the minima.
+
+        A second call continues from the refits of the first.
+        """
         if len(self.refits) == 1:
             self._outward()
         met = list[Iterate]()

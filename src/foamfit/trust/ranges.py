@@ -100,7 +100,10 @@ def left_open(
 
 
 def _with_other_zeros(best: BestPoint) -> Array:
-    """Return the parameters for ± the error of each held contact or zero, to first order, (2 m, k)."""
+    """Return the parameters with each held contact time or zero off by ± its error, (2 m, k).
+
+    To first order, within the limits of the parameters.
+    """
     moves = best.sizes[:, None] * (np.linalg.pinv(best.scaled, rcond=1e-10) @ best.shifts)
     sides = np.concatenate([moves, -moves], axis=1).T
     return np.asarray(np.clip(best.values[best.places] + sides, *best.box))
