@@ -169,8 +169,7 @@ def make_budget(
         if item.range is not None:
             row["law"] = 0.5 * (item.range[1] - item.range[0]) / 1.96
         rows[name] = row
-    scales = dict(zip(best.names, best.sizes.tolist(), strict=True))
-    return out, Budget(rows, {name: scales[name] for name in rows}) if rows else None
+    return out, Budget(rows, {name: best.size(name) for name in rows}) if rows else None
 
 
 def _of_covariance(best: BestPoint) -> Iterator[tuple[str, dict[str, float]]]:
@@ -181,9 +180,8 @@ def _of_covariance(best: BestPoint) -> Iterator[tuple[str, dict[str, float]]]:
     """
     if not best.names:
         return
-    known = np.isfinite(best.spread.stderr) & (best.spread.stderr > 0.0)
-    names = [name for name, is_known in zip(best.names, known, strict=True) if is_known]
-    matrix = best.spread.correlation[np.ix_(known, known)]
+    known = np.flatnonzero(np.isfinite(best.spread.stderr) & (best.spread.stderr > 0.0))
+    names, matrix = [best.names[i] for i in known], best.spread.correlation[np.ix_(known, known)]
 
     def conditional(fixed: tuple[str, ...]) -> Array:
         at = [i for i, name in enumerate(names) if name in fixed]

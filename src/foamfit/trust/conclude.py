@@ -140,19 +140,15 @@ def _notes(best: BestPoint) -> tuple[str, ...]:
     """Return notes on the effects that the model omits, on priors, noise and units of residuals."""
     test, objective = best.problem.measurement, best.problem.objective
     single = len(best.problem.model.kinds) == 1
-    integrated = {
-        name: misfit
-        for name in MOTION_CURVES
-        if test.motion == INTEGRATED
-        if name not in objective.counted and (misfit := objective.off(best.simulated, name))
-    }
+    derived = set(MOTION_CURVES) - set(objective.counted) if test.motion == INTEGRATED else ()
+    off = {name: objective.off(best.simulated, name) for name in MOTION_CURVES if name in derived}
     text = say(
         "notes",
         "all",
         objective=objective,
         loops=_inner_loops(best),
         priors=[(p, unit_of(p.name), best.value(p.name)) for p in objective.given],
-        off=integrated,
+        off={name: misfit for name, misfit in off.items() if misfit},
         inside=list(map(interior_channel, sorted(test.interior))) if single else [],
         masses=None if single else _masses(best),
         noises=noise_sentences(test),
@@ -225,13 +221,13 @@ def _estimates(
         else:
             vary, spring = bool(parameter.vary), split_name(name)[0] + 1
             state, key = ("not determined", "unreached") if vary else ("fixed", "held")
-            key, branch = "tied" if parameter.expr else key, best.unreached.get(name)
-            why = say("why", key, branch=branch, spring=spring, expression=parameter.expr)
-            estimate = ParameterEstimate(value, None, None, unit_of(name), vary, state, why)
+            key, stderr, ends = "tied" if parameter.expr else key, None, None
             if (shown := problem.kept.get(name)) is not None:
-                half, why = 1.96 * shown.sigma, say("why", "kept")
+                key, stderr, half = "kept", shown.sigma, 1.96 * shown.sigma
                 ends = value - half, value + half
-                estimate = replace(estimate, stderr=shown.sigma, ci95=ends, why=why)
+            facts = {"branch": best.unreached.get(name), "expression": parameter.expr}
+            why = say("why", key, spring=spring, **facts)
+            estimate = ParameterEstimate(value, stderr, ends, unit_of(name), vary, state, why)
         parameter.stderr = estimate.stderr
         out[name] = estimate.counted_from(-problem.measurement.origins.get(name, 0.0))
     return out
@@ -257,12 +253,12 @@ def _varied(
         span = min(span[0], value), max(span[1], value)
     state, why = _state_of(best, name, ends, insight, span)
     objective, other = problem.objective, intervals.elsewhere.get(name)
+    zero = problem.measurement.origins.get(name, 0.0)  # in the numbers of the file
     misfit, curve = max((objective.off(best.simulated, n) or 0.0, n) for n in objective.counted)
     if state == "determined" and (objective.interior_mass or other is not None or misfit > POOR):
-        other = None if other is None else other + problem.measurement.origins.get(name, 0.0)
-        facts = {"vibrates": objective.interior_mass, "there": other, "off": misfit, "curve": curve}
+        there = None if other is None else other + zero
+        facts = {"vibrates": objective.interior_mass, "there": there, "off": misfit, "curve": curve}
         state, why = "weak", say("why", "weak", why=why, unit=unit, **facts)
-    zero = problem.measurement.origins.get(name, 0.0)
     state, why = judged(settled, best, name, (ends[0] + zero, ends[1] + zero), (state, why))
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)

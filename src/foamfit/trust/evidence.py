@@ -3,13 +3,10 @@
 AICc and BIC use the numbers of effective samples and parameters, so that neither correlated
 residuals nor combinations of parameters that the curves do not fix count as evidence. They assume
 that the residuals are noise. If every model has an error of its own, models are compared by how
-well they predict held-out blocks of the test.
-
-Cross-validation in blocks (Burman, Chow & Nolan 1994, Biometrika 81, 351): where there is model
-error, neighbouring residuals are similar, and single held-out samples would be predicted by their
-neighbours. Instead, contiguous blocks in time are held out in turn. The parameters are fitted to
-the rest, starting from the best point, and the complete history is simulated, so that each block is
-predicted with the state in which the test enters it.
+well they predict contiguous blocks in time that are held out in turn (Burman, Chow & Nolan 1994,
+Biometrika 81, 351); single samples would be predicted by their neighbours. The parameters are
+fitted to the rest, starting from the best point, and the complete history is simulated, so that
+each block is predicted with the state in which the test enters it.
 """
 
 from __future__ import annotations

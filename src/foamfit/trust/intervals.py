@@ -59,19 +59,17 @@ class Choice:
 
     def __post_init__(self) -> None:
         """Reject an unknown method, an invalid number of draws and a missing package."""
-        if self.method not in METHODS:
-            raise InputError(
-                f"intervals '{self.method}' is unknown; it must be one of {', '.join(METHODS)}"
-            )
-        least = LEAST_DRAWS if self.method == "mcmc" else 0
+        by, least = self.method, LEAST_DRAWS if self.method == "mcmc" else 0
+        if by not in METHODS:
+            raise InputError(f"intervals '{by}' is unknown; it must be one of {', '.join(METHODS)}")
         if not least <= self.draws <= MOST_DRAWS:
             few = self.draws < least
             wrong, limit = ("few", f"least {least}") if few else ("many", f"most {MOST_DRAWS}")
             raise InputError(
-                f"{self.draws} draws are too {wrong} for intervals by {self.method}; "
+                f"{self.draws} draws are too {wrong} for intervals by {by}; "
                 f"there must be at {limit}"
             )
-        if self.method == "mcmc" and importlib.util.find_spec("emcee") is None:
+        if by == "mcmc" and importlib.util.find_spec("emcee") is None:
             raise InputError(
                 'Markov chains need emcee, which is not installed; pip install "foamfit[mcmc]"'
             )
@@ -158,8 +156,7 @@ def _far_values(
     near, far = best.rises(residual) <= (HARDLY_WORSE * best.quantiles) ** 2, dict[str, float]()
     for name in best.known:
         value, (low, high) = float(point[best.index[name]]), made.ends.get(name, best.local(name))
-        outside = max(low - value, value - high)
-        if near[best.names.index(name)] and outside > FAR * (high - low):
+        if near[best.names.index(name)] and max(low - value, value - high) > FAR * (high - low):
             far[name] = value
     return far
 
@@ -249,7 +246,7 @@ def _by_profiles(
     ends = {p.name: p.ci95 for p in profiles if p.complete}
     left = tuple(name for name in wanted if name not in ends)
     facts = {"done": len(ends), "count": len(wanted), "names": ", ".join(left)}
-    stopped = [p.stopped for p in profiles if p.stopped]
+    stopped = (p.stopped for p in profiles if p.stopped)
     warnings = tuple(say("interval", "profiles", by=by, **facts) for by in stopped)
     methods = dict.fromkeys(ends, "profile likelihood")
     return Intervals(ends, methods, profiles, left, warnings=warnings, better=better)
@@ -272,8 +269,8 @@ def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
     if few:
         return Intervals(warnings=(note,))
     low, high = np.percentile(chain.samples, [2.5, 97.5], axis=0).tolist()
-    pairs = dict(zip(best.names, zip(low, high, strict=True), strict=True))
-    ends = {name: pairs[name] for name in best.known}
+    pairs = zip(best.names, low, high, strict=True)
+    ends = {name: (a, b) for name, a, b in pairs if name in best.known}
     fine = chain.converged and chain.stopped is None
     samples = chain.samples.reshape(-1, chain.walkers, len(best.names)).T  # (k, walkers, steps)
     return Intervals(
