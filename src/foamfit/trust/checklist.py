@@ -97,19 +97,12 @@ def make_checklist(
     return tuple(by_key[key] for key in SENTENCES["check"])
 
 
-def _check(
-    key: str,
-    answer: bool | None,
-    *,
-    warnings: Iterable[str] | None = None,
-    fatal: bool = False,
-    **facts: object,
-) -> Check:
-    """Fill in a check of `sentences.toml`; `warnings` default to those given there."""
+def _check(key: str, answer: bool | None, *, fatal: bool = False, **facts: Any) -> Check:
+    """Fill in a check of `sentences.toml`; the fact `warnings` replaces those given there."""
     table, section = SENTENCES["check"][key], f"check.{key}"
     case = {True: "yes", False: "no", None: "unknown"}[answer]
     sentence = say(section, case if case in table else "said", **facts)
-    if warnings is None:
+    if (warnings := facts.get("warnings")) is None:
         warn = answer is False and "warning" in table
         warnings = say(section, "warning", **facts).splitlines() if warn else ()
     return Check(key, table["question"], answer, sentence, tuple(warnings), fatal)
@@ -213,8 +206,7 @@ def _visited(best: BestPoint, estimates: Estimates) -> Check:
         for spring, branches in zip(seen, needed, strict=True)
     }
     lost = [f"{branch} of {spring}" for spring, gone in absent.items() for branch in gone]
-    # An absent branch is a fault only if a varied parameter depends on it, which has its own
-    # warning.
+    # An absent branch is a fault only if a varied parameter, which has its own warning, needs it.
     depend = any(
         item.state == "not determined" and absent.get(f"s{split_name(name)[0] + 1}")
         for name, item in estimates.items()
@@ -249,9 +241,8 @@ def _of_test(
     doubts = [note for note in test.notes if note.startswith(ASKED) and note not in small]
     told: dict[bool, list[str]] = {True: [], False: []}
     for one in (one for one in contradictions if one.quantity != "time_shift"):
-        told[one.quantity == "force_scale"].append(
-            say("contradiction", "said", one=one, drive=drive)
-        )
+        sentence = say("contradiction", "said", one=one, drive=drive)
+        told[one.quantity == "force_scale"].append(sentence)
     settled = len(contradictions) < len(balance.contradictions)
     ratio, absorbed = balance.impulse_ratio, balance.absorbed_over_striker
     said = any(one.quantity != "time_shift" for one in balance.contradictions)

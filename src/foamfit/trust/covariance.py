@@ -270,8 +270,7 @@ class Uncertainty:
         used = np.array([(block.through != 0.0).any(axis=0) for block in self.blocks])
         own = used & (used.sum(axis=0) == 1)
         effective = [
-            sum(n / one.tau for n, one in zip(block.sizes, block.noise, strict=True))
-            for block in self.blocks
+            sum(len(columns) / one.tau for one, columns in block.curves) for block in self.blocks
         ]
         most[:] = sum(effective) - m
         for t, (left, block) in enumerate(zip(self.lefts, self.blocks, strict=False)):

@@ -149,11 +149,6 @@ class _Side:
         return self.refits[last], self.refits[last + 1] if last + 1 < len(self.refits) else None
 
     @property
-    def is_open(self) -> bool:
-        """Whether no refit is above the cut."""
-        return self.bracket[1] is None
-
-    @property
     def bound(self) -> float:
         """Value at which the root of the rise crosses that of the cut, or else the limit."""
         inner, outer = self.bracket
@@ -172,7 +167,7 @@ class _Side:
         met = list[Iterate]()
         for point in sorted(minima, key=lambda point: -self.sign * float(point[self.place])):
             value = float(point[self.place])
-            edge = self.value(self.refits[-1]) if self.is_open else self.bound
+            edge = self.bound if self.bracket[1] else self.value(self.refits[-1])
             if self.better or self.sign * (value - edge) <= PLACED * self.half:
                 break
             if self._known(point, value, met):
@@ -290,8 +285,8 @@ class Tracing:
             points=np.array([at.point for at in refits]),
             cut=low.quantile**2,
             ci95=(low.bound, high.bound if self._turned else high.value(high.refits[0])),
-            open_low=low.is_open,
-            open_high=high.is_open or not self._turned,
+            open_low=low.bracket[1] is None,
+            open_high=high.bracket[1] is None or not self._turned,
             stopped=self.stopped,
         )
 
