@@ -96,7 +96,8 @@ def settle(
         again = _refitted(best, way, starts=STARTS * far) if way else plain
         moved = None if again is None or plain is None else best.values + again - plain
         words = [say("contradiction", "way", name=name, by=by) for name, by in way.items()]
-        out += [Settled(listed(words) if words else "", moved)] if way or moved is not None else []
+        if way or moved is not None:
+            out.append(Settled(listed(words) if words else "", moved))
     return tuple(out)
 
 

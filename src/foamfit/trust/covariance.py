@@ -74,6 +74,13 @@ def _directions(rows: Array) -> tuple[Array, Array, Array]:
     return left[:, seen], singular[seen], vt[seen]
 
 
+def _principal(spread: Array) -> Array:
+    """Return the principal axes of a covariance, one standard deviation long."""
+    power, axes = np.linalg.eigh(0.5 * (spread + spread.T))
+    least = 1e-12 * power.max(initial=0.0)  # rounding may make a variance negative
+    return np.asarray(axes * np.sqrt(np.maximum(power, least)))
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """One test in a covariance, with all quantities scaled so that directions are comparable.
@@ -113,9 +120,8 @@ class Block:
     def meat(self) -> Array:
         """Covariance of the noise along the orthonormal columns, (r, r)."""
         rest = self.axes[0][sum(self.sizes) :]
-        return np.asarray(
-            sum(left.T @ one.times(left) for one, left in self.curves) + rest.T @ rest
-        )
+        inner = sum(left.T @ one.times(left) for one, left in self.curves)
+        return np.asarray(inner + rest.T @ rest)
 
     def without(self, held: NDArray[np.bool_]) -> Block:
         """Return the block with some of the unknowns fixed."""
@@ -135,11 +141,9 @@ class Block:
         In this basis JᵀJ is the unit matrix. The curvature is a difference of gradients, one
         standard error to either side along the principal axes of the covariance `spread` (r, r).
         """
-        unit = np.eye(len(spread))
+        unit, axes = np.eye(len(spread)), _principal(spread)
         if self.gradient is None or not len(spread):
             return unit
-        power, axes = np.linalg.eigh(0.5 * (spread + spread.T))
-        axes = axes * np.sqrt(np.maximum(power, 1e-12 * power.max()))
         every, rows = np.arange(self.jacobian.shape[1]), self.axes[1]
         unit_steps = rows.T / np.sum(rows**2, axis=1)
         change = [
@@ -174,9 +178,10 @@ class Uncertainty:
     def __post_init__(self) -> None:
         """Solve for the directions.
 
-        `root` (m, s) contains the step of the unknowns that is a unit step along each direction,
-        `lefts` the components of the directions along each test's orthonormal columns, then
-        `drawn`; `lost` (m,) are the unknowns that the tests do not determine.
+        `root` (m, s) contains the steps of the unknowns that are unit steps along the directions,
+        `lefts` the components of these along each test's orthonormal columns, then `drawn`; `lost`
+        (m,) are the unknowns that the tests do not determine, and `errs` is whether a test has
+        model error.
         """
         rows = [block.axes[1] @ block.through for block in self.blocks]
         rows += [] if self.drawn is None else [self.drawn[0]]
@@ -185,17 +190,14 @@ class Uncertainty:
         self.root = vt.T / singular
         along = self.root / np.maximum(np.linalg.norm(self.root, axis=0), 1e-300)
         self.lost: NDArray[np.bool_] = np.sum(along**2, axis=1) < 1.0 - 1e-6
-        self.errs = any(block.gradient for block in self.blocks)  # model error in some test
+        self.errs = any(block.gradient for block in self.blocks)
 
     @cached_property
     def axes(self) -> Array:
         """Principal axes of the covariance of the noise, one standard deviation long, (s, s)."""
         rows = [block.meat @ left for left, block in zip(self.lefts, self.blocks, strict=False)]
         rows += [] if self.drawn is None else [self.drawn[1][:, None] * self.lefts[-1]]
-        meat = self._left.T @ np.concatenate(rows)
-        power, axes = np.linalg.eigh(0.5 * (meat + meat.T))
-        least = 1e-12 * power.max(initial=0.0)  # rounding may make a variance negative
-        return np.asarray(axes * np.sqrt(np.maximum(power, least)))
+        return _principal(self._left.T @ np.concatenate(rows))
 
     @cached_property
     def _bread(self) -> Array:

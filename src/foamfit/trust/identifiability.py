@@ -167,14 +167,12 @@ def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
     autocorrelation time.
     """
     problem, objective, k = best.problem, best.problem.objective, len(best.names)
-    labels, at = np.array(sections(problem, best.simulated)), 0
+    labels = np.array(sections(problem, best.simulated))
     parts, triangles = list[tuple[str, str]](), list[Array]()
-    for curve in objective.counted:
-        kept = objective.kept(curve)
-        rows = best.scaled[at : at + kept.size] / (objective.factor(curve) * noise[curve])
-        at += kept.size
+    for curve, slopes in objective.by_curve(best.scaled).items():
+        rows = slopes / (objective.factor(curve) * noise[curve])
         for label in dict.fromkeys(labels.tolist()):
-            triangle = np.linalg.qr(rows[labels[kept] == label], mode="r")
+            triangle = np.linalg.qr(rows[labels[objective.kept(curve)] == label], mode="r")
             parts.append((curve, label))
             triangles.append(np.pad(triangle, ((0, k - len(triangle)), (0, 0))))
     return Insight(

@@ -25,7 +25,6 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import WEAK
 from foamfit.trust.markov_chain import mcmc, walkers
 from foamfit.trust.profile import BETTER, PLACED, STEPS, Refit, Tracing, departures
-from foamfit.trust.residuals.noise_process import parts
 
 METHODS = ("auto", "local", "profile", "mcmc")
 # "auto" profiles a parameter if the root of the cost departs from a straight line by this share at
@@ -202,9 +201,9 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     """
     if best.misfits:
         apart, objective = (residual - best.residual)[:, None], best.problem.objective
-        noise = zip(best.spread.noise, parts(objective.sizes), strict=True)
+        pairs = zip(best.spread.noise, objective.by_curve(apart).values(), strict=True)
         spread = float(np.sum(apart[objective.n_data :] ** 2))  # of priors, of unit variance
-        spread += sum(float(process.forms(apart[part])[0]) for process, part in noise)
+        spread += sum(float(process.forms(own)[0]) for process, own in pairs)
         near = float(residual @ residual) - best.cost <= 1.96 * 2.0 * math.sqrt(spread)
         return best.halves if near else np.full(best.halves.shape, np.nan)
     left = 1.0 - best.rises(residual) / best.quantiles**2
