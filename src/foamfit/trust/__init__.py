@@ -9,40 +9,37 @@ gives each parameter its state. All sentences are in `sentences.toml`. A newcome
 
 from __future__ import annotations
 
-import functools
 import tomllib
+from functools import cache, reduce
 from importlib.resources import files
+from operator import getitem
 from typing import TYPE_CHECKING, Any
 
 from foamfit import text
 
 if TYPE_CHECKING:
-    from jinja2 import Environment, Template
+    from jinja2 import Environment
 
 SENTENCES: dict[str, Any] = tomllib.loads(
     files(__package__).joinpath("sentences.toml").read_text(encoding="utf-8")
 )
 
 
-@functools.cache
+@cache
 def _environment() -> Environment:
-    from jinja2 import Environment, StrictUndefined
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
 
-    environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    every: Any = SENTENCES
+    loader = FunctionLoader(lambda place: str(reduce(getitem, place.split("."), every)))
+    environment = Environment(
+        loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     filters = (text.percent, text.engineering, text.listed, text.quantity)
     environment.filters |= {function.__name__: function for function in filters}
     environment.filters |= {"fmt": format, "spoken": lambda name: name.replace("_", "-")}
     return environment
 
 
-@functools.cache
-def _template(section: str, key: str) -> Template:
-    table = SENTENCES
-    for part in section.split("."):
-        table = table[part]
-    return _environment().from_string(table[key])
-
-
 def say(section: str, key: str, **facts: object) -> str:
     """Return a sentence of a section, such as "why" or "check.noise", filled with facts."""
-    return _template(section, key).render(facts)
+    return _environment().get_template(f"{section}.{key}").render(facts)

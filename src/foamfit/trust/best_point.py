@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together
 from foamfit.trust import covariance
-from foamfit.trust.covariance import Block, Covariance, Uncertainty
+from foamfit.trust.covariance import Block, Covariance, Ends, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.residuals.noise_process import basis_of
 
@@ -87,10 +88,23 @@ class BestPoint:
         """Scales of the k parameters, (k,)."""
         return self.problem.sizes(self.names, self.values)
 
-    def limits(self, name: str) -> tuple[float, float]:
+    def value(self, name: str) -> float:
+        """Value of a parameter, SI."""
+        return float(self.values[self.index[name]])
+
+    def size(self, name: str) -> float:
+        """Scale of a parameter, SI."""
+        return float(self.problem.sizes((name,), self.values)[0])
+
+    def limits(self, name: str) -> Ends:
         """Limits of a parameter, SI."""
         parameter = self.problem.params[name]
         return float(parameter.min), float(parameter.max)
+
+    def local(self, name: str) -> Ends:
+        """Ends of the local 95 % interval of one of the k parameters, not cut at its limits."""
+        value, half = self.value(name), float(self.halves[self.names.index(name)])
+        return value - half, value + half
 
     @cached_property
     def box(self) -> Array:
@@ -124,16 +138,13 @@ class BestPoint:
 
     def block(self, errors: Sequence[CurveError]) -> Block:
         """Return the block of this test in a covariance; `errors` are those of its curves."""
+        noise, through = [error.noise for error in errors], np.eye(self.sizes.size)
         return Block(
-            self.scaled,
-            self.residual,
-            self.problem.objective.sizes,
-            [error.noise for error in errors],
-            np.eye(len(self.names)),
-            self.gradient if any(error.found for error in errors) else None,
-            (np.abs(self.box - self.values[self.places]) / self.sizes).T,
+            self.scaled, self.residual, self.problem.objective.sizes, noise, through,
+            gradient=self.gradient if any(error.found for error in errors) else None,
+            room=(np.abs(self.box - self.values[self.places]) / self.sizes).T,
             shifts=self.shifts if self.problem.kept else None,
-        )
+        )  # fmt: skip
 
     @cached_property
     def shifts(self) -> Array:
@@ -170,6 +181,11 @@ class BestPoint:
         """Student's t of the 95 % interval of each parameter, (k,)."""
         return np.array([covariance.half_width(1.0, freedom) for freedom in self.spread.freedom])
 
+    @property
+    def cuts(self) -> Array:
+        """Rise of the cost at the ends of each local 95 % interval, (k,)."""
+        return self.quantiles**2 * self.spread.inflation
+
     @cached_property
     def halves(self) -> Array:
         """Half of each local 95 % interval, (k,)."""
@@ -178,8 +194,8 @@ class BestPoint:
     @cached_property
     def known(self) -> list[str]:
         """Parameters that are determined or weak by their local interval."""
-        known = np.flatnonzero(self.halves <= covariance.NOTHING * self.sizes)
-        return [self.names[i] for i in known]
+        known = self.halves <= covariance.NOTHING * self.sizes
+        return [name for name, is_known in zip(self.names, known, strict=True) if is_known]
 
     def rises(self, residual: Array) -> Array:
         """Return the rise of the cost at another point as the χ² of each parameter, (k,)."""
@@ -219,12 +235,11 @@ class JointPoint:
     @cached_property
     def _own(self) -> list[dict[str, int]]:
         """Place of each own parameter of each test among the unknowns."""
-        count, out = len(self.names), list[dict[str, int]]()
-        for best in self.bests:
-            own = [name for name in best.names if name in self.found.own]
-            out.append({name: count + i for i, name in enumerate(own)})
-            count += len(own)
-        return out
+        places = count(len(self.names))
+        return [
+            {name: next(places) for name in best.names if name in self.found.own}
+            for best in self.bests
+        ]
 
     @cached_property
     def _scales(self) -> Array:
@@ -232,9 +247,9 @@ class JointPoint:
         out, shared = list[float](), set(self.found.shared)
         for name in self.names:
             users = [b for b in self.bests if name in shared and name in b.problem.free()]
-            out += users[0].problem.sizes((name,), users[0].values).tolist() if users else [1.0]
+            out.append(users[0].size(name) if users else 1.0)
         for best, own in zip(self.bests, self._own, strict=True):
-            out += [best.sizes[best.names.index(name)] for name in own]
+            out += map(best.size, own)
         return np.array(out)
 
     @cached_property
@@ -280,7 +295,7 @@ class JointPoint:
             for t, (best, own) in enumerate(zip(self.bests, self._own, strict=True)):
                 if name not in own or name not in self.names:
                     continue
-                row, value = np.zeros(self._scales.size), float(best.values[best.index[name]])
+                row, value = np.zeros(self._scales.size), best.value(name)
                 row[own[name]] = self._scales[own[name]] / value if value else 0.0
                 row[self.names.index(name)] = -1.0
                 rows.append(row * pulls[t])
@@ -352,10 +367,7 @@ class JointPoint:
         return matrix * scales, inverse * scales
 
     def own_errors(self, test: int, names: Sequence[str]) -> Array:
-        """Return the covariance of own parameters of a test from the data alone, SI, (k, k).
-
-        Zero for undetermined parameters.
-        """
+        """Return the covariance of own parameters from a test's data alone, SI; else 0."""
         out, own = np.zeros((len(names), len(names))), self._own[test]
         rows = [i for i, name in enumerate(names) if name in own]
         places = [own[names[i]] for i in rows]

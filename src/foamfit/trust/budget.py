@@ -20,6 +20,7 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import SimulationError
 from foamfit.fitting import nuisance
+from foamfit.fitting.objective import Objective
 from foamfit.results import SOURCES, Budget, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE
 from foamfit.trust.best_point import BestPoint
@@ -32,13 +33,13 @@ ROUNDING = 1e-6
 # Nuisance parameters by the source of uncertainty to which they contribute.
 _CONTACT = (nuisance.CONTACT_TIME, *nuisance.ZEROS)
 _STRIKER = (*nuisance.POSITIVE, nuisance.TIME_SHIFT)
-# Owner and field of each quantity in a test, and its source of uncertainty.
+# Owner of each quantity in a test, and its field, which is also its source of uncertainty.
 _QUANTITIES = {
-    "height": ("specimen", "height", "height"),
-    "area": ("specimen", "area", "area"),
-    "specimen_mass": ("specimen", "mass", "mass"),
-    "striker_mass": ("striker", "mass", "mass"),
-    "velocity": ("striker", "velocity", "velocity"),
+    "height": ("specimen", "height"),
+    "area": ("specimen", "area"),
+    "specimen_mass": ("specimen", "mass"),
+    "striker_mass": ("striker", "mass"),
+    "velocity": ("striker", "velocity"),
 }
 
 
@@ -61,7 +62,7 @@ def _value(test: Measurement, quantity: str) -> float:
     """Return the value of a quantity of the TOML, SI; 1 for a scale, whose ± is relative."""
     if quantity.startswith("height_"):
         return (test.specimen.heights or ())[int(quantity.removeprefix("height_")) - 1]
-    owner, field, _ = _QUANTITIES.get(quantity, ("", "", ""))
+    owner, field = _QUANTITIES.get(quantity, ("", ""))
     return float(getattr(getattr(test, owner, None), field, None) or 1.0)
 
 
@@ -99,10 +100,14 @@ def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array
                 values[best.index[name]] *= 1.0 + share
     elif quantity in best.index:
         values[best.index[quantity]] *= 1.0 + share
-    same = test.displacement is problem.measurement.displacement
-    followed = (problem.objective.motion,) if same else ()
-    objective = replace(problem.objective, measurement=test, followed=followed)
+    objective = on_test(problem.objective, test)
     return values, objective.compare(objective.simulate(values), values)
+
+
+def on_test(objective: Objective, test: Measurement) -> Objective:
+    """Return the objective for a changed test; the same motion is not smoothed again."""
+    same = test.displacement is objective.measurement.displacement
+    return replace(objective, measurement=test, followed=(objective.motion,) if same else ())
 
 
 def changed(test: Measurement, quantity: str, share: float) -> Measurement:
@@ -110,7 +115,7 @@ def changed(test: Measurement, quantity: str, share: float) -> Measurement:
 
     The noise of a channel and the error of its zero scale with the channel.
     """
-    by, (name, field, _) = 1.0 + share, _QUANTITIES.get(quantity, ("", "", ""))
+    by, (name, field) = 1.0 + share, _QUANTITIES.get(quantity, ("", ""))
     owner: Any = getattr(test, name, None)
     if value := getattr(owner, field, None):
         larger: dict[str, Any] = {name: replace(owner, **{field: by * value})}
@@ -164,8 +169,7 @@ def make_budget(
         if item.range is not None:
             row["law"] = 0.5 * (item.range[1] - item.range[0]) / 1.96
         rows[name] = row
-    scales = dict(zip(best.names, best.sizes.tolist(), strict=True))
-    return out, Budget(rows, {name: scales[name] for name in rows}) if rows else None
+    return out, Budget(rows, {name: best.size(name) for name in rows}) if rows else None
 
 
 def _of_covariance(best: BestPoint) -> Iterator[tuple[str, dict[str, float]]]:
@@ -176,9 +180,8 @@ def _of_covariance(best: BestPoint) -> Iterator[tuple[str, dict[str, float]]]:
     """
     if not best.names:
         return
-    known = np.isfinite(best.spread.stderr) & (best.spread.stderr > 0.0)
-    names = [name for name, is_known in zip(best.names, known, strict=True) if is_known]
-    matrix = best.spread.correlation[np.ix_(known, known)]
+    known = np.flatnonzero(np.isfinite(best.spread.stderr) & (best.spread.stderr > 0.0))
+    names, matrix = [best.names[i] for i in known], best.spread.correlation[np.ix_(known, known)]
 
     def conditional(fixed: tuple[str, ...]) -> Array:
         at = [i for i, name in enumerate(names) if name in fixed]

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import chain, groupby
 from typing import Any
 
@@ -97,19 +97,12 @@ def make_checklist(
     return tuple(by_key[key] for key in SENTENCES["check"])
 
 
-def _check(
-    key: str,
-    answer: bool | None,
-    *,
-    warnings: Iterable[str] | None = None,
-    fatal: bool = False,
-    **facts: object,
-) -> Check:
-    """Fill in a check of `sentences.toml`; `warnings` default to those given there."""
+def _check(key: str, answer: bool | None, *, fatal: bool = False, **facts: Any) -> Check:
+    """Fill in a check of `sentences.toml`; the fact `warnings` replaces those given there."""
     table, section = SENTENCES["check"][key], f"check.{key}"
     case = {True: "yes", False: "no", None: "unknown"}[answer]
     sentence = say(section, case if case in table else "said", **facts)
-    if warnings is None:
+    if (warnings := facts.get("warnings")) is None:
         warn = answer is False and "warning" in table
         warnings = say(section, "warning", **facts).splitlines() if warn else ()
     return Check(key, table["question"], answer, sentence, tuple(warnings), fatal)
@@ -138,10 +131,7 @@ def _followed(best: BestPoint, misfit: Mapping[str, float | None]) -> Check:
 
 
 def _at_noise(best: BestPoint) -> Check:
-    """Check whether the residuals are noise, by their size, correlation and model error.
-
-    This is the only verdict on the noise; `Fit.at_noise` returns its answer.
-    """
+    """Check by size, correlation and model error whether residuals are noise (`Fit.at_noise`)."""
     objective, has_noise, longest = best.problem.objective, False, 1.0
     errors = best.errors if best.names else (None,) * len(objective.counted)
     rms = objective.rms(best.residual)
@@ -169,7 +159,7 @@ def _of_record(best: BestPoint, estimates: Estimates, record: SearchRecord) -> C
     freed = record.freed
     if freed is None:
         fitted = any(name in NUISANCE for name in best.names)
-        return _check("record", True if fitted else None, names=())
+        return _check("record", fitted or None, names=())
     moves = dict[str, float]()
     for name, (held, free) in freed.moved.items():
         if name in estimates and (ends := estimates[name].ci95) is not None:
@@ -177,16 +167,10 @@ def _of_record(best: BestPoint, estimates: Estimates, record: SearchRecord) -> C
     most, change = max(moves, key=moves.__getitem__, default=""), 0.0
     if moves.get(most, 0.0) > 1.0:
         held, free = freed.moved[most]
-        change = abs(free - held) / float(best.problem.sizes((most,), best.values)[0])
-    return _check(
-        "record",
-        not (freed.free < (1.0 - BOUGHT) * freed.held or change),
-        names=freed.names,
-        held=freed.held,
-        free=freed.free,
-        moved=most if change else "",
-        change=change,
-    )
+        change = abs(free - held) / best.size(most)
+    answer = not (freed.free < (1.0 - BOUGHT) * freed.held or change)
+    moved = most if change else ""
+    return _check("record", answer, **asdict(freed) | {"moved": moved, "change": change})
 
 
 def _determined(best: BestPoint, estimates: Estimates) -> Check:
@@ -201,24 +185,17 @@ def _determined(best: BestPoint, estimates: Estimates) -> Check:
         groups = groupby(why_of, key=why_of.__getitem__)
         reasons_of[state] = [(", ".join(names), why) for why, names in groups]
     states = [item.state for item in own.values() if item.state != "fixed"]
-    return _check(
-        "determined",
-        not any(reasons_of.values()),
-        reasons_of=reasons_of,
-        vanishing=vanishing,
-        count=states.count("determined"),
-        all=len(states),
-        most=REASONS,
-    )
+    facts: dict[str, Any] = {"reasons_of": reasons_of, "vanishing": vanishing, "most": REASONS}
+    facts |= {"count": states.count("determined"), "all": len(states)}
+    return _check("determined", not any(reasons_of.values()), **facts)
 
 
 def _vanishes(best: BestPoint, name: str, item: ParameterEstimate) -> bool:
     """Whether a parameter is consistent with zero and its upper bound is small."""
     if item.state != "weak" or item.ci95 is None or not may_vanish(name):
         return False
-    size = float(best.problem.sizes((name,), best.values)[0])
     ends = (*item.ci95, *(item.range or ()))
-    return bool(min(ends) <= 0.0 <= max(ends) and max(map(abs, ends)) <= WEAK * size)
+    return bool(min(ends) <= 0.0 <= max(ends) and max(map(abs, ends)) <= WEAK * best.size(name))
 
 
 def _visited(best: BestPoint, estimates: Estimates) -> Check:
@@ -229,8 +206,7 @@ def _visited(best: BestPoint, estimates: Estimates) -> Check:
         for spring, branches in zip(seen, needed, strict=True)
     }
     lost = [f"{branch} of {spring}" for spring, gone in absent.items() for branch in gone]
-    # An absent branch is a fault only if a varied parameter depends on it, which has its own
-    # warning.
+    # An absent branch is a fault only if a varied parameter, which has its own warning, needs it.
     depend = any(
         item.state == "not determined" and absent.get(f"s{split_name(name)[0] + 1}")
         for name, item in estimates.items()
@@ -247,11 +223,9 @@ def _of_intervals(
     answer = False if intervals.warnings else True if methods else None
     yield _check("intervals", answer, warnings=intervals.warnings, made=methods)
     stuck, natural = [], []
-    varied = tuple(name for name in with_error if estimates[name].vary)
-    for name, size in zip(varied, best.problem.sizes(varied, best.values), strict=True):
-        for bound in best.limits(name):
-            if abs(best.values[best.index[name]] - bound) > AT_LIMIT * size:
-                continue
+    for name in (name for name in with_error if estimates[name].vary):
+        near = AT_LIMIT * best.size(name)
+        for bound in (b for b in best.limits(name) if abs(best.value(name) - b) <= near):
             if bound == 0.0 and may_vanish(name):
                 natural.append(name)
             else:
@@ -267,9 +241,8 @@ def _of_test(
     doubts = [note for note in test.notes if note.startswith(ASKED) and note not in small]
     told: dict[bool, list[str]] = {True: [], False: []}
     for one in (one for one in contradictions if one.quantity != "time_shift"):
-        told[one.quantity == "force_scale"].append(
-            say("contradiction", "said", one=one, drive=drive)
-        )
+        sentence = say("contradiction", "said", one=one, drive=drive)
+        told[one.quantity == "force_scale"].append(sentence)
     settled = len(contradictions) < len(balance.contradictions)
     ratio, absorbed = balance.impulse_ratio, balance.absorbed_over_striker
     said = any(one.quantity != "time_shift" for one in balance.contradictions)
@@ -297,8 +270,7 @@ def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
     damper, alone, eta = problem.params[name], len(problem.model.kinds) == 1, 0.0
     if alone and problem.measurement.time is not None and not damper.vary and damper.value == 0.0:
         column = problem.slopes(best.values, (name,))[:, 0]
-        size = float(problem.sizes((name,), best.values)[0])
-        eta = max(_one_step(best, with_error, column, size) or 0.0, 0.0)
+        eta = max(_one_step(best, with_error, column, best.size(name)) or 0.0, 0.0)
     return _check("damping", eta == 0.0, eta=eta)
 
 
@@ -308,8 +280,8 @@ def _time_shift(
     test, objective = best.problem.measurement, best.problem.objective
     clocks = [one for one in found if one.quantity == "time_shift"]
     contradicted = len(found) > len(clocks) and objective.drive == "impact"
-    facts: dict[str, Any] = {"held": False, "clipped": is_clipped(test), "shift": None}
-    facts["contradicted"] = contradicted
+    facts: dict[str, Any] = {"held": False, "shift": None}
+    facts |= {"clipped": is_clipped(test), "contradicted": contradicted}
     if objective.time_shift:
         shift = estimates.get("time_shift")
         facts |= {"held": shift is None or not shift.vary, "shift": shift and shift.value}

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstima
 from foamfit.solve.cache import SPENT
 from foamfit.springs import laws
 from foamfit.springs.parameters import any_param, split_name, unit_of
-from foamfit.text import engineering, listed, percent
+from foamfit.text import engineering, listed
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
 from foamfit.trust.budget import make_budget
@@ -119,10 +120,10 @@ def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[st
     residuals.
     """
     objective, out = best.problem.objective, {}
-    error_of = dict(zip(objective.counted, errors, strict=True)) if errors else {}
-    for name, rms in objective.rms(best.residual).items():
+    pairs = zip(objective.rms(best.residual).items(), errors or repeat(None), strict=False)
+    for (name, rms), error in pairs:
         residual = best.simulated.curves[name] - objective.measured[name]
-        level, error = objective.noise(name), error_of.get(name)
+        level = objective.noise(name)
         out[name] = asdict(level) | {
             "scale": objective.scale[name],
             "range": float(np.ptp(objective.measured[name])),
@@ -139,19 +140,15 @@ def _notes(best: BestPoint) -> tuple[str, ...]:
     """Return notes on the effects that the model omits, on priors, noise and units of residuals."""
     test, objective = best.problem.measurement, best.problem.objective
     single = len(best.problem.model.kinds) == 1
-    integrated = {
-        name: misfit
-        for name in MOTION_CURVES
-        if test.motion == INTEGRATED
-        if name not in objective.counted and (misfit := objective.off(best.simulated, name))
-    }
+    derived = set(MOTION_CURVES) - set(objective.counted) if test.motion == INTEGRATED else ()
+    off = {name: objective.off(best.simulated, name) for name in MOTION_CURVES if name in derived}
     text = say(
         "notes",
         "all",
         objective=objective,
         loops=_inner_loops(best),
-        priors=[(p, unit_of(p.name), best.values[best.index[p.name]]) for p in objective.given],
-        off=integrated,
+        priors=[(p, unit_of(p.name), best.value(p.name)) for p in objective.given],
+        off={name: misfit for name, misfit in off.items() if misfit},
         inside=list(map(interior_channel, sorted(test.interior))) if single else [],
         masses=None if single else _masses(best),
         noises=noise_sentences(test),
@@ -176,13 +173,11 @@ def _masses(best: BestPoint) -> dict[str, Any] | None:
         with_mass = massive.simulate(best.values, everything=True).curves
     except SimulationError as error:
         return {"changes": [], "ended": error}
-    titles = {"stress_time": "the base stress", "displacement_time": "the displacement"}
-    changes = []
-    for name, curve in best.simulated.curves.items():
-        if name != "stress_strain" and name in with_mass:
-            change = float(np.sqrt(np.mean((curve - with_mass[name]) ** 2)) / np.ptp(curve))
-            size = "less than 0.01 %" if change < 1e-4 else percent(change)
-            changes.append(f"{titles.get(name, name.removesuffix('_time'))} by {size}")
+    changes = [
+        (name, float(np.sqrt(np.mean((curve - with_mass[name]) ** 2)) / np.ptp(curve)))
+        for name, curve in best.simulated.curves.items()
+        if name != "stress_strain" and name in with_mass
+    ]
     return {"mass": mass, "changes": changes}
 
 
@@ -226,13 +221,13 @@ def _estimates(
         else:
             vary, spring = bool(parameter.vary), split_name(name)[0] + 1
             state, key = ("not determined", "unreached") if vary else ("fixed", "held")
-            key, branch = "tied" if parameter.expr else key, best.unreached.get(name)
-            why = say("why", key, branch=branch, spring=spring, expression=parameter.expr)
-            estimate = ParameterEstimate(value, None, None, unit_of(name), vary, state, why)
+            key, stderr, ends = "tied" if parameter.expr else key, None, None
             if (shown := problem.kept.get(name)) is not None:
-                half, why = 1.96 * shown.sigma, say("why", "kept")
+                key, stderr, half = "kept", shown.sigma, 1.96 * shown.sigma
                 ends = value - half, value + half
-                estimate = replace(estimate, stderr=shown.sigma, ci95=ends, why=why)
+            facts = {"branch": best.unreached.get(name), "expression": parameter.expr}
+            why = say("why", key, spring=spring, **facts)
+            estimate = ParameterEstimate(value, stderr, ends, unit_of(name), vary, state, why)
         parameter.stderr = estimate.stderr
         out[name] = estimate.counted_from(-problem.measurement.origins.get(name, 0.0))
     return out
@@ -243,9 +238,8 @@ def _varied(
 ) -> ParameterEstimate:
     """Return the estimate of a varied parameter whose branch was reached."""
     (low, high), column = best.limits(name), best.names.index(name)
-    problem, value, unit = best.problem, float(best.values[best.index[name]]), unit_of(name)
-    half, method = float(best.halves[column]), intervals.methods.get(name, "local covariance")
-    local = (value - half, value + half)
+    problem, value, unit = best.problem, best.value(name), unit_of(name)
+    local, method = best.local(name), intervals.methods.get(name, "local covariance")
     # The percentiles of a Markov chain may all lie to one side of the best point.
     points = (*intervals.ends.get(name, local), value)
     ends = min(points), max(points)
@@ -259,12 +253,12 @@ def _varied(
         span = min(span[0], value), max(span[1], value)
     state, why = _state_of(best, name, ends, insight, span)
     objective, other = problem.objective, intervals.elsewhere.get(name)
+    zero = problem.measurement.origins.get(name, 0.0)  # in the numbers of the file
     misfit, curve = max((objective.off(best.simulated, n) or 0.0, n) for n in objective.counted)
     if state == "determined" and (objective.interior_mass or other is not None or misfit > POOR):
-        other = None if other is None else other + problem.measurement.origins.get(name, 0.0)
-        facts = {"vibrates": objective.interior_mass, "there": other, "off": misfit, "curve": curve}
+        there = None if other is None else other + zero
+        facts = {"vibrates": objective.interior_mass, "there": there, "off": misfit, "curve": curve}
         state, why = "weak", say("why", "weak", why=why, unit=unit, **facts)
-    zero = problem.measurement.origins.get(name, 0.0)
     state, why = judged(settled, best, name, (ends[0] + zero, ends[1] + zero), (state, why))
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
@@ -284,7 +278,7 @@ def _state_of(
     combination. `span` is its range, if there is one; the wider of the two decides.
     """
     (ends, what), limits, unit = covariance.wider(ends, span), best.limits(name), unit_of(name)
-    value, size = float(best.values[best.index[name]]), float(best.sizes[best.names.index(name)])
+    value, size = best.value(name), best.size(name)
     state, why = covariance.state(name, value, (ends, what), size, limits)
     if state == "not determined":
         reason = why if math.isfinite(ends[1] - ends[0]) else say("why", "independent")

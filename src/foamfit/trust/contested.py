@@ -18,20 +18,13 @@ from foamfit.fitting import nuisance
 from foamfit.fitting.curves import later
 from foamfit.fitting.search import Tracker, descend, search
 from foamfit.springs.parameters import unit_of
-from foamfit.text import engineering, listed
+from foamfit.text import listed
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.budget import changed
+from foamfit.trust.budget import changed, on_test
 from foamfit.trust.covariance import Ends
 
 STEPS, STARTS = 40, 4  # steps of a descent from the best point, start points of a search
-# Quantities of `budget.changed` in words.
-_WORDS = {
-    "velocity": "velocity",
-    "striker_mass": "mass",
-    "stress_scale": "force",
-    "displacement_scale": "motion",
-}
 # A force whose zero is known no better than this share of its peak is doubtful.
 DOUBTFUL = 0.005
 
@@ -102,16 +95,10 @@ def settle(
         way = {name: by for name, by in way.items() if impact or name not in nuisance.STRIKER}
         again = _refitted(best, way, starts=STARTS * far) if way else plain
         moved = None if again is None or plain is None else best.values + again - plain
-        words = listed(_in_words(name, by) for name, by in way.items()) if way else ""
-        out += [Settled(words, moved)] if way or moved is not None else []
+        words = [say("contradiction", "way", name=name, by=by) for name, by in way.items()]
+        if way or moved is not None:
+            out.append(Settled(listed(words) if words else "", moved))
     return tuple(out)
-
-
-def _in_words(name: str, by: float) -> str:
-    if name == nuisance.TIME_SHIFT:
-        sooner = "earlier" if by > 0.0 else "later"
-        return f"the motion {engineering(abs(by), 's')} {sooner}"
-    return f"{_WORDS[name]} × {by:.2f}"
 
 
 def judged(
@@ -123,11 +110,11 @@ def judged(
     the contradiction.
     """
     for one in settled if state[0] == "determined" else ():
-        there, unit = None, unit_of(name)
+        there = None
         if one.values is not None:
             there = float((one.values + best.problem.origins)[best.index[name]])
         if there is None or not ends[0] <= there <= ends[1]:
-            return "weak", say("why", "contested", way=one.words, there=there, unit=unit)
+            return "weak", say("why", "contested", settled=one, there=there, unit=unit_of(name))
     # The law errs, and the contradiction, or a doubtful force in an impact, may be the reason.
     impact, test = best.problem.objective.drive == "impact", best.problem.measurement
     if state[0] == "determined" and (best.problem.kept if impact else settled and best.misfits):
@@ -149,10 +136,7 @@ def _earlier(test: Measurement, late: float) -> tuple[Measurement, float]:
 
 
 def _refitted(best: BestPoint, way: Way, starts: int = 0) -> Array | None:
-    """Return the best point of the test with changed quantities, near the present one.
-
-    With `starts` start points of a search, it may be far off.
-    """
+    """Return the best point with changed quantities, found nearby or by a search of `starts`."""
     problem, values, test = best.problem, best.values.copy(), best.problem.measurement
     params, stresses = problem.params.copy(), way.get("stress_scale", 1.0)
     for name in problem.kept if way else ():  # held for an error that may be the contradiction's
@@ -171,9 +155,7 @@ def _refitted(best: BestPoint, way: Way, starts: int = 0) -> Array | None:
             one, place = params[name], best.index[name]
             one.set(value=by * one.value, min=by * one.min, max=by * one.max)
             values[place] *= by
-    same = test.displacement is problem.measurement.displacement
-    followed = (problem.objective.motion,) if same else ()
-    objective = replace(problem.objective, measurement=test, followed=followed)
+    objective = on_test(problem.objective, test)
     space = replace(problem, measurement=test, objective=objective, params=params).space()
     tracker = Tracker(objective)
     descend(tracker, space, space.encode(values), STEPS)

@@ -74,6 +74,13 @@ def _directions(rows: Array) -> tuple[Array, Array, Array]:
     return left[:, seen], singular[seen], vt[seen]
 
 
+def _principal(spread: Array) -> Array:
+    """Return the principal axes of a covariance, one standard deviation long."""
+    power, axes = np.linalg.eigh(0.5 * (spread + spread.T))
+    least = 1e-12 * power.max(initial=0.0)  # rounding may make a variance negative
+    return np.asarray(axes * np.sqrt(np.maximum(power, least)))
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """One test in a covariance, with all quantities scaled so that directions are comparable.
@@ -103,31 +110,18 @@ class Block:
         left, singular, vt = _directions(self.jacobian)
         return left, singular[:, None] * vt
 
-    @cached_property
-    def steps(self) -> Array:
-        """Steps of the parameters that are unit steps along the orthonormal columns, (k, r)."""
-        rows = self.axes[1]
-        return np.asarray(rows.T / np.sum(rows**2, axis=1))
+    @property
+    def curves(self) -> list[tuple[NoiseProcess, Array]]:
+        """Noise of each curve, and its rows of the orthonormal columns."""
+        pairs = zip(self.noise, parts(self.sizes), strict=True)
+        return [(one, self.axes[0][part]) for one, part in pairs]
 
     @cached_property
     def meat(self) -> Array:
         """Covariance of the noise along the orthonormal columns, (r, r)."""
-        left = self.axes[0]
-        pairs = zip(self.noise, parts(self.sizes), strict=True)
-        inner = np.sum([left[p].T @ one.times(left[p]) for one, p in pairs], axis=0)
-        rest = left[sum(self.sizes) :]
+        rest = self.axes[0][sum(self.sizes) :]
+        inner = sum(left.T @ one.times(left) for one, left in self.curves)
         return np.asarray(inner + rest.T @ rest)
-
-    @property
-    def effective(self) -> float:
-        """Effective number of samples."""
-        return float(sum(n / one.tau for n, one in zip(self.sizes, self.noise, strict=True)))
-
-    def doubt(self, mix: Array) -> Array:
-        """Return the variance of the estimated noise variances along `mix` (r, m), (m,)."""
-        left = self.axes[0]
-        pairs = zip(self.noise, parts(self.sizes), strict=True)
-        return np.asarray(np.sum([one.doubt(left[p], mix) for one, p in pairs], axis=0))
 
     def without(self, held: NDArray[np.bool_]) -> Block:
         """Return the block with some of the unknowns fixed."""
@@ -147,24 +141,23 @@ class Block:
         In this basis JᵀJ is the unit matrix. The curvature is a difference of gradients, one
         standard error to either side along the principal axes of the covariance `spread` (r, r).
         """
-        unit = np.eye(len(spread))
+        unit, axes = np.eye(len(spread)), _principal(spread)
         if self.gradient is None or not len(spread):
             return unit
-        power, axes = np.linalg.eigh(0.5 * (spread + spread.T))
-        axes = axes * np.sqrt(np.maximum(power, 1e-12 * power.max()))
-        every = np.arange(self.jacobian.shape[1])
+        every, rows = np.arange(self.jacobian.shape[1]), self.axes[1]
+        unit_steps = rows.T / np.sum(rows**2, axis=1)
         change = [
             0.5 * (self.gradient(every, step) - self.gradient(every, -step))
-            for step in (self.steps @ axes).T
+            for step in (unit_steps @ axes).T
         ]
         try:
-            curved = np.linalg.solve(axes.T, np.array(change) @ self.steps)
+            curved = np.linalg.solve(axes.T, np.array(change) @ unit_steps)
         except np.linalg.LinAlgError:
             return unit
         return np.asarray(0.5 * (curved + curved.T))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Uncertainty:
     """Uncertainty of m unknowns due to noise at the best point of one test or several.
 
@@ -182,47 +175,29 @@ class Uncertainty:
     bend: Array | None = None
     curvatures: tuple[Array, ...] | None = None
 
-    @property
-    def errs(self) -> bool:
-        """Whether there is model error in some test."""
-        return any(block.gradient for block in self.blocks)
+    def __post_init__(self) -> None:
+        """Solve for the directions.
 
-    @cached_property
-    def _solved(self) -> tuple[Array, Array]:
+        `root` (m, s) contains the steps of the unknowns that are unit steps along the directions,
+        `lefts` the components of these along each test's orthonormal columns, then `drawn`; `lost`
+        (m,) are the unknowns that the tests do not determine, and `errs` is whether a test has
+        model error.
+        """
         rows = [block.axes[1] @ block.through for block in self.blocks]
         rows += [] if self.drawn is None else [self.drawn[0]]
-        left, singular, vt = _directions(np.concatenate(rows))
-        return left, vt.T / singular
-
-    @property
-    def root(self) -> Array:
-        """Steps of the unknowns that are unit steps along each direction, (m, s)."""
-        return self._solved[1]
-
-    @cached_property
-    def lost(self) -> NDArray[np.bool_]:
-        """Unknowns that the tests do not determine, (m,)."""
+        self._left, singular, vt = _directions(np.concatenate(rows))
+        self.lefts = np.split(self._left, np.cumsum([len(row) for row in rows[:-1]]))
+        self.root = vt.T / singular
         along = self.root / np.maximum(np.linalg.norm(self.root, axis=0), 1e-300)
-        return np.asarray(np.sum(along**2, axis=1) < 1.0 - 1e-6)
-
-    @cached_property
-    def lefts(self) -> list[Array]:
-        """Components of the directions along each test's orthonormal columns, then `drawn`."""
-        return np.split(self._solved[0], np.cumsum([len(block.axes[1]) for block in self.blocks]))
-
-    @property
-    def _pairs(self) -> list[tuple[Array, Block]]:
-        return list(zip(self.lefts, self.blocks, strict=False))
+        self.lost: NDArray[np.bool_] = np.sum(along**2, axis=1) < 1.0 - 1e-6
+        self.errs = any(block.gradient for block in self.blocks)
 
     @cached_property
     def axes(self) -> Array:
         """Principal axes of the covariance of the noise, one standard deviation long, (s, s)."""
-        rows = [block.meat @ left for left, block in self._pairs]
+        rows = [block.meat @ left for left, block in zip(self.lefts, self.blocks, strict=False)]
         rows += [] if self.drawn is None else [self.drawn[1][:, None] * self.lefts[-1]]
-        meat = self._solved[0].T @ np.concatenate(rows)
-        power, axes = np.linalg.eigh(0.5 * (meat + meat.T))
-        least = 1e-12 * power.max(initial=0.0)  # rounding may make a variance negative
-        return np.asarray(axes * np.sqrt(np.maximum(power, least)))
+        return _principal(self._left.T @ np.concatenate(rows))
 
     @cached_property
     def _bread(self) -> Array:
@@ -230,9 +205,9 @@ class Uncertainty:
         out = np.eye(self.root.shape[1])
         if self.curvatures is None:
             return out
-        pairs = list(zip(self.lefts, self.curvatures, strict=False))
-        more = [(curved - np.eye(len(curved))) @ left for left, curved in pairs]
-        out += np.concatenate([left for left, _ in pairs]).T @ np.concatenate(more)
+        pairs = zip(self.lefts, self.curvatures, strict=False)
+        more = np.concatenate([(curved - np.eye(len(curved))) @ left for left, curved in pairs])
+        out += self._left[: len(more)].T @ more
         out += 0.0 if self.bend is None else self.root.T @ self.bend @ self.root
         values, vectors = np.linalg.eigh(0.5 * (out + out.T))
         return np.asarray((vectors / np.where(values > FLATTEST, values, 1.0)) @ vectors.T)
@@ -247,7 +222,7 @@ class Uncertainty:
         """Covariance of the scaled unknowns, (m, m); NaN for undetermined ones."""
         spread = self.root @ self._bread @ self.axes
         out = spread @ spread.T
-        for t, (left, block) in enumerate(self._pairs):
+        for t, (left, block) in enumerate(zip(self.lefts, self.blocks, strict=False)):
             if block.given is not None and block.given.any():
                 moved = block.axes[1] @ block.given
                 moved = moved if self.curvatures is None else self.curvatures[t] @ moved
@@ -296,13 +271,15 @@ class Uncertainty:
         variance, doubt, most = np.zeros((3, m))
         used = np.array([(block.through != 0.0).any(axis=0) for block in self.blocks])
         own = used & (used.sum(axis=0) == 1)
-        effective = sum(block.effective for block in self.blocks)
-        for (left, block), mine in zip(self._pairs, own, strict=True):
+        effective = [
+            sum(len(columns) / one.tau for one, columns in block.curves) for block in self.blocks
+        ]
+        most[:] = sum(effective) - m
+        for t, (left, block) in enumerate(zip(self.lefts, self.blocks, strict=False)):
             mix = left @ back
             variance += np.einsum("ij,ij->j", mix, block.meat @ mix)
-            doubt += block.doubt(mix)
-            most[mine] = block.effective - np.count_nonzero(mine)
-        most[~own.any(axis=0)] = effective - m
+            doubt += sum(one.doubt(columns, mix) for one, columns in block.curves)
+            most[own[t]] = effective[t] - np.count_nonzero(own[t])
         if self.drawn is not None:
             mix = self.lefts[-1] @ back
             variance += self.drawn[1] @ mix**2
@@ -311,7 +288,7 @@ class Uncertainty:
             self.matrix * np.outer(self.scales, self.scales),
             np.diag(self.matrix) / np.where(self.lost, np.nan, np.diag(self.inverse)),
             np.minimum(freedom, np.maximum(most, 1.0)),
-            effective,
+            float(sum(effective)),
             tuple(process for block in self.blocks for process in block.noise),
         )
 

@@ -3,13 +3,10 @@
 AICc and BIC use the numbers of effective samples and parameters, so that neither correlated
 residuals nor combinations of parameters that the curves do not fix count as evidence. They assume
 that the residuals are noise. If every model has an error of its own, models are compared by how
-well they predict held-out blocks of the test.
-
-Cross-validation in blocks (Burman, Chow & Nolan 1994, Biometrika 81, 351): where there is model
-error, neighbouring residuals are similar, and single held-out samples would be predicted by their
-neighbours. Instead, contiguous blocks in time are held out in turn. The parameters are fitted to
-the rest, starting from the best point, and the complete history is simulated, so that each block is
-predicted with the state in which the test enters it.
+well they predict contiguous blocks in time that are held out in turn (Burman, Chow & Nolan 1994,
+Biometrika 81, 351); single samples would be predicted by their neighbours. The parameters are
+fitted to the rest, starting from the best point, and the complete history is simulated, so that
+each block is predicted with the state in which the test enters it.
 """
 
 from __future__ import annotations
@@ -198,10 +195,7 @@ class Score:
         return self.predicted < other.predicted * (1.0 - SHARE) ** (self.varied - other.varied)
 
     def rules_out(self, other: Score) -> bool:
-        """Whether it follows the curves better with fewer parameters, or much better with as many.
-
-        Much better means a misfit smaller by a factor of `WORSE`.
-        """
+        """Whether it follows the curves better with fewer parameters, or `WORSE` times better."""
         factor = 1.0 if self.varied < other.varied else WORSE
         return self.varied <= other.varied and factor * self.misfit < other.misfit
 
@@ -221,7 +215,7 @@ def scores_of(tried: Sequence[Tried]) -> list[Score]:
     """Return the scores of all models; if any has no prediction, fitted misfits replace all."""
     complete = all(one.predicted is not None for one in tried)
     return [
-        Score(one.varied, one.misfit, one.predicted if complete and one.predicted else one.misfit)
+        Score(one.varied, one.misfit, (one.predicted if complete else None) or one.misfit)
         for one in tried
     ]
 
@@ -230,8 +224,7 @@ def decide(scores: Sequence[Score], criteria: Sequence[Criteria], by_prediction:
     """Compare the models in the order of their number of parameters; see `choose`."""
     before: list[int | None] = [None] * len(scores)
     rulers = [
-        next((j for j, other in enumerate(scores) if j != i and other.rules_out(one)), None)
-        for i, one in enumerate(scores)
+        next((j for j, other in enumerate(scores) if other.rules_out(one)), None) for one in scores
     ]
     best: int | None = None
     judged: Sequence[Any] = scores if by_prediction else criteria

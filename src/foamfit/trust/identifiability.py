@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 PART = 0.05  # smallest component of a direction that counts
 NAMED = 0.3  # smallest component, relative to the largest, that is named in a sentence
+CLOSE = 0.9  # smallest correlation that is named
 MOST = 3  # largest number of parameters named in a joint change
 # Times and zeros have an arbitrary origin, so that powers of them are meaningless.
 OF_NO_POWER = set(NUISANCE) - set(POSITIVE)
@@ -142,19 +143,21 @@ class Insight:
         change[me] = 0.0
         order = np.argsort(-np.abs(change), kind="stable")
         parts = [i for i in order if abs(change[i]) > NAMED * abs(change[order[0]])]
-        text = ", ".join(f"{self.names[i]} ({change[i]:+.2g})" for i in parts[:MOST])
-        more = f" and {len(parts) - MOST} more" if len(parts) > MOST else ""
-        return say("why", "compensated", names=text.replace("-", "−") + more)
+        return say(
+            "why", "compensated", most=MOST, parts=[(self.names[i], change[i]) for i in parts]
+        )
 
-    def companion(self, name: str, least: float = 0.9) -> str:
-        """Name the most correlated parameter; "" if no correlation reaches `least`."""
+    def companion(self, name: str) -> str:
+        """Name the most correlated parameter; "" if no correlation reaches `CLOSE`."""
         me = self.names.index(name)
         row = np.nan_to_num(self.correlation[me])
         row[me] = 0.0
         at = int(np.argmax(np.abs(row)))
-        if abs(row[at]) < least:
-            return ""
-        return say("why", "correlated", name=self.names[at], r=row[at]).replace("-", "−")
+        return (
+            say("why", "correlated", name=self.names[at], r=row[at])
+            if abs(row[at]) >= CLOSE
+            else ""
+        )
 
 
 def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
@@ -164,14 +167,12 @@ def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
     autocorrelation time.
     """
     problem, objective, k = best.problem, best.problem.objective, len(best.names)
-    labels, at = np.array(sections(problem, best.simulated)), 0
+    labels = np.array(sections(problem, best.simulated))
     parts, triangles = list[tuple[str, str]](), list[Array]()
-    for curve in objective.counted:
-        kept = objective.kept(curve)
-        rows = best.scaled[at : at + kept.size] / (objective.factor(curve) * noise[curve])
-        at += kept.size
+    for curve, slopes in objective.by_curve(best.scaled).items():
+        rows = slopes / (objective.factor(curve) * noise[curve])
         for label in dict.fromkeys(labels.tolist()):
-            triangle = np.linalg.qr(rows[labels[kept] == label], mode="r")
+            triangle = np.linalg.qr(rows[labels[objective.kept(curve)] == label], mode="r")
             parts.append((curve, label))
             triangles.append(np.pad(triangle, ((0, k - len(triangle)), (0, 0))))
     return Insight(

@@ -25,7 +25,6 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import WEAK
 from foamfit.trust.markov_chain import mcmc, walkers
 from foamfit.trust.profile import BETTER, PLACED, STEPS, Refit, Tracing, departures
-from foamfit.trust.residuals.noise_process import parts
 
 METHODS = ("auto", "local", "profile", "mcmc")
 # "auto" profiles a parameter if the root of the cost departs from a straight line by this share at
@@ -59,19 +58,17 @@ class Choice:
 
     def __post_init__(self) -> None:
         """Reject an unknown method, an invalid number of draws and a missing package."""
-        if self.method not in METHODS:
-            raise InputError(
-                f"intervals '{self.method}' is unknown; it must be one of {', '.join(METHODS)}"
-            )
-        least = LEAST_DRAWS if self.method == "mcmc" else 0
+        by, least = self.method, LEAST_DRAWS if self.method == "mcmc" else 0
+        if by not in METHODS:
+            raise InputError(f"intervals '{by}' is unknown; it must be one of {', '.join(METHODS)}")
         if not least <= self.draws <= MOST_DRAWS:
             few = self.draws < least
             wrong, limit = ("few", f"least {least}") if few else ("many", f"most {MOST_DRAWS}")
             raise InputError(
-                f"{self.draws} draws are too {wrong} for intervals by {self.method}; "
+                f"{self.draws} draws are too {wrong} for intervals by {by}; "
                 f"there must be at {limit}"
             )
-        if self.method == "mcmc" and importlib.util.find_spec("emcee") is None:
+        if by == "mcmc" and importlib.util.find_spec("emcee") is None:
             raise InputError(
                 'Markov chains need emcee, which is not installed; pip install "foamfit[mcmc]"'
             )
@@ -116,8 +113,7 @@ def assess(
     order = sorted(known, key=lambda name: -far[best.names.index(name)])
     bent = [name for name in order if far[best.names.index(name)] > BENT]
     # Where the range is wider, model error outweighs noise, and a local interval is enough.
-    halves = dict(zip(best.names, best.halves, strict=True))
-    local = [n for n in bent if n in ranges and np.ptp(ranges[n]) > 2.0 * halves[n]]
+    local = [n for n in bent if n in ranges and np.ptp(ranges[n]) > np.ptp(best.local(n))]
     made = _by_profiles(best, [n for n in bent if n not in local], minima, tracker, budget)
     made = _with_minima(best, replace(made, doubtful=(*made.doubtful, *local)), others)
     return made if best.misfits or made.better is not None else _with_far(best, made, tracker)
@@ -136,7 +132,7 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
     Values far outside their intervals, at minima hardly worse than the best, go to `elsewhere`.
     """
     ends, methods = dict(made.ends), dict(made.methods)
-    intervals = {name: _interval(best, made, name) for name in best.known}
+    intervals = {name: made.ends.get(name, best.local(name)) for name in best.known}
     for point, residual in minima:
         halves = _halves(best, point, residual)
         for name, (low, high) in intervals.items():
@@ -152,21 +148,14 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
     return replace(made, elsewhere=elsewhere)
 
 
-def _interval(best: BestPoint, made: Intervals, name: str) -> tuple[float, float]:
-    """Return the interval of a parameter, by default the local one."""
-    value, half = float(best.values[best.index[name]]), best.halves[best.names.index(name)]
-    return made.ends.get(name, (value - half, value + half))
-
-
 def _far_values(
     best: BestPoint, made: Intervals, point: Array, residual: Array
 ) -> dict[str, float]:
     """Return the values of a point far outside their intervals, if it is hardly worse."""
     near, far = best.rises(residual) <= (HARDLY_WORSE * best.quantiles) ** 2, dict[str, float]()
     for name in best.known:
-        value, (low, high) = float(point[best.index[name]]), _interval(best, made, name)
-        outside = max(low - value, value - high)
-        if near[best.names.index(name)] and outside > FAR * (high - low):
+        value, (low, high) = float(point[best.index[name]]), made.ends.get(name, best.local(name))
+        if near[best.names.index(name)] and max(low - value, value - high) > FAR * (high - low):
             far[name] = value
     return far
 
@@ -180,8 +169,8 @@ def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
     refit, elsewhere = Refit(best, tracker), dict(made.elsewhere)
     try:
         for name in best.known:
-            column, value = best.names.index(name), float(best.values[best.index[name]])
-            low, high = _interval(best, made, name)
+            column, value = best.names.index(name), best.value(name)
+            low, high = made.ends.get(name, best.local(name))
             if name in NUISANCE or high - low > 2.0 * WEAK * best.sizes[column]:
                 continue
             least, most = best.limits(name)
@@ -212,9 +201,9 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     """
     if best.misfits:
         apart, objective = (residual - best.residual)[:, None], best.problem.objective
-        noise = zip(best.spread.noise, parts(objective.sizes), strict=True)
+        pairs = zip(best.spread.noise, objective.by_curve(apart).values(), strict=True)
         spread = float(np.sum(apart[objective.n_data :] ** 2))  # of priors, of unit variance
-        spread += sum(float(process.forms(apart[part])[0]) for process, part in noise)
+        spread += sum(float(process.forms(own)[0]) for process, own in pairs)
         near = float(residual @ residual) - best.cost <= 1.96 * 2.0 * math.sqrt(spread)
         return best.halves if near else np.full(best.halves.shape, np.nan)
     left = 1.0 - best.rises(residual) / best.quantiles**2
@@ -256,7 +245,7 @@ def _by_profiles(
     ends = {p.name: p.ci95 for p in profiles if p.complete}
     left = tuple(name for name in wanted if name not in ends)
     facts = {"done": len(ends), "count": len(wanted), "names": ", ".join(left)}
-    stopped = [p.stopped for p in profiles if p.stopped]
+    stopped = (p.stopped for p in profiles if p.stopped)
     warnings = tuple(say("interval", "profiles", by=by, **facts) for by in stopped)
     methods = dict.fromkeys(ends, "profile likelihood")
     return Intervals(ends, methods, profiles, left, warnings=warnings, better=better)
@@ -264,8 +253,7 @@ def _by_profiles(
 
 def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]:
     """Return the points within its cut, met by profiles, with a parameter's extreme values."""
-    column, at = best.names.index(name), best.index[name]
-    highest = best.quantiles[column] ** 2 * best.spread.inflation[column]
+    highest, at = best.cuts[best.names.index(name)], best.index[name]
     refits = [refit for tracing in tracings for refit in tracing.refits]
     points = [refit.point for refit in refits if refit.cost - best.cost < highest]
     points.sort(key=lambda point: float(point[at]))
@@ -273,19 +261,15 @@ def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]
 
 
 def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
-    """Return intervals between the 2.5th and 97.5th percentiles of a Markov chain.
-
-    A chain that is too short or was stopped gives a warning; with too few samples there are no
-    intervals.
-    """
+    """Return the 2.5th and 97.5th percentiles of a Markov chain, or a warning if it is short."""
     chain = mcmc(best, choice.draws, choice.seed, tracker)
     few = len(chain.samples) < ENOUGH_DRAWS
     note = chain.sentence([name for name in best.names if name not in best.known], few)
     if few:
         return Intervals(warnings=(note,))
     low, high = np.percentile(chain.samples, [2.5, 97.5], axis=0).tolist()
-    pairs = dict(zip(best.names, zip(low, high, strict=True), strict=True))
-    ends = {name: pairs[name] for name in best.known}
+    pairs = zip(best.names, low, high, strict=True)
+    ends = {name: (a, b) for name, a, b in pairs if name in best.known}
     fine = chain.converged and chain.stopped is None
     samples = chain.samples.reshape(-1, chain.walkers, len(best.names)).T  # (k, walkers, steps)
     return Intervals(

@@ -45,9 +45,7 @@ class Refit:
 
     def __post_init__(self) -> None:
         """Set the space of the parameters and the gain at which a refit ends."""
-        best = self.best
-        self.space = best.problem.space()
-        cuts = best.quantiles**2 * best.spread.inflation  # NaN for undetermined parameters
+        self.space, cuts = self.best.problem.space(), self.best.cuts
         self.enough = ENOUGH * float(min(cuts[np.isfinite(cuts)], default=1.0))
 
     def residual(self, point: Array) -> Array | None:
@@ -121,9 +119,8 @@ class _Side:
     """One side of a profile, below (-1) or above (+1): refits from the best point outward."""
 
     def __init__(self, refit: Refit, name: str, sign: float) -> None:
-        best = refit.best
+        best, self.column = refit.best, refit.best.names.index(name)
         self.refit, self.sign, self.place = refit, sign, best.index[name]
-        self.column = best.names.index(name)
         self.quantile, self.half = float(best.quantiles[self.column]), best.halves[self.column]
         self.limit = best.limits(name)[0 if sign < 0 else 1]
         self.refits = [Iterate(best.values, best.residual, best.scaled)]
@@ -134,8 +131,7 @@ class _Side:
 
     def rise(self, at: Iterate) -> float:
         """Return the rise of the cost as a χ²."""
-        best = self.refit.best
-        return (at.cost - best.cost) / float(best.spread.inflation[self.column])
+        return float(self.refit.best.rises(at.residual)[self.column])
 
     def root(self, at: Iterate) -> float:
         """Return the root of the rise, which is linear along a parabola."""
@@ -151,11 +147,6 @@ class _Side:
         """The outermost refit below the cut, and the next one; None if the profile is open."""
         last = max(i for i, at in enumerate(self.refits) if self.root(at) < self.quantile)
         return self.refits[last], self.refits[last + 1] if last + 1 < len(self.refits) else None
-
-    @property
-    def is_open(self) -> bool:
-        """Whether no refit is above the cut."""
-        return self.bracket[1] is None
 
     @property
     def bound(self) -> float:
@@ -176,7 +167,7 @@ class _Side:
         met = list[Iterate]()
         for point in sorted(minima, key=lambda point: -self.sign * float(point[self.place])):
             value = float(point[self.place])
-            edge = self.value(self.refits[-1]) if self.is_open else self.bound
+            edge = self.bound if self.bracket[1] else self.value(self.refits[-1])
             if self.better or self.sign * (value - edge) <= PLACED * self.half:
                 break
             if self._known(point, value, met):
@@ -254,7 +245,7 @@ class Tracing:
     def __init__(self, best: BestPoint, name: str, tracker: Tracker) -> None:
         """Start at the best point."""
         refit = Refit(best, tracker)
-        self.name, self.sides = name, [_Side(refit, name, sign) for sign in (-1.0, 1.0)]
+        self.name, self.low, self.high = name, _Side(refit, name, -1.0), _Side(refit, name, 1.0)
         self.stopped: str | None = None
         self._turned = False
 
@@ -265,29 +256,28 @@ class Tracing:
         the cut, whatever barrier lies between. If the deadline or Ctrl-C ends it early, it is
         incomplete and `ci95` covers only the part computed so far.
         """
-        low, high = self.sides
         try:
-            low.follow(minima)
+            self.low.follow(minima)
             self._turned = True
-            high.follow(minima)
+            self.high.follow(minima)
         except STOPPING as error:
             self.stopped = what_stopped(error)
 
     @property
     def refits(self) -> list[Iterate]:
         """All refits in the order of the parameter."""
-        return self.sides[0].refits[::-1] + self.sides[1].refits[1:]
+        return self.low.refits[::-1] + self.high.refits[1:]
 
     @property
     def better(self) -> Array | None:
         """A point of clearly lower cost than the best one, if there is one."""
         least = min(self.refits, key=lambda at: at.cost)
-        return least.point if any(side.better for side in self.sides) else None
+        return least.point if self.low.better or self.high.better else None
 
     @property
     def profile(self) -> Profile:
         """The profile so far."""
-        (low, high), refits = self.sides, self.refits
+        low, high, refits = self.low, self.high, self.refits
         return Profile(
             name=self.name,
             values=np.array([low.value(at) for at in refits]),
@@ -295,8 +285,8 @@ class Tracing:
             points=np.array([at.point for at in refits]),
             cut=low.quantile**2,
             ci95=(low.bound, high.bound if self._turned else high.value(high.refits[0])),
-            open_low=low.is_open,
-            open_high=high.is_open or not self._turned,
+            open_low=low.bracket[1] is None,
+            open_high=high.bracket[1] is None or not self._turned,
             stopped=self.stopped,
         )
 
@@ -318,20 +308,18 @@ def departures(best: BestPoint) -> Array:
         slope = best.scaled[:, others].T @ residual
         return float(residual @ residual - slope @ inverse @ slope)
 
-    for i, (value, limits) in enumerate(zip(best.values[best.places], best.box.T, strict=True)):
-        others = np.delete(np.arange(k), i)
-        stderr, half = float(best.spread.stderr[i]), float(best.halves[i])
-        for side, sign in enumerate((-1.0, 1.0)):
-            to_limit = abs(limits[side] - value)
-            if not to_limit > 0.05 * half:
-                continue
-            out[i, side] = np.inf
-            for share in (1.0, 0.5, 0.25):
-                shift = min(share * half, to_limit)
-                residual = refit.residual(refit.along(i, sign * shift))
-                if residual is not None:
-                    rise = least(residual, others) - least(best.residual, others)
-                    root = math.sqrt(max(rise / best.spread.inflation[i], 0.0))
-                    out[i, side] = root * stderr / shift - 1.0
-                    break
+    for i, side in np.ndindex(k, 2):
+        others, half = np.delete(np.arange(k), i), float(best.halves[i])
+        to_limit = abs(float(best.box[side, i] - best.values[best.places[i]]))
+        if not to_limit > 0.05 * half:
+            continue
+        out[i, side] = np.inf
+        for share in (1.0, 0.5, 0.25):
+            shift = min(share * half, to_limit)
+            residual = refit.residual(refit.along(i, shift if side else -shift))
+            if residual is not None:
+                rise = least(residual, others) - least(best.residual, others)
+                root = math.sqrt(max(rise / float(best.spread.inflation[i]), 0.0))
+                out[i, side] = root * float(best.spread.stderr[i]) / shift - 1.0
+                break
     return out

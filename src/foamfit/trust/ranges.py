@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 
@@ -51,10 +52,9 @@ def alike(
     refit.enough, allowed = 0.01 * most, tracker.objective.evaluations + budget
     out = [best.values, *(point for point in minima if refit.rise(point) <= most)]
     inverse = np.linalg.pinv(best.scaled.T @ best.scaled, rcond=1e-12, hermitian=True)
-    for column, row in enumerate(inverse):
-        for limit, sign in zip(best.box[:, column], (-1.0, 1.0), strict=True):
-            if tracker.objective.evaluations < allowed:
-                out += _held(refit, column, sign, float(limit), row, most)
+    for column, sign in product(range(len(best.names)), (-1.0, 1.0)):
+        if tracker.objective.evaluations < allowed:
+            out += _held(refit, column, sign, inverse[column], most)
     for weights in _weights(best):
         if tracker.objective.evaluations < allowed:
             out += _towards(refit, weights, most)
@@ -94,8 +94,7 @@ def left_open(
     values = np.array(points)[:, best.places] + 0.0  # turns -0 into 0
     values = np.concatenate([values, _with_other_zeros(best)])
     ends = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
-    cut = refit.enough / ENOUGH
-    lower = best.cost - tracker.best_cost > BETTER * cut
+    lower = best.cost - tracker.best_cost > BETTER * refit.enough / ENOUGH
     better = tracker.best_values if lower else None
     return Open(dict(zip(best.names, ends, strict=True)), tuple(further), better)
 
@@ -138,14 +137,13 @@ def _towards(refit: Refit, weights: Array, most: float) -> list[Array]:
     return []
 
 
-def _held(
-    refit: Refit, column: int, sign: float, limit: float, along: Array, most: float
-) -> list[Array]:
+def _held(refit: Refit, column: int, sign: float, along: Array, most: float) -> list[Array]:
     """Refit with one parameter fixed as far from its best value as the rise `most` allows."""
     best = refit.best
     size, value = best.sizes[column], best.values[best.places[column]]
     if not along[column] > 0.0:
         return []
+    limit = float(best.box[int(sign > 0.0), column])
     shift = min(math.sqrt(most * along[column]), abs(limit - value) / size)
     for _ in range(TRIALS if shift > 0.0 else 0):
         point = refit.moved(best.values, sign * shift * along / along[column])

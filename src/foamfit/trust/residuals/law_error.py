@@ -62,12 +62,11 @@ class CurveError:
 
 
 class _Sum(NamedTuple):
-    """A spectrum as the sum of model error, red noise and white noise, each (b,)."""
+    """A spectrum as the sum of model error and noise, each (b,)."""
 
     criterion: float  # Bayesian information criterion
     law: Array
-    red: Array
-    white: Array
+    noise: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +89,13 @@ class _Spectrum:
         edges = list(range(1, min(ALONE, n) + 1))
         while edges[-1] < n:
             edges.append(min(max(int(edges[-1] * BAND), edges[-1] + 1), n))
-        band = np.searchsorted(edges, k, side="right") - 1
         use = left > 1.0 - TAKEN
-        count = np.bincount(band, use, len(edges))
-        filled = count > 0.0
+        band = np.searchsorted(edges, k, side="right")[use] - 1
+        count = np.bincount(band)
+        filled = count > 0
 
         def mean(values: Array) -> Array:
-            sums = np.bincount(band, np.where(use, values, 0.0), len(edges))
-            return np.asarray(sums[filled] / count[filled])
+            return np.asarray(np.bincount(band, values[use])[filled] / count[filled])
 
         power = np.maximum(mean(power / np.where(use, left, 1.0)), 1e-300)
         return cls(np.exp(mean(np.log(k))), power, count[filled].astype(float), mean(left), n)
@@ -141,14 +139,11 @@ class _Spectrum:
             sizes = np.maximum(sizes * up / down, 1e-12 * level)
         total = np.einsum("mc,mcb->mb", sizes, shapes)
         cost = (np.log(total) + self.power / total) @ self.count
-        at = int(np.argmin(cost))
-        terms = list(sizes[at][:, None] * shapes[at])
-        law = terms.pop(0) if laws.any() else laws[0]
-        red = terms.pop(0) if reds.any() else reds[0]
-        white = terms.pop(0) if floor else flat[0]
-        parameters = floor + 3 * bool(laws.any()) + 2 * bool(reds.any())
-        penalty = parameters * math.log(float(self.count.sum()))
-        return _Sum(float(cost[at]) + penalty, law, red, white)
+        at, errs = int(np.argmin(cost)), bool(laws.any())
+        terms = sizes[at][:, None] * shapes[at]
+        penalty = (floor + 3 * errs + 2 * bool(reds.any())) * math.log(float(self.count.sum()))
+        law, noise = terms[0] if errs else laws[0], terms[errs:].sum(axis=0)
+        return _Sum(float(cost[at]) + penalty, law, noise)
 
 
 def curve_errors(
@@ -188,24 +183,23 @@ def _curve_error(residual: Array, basis: Array, own: NoiseProcess) -> CurveError
     alone = min(noises, key=attrgetter("criterion"))
     laws, firsts = seen.peaks(), seen.first_order(VISIBLE)
     both = []
-    for red in (none, seen.sum(none, firsts, floor=False).red[None]):
+    for red in (none, seen.sum(none, firsts, floor=False).noise[None]):
         both.append(seen.sum(laws, red, floor=not red.any()))
         both.append(seen.sum(both[-1].law[None], firsts, floor=False))
     with_law = min(both, key=attrgetter("criterion"))
     evidence = alone.criterion - with_law.criterion
-    noise = with_law.red + with_law.white
-    process = _process(seen, noise, max(float(seen.count @ (with_law.law < noise)), 1.0))
+    process = _process(seen, with_law)
     size = math.sqrt(max(float(residual @ residual) / n - process.variance, 0.0))
     if evidence <= 0.0 or size < SMALLEST:
         return CurveError(own, evidence)
     return CurveError(process, evidence, size)
 
 
-def _process(seen: _Spectrum, noise: Array, samples: float) -> NoiseProcess:
+def _process(seen: _Spectrum, found: _Sum) -> NoiseProcess:
     """Return autoregressive noise with a spectrum given in bands."""
-    k = np.arange(seen.samples)
-    spectrum = np.exp(np.interp(k, seen.frequency, np.log(noise)))
-    lags = np.fft.irfft(np.append(spectrum, spectrum[-1]))[: ORDER + 1]
+    noise, samples = found.noise, max(float(seen.count @ (found.law < found.noise)), 1.0)
     if np.ptp(noise) < 1e-9 * float(noise.max()):
         return NoiseProcess(np.empty(0), float(noise[0]), samples)
+    spectrum = np.exp(np.interp(np.arange(seen.samples), seen.frequency, np.log(noise)))
+    lags = np.fft.irfft(np.append(spectrum, spectrum[-1]))[: ORDER + 1]
     return NoiseProcess(levinson(lags)[-1][0], float(lags[0]), samples)

@@ -71,10 +71,7 @@ class NoiseProcess:
         return product[:n]
 
     def forms(self, columns: Array, mix: Array | None = None) -> Array:
-        """Return the variance lᵀΣl of the noise along each column l of `columns @ mix`, (m,).
-
-        `columns` is (n, k) and `mix` (k, m), by default the identity.
-        """
+        """Return the variance lᵀΣl along each column l of `columns` (n, k), times `mix` (k, m)."""
         inner = columns.T @ self.times(columns)
         if mix is None:
             return np.diag(inner)
@@ -121,10 +118,10 @@ def levinson(lags: Array) -> list[tuple[Array, float]]:
 
 
 def _lag_sums(one: Array, other: Array, order: int) -> Array:
-    """Return Σ_t one_t ⊗ other_(t+k), symmetrised in k, for k = 0 … order, (order+1, m, m)."""
+    """Return Σ_t one_t · other_(t+k), symmetrised in k, for k = 0 … order, (order+1,)."""
     n = len(one)
-    sums = [one[: n - k].T @ other[k:] + one[k:].T @ other[: n - k] for k in range(order + 1)]
-    return 0.5 * np.array(sums)
+    pairs = ((one[: n - k], other[k:], one[k:], other[: n - k]) for k in range(order + 1))
+    return 0.5 * np.array([np.vdot(a, b) + np.vdot(c, d) for a, b, c, d in pairs])
 
 
 def noise_processes(
@@ -146,9 +143,8 @@ def noise_processes(
     curves = parts(sizes)
     sums, processes = [], []
     for part in curves:
-        own = residual[part][:, None]
-        n = len(own)
-        lag_sums = _lag_sums(own, own, min(MOST_ORDERS, n // 10))[:, 0, 0]
+        own, n = residual[part], part.stop - part.start
+        lag_sums = _lag_sums(own, own, min(MOST_ORDERS, n // 10))
         fits = levinson(lag_sums / n)
         scores = [n * math.log(max(white, 1e-300)) + len(f) * math.log(n) for f, white in fits]
         order = int(np.argmin(scores))
@@ -184,9 +180,7 @@ def _corrected(
 ) -> NoiseProcess:
     """Return the process whose lag sums, less the absorbed part, are those `seen` in residuals."""
     n, order = len(basis), seen.size - 1
-    once = np.trace(_lag_sums(basis, image, order), axis1=1, axis2=2)
-    twice = np.einsum("kij,ji->k", _lag_sums(basis, basis, order), middle)
-    taken = 2.0 * once - twice
+    taken = _lag_sums(basis, 2.0 * image - basis @ middle, order)
     lags = (seen + taken) / (n - np.arange(order + 1))
     # If a fit absorbed most of a curve's noise, the correction is unreliable and must be limited.
     lags *= min(1.0, 4.0 * seen[0] / n / lags[0]) if lags[0] > 0.0 else 1.0

@@ -69,10 +69,7 @@ class Structure:
 
 
 def find_structure(residual: Array, places: NDArray[np.str_]) -> Structure:
-    """Find the place with the largest part of the structure in the residual of one curve.
-
-    `places` are as from `fitting.branches.branch_of_samples`.
-    """
+    """Find the place, as of `fitting.branches.branch_of_samples`, with the largest structure."""
     product, branches = residual[1:] * residual[:-1], places[1:]
     sums = {str(place): float(product[branches == place].sum()) for place in np.unique(places)}
     place = max(sums, key=lambda key: sums[key])
