@@ -32,6 +32,9 @@ OUTWARD, INWARD = 14, 6
 PLACED = 0.02
 # Two values are nearly the same if they differ by this share of their distance from the best one.
 NEARLY = 0.01
+# The end of a descent whose cost is above the cut by this factor is a minimum of its own, and a
+# refit beside it would not come below the cut.
+FARTHER = 10.0
 # A profile that falls below the best point by this share of the cut has found a better minimum.
 BETTER = 0.01
 
@@ -165,12 +168,13 @@ class _Side:
         if len(self.refits) == 1:
             self._outward()
         met = list[Iterate]()
+        far = FARTHER * self.quantile**2 * float(self.refit.best.spread.inflation[self.column])
         for point in sorted(minima, key=lambda point: -self.sign * float(point[self.place])):
             value = float(point[self.place])
             edge = self.bound if self.bracket[1] else self.value(self.refits[-1])
             if self.better or self.sign * (value - edge) <= PLACED * self.half:
                 break
-            if self._known(point, value, met):
+            if self.refit.rise(point) > far or self._known(point, value, met):
                 continue
             if (found := self.refit.run(point, (self.column, value))) is None:
                 continue
