@@ -7,7 +7,6 @@ import signal
 from dataclasses import replace
 from functools import partial
 
-import lmfit
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -276,12 +275,13 @@ def test_the_figure_of_a_stopped_fit_says_so():
 
 
 def test_a_stopped_fit_is_never_ok(monkeypatch):
+    from foamfit import settle
     from foamfit.fitting.search import SearchStoppedError
 
     def stop(*_: object, **__: object) -> None:
         raise SearchStoppedError
 
-    monkeypatch.setattr(lmfit, "minimize", stop)  # interrupts the refinement
+    monkeypatch.setattr(settle, "refine", stop)
     result = ff.fit(synthetic_impact(samples=201)[1], starts=2)
     assert result.stopped == "the time limit"
     assert result.status == "warnings"
