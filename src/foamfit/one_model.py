@@ -18,7 +18,6 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
-from foamfit.fitting.box import Space
 from foamfit.fitting.curves import check_time_shift, choose_drive
 from foamfit.fitting.minima import exchange_springs, in_order, scan_places, settle_ends
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
@@ -391,35 +390,34 @@ def _search(
     them to a fraction of a sample.
     """
     rng, early = np.random.default_rng(record.seed), list[Array]()
-    rough = problem.thinned()
-    scout = Tracker(rough.objective, tracker.deadline, tracker.better, looked=tracker.looked)
-    driven = problem.objective.drive != "impact"
+    thinned, impact = problem.thinned(), problem.objective.drive == "impact"
+    coarse = Tracker(thinned.objective, tracker.deadline, tracker.better, looked=tracker.looked)
 
-    def scouted(problem: Problem) -> list[tuple[float, int]]:
-        """Search on the thinned record; the ends are those of the tracker."""
+    def search_thinned(problem: Problem) -> list[tuple[float, int]]:
+        """Search on the thinned record; its ends become those of the tracker."""
         space = problem.space()
-        costs = search(scout, space, starts=record.starts, rng=rng, progress=progress)
-        reached = scout.best_cost
-        exchange_springs(scout, space)
-        scan_places(scout, space)
-        if scout.best_cost < (1.0 - NEWS) * reached:
-            leave_minimum(scout, space)
-        best = [] if scout.best_values is None else [scout.best_values]
-        tracker.ends += [*best, *scout.ends]
+        costs = search(coarse, space, starts=record.starts, rng=rng, progress=progress)
+        reached = coarse.best_cost
+        exchange_springs(coarse, space)
+        scan_places(coarse, space)
+        if coarse.best_cost < (1.0 - NEWS) * reached:
+            leave_minimum(coarse, space)
+        best = [] if coarse.best_values is None else [coarse.best_values]
+        tracker.ends += [*best, *coarse.ends]
         return costs
 
-    def search_held(_: Space) -> None:
+    def search_held() -> None:
         """Search with contact and zeros held, unless the first search did that."""
         if early:
             tracker.ends += early
         else:
-            scout.best_values, scout.best_cost, scout.ends = None, np.inf, []
-            scouted(held_by_record(rough, asked))
+            coarse.best_values, coarse.best_cost, coarse.ends = None, np.inf, []
+            search_thinned(held_by_record(thinned, asked))
 
     try:
-        costs = scouted(held_by_record(rough, asked) if driven else rough)
+        costs = search_thinned(thinned if impact else held_by_record(thinned, asked))
         record = replace(record, costs=tuple(costs))
-        early += tracker.ends if driven else []
+        early += [] if impact else tracker.ends
         progress(REFINED, "refinement")
         descend_again(problem, tracker)
         problem, freed = keep_to_record(problem, tracker, asked, search_held)
@@ -427,11 +425,11 @@ def _search(
         weigh_motion(problem, tracker)
         settle_ends(tracker, problem.space())
     except STOPPING as error:
-        if tracker.best_values is None and scout.best_values is not None:
-            tracker.consider(scout.best_values)
+        if tracker.best_values is None and coarse.best_values is not None:
+            tracker.consider(coarse.best_values)
         ensure_feasible(tracker, problem.space(), np.random.default_rng(record.seed))
         return problem, replace(record, stopped=what_stopped(error))
     finally:
-        problem.objective.add_counts(rough.objective)
+        problem.objective.add_counts(thinned.objective)
     progress(1.0, "done")
     return problem, record

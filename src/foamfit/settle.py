@@ -17,7 +17,6 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
-from foamfit.fitting.box import Space
 from foamfit.fitting.nuisance import shown_by
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import STOPPING, Freed, Tracker, descend, distinct, rank, squares
@@ -77,11 +76,11 @@ def keep_to_record(
     problem: Problem,
     tracker: Tracker,
     asked: Collection[str],
-    search_held: Callable[[Space], object] = lambda _: None,
+    search_held: Callable[[], object] = lambda: None,
 ) -> tuple[Problem, Freed | None]:
     """Hold contact and zeros where the record shows them, if the law errs more than the noise.
 
-    `search_held` searches a box without them; then descents begin from the ends of all searches.
+    `search_held` searches without them; then descents begin from the ends of all searches.
     """
     values, cost, found = tracker.best_values, tracker.best_cost, tracker.ends
     held = held_by_record(problem, asked)
@@ -89,7 +88,7 @@ def keep_to_record(
         return problem, None
     tracker.best_values, tracker.best_cost, tracker.ends = None, math.inf, []
     try:
-        search_held(held.space())
+        search_held()
         tracker.ends += [*found, values]
         descend_again(held, tracker)
     except STOPPING:
@@ -152,7 +151,7 @@ def follow_samples(problem: Problem, tracker: Tracker) -> Problem:
         smooth.add_counts(rough.objective)
     if trial.best_values is None or trial.best_cost * WORSE**2 >= cost:
         return problem
-    rough.objective.evaluations, rough.objective.failures = smooth.evaluations, smooth.failures
+    rough.objective.counts = smooth.counts
     tracker.objective, tracker.ends = rough.objective, trial.ends
     tracker.best_values, tracker.best_cost = trial.best_values, trial.best_cost
     return rough

@@ -235,12 +235,15 @@ def later(time: Array, curves: Array, late: float) -> Array:
     return np.asarray(make_interp_spline(time, curves, k=1, axis=-1)(time - late))
 
 
-def instants(time: Array, fine: int) -> Array:
-    """Return `fine` instants per sample, evenly spread over the interval that it averages."""
+def instants(time: Array, fine: int, most: float = np.inf) -> Array:
+    """Return `fine` instants per sample, evenly spread over the interval that it averages.
+
+    The interval is that between samples, `most` s at most.
+    """
     if fine == 1:
         return time
     gaps = np.diff(time)
-    widths = np.minimum(np.append(gaps, gaps[-1]), np.append(gaps[0], gaps))
+    widths = np.minimum(np.append(gaps, gaps[-1]), np.append(gaps[0], gaps)).clip(max=most)
     offsets = (np.arange(fine) + 0.5) / fine - 0.5
     return np.asarray((time[:, None] + widths[:, None] * offsets).ravel())
 

@@ -16,7 +16,7 @@ from foamfit.fitting.box import Space
 from foamfit.fitting.levenberg import Iterate, following
 from foamfit.fitting.nuisance import CONTACT_TIME
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.search import MISSING, Tracker, descend, has_several, race, rank, squares
+from foamfit.fitting.search import MISSING, Tracker, descend, halve, has_several, rank, squares
 from foamfit.springs.laws.record import Law
 from foamfit.springs.model import exchanges
 from foamfit.springs.parameters import relaxation_names, split_name
@@ -38,15 +38,15 @@ CONTACT_STEP = 0.12  # first step of the contact time: about the error of the fi
 TOO_HIGH, FLAT, NOTHING = 300.0, 4.0, 0.05
 
 
-def scan_places(tracker: Tracker, space: Space) -> bool:
-    """Move ε_a or ε_* in steps and descend from each; return whether the best point improved.
+def scan_places(tracker: Tracker, space: Space) -> None:
+    """Move ε_a or ε_* in steps and descend from each; the tracker keeps the best point.
 
     At each step the other parameters are fitted first, then all parameters. The contact time of an
     impact without a measured motion is scanned as well, because with a dashpot a wrong one may fit
     almost as well. Above the noise floor only better ends are kept.
     """
     if tracker.best_values is None:
-        return False
+        return
     best, cost, met = tracker.best_values, tracker.best_cost, [space.encode(tracker.best_values)]
     left = max(cost, tracker.objective.floor) / tracker.objective.n_data
     at_noise = cost <= tracker.objective.floor
@@ -77,7 +77,6 @@ def scan_places(tracker: Tracker, space: Space) -> bool:
                 if not _among(met, end) and (at_noise or now < cost):
                     met.append(end)
                     tracker.ends.append(space.decode(end))
-    return tracker.best_cost < cost
 
 
 def _moved(tracker: Tracker, space: Space, point: Array, column: int, share: float) -> Array | None:
@@ -92,17 +91,17 @@ def _moved(tracker: Tracker, space: Space, point: Array, column: int, share: flo
     return rank(tracker, space, [np.clip(point + step, low, high) for step in steps])[0][1]
 
 
-def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
-    """Exchange properties between springs of one kind, and descend; return the costs as `search`.
+def exchange_springs(tracker: Tracker, space: Space) -> None:
+    """Exchange properties between springs of one kind, and descend; the tracker keeps the ends.
 
     The loop of a chain hardly changes when two springs in series exchange a branch, so each
     exchange has its own minimum. The exchanges of every minimum that may lead to the best one are
     tried.
     """
     if tracker.best_values is None or not has_several(space.model):
-        return []
-    objective, costs = tracker.objective, list[tuple[float, int]]()
-    met, open_ends = [], [(tracker.best_cost, tracker.best_values)]
+        return
+    objective, met = tracker.objective, list[Array]()
+    open_ends = [(tracker.best_cost, tracker.best_values)]
     for _ in range(EXCHANGES):
         best = tracker.best_cost
         # Above the noise floor the true springs, if there are any, have not been found yet.
@@ -117,14 +116,12 @@ def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
         points = [space.encode(other) for other in exchanges(space.model, values)]
         most = len(points) if cost <= tracker.best_cost else EXCHANGED
         chosen = [point for _, point in rank(tracker, space, points)[:most]]
-        for cost, end in race(tracker, space, chosen):
+        for cost, end in halve(tracker, space, chosen):
             values = in_order(space, objective, space.decode(end))
-            costs.append((cost, 1))
             if not _among(met, space.encode(values)):
                 met.append(space.encode(values))
                 tracker.ends.append(values)
                 open_ends.append((cost, values))
-    return costs
 
 
 def settle_ends(tracker: Tracker, space: Space) -> None:

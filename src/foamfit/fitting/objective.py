@@ -66,16 +66,6 @@ class Effort(NamedTuple):
     compiled: float  # s, of these
     total: float  # s
 
-    def sentence(self) -> str:
-        """Say where the time went."""
-        each = 1e3 * self.simulating / max(self.simulations, 1)
-        share = self.compiled / max(self.simulating, 1e-12)
-        return (
-            f"{self.total:.2f} s: {self.simulations} simulations, {self.with_derivatives} of them "
-            f"with derivatives, took {self.simulating:.2f} s, {each:.2f} ms each, {share:.0%} of "
-            "this in compiled code; the rest is search and statistics."
-        )
-
 
 @dataclass(eq=False)
 class Objective:
@@ -97,6 +87,7 @@ class Objective:
     weighing: Weighing | None = None  # Effect of an uncertain driving motion; see `weigh_motion`
     given: tuple[nuisances.Prior, ...] = ()  # Priors of spring parameters
     followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is already known
+    averaged: float = np.inf  # longest time that a sample averages, s, if the samples are thinned
     # Largest amplitude, in standard deviations, of the motion that would explain the residual
     unexplained: float | None = field(default=None, init=False)
     evaluations: int = field(default=0, init=False)  # Number of simulated sets of parameters
@@ -118,7 +109,7 @@ class Objective:
         self.weights = checked_weights(self.weights, self.curves)
         self.scenes = Scenes(
             test, self.model, self.drive, self.curves, self.interior, self.nuisance, self.rtol,
-            self.interior_mass, self.followed,
+            self.interior_mass, self.followed, self.averaged,
         )  # fmt: skip
         self.time, self.usual = self.scenes.time, self.scenes.usual
         self.measured = self._measured()
@@ -166,10 +157,11 @@ class Objective:
         if test.stress.size > THIN * self.time.size:
             return self
         followed = (motion,) if self.driven else self.followed
-        rough = replace(self, measurement=test, followed=followed, weighing=None)
-        pairs = zip(self.counted, self.sizes, rough.sizes, strict=True)
+        gap = float(np.median(np.diff(self.time)))
+        few = replace(self, measurement=test, followed=followed, weighing=None, averaged=gap)
+        pairs = zip(self.counted, self.sizes, few.sizes, strict=True)
         more = {name: self.weights[name] * size / left for name, size, left in pairs}
-        return replace(rough, weights=self.weights | more)
+        return replace(few, weights=self.weights | more)
 
     @property
     def motion(self) -> SmoothMotion | None:
@@ -179,7 +171,7 @@ class Objective:
     @property
     def driven(self) -> bool:
         """Whether the measured motion drives the springs."""
-        return self.drive == "displacement"
+        return self.scenes.driven
 
     @property
     def stress(self) -> Array:
@@ -288,13 +280,23 @@ class Objective:
         slopes = {name: one[1:] for name, one in rows.items()} if places.size else None
         return Simulated(curves, motion, slopes)
 
+    @property
+    def counts(self) -> tuple[int, int, int, float]:
+        """Simulations, those that failed, those with derivatives, and the seconds they took."""
+        return self.evaluations, self.failures, self.sloped, self.seconds
+
+    @counts.setter
+    def counts(self, counts: tuple[int, int, int, float]) -> None:
+        self.evaluations, self.failures, self.sloped, self.seconds = counts
+
     def add_counts(self, other: Objective) -> None:
-        """Add the evaluations and failures of another objective."""
+        """Add the counts of another objective."""
         if other is not self:
-            self.evaluations += other.evaluations
-            self.failures += other.failures
-            self.sloped += other.sloped
-            self.seconds += other.seconds
+            simulated, failed, sloped, seconds = other.counts
+            self.evaluations += simulated
+            self.failures += failed
+            self.sloped += sloped
+            self.seconds += seconds
 
     def residual(self, values: Array) -> Array:
         """Return the weighted residuals of all counted curves and of the priors, dimensionless.
@@ -411,13 +413,13 @@ class Objective:
 
     def look(self, values: Array) -> dict[str, float | None] | None:
         """Return the misfits of all curves, without counting the evaluation; None if it fails."""
-        counts = self.evaluations, self.failures
+        counts = self.counts
         try:
             return self.misfit(self.simulate(values, everything=True))
         except SimulationError:
             return None
         finally:
-            self.evaluations, self.failures = counts
+            self.counts = counts
 
     def off(self, curves: Simulated, name: str) -> float | None:
         """Return the misfit of one curve; None if it was not measured or simulated."""

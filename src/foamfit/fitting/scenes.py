@@ -84,6 +84,7 @@ class Scenes:
     rtol: float
     interior_mass: bool
     followed: tuple[SmoothMotion | None, ...] = ()
+    averaged: float = np.inf
     _asked: dict[bytes, Wanted] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
@@ -93,7 +94,7 @@ class Scenes:
         self.driven = self.drive == "displacement"
         self.time = np.arange(test.stress.size, dtype=float) if test.time is None else test.time
         self._fine = min(test.block, FINEST) if self.drive != "stress" else 1
-        self.clock, self._own = instants(self.time, self._fine), None
+        self.clock, self._own = instants(self.time, self._fine, self.averaged), None
         if self.driven:
             own = self.clock
             self.clock = driven_instants(test, own, self.motion)

@@ -53,9 +53,10 @@ PROMISING = 100.0
 STIFFER = np.geomspace(1.0, 2.0, 71)[1:]
 
 
-# Legs of a race: iterations, the share of the starts that then goes on, and that of the work.
-LEGS = ((12, 0.5, 0.5), (12, 0.25, 0.25), (36, 0.25, 0.25))
-HALFWAY = LEGS[0][2]
+# Stages of successive halving: iterations, the share of the starts that then goes on, and that of
+# the work.
+STAGES = ((12, 0.5, 0.5), (12, 0.25, 0.25), (36, 0.25, 0.25))
+HALFWAY = STAGES[0][2]
 LEAST = 6  # descents that go on in any case
 
 
@@ -159,20 +160,20 @@ def descend(
     return end.cost, end.point
 
 
-def race(
+def halve(
     tracker: Tracker,
     space: Space,
     starts: Sequence[Array],
     step: Callable[[float], None] = lambda _: None,
 ) -> list[tuple[float, Array]]:
-    """Descend from many starts; return costs and coordinates of the ends.
+    """Descend from many starts by successive halving; return costs and coordinates of the ends.
 
-    After each of the `LEGS` only the better part of the descents goes on (successive halving;
-    Jamieson & Talwalkar 2016, AISTATS 51, 240). `step` is called with the share that is done.
+    After each of the `STAGES` only the better part of the descents goes on (Jamieson & Talwalkar
+    2016, AISTATS 51, 240). `step` is called with the share that is done.
     """
     functions, at = squares(tracker, space), list[levenberg.Iterate | Array](starts)
     done, out = 0.0, list[levenberg.Iterate]()
-    for iterations, share, work in LEGS:
+    for iterations, share, work in STAGES:
         out = []
         for i, one in enumerate(at):
             step(done + work * i / len(at))
@@ -241,7 +242,7 @@ def search(
 ) -> list[tuple[float, int]]:
     """Search for the best parameters, which the tracker keeps.
 
-    The best quarter of the descents on the loop (`starts` in number) are continued on the curves of
+    `starts` descents begin on the smooth loop, and the best of their ends go on along the curves of
     the drive; `ATTEMPTS` says when this is repeated. Returns the final costs, best first, each with
     the number of descents on the loop that led to it. Raises SearchStoppedError after the time
     limit.
@@ -346,10 +347,10 @@ def _descended(tracker: Tracker, space: Space, starts: Iterable[Array]) -> list[
     """Descend from each start; return the costs of the ends, which the tracker keeps.
 
     Far from a minimum a descent may begin badly and end well, so only the many starts of several
-    springs are raced: on a mycelium (80 s per cycle) a race misses the best minimum.
+    springs are halved: on a slow mycelium test, halving misses the best minimum of one spring.
     """
     if has_several(space.model):
-        ends = race(tracker, space, list(starts))
+        ends = halve(tracker, space, list(starts))
     else:
         ends = [descend(tracker, space, start, 60) for start in starts]
     tracker.ends += [space.decode(end) for _, end in ends]
@@ -466,7 +467,7 @@ def _search_loop(
     """
     objective = tracker.objective
     loop = _loop_of(objective)
-    along = objective if objective.driven else _along(objective, loop)
+    along = _along(objective, loop)
     inner = Tracker(along, tracker.deadline, tracker.better)
     own = space
     if objective.drive == "impact":  # contact and zeros do not affect its loop
@@ -483,7 +484,7 @@ def _search_loop(
                 tracker.consider(inner.best_values)
                 tracker.look()
 
-        ends = race(inner, own, spread_out(own, points, starts), step)
+        ends = halve(inner, own, spread_out(own, points, starts), step)
         ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
     finally:
         objective.add_counts(inner.objective)

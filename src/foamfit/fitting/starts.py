@@ -28,7 +28,8 @@ def thinned(
 ) -> Measurement:
     """Return a test with a few hundred of its samples, on which starts are ranked and descend.
 
-    The peaks of stress and motion and the turning points are among them. `followed` is the motion
+    The peaks of stress and motion and the turning points are among them. Each sample is still the
+    mean over as many rows of the file. `followed` is the motion
     without its noise, m, if it is known; otherwise the motion of a `loop` is smoothed. A `loop` is
     compared along the motion alone and begins at the contact.
     """
@@ -52,7 +53,8 @@ def thinned(
     acceleration = measurement.acceleration
     return replace(
         measurement, displacement=None if motion is None else motion[keep], stress=stress[keep],
-        time=None if time is None else time[keep], outliers={}, sampled=masks, block=1, noise=level,
+        time=None if time is None else time[keep], outliers={}, sampled=masks, noise=level,
+        block=1 if loop else measurement.block,
         interior={} if loop else {n: one[keep] for n, one in measurement.interior.items()},
         acceleration=None if loop or acceleration is None else acceleration[keep],
     )  # fmt: skip
