@@ -19,15 +19,15 @@ from foamfit.fitting.problem import Problem, make_problem
 if TYPE_CHECKING:
     from foamfit.results import Fit
 
-METHOD = "foamfit: races of descents (Levenberg-Marquardt)"
+METHOD = "foamfit, multi-start Levenberg-Marquardt"
 # Largest relative difference between the χ² of a result and that of its own residual.
 SAME = 1e-6
 
 
 def problem_of(fit: Fit) -> Problem:
-    """Return the problem of a result, made again if the result was read from its folder.
+    """Return the problem of a result, rebuilt if the result was read from its folder.
 
-    Raises InputError if its residual was weighed in a way that the folder does not tell.
+    Raises InputError if the folder does not say how the residual was weighted.
     """
     if fit.problem is not None:
         made: Problem = fit.problem
@@ -40,8 +40,8 @@ def problem_of(fit: Fit) -> Problem:
     was = float(fit.statistics["chisqr"] or 0.0)
     if not math.isclose(float(residual @ residual), was, rel_tol=SAME, abs_tol=1e-9):
         raise InputError(
-            f"{fit.measurement.name}: the folder does not tell how the samples of this fit were "
-            "weighed; fit the test again for lmfit's functions"
+            f"{fit.measurement.name}: the folder does not say how the samples of this fit were "
+            "weighted; fit the test again to use it with lmfit"
         )
     return made
 
@@ -72,17 +72,15 @@ def lmfit_params(fit: Fit) -> lmfit.Parameters:
 
 def result_of(fit: Fit) -> MinimizerResult:
     """Return the numbers of a result as those of lmfit."""
-    params, numbers = lmfit_params(fit), fit.statistics
+    params, numbers, found = lmfit_params(fit), fit.statistics, fit.correlation
     names = [name for name, one in params.items() if one.vary]
     sizes = np.array([params[name].stderr for name in names], dtype=float)
-    correl = np.eye(len(names))
-    for i, name in enumerate(names):
-        for j, other in enumerate(names):
-            correl[i, j] = 1.0 if i == j else (params[name].correl or {}).get(other, 0.0)
+    places = [found.names.index(name) for name in names] if found else []
+    matrix = found.matrix[np.ix_(places, places)] if found else np.empty((0, 0))
     values: dict[str, Any] = {
         "params": params,
         "var_names": names,
-        "covar": correl * np.outer(sizes, sizes),
+        "covar": matrix * np.outer(sizes, sizes),
         "errorbars": bool(names),
         "method": METHOD,
         "ndata": numbers["n_data"],

@@ -174,7 +174,8 @@ class _Side:
             edge = self.bound if self.bracket[1] else self.value(self.refits[-1])
             if self.better or self.sign * (value - edge) <= PLACED * self.half:
                 break
-            if self.refit.rise(point) > far or self._known(point, value, met):
+            rise = self.refit.rise(point)
+            if rise > far or self._known(rise, value, met):
                 continue
             if (found := self.refit.run(point, (self.column, value))) is None:
                 continue
@@ -185,12 +186,12 @@ class _Side:
                 self.refits = [*inside, found]
                 self._outward()
 
-    def _known(self, point: Array, value: float, met: Sequence[Iterate]) -> bool:
+    def _known(self, rise: float, value: float, met: Sequence[Iterate]) -> bool:
         """Whether an earlier refit has a lower cost at nearly this value; many descents agree."""
         start = self.value(self.refits[0])
         near = [at for at in met if abs(self.value(at) - value) < NEARLY * abs(value - start)]
         least = min((at.cost for at in near), default=0.0)
-        return bool(near) and self.refit.rise(point) >= least - self.refit.best.cost
+        return bool(near) and rise >= least - self.refit.best.cost
 
     def _outward(self) -> None:
         """Go on from the outermost refit until well beyond the cut, and place the crossing."""
