@@ -11,11 +11,10 @@ fitted by plain least squares of the same law along the measured motion (SciPy's
 25 random starts, zeros as prepared).
 
 Answer. No fit accepts what its record excludes. The loops are followed within 1.05 times plain
-least squares. On cartilage 3 and one mycelium the bistable spring is better than that, but a better
-minimum (3.8 and 2.7 %) is missed: see README.md. Also written: fits.csv and
-loops.csv.
+least squares. On cartilage 3 the bistable spring is better than that, but a better minimum (3.8 %)
+is missed: see README.md. Also written: fits.csv and loops.csv.
 
-    FOAMFIT_DATA=path/to/data python experiments/real_records/real_records.py   # 15 minutes
+    FOAMFIT_DATA=path/to/data python experiments/real_records/real_records.py   # 8 minutes
 """
 
 from __future__ import annotations
