@@ -230,13 +230,28 @@ def drawn_impact(setup: Impact, rng: np.random.Generator) -> Course:
 
 def impact(setup: Impact, seed: int) -> Record:
     """Return the record of an impact."""
-    course = drawn_impact(setup, np.random.default_rng([seed, 1]))
+    return recorded(setup, drawn_impact(setup, np.random.default_rng([seed, 1])), seed)
+
+
+def recorded(
+    setup: Impact,
+    course: Course,
+    seed: int,
+    ranges: dict[str, float] | None = None,
+    step: float | None = None,
+) -> Record:
+    """Return the record of the course of an impact.
+
+    The noise is relative to `ranges` (SI, by default those of this test); `step` is the sampling
+    interval (s).
+    """
     rng = np.random.default_rng([seed, 2])
     rig, lasts = course.rig, course.end
     drawn = 10 ** rng.uniform(math.log10(150), math.log10(3000))
     slowest, fastest = 20e3 * lasts, 2e6 * lasts  # samples per second
     samples = setup.samples or round(max(150.0, min(max(drawn, slowest), fastest)))
-    step = float(f"{lasts / samples:.3g}")
+    step = float(f"{lasts / samples:.3g}") if step is None else step
+    samples = round(lasts / step)
     part, after, late = rng.uniform(0.0, 0.6), rng.uniform(0.05, 0.25), rng.uniform(0.05, 0.95)
     origin = rng.uniform(-lasts, 0.0) if rng.random() < 0.5 else rng.uniform(0.0, 20.0)
     zeros = rng.uniform(-3.0, 3.0), rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05)
@@ -255,7 +270,8 @@ def impact(setup: Impact, seed: int) -> Record:
     }
     inside = (own >= 0.0) & (own <= lasts)
     clean = {name: everything[name] for name in setup.channels}
-    ranges = {name: float(np.ptp(values[inside])) for name, values in clean.items()}
+    own_ranges = {name: float(np.ptp(values[inside])) for name, values in clean.items()}
+    ranges = own_ranges if ranges is None else ranges
     zero = round(zeros[0] * rig.height, 7) if setup.zero and not setup.trimmed else 0.0
     shifts = {"displacement": zero}
     if setup.sensor and not setup.trimmed:

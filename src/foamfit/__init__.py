@@ -32,6 +32,8 @@ _HOME = {
     "batch": "study.batch",
     "Prediction": "report.studies.prediction",
     "predict": "study.predict",
+    "Plan": "report.studies.plan",
+    "plan": "study.plan",
     "JointResult": "study.joint_result",
     "joint": "study.joint",
     "Card": "cards.card",

@@ -1,4 +1,4 @@
-"""`foamfit compare`, `published`, `predict` and `card`: commands that use results."""
+"""`foamfit compare`, `published`, `predict`, `plan` and `card`: commands that use results."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import click
 from foamfit.cli import options
 from foamfit.cli.group import main
 from foamfit.cli.options import Output
+from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
 from foamfit.terminal import say
 
@@ -129,6 +130,53 @@ def predict(
         compile_rest()
         found = study.predict(result, measurement, **asked)
         page, text = folder / "prediction.png", partial(prediction_text, found)
+        output.finish(found.save, page, found.to_json_dict, text)
+
+
+@main.command()
+@click.argument("results", metavar="RESULT [RESULT …]", nargs=-1, required=True)
+@options.option("--rig", "What the rig can do. Default: the record of RESULT.", options.FILE,
+                metavar="RIG.toml")  # fmt: skip
+@options.option(
+    "--for quantity",
+    "What the foam is needed for: peak_force, absorbed_energy or peak_strain at a velocity.",
+    metavar='"peak_force at 3 m/s"',
+)
+@options.option(
+    "--seed", "The same results, rig and seed give the same numbers.", options.WHOLE, default=0
+)
+@options.output("plans/<test>", "plan.json")
+def plan(
+    results: tuple[str, ...], rig: Path | None, quantity: str | None, seed: int, output: Output
+) -> None:
+    """Find the test that would determine most of what the results leave open.
+
+    RESULT is the folder of a fit or joint fit, or a published set. Several results of one model are
+    tests of one foam; a result of another model is a rival, which the test should tell apart.
+    Every test of the rig is simulated over what the results leave open. Writes plan.json,
+    plan.html, figures, next.toml (the TOML of the advised test) and joint.toml, which fits its
+    record together with the tests at hand. `foamfit init --rig RIG.toml` writes a draft of the rig.
+
+    \b
+    Examples:
+        foamfit plan fits/TEST/bistable
+        foamfit plan fits/TEST/bistable --rig RIG.toml --for "peak_force at 3 m/s"
+        foamfit plan foam-1/model-2
+    """
+    output.check(without_report=False)
+    name = Path(results[0]).resolve()
+    default = name.parent.name if name.is_dir() else results[0].replace("/", "-")
+    given = [path for path in map(Path, results) if path.exists()]
+    folder = output.folder(Path("plans", default), [*given, *([rig] if rig else [])])
+    with options.compiling(output.silent) as compile_rest:
+        from foamfit.report.studies.plan import plan_text
+        from foamfit.study import plan as study
+
+        compile_rest()
+        with progress_line(output.silent, "plan") as line:
+            found = study.plan(*results, rig=rig, quantity=quantity, seed=seed,
+                               progress=line.progress)  # fmt: skip
+        page, text = folder / "plan.html", partial(plan_text, found)
         output.finish(found.save, page, found.to_json_dict, text)
 
 

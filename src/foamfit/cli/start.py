@@ -35,22 +35,39 @@ def check(test: Path, specimen: Path | None) -> None:
 @main.command()
 @options.TEST
 @options.option("--force", "Overwrite an existing TOML.")
-def init(test: Path, force: bool) -> None:
+@options.option("--rig", "Write a draft of a rig for foamfit plan, with the name given.")
+def init(test: Path, force: bool, rig: bool) -> None:
     """Write a TOML for TEST.csv, with questions to answer.
 
     TEST.toml contains what the headers of TEST.csv say, and questions for the rest.
     Each question is a line after "# " with a unit and an example: enter your value and remove the
     "# ". An existing TOML is kept unless --force is given.
 
-    Example: foamfit init TEST.csv
+    \b
+    Examples:
+        foamfit init TEST.csv
+        foamfit init --rig RIG.toml
     """
+    from foamfit.data.rig import DRAFT
     from foamfit.data.tables.csv_table import read_text
     from foamfit.data.tables.draft import draft
     from foamfit.data.toml_file import toml_beside
-    from foamfit.files import reason, write_file
 
+    if rig:
+        _write(test, DRAFT, force, "name another file")
+        say(f"written to {test}; then: foamfit plan RESULT --rig {test}")
+        return
     text, asked = draft(read_text(test, "the CSV file of a test"))
     target = toml_beside(test)
+    _write(target, text, force, f"foamfit check {test} says what it lacks")
+    say("\n    ".join([f"written to {target}; it asks for", *asked]))
+    say(f"then: foamfit check {test}")
+
+
+def _write(target: Path, text: str, force: bool, kept: str) -> None:
+    """Write a new file, or with `force` replace it; `kept` tells about an existing one."""
+    from foamfit.files import reason, write_file
+
     try:
         if force:
             write_file(target, text.encode())
@@ -59,13 +76,10 @@ def init(test: Path, force: bool) -> None:
                 file.write(text)
     except FileExistsError:
         raise InputError(
-            f"{target} exists already and is not changed; foamfit check {test} says what it lacks, "
-            "and --force overwrites it"
+            f"{target} exists already and is not changed; {kept}, and --force overwrites it"
         ) from None
     except OSError as error:
         raise InputError(f"{target} cannot be written: {reason(error)}") from None
-    say("\n    ".join([f"written to {target}; it asks for", *asked]))
-    say(f"then: foamfit check {test}")
 
 
 @main.command()

@@ -9,6 +9,7 @@ import io
 import re
 import shlex
 import shutil
+import tempfile
 import tomllib
 import unicodedata
 import zipfile
@@ -226,6 +227,14 @@ class Desk:
                 archive.write(path, path.relative_to(self.result))
             archive.write(self.result.with_suffix(".toml"), "test.toml")
         return content.getvalue()
+
+    def planned(self, cycle: int) -> bytes:
+        """Return plan.html, the plan after the fit of a cycle (0: a single fit)."""
+        from foamfit.study.plan import plan
+
+        with tempfile.TemporaryDirectory() as folder:
+            plan(self.fits[cycle]).save(Path(folder, "plan"))
+            return Path(folder, "plan", "plan.html").read_bytes()
 
 
 def wrong_quantity(message: str) -> str:

@@ -36,6 +36,7 @@ FILES = {
     | {"table.tex"},
     "batch.json": {*(f"summary.{kind}" for kind in _KINDS), "batch.json"},
     "prediction.json": {f"prediction.{kind}" for kind in _KINDS},
+    "plan.json": {*(f"plan.{kind}" for kind in _KINDS), "next.toml", "joint.toml"},
 }
 
 

@@ -161,6 +161,9 @@ class Law:
     read_off: Callable[[Loop, Array, Any, int], Array] | None = None
     #: the same for one of several springs: (loop, marks, fraction of the height)
     read_in_series: Callable[[Loop, Array, float], Array] | None = None
+    #: likely(values, marks): parameters of a foam like those published, about the known ones in
+    #: `values`, for branches that no test has reached; marks (n_params,) are in [0, 1]
+    likely: Callable[[Array, Array], Array] | None = None
     marks: int = 5  #: number of marks
     ways: int = 1  #: number of ways to read a loop
     #: stress of the first snap as a function of the parameters, by which interchangeable springs

@@ -1,0 +1,251 @@
+"""Does the advised test determine what a first test left open?
+
+Method. Synthetic foams of one bistable spring, and of two in series, are drawn by `recovery/rig.py`
+and simulated by `recovery/truth.py`, which know nothing of foamfit. Each is first hit too softly to
+close its loop. Rig: the same striker and one of twice its mass, velocities up to 1.3 to 2.5 times
+the closing one, a largest force of 3 to 20 times that at C1, the noise and sampling of the first
+test. The record (CSV with pre-trigger, arbitrary zeros, clock and noise, and its TOML) is fitted,
+`foamfit.plan` advises a second test, and this one, the strongest test of the rig, a random one
+and an ideal one (10 % above the closing velocity, which only the truth knows) are simulated,
+recorded and fitted jointly with the first by `foamfit.joint`. A test that exceeds a limit breaks
+the rig and gives no record. "Could be determined" are the parameters that at least one of these
+joint fits determines.
+
+Answer. See README.md.
+
+    python experiments/plan/plan.py                        # 40 foams of one spring, 20 of two
+    python experiments/plan/plan.py --foams 4 --two 2      # a look
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import foamfit as ff
+from foamfit.errors import InputError, SimulationError
+
+HERE = Path(__file__).parent
+sys.path[:0] = [str(HERE.parent), str(HERE.parent / "recovery")]
+import studies  # noqa: E402
+from rig import BENCH, MOST_STRAIN, TOWER, Impact, draw_bistable, recorded, work, write  # noqa: E402
+from truth import Course, Rig  # noqa: E402
+
+SECOND = ("advised", "strongest", "random", "ideal")
+Foam = dict[str, Any]
+
+
+def draw(seed: int, springs: int) -> Foam:
+    """Draw a foam, a rig and a first velocity that does not close the loop."""
+    rng = np.random.default_rng([seed, springs])
+    while True:
+        height, area, mass = BENCH if rng.random() < 0.5 else TOWER
+        each = sorted((draw_bistable(rng) for _ in range(springs)), key=lambda s: s.points[0])
+        if springs == 2 and not 1.5 < each[1].points[0] / each[0].points[0] < 4.0:
+            continue
+        heights = (height / springs,) * springs
+        top = max(spring.points[2] for spring in each)
+        strains = [spring.strain(top, ("c", 0.0))[0] for spring in each]
+        if max(strains) > 0.85:
+            continue
+        energy = sum(h * work(spring, top) for h, spring in zip(heights, each, strict=True)) * area
+        closing = math.sqrt(2.0 * energy / mass)
+        first = closing * math.sqrt(rng.uniform(0.35, 0.85))
+        if springs == 1 and rng.random() < 0.5:
+            eta = 10 ** rng.uniform(-2.5, -1.5) * top * height / closing
+            each = [replace(each[0], eta=eta)]
+        foam = {
+            "springs": tuple(each), "heights": heights, "area": area, "mass": mass,
+            "closing": closing, "first": first, "fastest": closing * rng.uniform(1.3, 2.5),
+            "force": top * area * 10 ** rng.uniform(0.5, 1.3), "seed": seed,
+        }  # fmt: skip
+        random = np.exp(rng.uniform(math.log(0.5 * first), math.log(foam["fastest"])))
+        foam["random"] = float(random), mass * float(rng.choice([1.0, 2.0]))
+        hit = run(foam, first, mass)
+        if hit is not None and hit[1] < 0.999 * top * area:
+            return foam
+
+
+def run(foam: Foam, velocity: float, mass: float) -> tuple[Course, float, float] | None:
+    """Return the course of an impact, its largest force (N) and strain; None beyond the lock-up."""
+    height = math.fsum(foam["heights"])
+    rig = Rig(foam["springs"], foam["heights"], foam["area"], mass, velocity)
+    try:
+        course = rig.run(0.0, 100.0 * height / velocity)
+    except AssertionError:
+        return None
+    when = np.linspace(0.0, course.end, 2000)
+    force = float(course.stress(when).max()) * foam["area"]
+    return course, force, float(course.top(when, gauge=False).max()) / height
+
+
+def judged(seed: int, springs: int) -> list[dict[str, Any]]:
+    """Return one row for the first test and one for each second test and parameter."""
+    foam, rows = draw(seed, springs), list[dict[str, Any]]()
+    model = "+".join(["bistable"] * springs)
+    about = {"foam": seed, "springs": springs}
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        hit = run(foam, foam["first"], foam["mass"])
+        assert hit is not None
+        first = recorded(Impact(), hit[0], seed)
+        step = float(np.median(np.diff(first.time)))
+        ranges = {name: sigma / first.setup.noise for name, sigma in first.noise.items()}
+        path = write(first, folder, "first")
+        (folder / "rig.toml").write_text(rig_toml(foam, step, first.noise), encoding="utf-8")
+        began = time.perf_counter()
+        result = ff.fit(ff.read_test(path), model=model)
+        fitted = time.perf_counter()
+        plan = ff.plan(result, rig=folder / "rig.toml")
+        planned = time.perf_counter()
+        advice = plan.advice
+        seconds = {"fit (s)": fitted - began, "plan (s)": planned - fitted}
+        for name, one in result.parameters.items():
+            if name in plan.now:
+                rows.append(about | seconds | {"second": "none", **shown(name, one, None)})
+        tests = {
+            "advised": None if advice is None else (advice.candidate.velocity,
+                                                    advice.candidate.mass),
+            "strongest": (foam["fastest"], 2.0 * foam["mass"]),
+            "random": foam["random"],
+            "ideal": (1.1 * foam["closing"], foam["mass"]),
+        }  # fmt: skip
+        for number, (kind, asked) in enumerate(tests.items(), start=1):
+            row = about | {"second": kind}
+            if asked is None:
+                rows.append(row | {"error": "no test is advised"})
+                continue
+            row |= {"velocity over closing": asked[0] / foam["closing"], "mass": asked[1]}
+            hit = run(foam, *asked)
+            limits = hit is not None and hit[1] <= foam["force"] and hit[2] <= MOST_STRAIN
+            if hit is None or not limits:
+                rows.append(row | {"broke": True})
+                continue
+            second = recorded(Impact(), hit[0], 1000 * number + seed, ranges, step)
+            write(second, folder, f"second-{kind}")
+            expected = {} if advice is None else nearest(plan, *asked)
+            rows += [row | {"broke": False, "force (N)": hit[1]} | one
+                     for one in together(folder, kind, model, expected)]  # fmt: skip
+    return rows
+
+
+def rig_toml(foam: Foam, step: float, noise: dict[str, float]) -> str:
+    """Return RIG.toml."""
+    stress = noise["force"] / foam["area"]
+    return "\n".join([
+        "[striker]",
+        f'velocity = "{0.5 * foam["first"]} to {foam["fastest"]} m/s"',
+        f'masses = ["{foam["mass"]} kg", "{2.0 * foam["mass"]} kg"]',
+        "[limits]", f'force = "{foam["force"]} N"', f"strain = {MOST_STRAIN}",
+        "[record]", f'rate = "{1.0 / step} Hz"',
+        f'noise = {{ stress = "{stress} Pa", displacement = "{noise["displacement"]} m" }}',
+    ]) + "\n"  # fmt: skip
+
+
+def nearest(plan: ff.Plan, velocity: float, mass: float) -> dict[str, Any]:
+    """Return what the plan expects of the candidate nearest to a test."""
+    def far(one: Any) -> float:
+        asked = one.candidate
+        return abs(math.log(asked.velocity / velocity)) + 10 * abs(math.log(asked.mass / mass))
+
+    return min(plan.outcomes, key=far).expected
+
+
+def together(
+    folder: Path, kind: str, model: str, expected: dict[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """Fit the first and a second test jointly; yield a row for each parameter."""
+    names = [name for name in expected or ()]
+    lines = [f'name = "{kind}"', f'tests = ["first.csv", "second-{kind}.csv"]',
+             f'model = "{model}"', "[parameters]", *(f'{name} = "shared"' for name in names)]  # fmt: skip
+    study = folder / f"{kind}.toml"
+    study.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    began = time.perf_counter()
+    try:
+        found = ff.joint(study, jobs=1)
+    except (InputError, SimulationError) as error:
+        yield {"error": str(error)}
+        return
+    seconds = time.perf_counter() - began
+    for name in names:
+        yield {"joint (s)": seconds, **shown(name, found.parameters[name], expected[name])}
+
+
+def shown(name: str, one: Any, expected: Any) -> dict[str, Any]:
+    """Return state and width of a parameter, and what was expected."""
+    width = math.nan if one.ci95 is None else one.ci95[1] - one.ci95[0]
+    row = {"parameter": name, "value": one.value, "state": one.state, "width": width}
+    if expected is not None:
+        row |= {"expected state": expected.state, "expected width": expected.width,
+                "low": expected.ends[0], "high": expected.ends[1]}  # fmt: skip
+    return row
+
+
+def summary(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return, for each kind of second test, parameters determined and agreement of widths."""
+    out = list[dict[str, Any]]()
+    for springs, part in rows.groupby("springs"):
+        good = part[part.state == "determined"].groupby(["foam", "second"]).parameter.agg(set)
+        foams = sorted(part.foam.unique())
+        of_first = {foam: good.get((foam, "none"), set()) for foam in foams}
+
+        def after(foam: int, kind: str, good: Any = good, of_first: Any = of_first) -> set[str]:
+            return set(good.get((foam, kind), of_first[foam]))
+
+        could = {foam: set().union(*(after(foam, kind) for kind in SECOND)) for foam in foams}
+        total = sum(map(len, could.values()))
+        for kind in ("none", *SECOND):
+            mine, own = part[part.second == kind], {foam: after(foam, kind) for foam in foams}
+            sure = mine[(mine["expected width"] > 0.0) & (mine.width > 0.0)]
+            ratio = sure.width / sure["expected width"]
+            out.append({
+                "springs": springs, "second test": kind, "foams": len(foams),
+                "determined": sum(len(own[f] & could[f]) for f in foams), "could be": total,
+                "broke the rig": int(mine.drop_duplicates("foam").broke.eq(True).sum()),
+                "fewer than random": sum(len(own[f]) < len(after(f, "random")) for f in foams),
+                "velocity over closing": mine["velocity over closing"].median(),
+                "force (N)": mine["force (N)"].median(),
+                "width over expected": ratio.median(),
+                "within 1.5 (%)": 100.0 * float(((ratio < 1.5) & (ratio > 1 / 1.5)).mean()),
+                "within 10 to 90 % of draws (%)": 100.0 * float(
+                    ((sure.width >= sure.low) & (sure.width <= sure.high)).mean()),
+            })  # fmt: skip
+    return pd.DataFrame(out)
+
+
+def main() -> None:
+    """Run the study."""
+    parser = studies.arguments(__doc__, HERE, foams=(40, "foams of one spring"),
+                               two=(20, "foams of two springs"), first=(1, "first seed"))  # fmt: skip
+    asked = parser.parse_args()
+    jobs = [(asked.first + i, 1) for i in range(asked.foams)]
+    jobs += [(asked.first + i, 2) for i in range(asked.two)]
+    rows = list[dict[str, Any]]()
+    with ProcessPoolExecutor(2) as pool:
+        for made in pool.map(judged, *zip(*jobs, strict=True)):
+            rows += made
+            print(json.dumps({key: made[0][key] for key in ("foam", "springs", "plan (s)")}),
+                  flush=True)  # fmt: skip
+    table = pd.DataFrame(rows)
+    for column in ("broke", "error", "expected width", "force (N)", "velocity over closing"):
+        if column not in table:
+            table[column] = math.nan
+    table.to_csv(asked.out / "foams.csv", index=False, float_format="%.6g")
+    found = summary(table)
+    found.to_csv(asked.out / "plan.csv", index=False, float_format="%.4g")
+    print(found.to_string(index=False))
+
+
+if __name__ == "__main__":
+    studies.run(main, HERE)

@@ -1,0 +1,365 @@
+"""Plan of the next test: folder, text, table, figure and page."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from foamfit.data.measurement import Measurement
+from foamfit.data.rig import Candidate, Rig
+from foamfit.report import figures
+from foamfit.report import folder as results
+from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
+from foamfit.report.readable import own_name
+from foamfit.report.render import page, sentences, words
+from foamfit.results import law_in_words, plain
+from foamfit.springs.model import Model
+from foamfit.springs.parameters import unit_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SCHEMA = 1
+RISKY = 0.05  # largest probability of exceeding a limit of an advised test
+SHOWN = 3.2  # largest half interval over the scale of a parameter that the figure shows
+BEST = 12  # rows of the table of tests on the page
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What is expected of a parameter: 95 % interval and state.
+
+    `width` is the median width of the interval over the draws (SI; NaN where it is unknown), and
+    `ends` their 10 and 90 % quantiles. `share` is half of it over the scale of the parameter, and
+    `chance` the probability that the parameter is determined.
+    """
+
+    width: float
+    ends: tuple[float, float]
+    share: float
+    state: str
+    chance: float
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a test would determine, together with the tests at hand."""
+
+    candidate: Candidate
+    breaks: float  #: probability that it exceeds a limit of the rig
+    expected: dict[str, Expected]
+    force: float  #: median of the largest force, N
+    error: float | None  #: expected standard error of the quantity asked for, over its value
+    apart: dict[str, float]  #: χ² by which it would exclude each rival law
+
+    @property
+    def number(self) -> float:
+        """Expected number of determined parameters."""
+        return sum(one.chance for one in self.expected.values())
+
+    @property
+    def determined(self) -> list[str]:
+        """Parameters that are probably determined."""
+        return [name for name, one in self.expected.items() if one.state == "determined"]
+
+    @property
+    def open(self) -> list[str]:
+        """Parameters that probably stay open."""
+        return [name for name in self.expected if name not in self.determined]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity that the foam is needed for: its value and standard error over it, as known."""
+
+    text: str
+    unit: str
+    value: float
+    error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The tests that a rig can make, ranked by what they would determine; SI."""
+
+    tests: tuple[Measurement, ...]  #: the tests at hand
+    model: str
+    relaxation: int
+    rig: Rig
+    now: dict[str, Expected]  #: what is known now
+    outcomes: tuple[Outcome, ...]
+    advised: int | None  #: place of the advised test in `outcomes`; None if none is safe
+    #: the pair of tests that determines most, with what both determine
+    pair: tuple[Outcome, Candidate] | None
+    never: dict[str, str]  #: parameters that no test of this rig determines, and what would
+    #: by striker mass: velocities that reach every branch in half, and in 95 % of the draws
+    closing: dict[float, tuple[float, float]]
+    quantity: Quantity | None
+    rivals: tuple[str, ...]  #: laws of further results, which the test should tell apart
+    missed: bool  #: whether the law misses the record by more than the noise
+    seed: int
+
+    @property
+    def advice(self) -> Outcome | None:
+        """The advised test."""
+        return None if self.advised is None else self.outcomes[self.advised]
+
+    @property
+    def name(self) -> str:
+        """Name of the first test at hand."""
+        return self.tests[0].name
+
+    @property
+    def law(self) -> str:
+        """The model and its relaxation in words."""
+        return law_in_words(self.model, self.relaxation)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The advice: next test, what it will determine, what stays open, and remarks."""
+        return sentences("plan", plan=self, advice=self.advice, own=self.own)
+
+    def own(self, names: Sequence[str]) -> list[str]:
+        """Return names of parameters, without the spring if there is only one."""
+        return [own_name(name, self.model) for name in names]
+
+    def __repr__(self) -> str:
+        """Return the advice."""
+        return "\n  ".join((f"{self.name}: which test next?", *self.sentences))
+
+    def _repr_html_(self) -> str:
+        lines = "".join(f"<li>{line}</li>" for line in self.sentences)
+        return f"<p><b>{self.name}: which test next?</b></p><ul>{lines}</ul>"
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each test: settings, risk, expected number and widths (SI)."""
+        import pandas as pd
+
+        rows = []
+        for one in self.outcomes:
+            asked = one.candidate
+            row: dict[str, Any] = {key: getattr(asked, key) for key in SETTINGS}
+            row |= {"breaks": one.breaks, "determined": one.number, "peak_force": one.force}
+            row |= {"error": one.error} if self.quantity else {}
+            row |= {f"told apart from {name}": x for name, x in one.apart.items()}
+            row |= {f"{name}_ci95_width": x.width for name, x in one.expected.items()}
+            rows.append(row | {f"{name}_state": x.state for name, x in one.expected.items()})
+        return pd.DataFrame(rows)
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the intervals now and after the advised test; returns the axes."""
+        with figures.axes_or_new(ax) as axes:
+            _intervals(axes, self)
+        return axes
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content of ``plan.json``: SI, plain types, None for missing values."""
+        best = self.advice
+        pair = self.pair and [_asked(self.pair[0].candidate), _asked(self.pair[1])]
+        content: dict[str, Any] = plain({
+            "schema": SCHEMA,
+            "foamfit": version("foamfit"),
+            "tests": [one.name for one in self.tests],
+            "model": self.model,
+            "relaxation": self.relaxation,
+            "seed": self.seed,
+            "advice": best and _asked(best.candidate) | {
+                "determined": best.determined, "open": best.open, "breaks": best.breaks,
+                "expected": _shown(best.expected),
+            },
+            "now": _shown(self.now),
+            "candidates": [
+                _asked(one.candidate) | {
+                    "breaks": one.breaks, "number_determined": one.number,
+                    "expected": _shown(one.expected), "peak_force": one.force,
+                    "quantity_error": one.error, "told_apart": one.apart,
+                }
+                for one in self.outcomes
+            ],
+            "pair": pair and {"tests": pair, "determined": self.pair and self.pair[0].determined},
+            "never_determined": self.never,
+            "closing_velocity": [
+                {"mass": mass, "half": ends[0], "sure": ends[1]}
+                for mass, ends in self.closing.items()
+            ],
+            "quantity": self.quantity,
+            "rig": self.rig,
+            "sentences": self.sentences,
+        })  # fmt: skip
+        return content
+
+    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
+        """Write plan.json, plan.html, plan.png, plan.pdf, next.toml and joint.toml; return it.
+
+        A complete new plan replaces an older one. Without `report` there are no figure and no page.
+        """
+        figures.inches(figure_width)  # rejects an invalid width
+
+        def write(fresh: Path) -> None:
+            results.write_json(fresh / "plan.json", self.to_json_dict())
+            if self.advice is not None:
+                (fresh / "next.toml").write_text(
+                    self.advice.candidate.toml(self.tests[0]), encoding="utf-8"
+                )
+                (fresh / "joint.toml").write_text(self._study(Path(folder)), encoding="utf-8")
+            if report:
+                png = figures.write_both(plot_plan(self, width=figure_width), fresh / "plan")
+                (fresh / "plan.html").write_text(self._page(png), encoding="utf-8")
+
+        results.check_target(folder, of="plan.json")
+        return results.save_whole(folder, write)
+
+    def _page(self, png: bytes) -> str:
+        """Return plan.html."""
+        ranked = sorted(self.outcomes, key=lambda one: (one.breaks > RISKY, -one.number))
+        return page("plan", plan=self, png=png, best=ranked[:BEST], risky=RISKY, unit_of=unit_of)
+
+    def _study(self, folder: Path) -> str:
+        """Return joint.toml, the study of the tests at hand and the next one."""
+        files = [os.path.relpath(one.path, folder) for one in self.tests if one.path is not None]
+        model = Model.parse(self.model)
+        lines = [
+            "# Fits the next test together with those at hand, once next.csv is here:",
+            f"#     foamfit joint {folder / 'joint.toml'}",
+            f"name = {json.dumps(f'{self.name} and the next test', ensure_ascii=False)}",
+            f"tests = {json.dumps([*files, 'next.csv'], ensure_ascii=False)}",
+            f'model = "{model.words}"',
+            f"relaxation = {self.relaxation}",
+            *(f"{name} = true" for name, is_set in model.options.items() if is_set),
+            "",
+            "[parameters]",
+            *(f'{name} = "shared"' for name in self.now),
+        ]
+        return "\n".join(lines) + "\n"
+
+
+SETTINGS = ("drive", "mass", "velocity", "strain", "rate", "cycles", "hold", "interior", "repeat")
+
+
+def _asked(one: Candidate) -> dict[str, Any]:
+    """Return the settings of a test that apply to it."""
+    given = {key: getattr(one, key) for key in SETTINGS}
+    given = {key: value for key, value in given.items() if value not in (None, False, 0.0)}
+    return given if one.drive == "displacement" else given | {"cycles": 1}
+
+
+def _shown(expected: dict[str, Expected]) -> dict[str, dict[str, Any]]:
+    """Return expected intervals for plan.json."""
+    return {
+        name: {
+            "ci95_width": one.width,
+            "state": one.state,
+            "ci95_width_10_90": one.ends,
+            "probability": one.chance,
+        }
+        for name, one in expected.items()
+    }
+
+
+def plan_text(plan: Plan) -> str:
+    """Return the text that the command prints."""
+    return words("plan_terminal", plan=plan)
+
+
+def plot_plan(plan: Plan, *, width: str = TWO) -> Figure:
+    """Draw the expected number of determined parameters over all tests, and the intervals."""
+    wide, best = figures.inches(width), plan.advice
+    title = [f"{plan.name}: {plan.law}. Expected by simulation, not measured."]
+    if best is not None:
+        title.append(f"Advised: {best.candidate}.")
+    lines = figures.title_lines(wide, *title, titled=figures.is_titled(width))
+    stacked = wide < 5.0
+    tall = (5.6 if stacked else 2.9) + 0.16 * max(len(plan.now) - 8, 0)
+    with figures.drawing(wide, tall + 0.15 * len(lines), lines) as figure:
+        left, right = figure.subplots(2, 1) if stacked else figure.subplots(1, 2)
+        _map(left, plan)
+        _intervals(right, plan)
+    return figure
+
+
+def _map(ax: Axes, plan: Plan) -> None:
+    """Draw the expected number of determined parameters against the settings of the tests.
+
+    Tests that exceed a limit with more than 5 % probability are hatched.
+    """
+    import matplotlib
+
+    impact = any(one.candidate.drive == "impact" for one in plan.outcomes)
+    keys = ("velocity", "mass") if impact else ("rate", "strain")
+    table = dict[tuple[float, float], Outcome]()
+    for one in plan.outcomes:
+        at = getattr(one.candidate, keys[0]) or 0.0, getattr(one.candidate, keys[1]) or 0.0
+        if one.candidate.drive != ("impact" if impact else "displacement"):
+            continue
+        if not one.candidate.repeat and (at not in table or table[at].number < one.number):
+            table[at] = one
+    if not table:
+        figures.say_nothing_there(ax, "no test of this kind")
+        return
+    x, y = (np.unique([at[i] for at in table]) for i in (0, 1))
+    count = np.array([[table[a, b].number if (a, b) in table else np.nan for a in x] for b in y])
+    edges, rows = _edges(x), np.arange(y.size + 1) - 0.5
+    shown = ax.pcolormesh(edges, rows, count, cmap="Blues", vmin=0.0, vmax=len(plan.now))
+    for (a, b), one in table.items():
+        if one.breaks > RISKY:
+            i, j = int(np.searchsorted(x, a)), int(np.searchsorted(y, b))
+            style: Any = {"facecolor": "none", "edgecolor": VERMILION, "hatch": "////"}
+            ax.fill_between(edges[i : i + 2], rows[j], rows[j + 1], linewidth=0.0, **style)
+    best = plan.advice
+    if best is not None and (best.candidate.drive == "impact") == impact:
+        place = [getattr(best.candidate, key) for key in keys]
+        row = int(np.argmin(np.abs(y - place[1])))
+        ax.plot(place[0], row, "*", color=VERMILION, markersize=11, markeredgecolor="white")
+    for mass, (half, _) in plan.closing.items() if impact else ():
+        row = int(np.argmin(np.abs(y - mass)))
+        if edges[0] < half < edges[-1]:
+            ax.plot([half] * 2, [row - 0.5, row + 0.5], color="black", linewidth=1.0, ls="--")
+    labels = [f"{1e3 * b:.4g} g" if impact else f"{b:.2g}" for b in y]
+    ax.set(xscale="log", yticks=range(y.size), yticklabels=labels, xlim=(edges[0], edges[-1]))
+    ax.set(ylabel="striker mass" if impact else "largest strain")
+    ax.set_xlabel("velocity (m/s)" if impact else "strain rate (1/s)")
+    ticks = matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0))
+    ax.xaxis.set_major_locator(ticks)
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.xaxis.set_minor_formatter("")
+    bar = ax.figure.colorbar(shown, ax=ax, location="top", aspect=30, pad=0.02)
+    bar.set_label(f"expected number of the {len(plan.now)} parameters determined")
+
+
+def _edges(x: Any) -> Any:
+    """Return the edges of cells about points that are spread evenly in ratio."""
+    ratio = 1.1 if x.size == 1 else (x[-1] / x[0]) ** (0.5 / (x.size - 1))
+    return np.append(x / ratio, x[-1] * ratio)
+
+
+def _intervals(ax: Axes, plan: Plan) -> None:
+    """Draw the 95 % interval of each parameter over its scale, now and after the advised test."""
+    names, best = list(plan.now), plan.advice
+    pairs: list[tuple[str, str, dict[str, Expected], float]] = [("now", GREY, plan.now, -0.17)]
+    if best is not None:
+        pairs.append(("after the advised test (expected)", BLUE, best.expected, 0.17))
+    for label, colour, expected, shift in pairs:
+        for i, name in enumerate(names):
+            one = expected[name]
+            unknown = one.state == "not determined" or not one.share < SHOWN
+            half = SHOWN if unknown else max(one.share, 0.01)
+            style: Any = {"color": colour, "linewidth": 2.6, "solid_capstyle": "butt"}
+            style |= {"linestyle": (0, (1, 1))} if unknown else {}
+            ax.plot([-half, half], [i + shift] * 2, label=label if i == 0 else None, **style)
+    for edge in (-0.5, 0.5):
+        ax.axvline(edge, color="black", linewidth=0.5, linestyle=":")
+    ax.set(yticks=range(len(names)), yticklabels=plan.own(names), ylim=(len(names) - 0.5, -0.5))
+    ax.set_xscale("symlog", linthresh=0.1)
+    ax.set(xticks=(-3, -0.5, 0, 0.5, 3), xlim=(-SHOWN, SHOWN))
+    ax.set_xticklabels(["−300 %", "−50 %", "0", "50 %", "300 %"])
+    ax.set_xlabel("95 % interval (dotted: not determined)")
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=1)

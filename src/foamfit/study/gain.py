@@ -1,0 +1,313 @@
+"""What a candidate test would add to what is known about the parameters of a foam.
+
+A fit with residuals r, slopes J and noise of covariance Σ has the covariance H⁻¹ (JᵀΣJ) H⁻¹ with
+H = JᵀJ (`trust.covariance`), with contact time and zeros eliminated from J. H and JᵀΣJ of several
+tests add up. Where the law misses the record, the range due to model error is expected by the rule
+of `trust.ranges`: all values whose cost rises by at most `tolerance`, to first order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from foamfit.arrays import Array, Mask
+from foamfit.data.rig import Candidate, Rig
+from foamfit.data.units import parse_quantity
+from foamfit.errors import InputError, SimulationError
+from foamfit.fitting.branches import unreached
+from foamfit.fitting.problem import Problem, make_problem
+from foamfit.report.studies.plan import Expected, Quantity
+from foamfit.solve.simulation import simulate
+from foamfit.springs.chain import Impact
+from foamfit.springs.parameters import NUISANCE
+from foamfit.trust.covariance import NOTHING, WEAK
+from foamfit.trust.ranges import ALIKE
+
+NORMAL = 1.959964  # half the 95 % interval of a normal distribution, in standard deviations
+TINY, ROUNDING = 1e-6, 1e-12  # least information on a scaled parameter, and over the largest one
+LONGEST = 30.0  # longest contact, in times that the striker takes over the height of the specimen
+TIMED = 20  # number of draws from which the duration of an impact is taken
+UNITS = {"peak_force": "N", "absorbed_energy": "J", "peak_strain": ""}  # quantities of `Target`
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What the tests at hand say about the k varied parameters of the springs.
+
+    Parameters are scaled by `sizes` (k,). `bread` (k, k) is JᵀJ and `meat` JᵀΣJ, `missed` the sum
+    of squares of the model error, `share` its RMS over the range of each curve, `reached` (k,)
+    whether the branch of each parameter was reached. `draws` (d, n) are vectors of parameters that
+    follow the tests about equally well.
+    """
+
+    problem: Problem
+    values: Array
+    names: tuple[str, ...]
+    sizes: Array
+    bread: Array
+    meat: Array
+    missed: float
+    share: dict[str, float]
+    reached: Mask
+    draws: Array
+
+    @cached_property
+    def drawn_sizes(self) -> Array:
+        """Scale of each parameter in each draw over `sizes`, (d, k)."""
+        return np.array([self.problem.sizes(self.names, one) for one in self.draws]) / self.sizes
+
+    def with_springs(self, drawn: Array, problem: Problem) -> Array:
+        """Return the parameters of another test: drawn springs, and its nuisance parameters."""
+        count = len(self.problem.model.names)
+        return np.append(drawn[:count], problem.vector()[count:])
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a test would show in each of d draws."""
+
+    bread: Array  # (d, k, k)
+    meat: Array  # (d, k, k)
+    reached: Mask  # (d, k)
+    broken: Mask  # (d,): whether a limit was exceeded
+    missed: Array  # (d,): sum of squares of the model error
+    force: float  # median of the largest force, N
+    apart: dict[str, float] = field(default_factory=dict)  # χ² by which it excludes each rival
+
+
+def rows_of(problem: Problem, values: Array, names: tuple[str, ...], sizes: Array) -> Array:
+    """Return slopes by the nuisance parameters, then by scaled parameters, (n, q + k)."""
+    own = tuple(name for name in problem.free() if name in NUISANCE)
+    return problem.slopes(values, (*own, *names)) * np.append(problem.sizes(own, values), sizes)
+
+
+def without_nuisance(rows: Array, k: int) -> Array:
+    """Return the last k columns without their part along the others (Frisch & Waugh 1933)."""
+    others = np.linalg.qr(rows[:, :-k])[0]
+    return np.asarray(rows[:, -k:] - others @ (others.T @ rows[:, -k:]))
+
+
+def problem_for(known: Known, candidate: Candidate, rig: Rig) -> Problem:
+    """Return the problem of a candidate with the law of the tests at hand."""
+    problem, test = known.problem, known.problem.measurement
+    lasts, peak = 0.0, float(np.max(problem.objective.stress))
+    impact = candidate.drive == "impact"
+    if impact:
+        lasts, peak = _duration_and_peak(known, candidate, peak)
+    record = candidate.recorded(test, rig, lasts, peak)
+    inside = problem.objective.interior_mass and impact
+    law, terms = problem.model.name, problem.model.relaxation
+    return make_problem(record, law, candidate.drive, None, None, inside, relaxation=terms)
+
+
+def _duration_and_peak(known: Known, candidate: Candidate, usual: float) -> tuple[float, float]:
+    """Return a time (s) that covers the contact in nine of ten draws, and the median peak (Pa)."""
+    specimen, model = known.problem.measurement.specimen, known.problem.model
+    mass, velocity = candidate.mass or math.nan, candidate.velocity or math.nan
+    limit, ends, peaks = LONGEST * specimen.height / velocity, list[float](), list[float]()
+    for drawn in known.draws[:TIMED]:
+        try:
+            chain = model.chain(drawn[: len(model.names)], specimen.height, specimen.area)
+            found = simulate(chain, Impact(mass, velocity), np.linspace(0.0, limit, 200), 1e-3)
+        except (SimulationError, InputError):
+            continue
+        ends.append(found.contact_end or limit)
+        peaks.append(float(found.base_stress.max()))
+    if not ends:
+        return 0.2 * limit, usual
+    return 1.1 * float(np.quantile(ends, 0.9)), float(np.median(peaks))
+
+
+def look(
+    known: Known, candidate: Candidate, rig: Rig, rivals: Mapping[str, Known] | None = None
+) -> Seen:
+    """Simulate a candidate for every draw, with exact derivatives."""
+    problem = problem_for(known, candidate, rig)
+    objective, test = problem.objective, known.problem.measurement
+    each, counted = candidate.weight(objective.time, test, rig), objective.counted
+    weigh, noise = np.ones((2, objective.n_data + len(objective.priors)))
+    weigh[: objective.n_data] = math.sqrt(each)
+    own = [objective.noise(c).sigma * objective.factor(c) for c in counted]
+    noise[: objective.n_data] = np.repeat(own, objective.sizes)
+    k, d = len(known.names), len(known.draws)
+    bread, meat = np.zeros((2, d, k, k))
+    reached, broken = np.zeros((d, k), dtype=bool), np.ones(d, dtype=bool)
+    missed, forces, apart = np.zeros(d), list[float](), dict[str, list[float]]()
+    others = {name: Rival.of(one, candidate, rig, each) for name, one in (rivals or {}).items()}
+    for i, drawn in enumerate(known.draws):
+        values = known.with_springs(drawn, problem)
+        try:
+            shown = objective.simulate(values, everything=True)
+        except SimulationError:
+            continue
+        rows = rows_of(problem, values, known.names, known.sizes) * weigh[:, None]
+        rows = without_nuisance(rows, k)
+        bread[i], meat[i] = rows.T @ rows, (noise[:, None] * rows).T @ (noise[:, None] * rows)
+        silent = unreached(problem, shown)
+        reached[i] = [name not in silent for name in known.names]
+        forces.append(float(shown.motion.base_stress.max()) * test.specimen.area)
+        most = float(shown.motion.displacement[-1].max())
+        strain = most / test.specimen.height
+        within = forces[-1] <= rig.force and most <= rig.displacement
+        broken[i] = not (within and strain <= rig.largest_strain)
+        for curve, size in zip(counted, objective.sizes, strict=True):
+            off = known.share.get(curve, 0.0) * float(np.ptp(shown.curves[curve]))
+            missed[i] += each * size * (off * objective.factor(curve)) ** 2
+        for name, rival in others.items():
+            if rival is not None:
+                found = rival.excess(objective.compare(shown, values)) / (1.0 + missed[i])
+                apart.setdefault(name, []).append(found)
+    told = {name: float(np.median(found)) for name, found in apart.items()}
+    force = float(np.median(forces)) if forces else math.nan
+    return Seen(bread, meat, reached, broken, missed, force, told)
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """Another law at its best point for a candidate."""
+
+    residual: Array  # of its curves against the same placeholders
+    rows: Array  # slopes by all its parameters; below them the information on these
+    weight: float
+
+    @classmethod
+    def of(cls, known: Known, candidate: Candidate, rig: Rig, each: float) -> Rival | None:
+        """Return the rival; None if it cannot be simulated."""
+        k = len(known.names)
+        try:
+            problem = problem_for(known, candidate, rig)
+            values = known.with_springs(known.values, problem)
+            shown = problem.objective.simulate(values)
+        except SimulationError:
+            return None
+        n = problem.objective.n_data
+        rows = rows_of(problem, values, known.names, known.sizes)[:n]
+        root = np.linalg.cholesky(known.bread + TINY * np.eye(k)).T
+        prior = np.hstack([np.zeros((k, rows.shape[1] - k)), root])
+        residual = problem.objective.compare(shown, values)[:n]
+        return cls(residual, np.vstack([math.sqrt(each) * rows, prior]), each)
+
+    def excess(self, residual: Array) -> float:
+        """Return the χ² that remains when the rival is fitted to the curves, to first order."""
+        n = self.residual.size
+        if residual.size < n:
+            return 0.0
+        apart = math.sqrt(self.weight) * (residual[:n] - self.residual)
+        apart = np.append(apart, np.zeros(len(self.rows) - n))
+        left = apart - self.rows @ np.linalg.lstsq(self.rows, apart, rcond=1e-10)[0]
+        return float(left @ left)
+
+
+def covariance(known: Known, seen: Sequence[Seen], floor: float = TINY) -> tuple[Array, Array]:
+    """Return covariances (d, k, k), scaled: due to noise, and of the range due to model error.
+
+    `floor` is the least information on each parameter over its scale.
+    """
+    scale = known.drawn_sizes[:, :, None] * known.drawn_sizes[:, None, :]
+    bread = scale * sum((one.bread for one in seen), known.bread)
+    meat = scale * sum((one.meat for one in seen), known.meat)
+    missed = sum((one.missed for one in seen), np.full(len(known.draws), known.missed))
+    power, axes = np.linalg.eigh(bread)
+    least = np.maximum(power, np.maximum(floor, ROUNDING * power[:, -1:]))
+    inner = np.einsum("dji,djk,dkl->dil", axes, meat, axes)
+    inner += np.eye(power.shape[1]) * np.maximum(least - power, 0.0)[:, :, None]
+    axes = axes / least[:, None, :]
+    noise = np.einsum("dij,djk,dlk->dil", axes, inner, axes) * scale
+    law = np.einsum("dij,dj,dkj->dik", axes, least, axes) * scale
+    return noise, (ALIKE**2 - 1.0) * missed[:, None, None] * law
+
+
+def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
+    """Return the expected interval and state of every parameter after some further tests."""
+    noise, law = (np.diagonal(one, axis1=1, axis2=2) for one in covariance(known, seen))
+    halves, ranges = NORMAL * np.sqrt(noise), np.sqrt(np.maximum(law, 0.0))
+    shares, wide = halves / known.drawn_sizes, np.maximum(halves, ranges) / known.drawn_sizes
+    reached = np.broadcast_to(known.reached, halves.shape)
+    for one in seen:
+        reached = reached | one.reached
+    out = dict[str, Expected]()
+    for i, name in enumerate(known.names):
+        shown = reached[:, i]
+        chance = float(np.mean(shown & (wide[:, i] <= WEAK)))
+        some = float(np.mean(shown & (wide[:, i] <= NOTHING)))
+        state = "determined" if chance >= 0.5 else "weak" if some >= 0.5 else "not determined"
+        ends, share = np.full(3, math.nan), math.nan
+        if state != "not determined":
+            ends = 2.0 * known.sizes[i] * np.quantile(halves[shown, i], (0.1, 0.5, 0.9))
+            share = float(np.median(shares[shown, i]))
+        low, middle, high = ends.tolist()
+        out[name] = Expected(middle, (low, high), share, state, chance)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A quantity of another impact that the foam is needed for, in each draw."""
+
+    text: str
+    unit: str
+    values: Array  # (d,); NaN where the impact cannot be simulated
+    slopes: Array  # (d, k), by scaled parameters
+
+    @classmethod
+    def of(cls, text: str, known: Known, rig: Rig) -> Target:
+        """Return a quantity like "peak_force at 3 m/s"; InputError if it is unknown."""
+        name, _, speed = (part.strip() for part in text.partition(" at "))
+        if name not in UNITS:
+            raise InputError(
+                f"quantity {text!r} is unknown; give {', '.join(UNITS)} at a velocity, like "
+                '"peak_force at 3 m/s"'
+            )
+        velocity = parse_quantity(speed, "m/s", f"quantity {text!r}", "peak_force at 3 m/s")
+        striker = known.problem.measurement.striker
+        mass = (striker and striker.mass) or (rig.masses[0] if rig.masses else None)
+        if mass is None or velocity <= 0.0:
+            raise InputError(f"quantity {text!r} needs a striker; give its mass in the rig")
+        problem = problem_for(known, Candidate("impact", mass, velocity), rig)
+        found = [cls._in_draw(name, known, problem, drawn) for drawn in known.draws]
+        values, slopes = zip(*found, strict=True)
+        return cls(text, UNITS[name], np.array(values), np.array(slopes))
+
+    @staticmethod
+    def _in_draw(name: str, known: Known, problem: Problem, drawn: Array) -> tuple[float, Array]:
+        """Return the quantity in a draw, SI, and its slopes."""
+        objective, specimen = problem.objective, problem.measurement.specimen
+        values = known.with_springs(drawn, problem)
+        try:
+            curves = objective.simulate(values, everything=True).curves
+        except SimulationError:
+            return math.nan, np.full(len(known.names), math.nan)
+        parts = objective.by_curve(problem.slopes(values, known.names) * known.sizes)
+        by = {curve: part.T / objective.factor(curve) for curve, part in parts.items()}
+        stress, moved = curves["stress_time"], curves["displacement_time"]
+        by_stress, by_motion = (
+            by["stress_time"],
+            by.get("displacement_time", 0.0 * by["stress_time"]),
+        )
+        if name == "peak_force":
+            at = int(np.argmax(stress))
+            return float(stress[at]) * specimen.area, by_stress[:, at] * specimen.area
+        if name == "peak_strain":
+            at = int(np.argmax(moved))
+            return float(moved[at]) / specimen.height, by_motion[:, at] / specimen.height
+        work = np.trapezoid(stress, moved)
+        slopes = np.trapezoid(by_stress, moved, axis=1)
+        slopes += np.trapezoid(stress * np.gradient(by_motion, axis=1), axis=1)
+        return float(work) * specimen.area, slopes * specimen.area
+
+    def error(self, known: Known, seen: Sequence[Seen]) -> float:
+        """Return the expected standard error of the quantity after some tests, over its value."""
+        noise, law = covariance(known, seen, 1.0 / NOTHING**2)
+        total = noise + law / NORMAL**2
+        variance = np.einsum("di,dij,dj->d", self.slopes, total, self.slopes)
+        return float(np.nanmedian(np.sqrt(np.maximum(variance, 0.0)) / np.abs(self.values)))
+
+    def shown(self, known: Known) -> Quantity:
+        """Return the quantity as it is known now."""
+        middle = float(np.nanmedian(self.values))
+        return Quantity(self.text, self.unit, middle, self.error(known, []))

@@ -1,0 +1,390 @@
+"""Which test next: the expected gain of every test that a rig can make.
+
+The tests at hand leave some parameters open. Values of these are drawn, every candidate is
+simulated with each draw, and the expected interval of a parameter is the median over the draws
+(Chaloner & Verdinelli 1995, Statist. Sci. 10, 273: Bayesian design by the Fisher information).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from foamfit.api import FitResult
+from foamfit.arrays import Array, single_threaded
+from foamfit.data.measurement import MEASURED, Measurement, Noise, Specimen, Striker
+from foamfit.data.rig import Candidate, Rig, beyond, candidates, read_rig
+from foamfit.errors import InputError, SimulationError
+from foamfit.fitting.box import Space
+from foamfit.fitting.branches import unreached
+from foamfit.fitting.minimizer import problem_of
+from foamfit.fitting.nuisance import VELOCITY
+from foamfit.fitting.problem import Problem, make_problem
+from foamfit.report.studies.plan import RISKY, Expected, Outcome, Plan
+from foamfit.saved import SavedJoint, load
+from foamfit.solve.simulation import simulate
+from foamfit.springs.chain import Chain, Impact
+from foamfit.springs.parameters import NUISANCE
+from foamfit.springs.published import published
+from foamfit.study.gain import (
+    Known,
+    Seen,
+    Target,
+    expected,
+    look,
+    problem_for,
+    rows_of,
+    without_nuisance,
+)
+from foamfit.study.joint_result import JointResult
+from foamfit.text import counted
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.covariance import NOTHING
+from foamfit.trust.ranges import ALIKE, tolerance
+
+Progress = Callable[[float, str], None]
+DRAWS = 40  # number of drawn foams
+TRIES = 60  # attempts per draw
+NEARLY = 0.1  # tests that determine this many parameters fewer, on average, count as equal
+PAIRED = 40  # number of tests whose pairs are compared
+TOLD_APART = 9.0  # rise of χ² at which a test tells two laws apart
+HALVINGS = 12  # of the interval in which the closing velocity is sought
+
+
+@dataclass(frozen=True, eq=False)
+class Test:
+    """A test at hand: its problem and parameters, and its result if it was measured."""
+
+    problem: Problem
+    values: Array
+    fit: FitResult | None = None
+
+
+@single_threaded
+def plan(
+    *results: FitResult | JointResult | SavedJoint | str | Path,
+    rig: str | Path | None = None,
+    quantity: str | None = None,
+    seed: int = 0,
+    progress: Progress = lambda *_: None,
+) -> Plan:
+    """Find the test of a rig that would determine most of what the results leave open.
+
+    Parameters
+    ----------
+    results : FitResult, JointResult, str or Path
+        Results of `fit` or `joint`, their folders, or the name of a published set. Results of one
+        model are tests of one foam; results of other models are rivals, which the test should tell
+        apart from the first.
+    rig : str or Path, optional
+        RIG.toml; what it does not state is taken from the record of the first result.
+    quantity : str, optional
+        What the foam is needed for, such as "peak_force at 3 m/s"; its expected error decides
+        between tests that determine as many parameters.
+    seed : int
+        The same results, rig and seed give the same numbers.
+    progress : callable, optional
+        Called with the completed fraction and the name of the current step.
+
+    Returns
+    -------
+    Plan
+        With `.table()`, `.plot()` and `.save()`.
+
+    Raises
+    ------
+    InputError
+        If a result or the rig cannot be read, or if the rig can make no test.
+    """
+    tests, rivals = _read(results)
+    rng, test = np.random.default_rng(seed), tests[0].problem.measurement
+    relaxing = tests[0].problem.model.relaxation > 0
+    limits = read_rig(None if rig is None else Path(rig), test, relaxing=relaxing)
+    asked = candidates(limits, test, len(tests[0].problem.model.kinds))
+    if not asked:
+        raise InputError(
+            f"{test.name}: no test to plan; give a rig with a [striker] or a [machine] "
+            "(foamfit init --rig RIG.toml writes a draft)"
+        )
+    progress(0.0, "drawing what the tests leave open")
+    known = known_of(tests, rng, DRAWS)
+    others = {name: known_of([one], rng, 0) for name, one in rivals.items()}
+    target = None if quantity is None else Target.of(quantity, known, limits)
+    seen = list[Seen]()
+    for i, one in enumerate(asked):
+        progress(0.05 + 0.85 * i / len(asked), f"{counted(len(asked), 'candidate')}, {i} done")
+        seen.append(look(known, one, limits, others))
+
+    def outcome(one: Candidate, *more: Seen) -> Outcome:
+        risk = np.any([each.broken for each in more], axis=0)
+        error = None if target is None else target.error(known, more)
+        found = expected(known, more)
+        return Outcome(one, float(np.mean(risk)), found, more[0].force, error, more[0].apart)
+
+    outcomes = [outcome(one, what) for one, what in zip(asked, seen, strict=True)]
+    safe = [i for i, one in enumerate(outcomes) if one.breaks <= RISKY]
+    best = _advised(outcomes, safe) if safe else None
+    pair = _pair(known, outcomes, seen, safe)
+    progress(0.92, "what no test of this rig determines")
+    shown = {name for i in safe for name in outcomes[i].determined}
+    never = _beyond(known, [name for name in known.names if name not in shown], limits)
+    progress(0.97, "the velocity that closes the loop")
+    return Plan(
+        tests=tuple(one.problem.measurement for one in tests),
+        model=known.problem.model.name,
+        relaxation=known.problem.model.relaxation,
+        rig=limits,
+        now=_now(known, tests),
+        outcomes=tuple(outcomes),
+        advised=best,
+        pair=pair and (outcome(asked[pair[0]], *(seen[i] for i in pair)), asked[pair[1]]),
+        never=never,
+        closing={mass: _closing(known, mass, limits) for mass in limits.masses},
+        quantity=None if target is None else target.shown(known),
+        rivals=tuple(others),
+        missed=known.missed > 0.0,
+        seed=seed,
+    )
+
+
+# ------------------------------------------------------------------ the tests at hand
+
+
+def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
+    """Return the tests at hand, and one test of each rival model."""
+    found = list[Test]()
+    for one in results:
+        if isinstance(one, str) and one in published and not Path(one).exists():
+            found.append(_published(one))
+            continue
+        read = load(one) if isinstance(one, str | Path) else one
+        fits = read.test_fits() if isinstance(read, SavedJoint | JointResult) else [read]
+        for fit in fits:
+            if not isinstance(fit, FitResult):
+                raise InputError(f"{one} is not a fit or joint fit; name the folder of one")
+            problem = problem_of(fit)
+            found.append(Test(problem, problem.vector(fit.params) - problem.origins, fit))
+    if not found:
+        raise InputError("name at least one result to plan from")
+    first = found[0].problem.model
+    same = [one for one in found if one.problem.model == first]
+    rest = [one for one in found if one.problem.model.kinds != first.kinds]
+    return same, {one.problem.model.words: one for one in rest}
+
+
+def _published(name: str) -> Test:
+    """Return a simulated test of a published set at its own velocity, with 1 % noise, undamped."""
+    one, drive = published[name], published[name].chain
+    chain, height = Chain(drive.springs, drive.heights, drive.area), drive.height
+    heights = tuple(drive.heights) if len(drive.springs) > 1 else None
+    time = np.linspace(0.0, 6.0 * height / one.striker_velocity, 601)
+    seen = simulate(chain, Impact(one.striker_mass, one.striker_velocity), time)
+    stress, moved = np.maximum(seen.base_stress, 0.0), seen.displacement[-1]
+    within = moved[: int(np.searchsorted(time, seen.contact_end or time[-1]))]
+    test = Measurement(
+        name=f"{name} (simulated)", path=None, data_sha256="", time=time, stress=stress,
+        displacement=moved, specimen=Specimen(height, chain.area, one.specimen_mass, heights),
+        striker=Striker(one.striker_mass, one.striker_velocity), motion=MEASURED, contact="stress",
+        noise=Noise(0.01 * float(np.ptp(stress)), 0.01 * float(np.ptp(within))),
+    )  # fmt: skip
+    problem = make_problem(test, one.model, "impact", None, None, False)
+    values = problem.vector()
+    for i, spring in enumerate(chain.springs):
+        own = problem.model.own(i, values)
+        own[:] = [*(getattr(spring, key) for key in spring.law.own), 0.0]
+    values[problem.index["site_eta"]] = 0.0
+    return Test(problem, values)
+
+
+def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Known:
+    """Return what some tests of one foam say about the parameters of its springs."""
+    first = tests[0].problem
+    names = tuple(name for name in first.free() if name not in NUISANCE)
+    k, share = len(names), dict[str, list[float]]()
+    sizes, reached, missed = first.sizes(names, tests[0].values), np.zeros(k, dtype=bool), 0.0
+    breads, meats = np.zeros((2, len(tests), k, k))
+    for t, one in enumerate(tests):
+        best, objective = BestPoint(one.problem, one.values), one.problem.objective
+        rows = without_nuisance(rows_of(one.problem, one.values, names, sizes), k)
+        breads[t], root = rows.T @ rows, np.ones(k)
+        reached |= np.array([name not in best.unreached for name in names])
+        if one.fit is not None:  # a simulated test has neither noise nor model error
+            missed += tolerance(best) / (ALIKE**2 - 1.0)
+            for curve, error in zip(objective.counted, best.errors, strict=True):
+                share.setdefault(curve, []).append(error.law / max(objective.span(curve), 1e-300))
+            for name, found in zip(best.names, best.spread.inflation.tolist(), strict=True):
+                if name in names and math.isfinite(found):
+                    root[names.index(name)] = math.sqrt(found)
+        meats[t] = breads[t] * np.outer(root, root)
+    values, places = tests[0].values, [first.index[name] for name in names]
+    if len(tests) > 1:  # the mean, weighted by the information
+        pull = [b @ (one.values[places] / sizes) for b, one in zip(breads, tests, strict=True)]
+        values = values.copy()
+        values[places] = sizes * (np.linalg.pinv(breads.sum(axis=0), rcond=1e-10) @ sum(pull))
+        values = first.space().decode(first.space().encode(values))
+    means = {curve: float(np.mean(each)) for curve, each in share.items()}
+    both = breads.sum(axis=0), meats.sum(axis=0)
+    known = Known(first, values, names, sizes, *both, missed, means, reached, values[None])
+    return replace(known, draws=_draws(known, tests, rng, draws)) if draws else known
+
+
+def _draws(known: Known, tests: Sequence[Test], rng: np.random.Generator, count: int) -> Array:
+    """Return vectors of parameters that follow the tests about as well as the best one.
+
+    Parameters whose branch was reached are drawn from their covariance, including model error, and
+    the others from what the law calls likely, or from the limits of the search; a published set is
+    known but for the former. A draw that raises the cost by more than noise and model error allow
+    is drawn again, nearer to the best point.
+    """
+    problem, k = known.problem, len(known.names)
+    space, at = problem.space(), np.array([problem.index[name] for name in known.names])
+    measured = any(one.fit is not None for one in tests)
+    open_ = at[np.logical_not(known.reached) & measured]
+    allowed, prior = (ALIKE**2 - 1.0) * known.missed, np.eye(k) / NOTHING**2
+    inverse = np.linalg.inv(known.bread + prior)
+    spread = inverse @ (known.meat + prior) @ inverse + allowed / 1.96**2 * inverse
+    power, axes = np.linalg.eigh(spread)
+    axes = np.where(known.reached[:, None], axes * np.sqrt(np.maximum(power, 0.0)), 0.0)
+    best = space.encode(known.values)  # steps are taken in the coordinates of the search
+    slopes = space.slopes(best, known.values)[at] / known.sizes[:, None]
+    axes = np.linalg.lstsq(slopes, axes, rcond=1e-12)[0]
+    thin, n_springs = [one.problem.thinned().objective for one in tests], len(problem.model.names)
+
+    def cost(values: Array) -> float:
+        own = [np.append(values[:n_springs], one.values[n_springs:]) for one in tests]
+        return sum(float(np.sum(o.residual(v) ** 2)) for o, v in zip(thin, own, strict=True))
+
+    noise = float(np.max(np.diag(known.meat) / np.maximum(np.diag(known.bread), 1e-300)))
+    most = cost(known.values) + allowed + max(noise, 1.0) * float(stats.chi2.ppf(0.99, k))
+    out = np.repeat(known.values[None], count, axis=0)
+    for i in range(count):
+        for step in 0.95 ** np.arange(TRIES):
+            point = np.clip(best + step * axes @ rng.normal(size=k), *space.box)
+            values = _with_open(problem, space, space.decode(point), open_, rng)
+            values[n_springs:] = known.values[n_springs:]
+            if cost(values) <= most:
+                out[i] = values
+                break
+    return out
+
+
+def _with_open(
+    problem: Problem, space: Space, values: Array, open_: Array, rng: np.random.Generator
+) -> Array:
+    """Return parameters within their limits, with random ones at the places `open_`."""
+    for i, law in enumerate(problem.model.laws):
+        own = problem.model.own(i, values)
+        places = problem.model.own_places[i] + np.arange(own.size)
+        unseen = np.isin(places, open_)
+        if law.likely is not None and unseen.any():
+            own[unseen] = law.likely(own, rng.random(len(law.params)))[unseen]
+            open_ = np.setdiff1d(open_, places)
+    point = space.encode(values)
+    for j, one in enumerate(space.coordinates):
+        if one.place in open_ and one.param is not None:
+            point[j] = rng.uniform(*one.param.start_limits)
+    return space.decode(point)
+
+
+def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
+    """Return what is known now; of a single test what its result says."""
+    out, fit = expected(known, []), tests[0].fit
+    for i, name in enumerate(known.names if fit is not None and len(tests) == 1 else ()):
+        assert fit is not None
+        one = fit.parameters[name]
+        width = math.nan if one.ci95 is None else one.ci95[1] - one.ci95[0]
+        share, chance = 0.5 * width / known.sizes[i], float(one.state == "determined")
+        out[name] = Expected(width, (width, width), float(share), one.state, chance)
+    return out
+
+
+# ------------------------------------------------------------------ the advice
+
+
+def _advised(outcomes: Sequence[Outcome], safe: Sequence[int]) -> int:
+    """Return the place of the advised test among those that are `safe`.
+
+    Of the tests that determine most parameters it is the one with the least error of the quantity
+    asked for, or else the softest; of tests with rivals one that tells them apart.
+    """
+    most = max(outcomes[i].number for i in safe)
+    good = [i for i in safe if outcomes[i].number >= most - NEARLY]
+    told = [i for i in good if all(x >= TOLD_APART for x in outcomes[i].apart.values())]
+    if not told:
+        return max(good, key=lambda i: min(outcomes[i].apart.values()))
+    if outcomes[told[0]].error is not None:
+        return min(told, key=lambda i: outcomes[i].error or 0.0)
+
+    def effort(i: int) -> tuple[bool, float, int, float]:
+        asked = outcomes[i].candidate
+        return asked.interior is not None, asked.hold, asked.cycles, outcomes[i].force
+
+    return min(told, key=effort)
+
+
+def _pair(
+    known: Known, outcomes: Sequence[Outcome], seen: Sequence[Seen], safe: Sequence[int]
+) -> tuple[int, int] | None:
+    """Return the places of the two safe tests that determine most together."""
+    first = sorted(safe, key=lambda i: -outcomes[i].number)[:PAIRED]
+    few = replace(known, draws=known.draws[::2])
+
+    def number(pair: tuple[int, int]) -> float:
+        both = [_thinned(seen[i]) for i in pair]
+        return sum(one.chance for one in expected(few, both).values())
+
+    return max(combinations(first, 2), key=number, default=None)
+
+
+def _thinned(seen: Seen) -> Seen:
+    """Return every other draw."""
+    return replace(
+        seen, bread=seen.bread[::2], meat=seen.meat[::2], reached=seen.reached[::2],
+        broken=seen.broken[::2], missed=seen.missed[::2],
+    )  # fmt: skip
+
+
+def _beyond(known: Known, left: Sequence[str], rig: Rig) -> dict[str, str]:
+    """Return, for parameters that no test of the rig determines, what other rig would."""
+    out, test, springs = (
+        dict.fromkeys(left, ""),
+        known.problem.measurement,
+        len(known.problem.model.kinds),
+    )
+    few = replace(known, draws=known.draws[: DRAWS // 4])
+    for what, other in beyond(rig) if left else ():
+        made = [one for one in candidates(other, test, springs) if not one.repeat]
+        for one in made[:: max(len(made) // 12, 1)]:
+            found = expected(few, [look(few, one, other)])
+            new = [name for name in left if found[name].state == "determined" and not out[name]]
+            out |= dict.fromkeys(new, what)
+    return out
+
+
+def _closing(known: Known, mass: float, rig: Rig) -> tuple[float, float]:
+    """Return the velocities that reach every branch in half and in 95 % of the draws, m/s."""
+    top = 2.0 * rig.velocity[1]
+    speeds = np.geomspace(*rig.velocity, 4).tolist()
+    made = [problem_for(known, Candidate("impact", mass, speed), rig) for speed in speeds]
+    problem = max(made, key=lambda one: float(one.objective.time[-1]))  # of the longest contact
+    at, needed = problem.index[VELOCITY], list[float]()
+    for drawn in known.draws:
+        low, high, values = 0.0, top, known.with_springs(drawn, problem)
+        for _ in range(HALVINGS):
+            values[at] = middle = 0.5 * (low + high)
+            try:
+                shown = problem.objective.simulate(values, everything=True)
+                closed = not set(unreached(problem, shown)) & {*known.names}
+            except SimulationError:
+                closed = True  # beyond the lock-up
+            low, high = (low, middle) if closed else (middle, high)
+        needed.append(high)
+    ends = np.quantile(needed, (0.5, 0.95), method="higher").tolist()
+    half, sure = (math.inf if end >= top else end for end in ends)
+    return half, sure

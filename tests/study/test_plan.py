@@ -1,0 +1,291 @@
+"""The plan of the next test: what it promises, its limits, its files and its refusals."""
+
+import json
+import math
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import foamfit as ff
+from foamfit.cli import main
+from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.data.rig import Candidate, candidates, read_rig
+from foamfit.errors import InputError
+from foamfit.study.study_file import read_study
+
+FOAM_1 = Path(__file__).parents[2] / "experiments/foam-1"
+RIG = """\
+[striker]
+velocity = "0.9 to 4 m/s"
+masses = ["7 g", "14 g"]
+[limits]
+force = "{force} N"
+[record]
+rate = "1 MHz"
+noise = {{ stress = "35 kPa", displacement = "3.8 um" }}
+"""
+
+
+@pytest.fixture(scope="module")
+def soft():
+    """A fit of foam-1 hit too softly to close its loop, in 3 s."""
+    return ff.fit(ff.read_test(FOAM_1 / "model-2-1.75mps-reconstruction.csv"))
+
+
+@pytest.fixture(scope="module")
+def planned(soft, tmp_path_factory):
+    """Its plan for a rig with a force sensor of 400 N."""
+    rig = tmp_path_factory.mktemp("rig") / "RIG.toml"
+    rig.write_text(RIG.format(force=400), encoding="utf-8")
+    return ff.plan(soft, rig=rig)
+
+
+def test_published_foam_1_closes_its_loop_at_the_velocity_of_the_energy_balance():
+    """By root finding of ½mv² = A H ∫σ dε up to ε̂_c: 1.911 m/s with 7 g."""
+    item = ff.published["foam-1/model-2"]
+    spring = item.bistable
+    strain = np.linspace(0.0, spring.eps_hat_c, 20001)
+    work = np.trapezoid(spring.stress(strain), strain) * item.chain.area * item.chain.height
+    closing = math.sqrt(2.0 * work / item.striker_mass)
+    found = ff.plan("foam-1/model-2")
+    half, sure = found.closing[item.striker_mass]
+    assert half == pytest.approx(closing, rel=0.01)
+    assert sure == pytest.approx(closing, rel=0.02)
+    assert found.advice.candidate.velocity > closing
+    opened = {name for name, one in found.now.items() if one.state == "not determined"}
+    assert opened == {"s1_kc", "s1_dsigma", "s1_eps_c", "s1_kh_minus"}
+    assert opened < set(found.advice.determined)
+
+
+def test_a_soft_hit_is_followed_by_one_that_probably_closes_the_loop(planned):
+    best = planned.advice
+    assert best.breaks <= 0.05
+    assert best.number > sum(one.chance for one in planned.now.values()) + 1.0
+    softer = [one for one in planned.outcomes if one.candidate.velocity < 1.7]
+    assert all("s1_kc" not in one.determined for one in softer if one.candidate.mass == 7e-3)
+
+
+def test_a_test_that_exceeds_the_force_of_the_sensor_is_shown_and_not_advised(planned):
+    strong = [one for one in planned.outcomes if one.force > 400.0]
+    assert strong
+    assert all(one.breaks >= 0.5 for one in strong)
+    assert planned.advice not in strong
+
+
+def test_without_a_safe_test_none_is_advised(soft, tmp_path):
+    rig = tmp_path / "RIG.toml"
+    rig.write_text(RIG.format(force=1), encoding="utf-8")
+    found = ff.plan(soft, rig=rig)
+    assert found.advice is None
+    assert found.sentences[0].startswith("Next test: none.")
+    found.save(tmp_path / "plan")
+    assert not (tmp_path / "plan/next.toml").exists()
+
+
+def test_expected_widths_are_those_of_a_joint_fit_with_the_advised_test(tmp_path):
+    """The record of the second test is simulated; widths agree within a factor of 1.5."""
+    item, rng = ff.published["foam-1/model-2"], np.random.default_rng(3)
+    chain = ff.Chain(item.chain.springs, item.chain.heights, item.chain.area)
+    found = ff.plan("foam-1/model-2")
+    speeds = {"first": 1.75, "second": found.advice.candidate.velocity}
+    step, sizes = 1.0 / found.rig.sampling, found.rig.noise
+    for name, speed in speeds.items():
+        time = np.arange(0.0, 6.0 * chain.height / speed, step)
+        seen = ff.simulate(chain, ff.Impact(item.striker_mass, speed), time)
+        channels = [time * 1e3, seen.base_stress / 1e6, seen.displacement[-1] * 1e3]
+        noise = [0.0, sizes["stress"] / 1e6, sizes["displacement"] * 1e3]
+        rows = np.transpose(channels) + rng.standard_normal((time.size, 3)) * noise
+        head = "time (ms),stress (MPa),displacement (mm)"
+        np.savetxt(tmp_path / f"{name}.csv", rows, "%.9g", ",", header=head, comments="")
+        (tmp_path / f"{name}.toml").write_text(
+            '[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n'
+            f'[striker]\nmass = "7 g"\nvelocity = "{speed} m/s"\n'
+            f'[noise]\nstress = "{sizes["stress"]} Pa"\n'
+            f'displacement = "{sizes["displacement"]} m"\n',
+            encoding="utf-8",
+        )
+    names = [name for name in found.now if name != "s1_eta"]  # true value 0, at its limit
+    (tmp_path / "both.toml").write_text(
+        'name = "both"\ntests = ["first.csv", "second.csv"]\nmodel = "bistable"\n[parameters]\n'
+        + "".join(f'{name} = "shared"\n' for name in names),
+        encoding="utf-8",
+    )
+    joint = ff.joint(tmp_path / "both.toml", jobs=1)
+    for name in names:
+        low, high = joint.parameters[name].ci95
+        width = found.advice.expected[name].width
+        assert 1 / 1.5 < (high - low) / width < 1.5, (name, high - low, width)
+        assert joint.parameters[name].state == "determined"
+
+
+def test_a_quantity_is_known_better_after_the_test_that_is_chosen_for_it(soft):
+    found = ff.plan(soft, quantity="peak_force at 2.5 m/s")
+    errors = [one.error for one in found.outcomes if one.breaks <= 0.05]
+    assert found.advice.error < found.quantity.error
+    most = max(one.number for one in found.outcomes if one.breaks <= 0.05)
+    assert found.advice.number >= most - 0.1
+    assert min(errors) <= found.advice.error
+
+
+def test_a_rival_law_is_told_apart_by_a_test_beyond_the_first(soft):
+    test = ff.read_test(FOAM_1 / "model-2-1.75mps-reconstruction.csv")
+    rival = ff.fit(test, model="microscale", intervals="local")
+    found = ff.plan(soft, rival)
+    again = next(one for one in found.outcomes if one.candidate.repeat)
+    assert found.rivals == ("microscale",)
+    assert found.advice.apart["microscale"] > again.apart["microscale"]
+
+
+def test_the_same_seed_gives_the_same_plan(soft):
+    one, other = (ff.plan(soft, seed=4).to_json_dict() for _ in range(2))
+    assert json.dumps(one) == json.dumps(other)
+
+
+def test_files_and_terminal(soft, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    soft.save("fits/foam/bistable", report=False)
+    asked = ["plan", "fits/foam/bistable", "--for", "peak_strain at 2 m/s"]
+    ran = CliRunner().invoke(main, asked)
+    assert ran.exit_code == 0, ran.output
+    assert "Next test: an impact of 7 g at" in ran.output
+    folder = tmp_path / "plans/foam"
+    content = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
+    advice, now = content["advice"], content["now"]
+    assert content["schema"] == 1
+    assert {"drive", "mass", "velocity", "determined", "open", "breaks"} <= advice.keys()
+    assert now["s1_kc"] == now["s1_kc"] | {"ci95_width": None, "state": "not determined"}
+    first = content["candidates"][0]
+    assert {"drive", "mass", "velocity", "breaks", "expected"} <= first.keys()
+    assert first["expected"]["s1_k0"]["ci95_width"] > 0.0
+    striker = tomllib.loads((folder / "next.toml").read_text(encoding="utf-8"))["striker"]
+    assert striker["velocity"] == f"{advice['velocity']:.6g} m/s"
+    page = (folder / "plan.html").read_text(encoding="utf-8")
+    assert "which test next?" in page
+    assert 'src="data:image/png' in page
+    # Once the new record is there, one line fits both.
+    record = FOAM_1 / "model-2-2.0mps-reconstruction.csv"
+    (folder / "next.csv").write_bytes(record.read_bytes())
+    study = read_study(folder / "joint.toml")
+    assert [path.resolve() for _, path, _ in study.tests] == [
+        soft.measurement.path.resolve(), (folder / "next.csv").resolve()
+    ]  # fmt: skip
+    assert set(study.kinds.values()) == {"shared"}
+    table = ff.plan("fits/foam/bistable").table()
+    assert table.shape[0] == len(content["candidates"])
+
+
+def test_another_folder_is_not_replaced(tmp_path, planned):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/notes.txt").write_text("keep", encoding="utf-8")
+    with pytest.raises(InputError, match="mine"):
+        planned.save(tmp_path / "mine")
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+
+
+def slow_test() -> Measurement:
+    """A triangular loop of a microscale spring to a strain of 0.5 in 2 s, with 1 kPa of noise."""
+    rng, time = np.random.default_rng(0), np.linspace(0.0, 2.0, 401)
+    strain = 0.5 - 0.5 * np.abs(1.0 - time)
+    spring = ff.MicroscaleSpring(8e5, 4e5, 0.3, 1.1e5, 0.4, 7e4, 0.6, relaxation=[(0.5, 0.3)])
+    chain = ff.Chain([spring], [10e-3], 5e-5)
+    stress = ff.simulate(chain, ff.DisplacementDrive(strain * 10e-3), time).base_stress
+    return Measurement(
+        "loop", None, "0" * 64, time, stress + 1e3 * rng.standard_normal(401), strain * 10e-3,
+        Specimen(10e-3, 5e-5), noise=Noise(1e3, 1e-7), motion="measured",
+    )  # fmt: skip
+
+
+def test_a_slow_test_is_followed_by_cycles_and_holds():
+    result = ff.fit(slow_test(), model="microscale", relaxation=1)
+    found = ff.plan(result)
+    kinds = {(one.candidate.drive, one.candidate.hold > 0.0) for one in found.outcomes}
+    assert kinds == {("displacement", False), ("displacement", True)}
+    assert found.advice.number >= sum(one.chance for one in found.now.values())
+    fast = [one for one in found.outcomes if one.candidate.rate > 1.0]
+    slow = [one for one in found.outcomes if one.candidate.rate < 0.1]
+    share = {id(one): one.expected["s1_tau1"].share for one in (*fast, *slow)}
+    assert min(share[id(one)] for one in fast) < min(share[id(one)] for one in slow)
+
+
+def test_the_motion_of_a_candidate_rises_holds_and_returns():
+    one = Candidate("displacement", strain=0.4, rate=0.2, cycles=2, hold=3.0)
+    time, moved = one.motion(10e-3)
+    assert time[-1] == pytest.approx(2 * (2.0 + 3.0 + 2.0))
+    assert moved.max() == pytest.approx(4e-3)
+    held = time[np.isclose(moved, 4e-3, rtol=1e-9)]
+    assert np.ptp(held[held < 6.0]) == pytest.approx(3.0, abs=0.1)
+
+
+def test_two_springs_with_a_camera_have_candidates_with_an_interior_displacement(soft, tmp_path):
+    rig = tmp_path / "RIG.toml"
+    rig.write_text(RIG.format(force=400) + "interior = true\n", encoding="utf-8")
+    asked = candidates(read_rig(rig, soft.measurement), soft.measurement, 2)
+    assert {one.interior for one in asked} == {None, 1}
+    text = next(one for one in asked if one.interior).toml(soft.measurement)
+    assert "displacement_1" in text
+    assert tomllib.loads(text)["specimen"]["height"] == "1.19 mm"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[strikr]\n", "strikr"),
+        ("[striker]\nvelocity = 3\n", "velocity = 3"),
+        ('[striker]\nvelocity = "6 to 2 m/s"\n', "0.5 to 6 m/s"),
+        ('[striker]\nmasses = "7 g"\n', "masses must be a list"),
+        ('[limits]\nforce = "500 mm"\n', "wrong dimension"),
+        ('[limits]\nstrain = "-0.2"\n', "positive"),
+        ("[machine]\ncycles = 0\n", "a whole number from 1 up"),
+        ("[record]\nnoise = 3\n", "noise"),
+        ('[record]\nnoise = { sress = "2 Pa" }\n', "sress"),
+        ("velocity = 3\n", "velocity"),
+        ("[striker\n", "not valid TOML"),
+    ],
+)
+def test_a_wrong_rig_is_refused_by_name(soft, tmp_path, text, message):
+    rig = tmp_path / "RIG.toml"
+    rig.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=r"RIG\.toml") as refused:
+        ff.plan(soft, rig=rig)
+    assert message in str(refused.value)
+
+
+def test_what_cannot_be_planned_is_refused(soft, tmp_path):
+    with pytest.raises(InputError, match=r"no such file|not a folder"):
+        ff.plan(tmp_path / "missing")
+    with pytest.raises(InputError, match="at least one result"):
+        ff.plan()
+    with pytest.raises(InputError, match="peak_force"):
+        ff.plan(soft, quantity="mass at 3 m/s")
+    ran = CliRunner().invoke(main, ["plan", str(tmp_path / "missing")])
+    assert ran.exit_code == 1
+    assert len(ran.output.strip().splitlines()) == 1
+
+
+def test_init_writes_a_draft_of_the_rig_that_can_be_read(soft, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert CliRunner().invoke(main, ["init", "--rig", "RIG.toml"]).exit_code == 0
+    text = (tmp_path / "RIG.toml").read_text(encoding="utf-8")
+    (tmp_path / "all.toml").write_text(
+        text.replace("\n# ", "\n").replace("\nLines", "\n# Lines"), encoding="utf-8"
+    )
+    rig = read_rig(tmp_path / "all.toml", soft.measurement)
+    assert (rig.velocity, rig.masses, rig.force) == ((0.5, 6.0), (0.007, 0.014), 500.0)
+    assert rig.notes == ()
+    assert CliRunner().invoke(main, ["init", "--rig", "RIG.toml"]).exit_code == 1
+
+
+def test_what_the_rig_does_not_state_is_taken_from_the_record_and_said():
+    test = Measurement(
+        "impact", None, "", np.linspace(0.0, 1e-3, 101), np.linspace(0.0, 1e6, 101),
+        np.linspace(0.0, 1e-3, 101), Specimen(2e-3, 1e-5), Striker(7e-3, 2.0), Noise(1e4, 1e-6),
+    )  # fmt: skip
+    rig = read_rig(None, test)
+    assert rig.masses == (7e-3,)
+    assert rig.velocity == (1.0, 6.0)
+    assert rig.sampling == pytest.approx(1e5)
+    assert rig.noise == {"stress": 1e4, "displacement": 1e-6}
+    assert len(rig.notes) == 5
