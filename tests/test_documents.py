@@ -68,4 +68,4 @@ def test_the_example_of_the_readme_writes_into_a_folder_that_git_ignores():
 
 
 def test_the_readme_is_short():
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 700

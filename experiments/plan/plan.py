@@ -38,9 +38,10 @@ from foamfit.errors import InputError, SimulationError
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE.parent), str(HERE.parent / "recovery")]
-import studies  # noqa: E402
 from rig import BENCH, MOST_STRAIN, TOWER, Impact, draw_bistable, recorded, work, write  # noqa: E402
 from truth import Course, Rig  # noqa: E402
+
+import studies  # noqa: E402
 
 SECOND = ("advised", "strongest", "random", "ideal")
 Foam = dict[str, Any]
@@ -155,6 +156,7 @@ def rig_toml(foam: Foam, step: float, noise: dict[str, float]) -> str:
 
 def nearest(plan: ff.Plan, velocity: float, mass: float) -> dict[str, Any]:
     """Return what the plan expects of the candidate nearest to a test."""
+
     def far(one: Any) -> float:
         asked = one.candidate
         return abs(math.log(asked.velocity / velocity)) + 10 * abs(math.log(asked.mass / mass))
@@ -166,9 +168,14 @@ def together(
     folder: Path, kind: str, model: str, expected: dict[str, Any]
 ) -> Iterator[dict[str, Any]]:
     """Fit the first and a second test jointly; yield a row for each parameter."""
-    names = [name for name in expected or ()]
-    lines = [f'name = "{kind}"', f'tests = ["first.csv", "second-{kind}.csv"]',
-             f'model = "{model}"', "[parameters]", *(f'{name} = "shared"' for name in names)]  # fmt: skip
+    names = list(expected)
+    lines = [
+        f'name = "{kind}"',
+        f'tests = ["first.csv", "second-{kind}.csv"]',
+        f'model = "{model}"',
+        "[parameters]",
+        *(f'{name} = "shared"' for name in names),
+    ]
     study = folder / f"{kind}.toml"
     study.write_text("\n".join(lines) + "\n", encoding="utf-8")
     began = time.perf_counter()
@@ -226,8 +233,8 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
 
 def main() -> None:
     """Run the study."""
-    parser = studies.arguments(__doc__, HERE, foams=(40, "foams of one spring"),
-                               two=(20, "foams of two springs"), first=(1, "first seed"))  # fmt: skip
+    counts: dict[str, Any] = {"foams": (40, "foams of one spring"), "two": (20, "of two springs")}
+    parser = studies.arguments(__doc__, HERE, **counts, first=(1, "first seed"))
     asked = parser.parse_args()
     jobs = [(asked.first + i, 1) for i in range(asked.foams)]
     jobs += [(asked.first + i, 2) for i in range(asked.two)]

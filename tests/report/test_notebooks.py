@@ -16,6 +16,7 @@ LISTED = (
     "fit_a_new_test.ipynb",
     "fitted_against_published.ipynb",
     "what_changes_by_cycle.ipynb",
+    "which_test_next.ipynb",
     "turn_the_parameters.ipynb",
 )
 PLACE = re.compile(r"/(?:tmp|home|root|opt|usr|Users)/|[A-Z]:\\|\b0x[0-9a-f]{6,}")

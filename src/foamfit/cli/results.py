@@ -1,4 +1,4 @@
-"""`foamfit compare`, `published`, `predict`, `plan` and `card`: commands that use results."""
+"""`foamfit compare`, `list`, `published`, `predict`, `plan`, `card`: commands that use results."""
 
 from __future__ import annotations
 
@@ -52,6 +52,32 @@ def compare(
     if plot is not None:
         plot_comparison(comparison, plot, width=figure_width)
         say(f"\ndrawn in {plot}")
+
+
+@main.command("list")
+@click.argument("folder", metavar="[FOLDER]", default="fits", type=options.FILE)
+@options.option("--open opening", "Open the page in the browser.")
+def list_results(folder: Path, opening: bool) -> None:
+    """List the results in FOLDER (default: fits), a line each.
+
+    Writes FOLDER/index.html: a table to sort, with small loops and links to the reports.
+
+    \b
+    Examples:
+        foamfit list
+        foamfit list runs --open
+    """
+    import webbrowser
+
+    from foamfit.report.listing import lines, results_in, write_index
+
+    found = results_in(folder)
+    say(lines(found))
+    page = write_index(folder, found)
+    if page is not None:
+        say(f"\nthe same with loops and links: {page}")
+        if opening:
+            webbrowser.open(page.resolve().as_uri())
 
 
 @main.command()

@@ -301,11 +301,13 @@ class Target:
         return float(work) * specimen.area, slopes * specimen.area
 
     def error(self, known: Known, seen: Sequence[Seen]) -> float:
-        """Return the expected standard error of the quantity after some tests, over its value."""
+        """Return the standard error of the quantity after some tests, RMS of the draws, over it."""
         noise, law = covariance(known, seen, 1.0 / NOTHING**2)
         total = noise + law / NORMAL**2
         variance = np.einsum("di,dij,dj->d", self.slopes, total, self.slopes)
-        return float(np.nanmedian(np.sqrt(np.maximum(variance, 0.0)) / np.abs(self.values)))
+        return math.sqrt(max(float(np.nanmean(variance)), 0.0)) / abs(
+            float(np.nanmedian(self.values))
+        )
 
     def shown(self, known: Known) -> Quantity:
         """Return the quantity as it is known now."""

@@ -221,7 +221,9 @@ def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Kno
             for name, found in zip(best.names, best.spread.inflation.tolist(), strict=True):
                 if name in names and math.isfinite(found):
                     root[names.index(name)] = math.sqrt(found)
-        meats[t] = breads[t] * np.outer(root, root)
+        # So that the covariance of this test alone is that of its fit, D (JᵀJ)⁻¹ D.
+        alone = np.linalg.pinv(breads[t], rcond=1e-12, hermitian=True) * np.outer(root, root)
+        meats[t] = breads[t] @ alone @ breads[t]
     values, places = tests[0].values, [first.index[name] for name in names]
     if len(tests) > 1:  # the mean, weighted by the information
         pull = [b @ (one.values[places] / sizes) for b, one in zip(breads, tests, strict=True)]

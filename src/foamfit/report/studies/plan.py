@@ -71,6 +71,10 @@ class Outcome:
         """Parameters that are probably determined."""
         return [name for name, one in self.expected.items() if one.state == "determined"]
 
+    def chance(self, names: Sequence[str]) -> float:
+        """Return the least probability with which one of these parameters is determined."""
+        return min((self.expected[name].chance for name in names), default=1.0)
+
     @property
     def open(self) -> list[str]:
         """Parameters that probably stay open."""
@@ -127,6 +131,14 @@ class Plan:
     def sentences(self) -> tuple[str, ...]:
         """The advice: next test, what it will determine, what stays open, and remarks."""
         return sentences("plan", plan=self, advice=self.advice, own=self.own)
+
+    @property
+    def by_remedy(self) -> dict[str, list[str]]:
+        """What would determine the parameters that no test of this rig determines."""
+        out = dict[str, list[str]]()
+        for name, what in self.never.items():
+            out.setdefault(what, []).append(name)
+        return out
 
     def own(self, names: Sequence[str]) -> list[str]:
         """Return names of parameters, without the spring if there is only one."""
