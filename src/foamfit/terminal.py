@@ -16,6 +16,7 @@ from types import FrameType
 from typing import Any, TextIO
 
 from foamfit.errors import InputError
+from foamfit.system import ENDING
 
 # Control characters except tab and new line, and characters that reverse the direction of writing:
 # in a file name they could move the cursor or hide text. Also surrogates (non-UTF-8 bytes).
@@ -80,7 +81,7 @@ def say(text: str, *, err: bool = False, newline: bool = True) -> None:
 
 
 class TerminatedError(KeyboardInterrupt):
-    """Raised on SIGTERM, or SIGHUP of a closed terminal; the message is the name of the signal.
+    """Raised on SIGTERM, or when the terminal is closed; the message is the name of the signal.
 
     Like Ctrl-C it keeps the best point found so far.
     """
@@ -101,7 +102,7 @@ def _handles_signals() -> bool:
 
 @contextmanager
 def ending_cleanly() -> Iterator[None]:
-    """Turn SIGTERM and SIGHUP into an exception, so that no partial file stays behind.
+    """Turn SIGTERM and a closed terminal into an exception, so that no partial file stays behind.
 
     Neither these nor Ctrl-C are lost in code that cannot raise, such as numba's callbacks when it
     loads compiled code.
@@ -109,8 +110,7 @@ def ending_cleanly() -> Iterator[None]:
     if not _handles_signals():
         yield
         return
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    taken = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
+    taken = [number for number in ENDING if signal.getsignal(number) is signal.SIG_DFL]
     for number in taken:
         signal.signal(number, _terminate)
     told, sys.unraisablehook = sys.unraisablehook, _raise_again

@@ -66,7 +66,7 @@ class Here(Worker):
             patch.setattr(sys, "stdout", told)
             worker_module.main()
         told.seek(0)
-        self.process = SimpleNamespace(stdout=told, wait=lambda: 0, poll=lambda: 0)
+        self.process = SimpleNamespace(stdin=given, stdout=told, wait=lambda: 0, poll=lambda: 0)
         self._listen()
 
 

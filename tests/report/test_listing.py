@@ -38,7 +38,9 @@ def test_every_result_is_one_line(folder):
     assert len(lines) == 3
     content = json.loads((folder / "model-1/impact/fit.json").read_text(encoding="utf-8"))
     line = next(line for line in lines if "model-1" in line)
-    own = [p for n, p in content["parameters"].items() if n.startswith(("s1_", "site_")) and p["vary"]]
+    own = [
+        p for n, p in content["parameters"].items() if n.startswith(("s1_", "site_")) and p["vary"]
+    ]
     number = sum(p["state"] == "determined" for p in own)
     assert re.search(rf"bistable\s+ok\s.*{number} of {len(own)}\s", line)
     assert "damaged" in next(line for line in lines if line.startswith("bad"))

@@ -230,7 +230,7 @@ def test_summary_says_what_matters() -> None:
     assert second == "misfit stress-time 1.2 %, displacement-time 0.4 %; 5 of 7 determined"
     assert "fixed: s1_eta 0 Pa·s" in text
     assert "\nwarning: s1_kh_minus is not determined: branch e was never reached.\n" in text
-    assert last.startswith("next: --fix NAME=VALUE")
+    assert last.startswith("next: foamfit plan FOLDER")
     assert html.unescape(text) == text
 
 

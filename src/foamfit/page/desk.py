@@ -27,8 +27,9 @@ from foamfit.data.energy import audit
 from foamfit.data.measurement import Measurement
 from foamfit.data.toml_file import toml_beside
 from foamfit.errors import InputError
-from foamfit.page.worker import Job, Worker, end_all, parsed
+from foamfit.page.worker import Job, Worker, parsed
 from foamfit.springs import laws
+from foamfit.system import end_all
 from foamfit.text import listed
 
 LARGEST = 64 * 1024 * 1024  # bytes of the largest file that can be dropped

@@ -10,7 +10,6 @@ import asyncio
 import logging
 import secrets
 import shutil
-import signal
 import socket
 import tempfile
 import webbrowser
@@ -29,6 +28,7 @@ from foamfit.errors import InputError
 from foamfit.page.app import Window
 from foamfit.page.desk import LARGEST, Desk
 from foamfit.page.worker import FirstUse
+from foamfit.system import at_end
 from foamfit.terminal import say
 
 HOST = "127.0.0.1"
@@ -158,8 +158,7 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
             loop = asyncio.get_running_loop()
             loop.set_exception_handler(_pass_over_closed_windows)
             logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                loop.add_signal_handler(number, ending.set)
+            at_end(loop, ending.set)
             say(page.address)
             say("foamfit: the page is open at this address until Ctrl-C", err=True)
             if browser:

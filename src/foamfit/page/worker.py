@@ -1,11 +1,12 @@
 """Processes of the page: a fit, and the compilation of the solver.
 
-The process of a fit reads a job as one line of JSON and reports in lines of JSON. SIGINT stops its
-search and keeps the best point, as Ctrl-C does in a terminal.
+The process of a fit reads a job as one line of JSON and reports in lines of JSON. The line "stop"
+ends its search and keeps the best point, as Ctrl-C does in a terminal.
 """
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import json
 import os
@@ -25,6 +26,7 @@ from foamfit.cli.progress import APART, Watcher
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.solve import cache
 from foamfit.springs.model import Model
+from foamfit.system import apart, end_all
 
 if TYPE_CHECKING:
     from foamfit.arrays import Array
@@ -38,6 +40,7 @@ COMPILED = (("bistable", 0, "integrate"), ("microscale", 1, "follow"))
 COMPILE = """from foamfit.solve.precompile import at_first_use
 with at_first_use({!r}, {}, lambda: None) as compile_rest:
     compile_rest()"""
+STOP = "stop"
 STOPPED_EARLY = "The fit was stopped before it had a result; start it again."
 
 
@@ -73,14 +76,6 @@ def with_package() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": paths.rstrip(os.pathsep)}
 
 
-def end_all(process: subprocess.Popen[Any]) -> None:
-    """Kill a process that leads a session, and all processes that it has started."""
-    if process.poll() is None:
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-
-
 class Worker:
     """A fit in another process: its last report, and how it ended."""
 
@@ -97,19 +92,23 @@ class Worker:
             stderr=self._errors,
             encoding="utf-8",
             env=with_package(),
-            start_new_session=True,  # so that Ctrl-C in the terminal of the page does not reach it
+            **apart(),
         )
-        assert self.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
-            self.process.stdin.write(json.dumps(vars(job)) + "\n")
-            self.process.stdin.close()
+        self._tell(json.dumps(vars(job)))
         threading.Thread(target=self._listen, daemon=True).start()
 
     def stop(self) -> None:
         """Stop the search; the result of the best point is still written."""
         if not self.stopping and self.process.poll() is None:
             self.stopping = True
-            self.process.send_signal(signal.SIGINT)
+            self._tell(STOP)
+
+    def _tell(self, line: str) -> None:
+        """Write a line to the process, unless it has ended."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(BrokenPipeError, ValueError):
+            self.process.stdin.write(line + "\n")
+            self.process.stdin.flush()
 
     def _listen(self) -> None:
         """Read the reports of the process until it ends."""
@@ -126,6 +125,8 @@ class Worker:
                 self.news = News(**report)
         code = self.process.wait()
         self.process.stdout.close()
+        with contextlib.suppress(BrokenPipeError):
+            self.process.stdin.close()  # type: ignore[union-attr]
         done = self._why(code) if done is None else done
         self._errors.close()
         self.ended = done
@@ -165,7 +166,7 @@ class FirstUse:
         if self._closed or cache.compiled(loop):
             return
         command = [sys.executable, "-c", COMPILE.format(model, relaxation)]
-        self._process = subprocess.Popen(command, env=with_package(), start_new_session=True)
+        self._process = subprocess.Popen(command, env=with_package(), **apart())
         self._process.wait()
 
     def close(self) -> None:
@@ -265,12 +266,19 @@ def _run(job: Job) -> tuple[str, str]:
     return "", told
 
 
+def _wait_for_stop() -> None:
+    """Interrupt the main thread when stdin says so."""
+    if sys.stdin.readline().strip() == STOP:
+        _thread.interrupt_main()
+
+
 def main() -> None:
     """Run the job that stdin describes."""
     from foamfit.springs import laws
     from foamfit.terminal import ending_cleanly
 
     job = Job(**json.loads(sys.stdin.readline()))
+    threading.Thread(target=_wait_for_stop, daemon=True).start()
     laws.load_texts(job.laws)
     with ending_cleanly():
         ended, told = _run(job)

@@ -1,0 +1,84 @@
+"""The portable ways beside POSIX signals and fork servers, tried here as on Windows."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from foamfit import system
+from foamfit.study.processes import Processes
+
+PAGE = """
+from foamfit import system
+system.POSIX = False
+from foamfit.page.server import serve
+serve(None, 0, browser=False)
+"""
+
+
+@pytest.fixture
+def portable(monkeypatch):
+    monkeypatch.setattr(system, "POSIX", False)
+
+
+def test_a_process_that_was_started_apart_is_killed(portable):
+    process = subprocess.Popen(
+        [sys.executable, "-c", "import time; time.sleep(60)"], **system.apart()
+    )
+    system.end_all(process)
+    assert process.returncode != 0
+    system.end_all(process)  # again, after its end
+
+
+def test_the_page_ends_cleanly_without_signal_handlers_of_the_loop(tmp_path):
+    pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
+    process = subprocess.Popen(
+        [sys.executable, "-c", PAGE], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"TMPDIR": str(tmp_path), "MPLBACKEND": "Agg"},
+    )  # fmt: skip
+    assert process.stdout.readline().startswith("http://127.0.0.1:")
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 0, errors
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_processes_without_a_fork_server_are_spawned(monkeypatch):
+    monkeypatch.setattr(multiprocessing, "get_all_start_methods", lambda: ["spawn"])
+    with Processes(1) as pool:
+        assert pool.submit(pow, 2, 5).result(timeout=60) == 32
+
+
+def test_no_other_module_uses_what_windows_lacks():
+    lacking = ("SIGHUP", "killpg", "add_signal_handler", "start_new_session", "os.fork(")
+    root = os.path.dirname(system.__file__)
+    for folder, _, files in os.walk(root):
+        for name in files:
+            path = os.path.join(folder, name)
+            if name.endswith(".py") and path != system.__file__:
+                with open(path, encoding="utf-8") as file:
+                    text = file.read()
+                assert not [word for word in lacking if word in text], path
+
+
+def test_a_handler_of_the_portable_way_calls_the_loop(portable):
+    import asyncio
+
+    async def run() -> float:
+        ending = asyncio.Event()
+        before = {number: signal.getsignal(number) for number in system.ENDING}
+        try:
+            system.at_end(asyncio.get_running_loop(), ending.set)
+            began = time.monotonic()
+            signal.raise_signal(signal.SIGTERM)
+            await asyncio.wait_for(ending.wait(), 10)
+            return time.monotonic() - began
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    assert asyncio.run(run()) < 10
