@@ -14,7 +14,8 @@ joint fits determines.
 Answer. See README.md.
 
     python experiments/plan/plan.py                        # 40 foams of one spring, 20 of two
-    python experiments/plan/plan.py --foams 4 --two 2      # a look
+    python experiments/plan/plan.py --foams 4 --two 2 --out /tmp/plan     # a look
+    python experiments/plan/plan.py --foams 0 --two 0      # the page alone
 """
 
 from __future__ import annotations
@@ -231,8 +232,56 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(out)
 
 
+def draw_figure(rows: pd.DataFrame, found: pd.DataFrame, path: Path) -> None:
+    """Draw parameters determined after each second test, and obtained against expected widths."""
+    with studies.sheet(path, 7.0, 2.8) as figure:
+        left, right = figure.subplots(1, 2)
+        for at, (springs, part) in enumerate(found.groupby("springs")):
+            x = np.arange(len(part)) + 0.4 * (at - 0.5)
+            share = 100.0 * part["determined"] / part["could be"]
+            colour, name = (studies.BLUE, "one spring") if at == 0 else (studies.ORANGE, "two")
+            left.bar(x, share, 0.38, color=colour, label=f"{name} ({int(part.foams.max())} foams)")
+            mine = rows[(rows.springs == springs) & (rows.second == "advised")]
+            right.plot(mine["expected width"] / mine.value.abs(), mine.width / mine.value.abs(),
+                       ".", color=colour, markersize=3)  # fmt: skip
+        left.axhline(90.0, color="black", linewidth=0.6, linestyle=":")
+        left.set_xticks(range(5), ["first test\nalone", *SECOND], fontsize=6.5)
+        left.set_ylabel("parameters determined (%)")
+        left.legend(loc="lower right", fontsize=6.5, frameon=True)
+        ends = np.array([1e-3, 3.0])
+        for factor, dashes in ((1.0, "-"), (1.5, ":"), (1 / 1.5, ":")):
+            right.plot(ends, factor * ends, color="black", linewidth=0.5, linestyle=dashes)
+        right.set(xscale="log", yscale="log", xlim=ends, ylim=ends)
+        right.set(xlabel="expected width over value", ylabel="obtained width over value")
+
+
+def write_page(out: Path) -> None:
+    """Write README.md and plan.png from foams.csv, plan.csv and real.csv."""
+    rows, found = (pd.read_csv(out / name) for name in ("foams.csv", "plan.csv"))
+    draw_figure(rows, found, out / "plan.png")
+    head = ["springs", "second test", "foams", "determined", "could be", "broke the rig",
+            "fewer than random", "velocity over closing", "width over expected",
+            "within 1.5 (%)"]  # fmt: skip
+    shown = found[head].map(lambda x: f"{x:.3g}" if isinstance(x, float) else x)
+    values = dict[str, Any]()
+    for name, springs in (("one", 1), ("two", 2)):
+        row = found[(found.springs == springs) & (found["second test"] == "advised")].iloc[0]
+        values |= {
+            f"share_{name}": f"{100.0 * row['determined'] / row['could be']:.1f} %",
+            f"fewer_{name}": row["fewer than random"], f"foams_{name}": row["foams"],
+            f"within_{name}": f"{row['within 1.5 (%)']:.1f} %",
+            f"broke_{name}": f"{row['broke the rig']} of {row['foams']}",
+        }  # fmt: skip
+    real = pd.read_csv(out / "real.csv").fillna("–")
+    tables = {"table": (shown, head), "real": (real, list(real))}
+    for name, (table, columns) in tables.items():
+        text = studies.markdown(columns, table.to_numpy().tolist())
+        values[name] = text.replace("| nan ", "| – ")
+    studies.write_page(HERE, out=out, circumstances=studies.circumstances(), **values)
+
+
 def main() -> None:
-    """Run the study."""
+    """Run the study, or with no foams write its page."""
     counts: dict[str, Any] = {"foams": (40, "foams of one spring"), "two": (20, "of two springs")}
     parser = studies.arguments(__doc__, HERE, **counts, first=(1, "first seed"))
     asked = parser.parse_args()
@@ -240,18 +289,19 @@ def main() -> None:
     jobs += [(asked.first + i, 2) for i in range(asked.two)]
     rows = list[dict[str, Any]]()
     with ProcessPoolExecutor(2) as pool:
-        for made in pool.map(judged, *zip(*jobs, strict=True)):
+        for made in pool.map(judged, *zip(*jobs, strict=True)) if jobs else ():
             rows += made
             print(json.dumps({key: made[0][key] for key in ("foam", "springs", "plan (s)")}),
                   flush=True)  # fmt: skip
-    table = pd.DataFrame(rows)
-    for column in ("broke", "error", "expected width", "force (N)", "velocity over closing"):
-        if column not in table:
-            table[column] = math.nan
-    table.to_csv(asked.out / "foams.csv", index=False, float_format="%.6g")
-    found = summary(table)
-    found.to_csv(asked.out / "plan.csv", index=False, float_format="%.4g")
-    print(found.to_string(index=False))
+    if rows:
+        table = pd.DataFrame(rows)
+        for column in ("broke", "error", "expected width", "force (N)", "velocity over closing"):
+            if column not in table:
+                table[column] = math.nan
+        table.to_csv(asked.out / "foams.csv", index=False, float_format="%.6g")
+        summary(table).to_csv(asked.out / "plan.csv", index=False, float_format="%.4g")
+    if (asked.out / "real.csv").is_file():
+        write_page(asked.out)
 
 
 if __name__ == "__main__":
