@@ -128,12 +128,17 @@ def opened(browser, served):
 
 
 @pytest.fixture(scope="module")
-def window(playwright, served):
+def chromium(playwright):
     options = [] if not hasattr(os, "geteuid") or os.geteuid() else ["--no-sandbox"]
     browser = launch(playwright.chromium, CHROMIUM, args=options)
-    with opened(browser, served) as page:
-        yield page
+    yield browser
     browser.close()
+
+
+@pytest.fixture(scope="module")
+def window(chromium, served):
+    with opened(chromium, served) as page:
+        yield page
 
 
 def drop(page, *files):
@@ -351,3 +356,28 @@ def test_everyone_can_use_it_at_once(window):
     window.bring_to_front()
     took = sorted(window.evaluate(REDRAWS))
     assert took[len(took) // 2] < 100.0, took
+
+
+@pytest.mark.parametrize(("wide", "high"), [(1280, 900), (390, 800)])
+def test_a_raw_file_is_drawn_prompts_for_its_specimen_and_offers_its_columns(
+    chromium, served, wide, high, tmp_path
+):
+    rows_ = "\n".join(f"{0.005 * k:.4f},{0.01 * k:.4f},{0.01 * k:.5f}" for k in range(200))
+    raw = tmp_path / "raw.csv"
+    raw.write_text(f"time (s),Load (N),Crosshead\n{rows_}\n", encoding="utf-8")
+    with opened(chromium, served) as page:
+        page.set_viewport_size({"width": wide, "height": high})
+        page.get_by_label("Drop a CSV").set_input_files(TEST)
+        page.get_by_alt_text("Force of the file").wait_for()
+        prompt = page.get_by_text("fill in the specimen height")
+        api.expect(prompt).to_be_visible()
+        api.expect(page.get_by_role("alert")).to_have_count(0)
+        page.get_by_label("Drop a CSV").set_input_files(raw)
+        for label, value in (("Specimen height", "10 mm"), ("Specimen diameter", "8 mm")):
+            page.get_by_label(label).fill(value)
+            page.keyboard.press("Tab")
+        page.get_by_role("button", name="Use Crosshead in mm as displacement").click()
+        api.expect(page.get_by_role("alert")).to_have_count(0, timeout=SOON)
+        page.get_by_text("stress-strain").first.wait_for()
+        overflow = "() => document.documentElement.scrollWidth - innerWidth"
+        assert page.evaluate(overflow) <= 0

@@ -7,6 +7,7 @@ Content of files is always shown as escaped text.
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -19,6 +20,7 @@ import panel as pn
 
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
+from foamfit.page import preview as previews
 from foamfit.page.curves import Curves, grid, misfits_text
 from foamfit.page.desk import BUSY, FIRST, LARGEST, QUANTITIES, Desk, wrong_quantity
 from foamfit.page.turning import Turning
@@ -50,6 +52,7 @@ COMPILING = (
     "The solver is being compiled, once after installation. This takes half a minute, or a minute "
     "on a busy machine. Meanwhile you can drop a test and fill in its specimen."
 )
+PROMPT = "To fit this test, fill in the {0} above, like {1}."
 TEXT, FIELD = style("text"), style("field")
 WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: var(--bad); }"
 STYLE: dict[str, Any] = {
@@ -83,7 +86,8 @@ class Window:
         parts = {
             "test": [self.upload, self.chosen, first],
             "specimen": [*fields[FIRST:], self.rest],
-            "check": [self.check, self.problem],
+            "columns": [self.picked],
+            "check": [self.check, self.problem, self.remedies],
             "model": [self.options[name].widget for name in SHOWN],
             "more": [self.options[name].widget for name in FOLDED],
             "run": [self.run, self.stop, self.progress],
@@ -137,6 +141,20 @@ class Window:
             **STYLE,
         )
         self.check = button("Check the test", self._check)
+        self.remedies = pn.Column(**WIDE)
+        self.pickers = {
+            channel: (
+                select(name=f"Column of the {channel}", options=[""]),
+                select(name=f"Unit of the {channel}", options=["", *filter(None, units)]),
+            )
+            for channel, units in previews.UNITS.items()
+        }
+        for channel, pair in self.pickers.items():
+            for field in pair:
+                field.param.watch(partial(self._picked, channel), "value")
+        self.picked = pn.Column(*(grid([*pair], 8.0) for pair in self.pickers.values()), **WIDE)
+        for row in self.picked:
+            row.visible = True
         lists = {"model": models(), "relaxation": [*range(RELAXATIONS)]}
         self.options = {name: Field(name, lists.get(name), **STYLE) for name in (*SHOWN, *FOLDED)}
         self.model, _, self.relaxation, *self.cycles = (self.options[n].widget for n in SHOWN)
@@ -269,11 +287,22 @@ class Window:
 
     def _show_checked(self, found: str | Exception) -> None:
         error = found if isinstance(found, Exception) else ""
-        self.problem.object = wrong(error)
+        missing = wrong_quantity(str(error))
+        empty = bool(missing) and not self.quantities[missing].value
+        self.problem.object = (
+            soft(PROMPT.format(QUANTITIES[missing][0].lower(), QUANTITIES[missing][1]))
+            if empty
+            else wrong(error)
+        )
         for name, field in self.quantities.items():
-            field.stylesheets = [WRONG if name == wrong_quantity(str(error)) else FIELD]
+            field.stylesheets = [WRONG if name == missing and not empty else FIELD]
         if str(error) == BUSY:
             return
+        self._offer(str(error))
+        if error:
+            csv, rest = self.desk.csv, self.rest.value or ""
+            if csv is not None:
+                self._beside(PREPARING, lambda: previews.preview(csv, rest), self._show_preview)
         unread = "The test cannot be read yet; see the error message."
         self.understood.object = soft(unread) if error else piece("verbatim", found)
         self._allow()
@@ -283,6 +312,43 @@ class Window:
                 field.visible = count > 1
             self.cycles[0].name = f"{self.options['cycle'].label} This record has {count}."
         self._model_chosen()
+
+    def _offer(self, message: str) -> None:
+        """Show the entries of [columns] that a message proposes as buttons."""
+
+        def use(channel: str, content: str) -> Any:
+            made = pn.widgets.Button(name=previews.in_words(channel, content), **STYLE)
+            made.on_click(lambda _: self._add_column(channel, content))
+            return made
+
+        self.remedies[:] = [use(*one) for one in previews.remedies(message)]
+
+    def _add_column(self, channel: str, content: str) -> None:
+        try:
+            self.rest.value = previews.with_column(self.rest.value or "", channel, content)
+        except InputError as error:
+            self.problem.object = wrong(error)
+
+    def _picked(self, channel: str, event: Any) -> None:
+        """Enter the column and unit that were chosen from the lists."""
+        column, unit = (field.value for field in self.pickers[channel])
+        if self._filling or self.desk.csv is None:
+            return
+        given = f"column = {json.dumps(column, ensure_ascii=False)}" if column else ""
+        self._add_column(channel, given + (f', unit = "{unit}"' if given and unit else ""))
+
+    def _show_preview(self, found: previews.Preview | Exception) -> None:
+        """Show the curves of a file whose specimen is not known yet, and its columns."""
+        if isinstance(found, Exception):
+            return
+        self._filling = True
+        for column, _ in self.pickers.values():
+            if column.options != ["", *found.headers]:
+                column.param.update(options=["", *found.headers], value="")
+        self._filling = False
+        if found.picture is not None:
+            png = base64.b64encode(found.picture).decode()
+            self.misfit.object = piece("preview", png)
 
     # ------------------------------------------------------------------------------- the curves
 
