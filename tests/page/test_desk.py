@@ -17,15 +17,15 @@ from click.testing import CliRunner
 
 import foamfit as ff
 from conftest import EXPERIMENTS, few_bytes, synthetic_impact, synthetic_loop, without_pictures
-from cycled import FRESH, write_record
+from cycled import write_record
 from foamfit.cli import main
-from foamfit.data.cycles import cycles_of, find_turns
+from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement, Specimen
 from foamfit.errors import InputError
 from foamfit.page import desk as desk_module
 from foamfit.page import worker as worker_module
 from foamfit.page.desk import Desk, join_toml, safe_name, split_toml, wrong_quantity
-from foamfit.page.turning import INSTANTS, Turning
+from foamfit.page.turning import Turning
 from foamfit.page.worker import News, Worker
 from foamfit.report.folder import load_result
 from foamfit.report.studies import cycles as cycles_report
@@ -374,35 +374,6 @@ def test_a_history_is_drawn_as_a_whole_with_what_springs_remember(tmp_path):
     loading = [part.start + (part.stop - part.start) // 4 for part in cycles_of(record).values()]
     stresses = np.interp(loading, np.arange(len(stress)), drawn.curves["stress_strain"][1])
     assert stresses[1] < 0.95 * stresses[0]
-    # The chain follows all cycles, and most micro-springs are snapped at maximum compression.
-    turns = find_turns(drawn.chain["strain"], 0.1)
-    assert len(turns) >= 5
-    snapped = drawn.chain["snapped"][0]
-    assert snapped[0] == 0.0
-    assert snapped[drawn.chain["strain"].argmax()] == pytest.approx(snapped.max(), abs=0.02)
-
-
-@pytest.mark.parametrize("model", ["bistable", "linear+bistable", "microscale+microscale"])
-def test_a_chain_is_drawn_with_the_fraction_snapped_of_each_spring(model):
-    turning = Turning(ff.read_test(TEST), model)
-    chain, kinds = turning.turn({}).chain, model.split("+")
-    assert np.isnan(chain["snapped"]).any(axis=1).tolist() == [kind == "linear" for kind in kinds]
-    assert len(chain["strain"]) <= INSTANTS
-    tall = chain["heights"].sum(axis=0)
-    pressed = chain["top"] < 1.0
-    np.testing.assert_allclose(tall[pressed], chain["top"][pressed], atol=0.01)
-    np.testing.assert_allclose(tall[0], 1.0)  # the striker does not compress it yet
-    for shares in chain["snapped"][np.isfinite(chain["snapped"][:, 0])]:
-        assert shares[0] == 0.0
-        assert 0.0 <= shares.min() < shares.max() <= 1.0
-
-
-def test_the_fraction_snapped_of_a_bistable_spring_is_its_way_along_d_and_e():
-    spring = FRESH
-    strain = np.array([0.0, spring.eps_a, 0.5 * (spring.eps_a + spring.eps_hat_c), 0.4, 0.5])
-    strain = np.append(strain, [spring.eps_c, 0.5 * (spring.eps_c + spring.eps_hat_a), 0.0])
-    expected = [0.0, 0.0, 0.5, 1.0, 1.0, 1.0, 0.5, 0.0]
-    np.testing.assert_allclose(spring.snapped_along(strain), expected, atol=1e-9)
 
 
 def test_what_is_not_admissible_is_named():
@@ -465,7 +436,7 @@ def test_a_test_without_stress_and_motion_is_refused():
 # ------------------------------------------------------------- fixed and varied parameters
 
 
-def test_the_notebook_shows_a_history_and_its_chain(tmp_path):
+def test_the_notebook_shows_a_history(tmp_path):
     pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
     from foamfit.page.curves import Curves
 
@@ -473,11 +444,8 @@ def test_the_notebook_shows_a_history_and_its_chain(tmp_path):
     curves = Curves(Turning(record, "microscale", mullins=True))
     assert "cycles 1 to 3: misfit" in curves.sliders.told
     assert np.isfinite(curves._turned.data["stress_strain_x"]).sum() > 600
-    before = curves.chain.frames
-    curves.put({"s1_sigma_plus": 0.5 * curves.turning.named["s1_sigma_plus"]})
-    assert max(curves.chain.frames["snapped"][0]) > max(before["snapped"][0])
     curves.put({"s1_k0": -1.0})  # not admissible
-    assert curves.chain.frames == {}
+    assert curves.sliders.wrong
 
 
 def test_ticks_say_what_a_fit_holds_and_varies():

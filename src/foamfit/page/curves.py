@@ -17,7 +17,7 @@ from bokeh.plotting import figure
 
 from foamfit.arrays import Array
 from foamfit.page.turning import PANELS, Drawn, Row, Turning
-from foamfit.page.widgets import WIDE, Chain, Sliders, message, piece
+from foamfit.page.widgets import WIDE, Sliders, message, piece
 from foamfit.report.figures import GREY, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
@@ -67,8 +67,7 @@ class Curves:
         self._panes = {n: pn.pane.Bokeh(self._figures[n], **WIDE) for n in loop_first}
         self._panels = grid([*self._panes.values()], 14.5)
         self._panels.insert(0, legend)  # the legend of a figure would be redrawn each time
-        self.chain = Chain(visible=False, **WIDE)
-        self.view = pn.Column(self._panels, self.sliders, self.chain, **WIDE)
+        self.view = pn.Column(self._panels, self.sliders, **WIDE)
         if turning is not None:
             self.show(turning)
 
@@ -99,7 +98,7 @@ class Curves:
         """Hide everything."""
         self.sliders.tell("")
         self.turning, self._rows, self.sliders.rows = None, {}, []
-        self._panels.visible = self.chain.visible = False
+        self._panels.visible = False
 
     def chosen(self) -> tuple[dict[str, float], list[str]]:
         """Return the parameters to fix in a fit, with values (SI), and those to vary.
@@ -169,7 +168,7 @@ class Curves:
                 more = beyond * float(np.ptp(values))
                 low, high = float(values.min()) - more, float(values.max()) + more
                 limits.update(start=low, end=high, reset_start=low, reset_end=high)
-        self._panels.visible = self.chain.visible = True
+        self._panels.visible = True
 
     def _some(self, samples: Array, most: int) -> slice:
         """Return a slice with at most `most` samples of each cycle."""
@@ -209,7 +208,6 @@ class Curves:
             sent[name][: len(values)] = values
         self._turned.data = sent
         self._draw_points(drawn)
-        self._draw_chain(drawn.chain)
         test = self.turning.problem.measurement
         text = f"{self.turning.law}, {self.turning.drive} drive"
         if test.last_cycle is not None:
@@ -228,12 +226,6 @@ class Curves:
             beside = [(-8 - 7 * len(name), 2) if name[-1] == "1" else (6, -15) for name in names]
             aside, up = np.array(beside).reshape(-1, 2).T
             self._points.data = {"x": x / fx, "y": y / fy, "name": names, "aside": aside, "up": up}
-
-    def _draw_chain(self, chain: Mapping[str, Array]) -> None:
-        factor, unit = readable_unit(float(np.ptp(chain.get("stress", 0.0))), "Pa")
-        scaled = {name: one / factor if name == "stress" else one for name, one in chain.items()}
-        frames: dict[str, Any] = {name: np.round(one, 4).tolist() for name, one in scaled.items()}
-        self.chain.frames = frames | {"unit": unit} if frames else {}
 
 
 def misfits_text(misfit: Mapping[str, float | None]) -> str:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Unpack
@@ -22,12 +21,9 @@ from foamfit.one_model import Keywords, Options
 from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
 from foamfit.results import law_in_words
-from foamfit.solve.plan import Motion
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
-from foamfit.springs.spring import Spring
 
 WIDE = 4.0  # upper end of a slider, as a multiple of the value
-INSTANTS = 60  # number of drawings of the chain along one cycle
 PANELS = tuple(CURVES)
 
 
@@ -51,18 +47,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Curves (x, y) by the name of their panel, or the error of the simulation.
-
-    `chain` describes the chain at m instants along its loop: "strain" and "stress" (Pa) of the
-    loop; "top" (m,) and "heights" (n_springs, m), divided by the height of the specimen at rest;
-    and "snapped" (n_springs, m), the fraction of each spring that has snapped, NaN if its law does
-    not define one.
-    """
+    """Curves (x, y) by the name of their panel, or the error of the simulation."""
 
     curves: dict[str, tuple[Array, Array]]
     misfit: dict[str, float | None]
     points: dict[str, tuple[float, float]] = field(default_factory=dict)  # strain, stress
-    chain: dict[str, Array] = field(default_factory=dict)
     error: str = ""
 
 
@@ -135,30 +124,10 @@ class Turning:
         stress = m.stress if drive == "stress" else found.get("stress_time", without_time)
         moved = m.displacement if drive == "displacement" else found.get("displacement_time")
         panels = self._panels(stress, moved)
-        chain = self._chained(springs, simulated.motion, *panels["stress_strain"])
         curves = {n: xy for n, xy in panels.items() if n in self.measured}
         alone = len(springs) == 1 and not problem.model.relaxation
         points = springs[0].corners if alone else {}
-        return Drawn(curves, problem.objective.misfit(simulated), points, chain)
-
-    def _chained(
-        self, springs: Sequence[Spring], motion: Motion, strain: Array, stress: Array
-    ) -> dict[str, Array]:
-        """Return the chain along its loop; the springs are at rest before and after contact."""
-        problem, total = self.problem, self.problem.measurement.specimen.height
-        heights = problem.model.heights(self.values[: len(problem.model.names)], total)[:, None]
-        strains = np.maximum(np.diff(motion.displacement, axis=0, prepend=0.0) / heights, 0.0)
-        along = np.cumsum(np.abs(np.diff(strain, prepend=strain[0])))
-        steps = np.linspace(0.0, along[-1], INSTANTS * self.cycles)
-        at = np.unique(np.searchsorted(along, steps))
-        snapped = np.full(strains.shape, np.nan)
-        for row, spring, own in zip(snapped, springs, strains, strict=True):
-            with suppress(SimulationError):  # beyond the end of a branch
-                shares = spring.snapped_along(own)
-                row[:] = np.nan if shares is None else shares
-        parts = {"strain": strain, "stress": stress, "top": 1.0 - motion.displacement[-1] / total}
-        parts |= {"heights": heights / total * (1.0 - strains), "snapped": snapped}
-        return {name: part[..., at] for name, part in parts.items()}
+        return Drawn(curves, problem.objective.misfit(simulated), points)
 
     @cached_property
     def measured(self) -> dict[str, tuple[Array, Array]]:

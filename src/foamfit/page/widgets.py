@@ -70,15 +70,6 @@ class Sliders(JSComponent):
         self._send_msg({"drawn": True})
 
 
-class Chain(JSComponent):
-    """The deformed chain at an instant of its loop, selected or animated."""
-
-    frames = param.Dict({})
-
-    _esm = TEMPLATES / "chain.js"
-    _stylesheets: ClassVar[list[str]] = [style("inputs"), style("chain")]
-
-
 def message(event: Any) -> dict[str, Any]:
     """Return the data of a message as a dictionary; a browser may send anything."""
     return event.data if isinstance(event.data, dict) else {}

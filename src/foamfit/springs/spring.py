@@ -138,10 +138,6 @@ class Spring(ABC):
         """Return the fraction of snapped micro-springs along a stress history (Pa), or None."""
         return None
 
-    def snapped_along(self, strain: ArrayLike) -> Array | None:
-        """Return the snapped fraction along a strain history, (n,), or None."""
-        return None
-
     def stress(self, strain: ArrayLike) -> Array:
         """Return the stress (Pa) along a strain history (n,), from rest (eqs. 2 and 3).
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from foamfit.arrays import Array
 from foamfit.springs.law import BRANCH_NAMES, derived_points
@@ -136,15 +135,6 @@ class BistableSpring(Spring):
         if self.eps_hat_a is not None and self.sigma_hat_a is not None:
             out["A2"] = (self.eps_hat_a, self.sigma_hat_a)
         return out
-
-    def snapped_along(self, strain: ArrayLike) -> Array:
-        """Return the position between branch a (0) and c (1) along a strain history, (n,)."""
-        history, _, branches = self._along(strain)
-        back = self.eps_hat_a or 0.0
-        on_d = (history - self.eps_a) / (self.eps_hat_c - self.eps_a)
-        on_e = (history - back) / (self.eps_c - back)
-        shares = np.choose(branches, [0.0 * history, on_d, 1.0 + 0.0 * history, on_e])
-        return np.asarray(np.clip(shares, 0.0, 1.0))
 
 
 def _sigma_a(k0: float, eps_a: float) -> float:

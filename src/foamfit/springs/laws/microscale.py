@@ -139,10 +139,6 @@ class MicroscaleSpring(Spring):
             out[:, j] = p, most
         return out[0], out[1]
 
-    def snapped_along(self, strain: ArrayLike) -> Array:
-        """Return the snapped fraction along a strain history, (n,), from rest."""
-        return self.fraction_along(self._along(strain)[1])
-
     def elastic_branches(self, stress: Array) -> dict[str, Array]:
         """Return the strains of branches a (p = 0) and c (p = 1) at these stresses (Pa).
 
