@@ -54,3 +54,23 @@ def test_an_entry_is_replaced_and_removed_and_the_rest_stays():
     assert "columns" not in with_column(new, "force", "")
     with pytest.raises(InputError, match="not valid TOML"):
         with_column("[columns", "force", 'column = "F"')
+
+
+def test_a_fit_offers_its_card_and_the_plan_of_the_next_test(tmp_path):
+    import io
+    import zipfile
+
+    import foamfit as ff
+    from conftest import EXPERIMENTS
+    from foamfit.page.desk import Desk
+
+    class Fitted(Desk):
+        fits = {0: tmp_path / "fit"}  # noqa: RUF012
+
+    desk = Fitted(tmp_path / "window")
+    test = ff.read_test(EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv")
+    ff.fit(test).save(tmp_path / "fit", report=False)
+    names = zipfile.ZipFile(io.BytesIO(desk.card(0))).namelist()
+    assert {"foam.k", "foam.k.json"} <= set(names)
+    assert b"which test next?" in desk.planned(0)
+    desk.close()

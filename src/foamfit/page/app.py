@@ -175,14 +175,16 @@ class Window:
             ("the result folder", "result.zip", lambda: BytesIO(self.desk.zipped())),
             ("the report", "report.html", lambda: BytesIO(self._report().encode())),
             ("the TOML", "test.toml", lambda: BytesIO(self.desk.toml)),
-            ("the plan of the next test", "plan.html", self._planned),
+            ("the LS-DYNA card", "card.zip", lambda: BytesIO(self.desk.card(self.report_of.value))),
+            (
+                "the test plan",
+                "plan.html",
+                lambda: BytesIO(self.desk.planned(self.report_of.value)),
+            ),
         )
         self.saves = grid(
             [save(label=f"Save {s}", filename=n, callback=c) for s, n, c in saves], 11.0
         )
-
-    def _planned(self) -> BytesIO:
-        return BytesIO(self.desk.planned(self.report_of.value))
 
     def _report(self) -> str:
         """Return the HTML report of the fit, or of the selected cycle."""

@@ -222,12 +222,15 @@ class Desk:
     def zipped(self) -> bytes:
         """Return the result folder as a ZIP, with the TOML of the test."""
         assert self.result is not None
-        content = io.BytesIO()
-        with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-            for path in sorted(self.result.rglob("*")):
-                archive.write(path, path.relative_to(self.result))
-            archive.write(self.result.with_suffix(".toml"), "test.toml")
-        return content.getvalue()
+        return _zip(self.result, {"test.toml": self.result.with_suffix(".toml")})
+
+    def card(self, cycle: int) -> bytes:
+        """Return an LS-DYNA card of the fit of a cycle (0: a single fit) as a ZIP."""
+        from foamfit.cards.card import card
+
+        with tempfile.TemporaryDirectory() as folder:
+            card(self.fits[cycle], format="mat083").save(Path(folder, "foam.k"))
+            return _zip(Path(folder), {})
 
     def planned(self, cycle: int) -> bytes:
         """Return plan.html, the plan after the fit of a cycle (0: a single fit)."""
@@ -236,6 +239,17 @@ class Desk:
         with tempfile.TemporaryDirectory() as folder:
             plan(self.fits[cycle]).save(Path(folder, "plan"))
             return Path(folder, "plan", "plan.html").read_bytes()
+
+
+def _zip(folder: Path, more: Mapping[str, Path]) -> bytes:
+    """Return the files of a folder, and more by their names, as a ZIP."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(folder.rglob("*")):
+            archive.write(path, path.relative_to(folder))
+        for name, path in more.items():
+            archive.write(path, name)
+    return content.getvalue()
 
 
 def wrong_quantity(message: str) -> str:
