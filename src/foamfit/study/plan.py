@@ -129,7 +129,8 @@ def plan(
 
     outcomes = [outcome(one, what) for one, what in zip(asked, seen, strict=True)]
     safe = [i for i, one in enumerate(outcomes) if one.breaks <= RISKY]
-    best = _advised(outcomes, safe) if safe else None
+    now = _now(known, tests)
+    best = _advised(outcomes, safe, sum(one.chance for one in now.values())) if safe else None
     pair = _pair(known, outcomes, seen, safe)
     progress(0.92, "what no test of this rig determines")
     shown = {name for i in safe for name in outcomes[i].determined}
@@ -140,7 +141,7 @@ def plan(
         model=known.problem.model.name,
         relaxation=known.problem.model.relaxation,
         rig=limits,
-        now=_now(known, tests),
+        now=now,
         outcomes=tuple(outcomes),
         advised=best,
         pair=pair and (outcome(asked[pair[0]], *(seen[i] for i in pair)), asked[pair[1]]),
@@ -309,11 +310,12 @@ def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
 # ------------------------------------------------------------------ the advice
 
 
-def _advised(outcomes: Sequence[Outcome], safe: Sequence[int]) -> int:
+def _advised(outcomes: Sequence[Outcome], safe: Sequence[int], now: float) -> int:
     """Return the place of the advised test among those that are `safe`.
 
     Of the tests that determine most parameters it is the one with the least error of the quantity
-    asked for, or else the softest; of tests with rivals one that tells them apart.
+    asked for, or else the softest, or if none determines more than `now` the one with the narrowest
+    intervals; of tests with rivals one that tells them apart.
     """
     most = max(outcomes[i].number for i in safe)
     good = [i for i in safe if outcomes[i].number >= most - NEARLY]
@@ -327,6 +329,8 @@ def _advised(outcomes: Sequence[Outcome], safe: Sequence[int]) -> int:
         asked = outcomes[i].candidate
         return asked.interior is not None, asked.hold, asked.cycles, outcomes[i].force
 
+    if most <= now + NEARLY:
+        return min(told, key=lambda i: outcomes[i].narrowness)
     return min(told, key=effort)
 
 

@@ -71,6 +71,12 @@ class Outcome:
         """Parameters that are probably determined."""
         return [name for name, one in self.expected.items() if one.state == "determined"]
 
+    @property
+    def narrowness(self) -> float:
+        """Mean logarithm of the expected intervals over the parameters."""
+        known = [one.share for one in self.expected.values() if one.share > 0.0]
+        return float(np.mean(np.log(known))) if known else np.inf
+
     def chance(self, names: Sequence[str]) -> float:
         """Return the least probability with which one of these parameters is determined."""
         return min((self.expected[name].chance for name in names), default=1.0)
@@ -298,40 +304,44 @@ def plot_plan(plan: Plan, *, width: str = TWO) -> Figure:
     return figure
 
 
+def _cells(plan: Plan, impact: bool) -> dict[tuple[float, float], Outcome]:
+    """Return the best test at each velocity and mass, or at each strain rate and strain."""
+    out = dict[tuple[float, float], Outcome]()
+    for one in plan.outcomes:
+        asked = one.candidate
+        pair = (asked.velocity, asked.mass) if impact else (asked.rate, asked.strain)
+        if None in pair or asked.repeat:
+            continue
+        at = float(pair[0] or 0.0), float(pair[1] or 0.0)
+        if at not in out or out[at].number < one.number:
+            out[at] = one
+    return out
+
+
 def _map(ax: Axes, plan: Plan) -> None:
     """Draw the expected number of determined parameters against the settings of the tests.
 
     Tests that exceed a limit with more than 5 % probability are hatched.
     """
-    import matplotlib
+    from matplotlib.ticker import LogLocator
 
-    impact = any(one.candidate.drive == "impact" for one in plan.outcomes)
-    keys = ("velocity", "mass") if impact else ("rate", "strain")
-    table = dict[tuple[float, float], Outcome]()
-    for one in plan.outcomes:
-        at = getattr(one.candidate, keys[0]) or 0.0, getattr(one.candidate, keys[1]) or 0.0
-        if one.candidate.drive != ("impact" if impact else "displacement"):
-            continue
-        if not one.candidate.repeat and (at not in table or table[at].number < one.number):
-            table[at] = one
-    if not table:
-        figures.say_nothing_there(ax, "no test of this kind")
-        return
+    impact, best = bool(plan.rig.masses), plan.advice
+    table = _cells(plan, impact)
     x, y = (np.unique([at[i] for at in table]) for i in (0, 1))
     count = np.array([[table[a, b].number if (a, b) in table else np.nan for a in x] for b in y])
     edges, rows = _edges(x), np.arange(y.size + 1) - 0.5
     shown = ax.pcolormesh(edges, rows, count, cmap="Blues", vmin=0.0, vmax=len(plan.now))
+    style: Any = {"facecolor": "none", "edgecolor": VERMILION, "hatch": "////", "linewidth": 0.0}
     for (a, b), one in table.items():
         if one.breaks > RISKY:
             i, j = int(np.searchsorted(x, a)), int(np.searchsorted(y, b))
-            style: Any = {"facecolor": "none", "edgecolor": VERMILION, "hatch": "////"}
-            ax.fill_between(edges[i : i + 2], rows[j], rows[j + 1], linewidth=0.0, **style)
-    best = plan.advice
+            ax.fill_between(edges[i : i + 2], rows[j], rows[j + 1], **style)
     if best is not None and (best.candidate.drive == "impact") == impact:
-        place = [getattr(best.candidate, key) for key in keys]
-        row = int(np.argmin(np.abs(y - place[1])))
-        ax.plot(place[0], row, "*", color=VERMILION, markersize=11, markeredgecolor="white")
-    for mass, (half, _) in plan.closing.items() if impact else ():
+        asked = best.candidate
+        place = (asked.velocity, asked.mass) if impact else (asked.rate, asked.strain)
+        row = int(np.argmin(np.abs(y - float(place[1] or 0.0))))
+        ax.plot(float(place[0] or 0.0), row, "*", color=VERMILION, ms=11, markeredgecolor="white")
+    for mass, (half, _) in plan.closing.items():
         row = int(np.argmin(np.abs(y - mass)))
         if edges[0] < half < edges[-1]:
             ax.plot([half] * 2, [row - 0.5, row + 0.5], color="black", linewidth=1.0, ls="--")
@@ -339,8 +349,7 @@ def _map(ax: Axes, plan: Plan) -> None:
     ax.set(xscale="log", yticks=range(y.size), yticklabels=labels, xlim=(edges[0], edges[-1]))
     ax.set(ylabel="striker mass" if impact else "largest strain")
     ax.set_xlabel("velocity (m/s)" if impact else "strain rate (1/s)")
-    ticks = matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0))
-    ax.xaxis.set_major_locator(ticks)
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.xaxis.set_major_formatter("{x:g}")
     ax.xaxis.set_minor_formatter("")
     bar = ax.figure.colorbar(shown, ax=ax, location="top", aspect=30, pad=0.02)
