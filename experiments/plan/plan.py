@@ -272,7 +272,7 @@ def write_page(out: Path) -> None:
             f"within_{name}": f"{row['within 1.5 (%)']:.1f} %",
             f"broke_{name}": f"{row['broke the rig']} of {row['foams']}",
         }  # fmt: skip
-    real = pd.read_csv(out / "real.csv").fillna("–")
+    real = pd.read_csv(out / "real.csv", dtype=str).fillna("–")
     tables = {"table": (shown, head), "real": (real, list(real))}
     for name, (table, columns) in tables.items():
         text = studies.markdown(columns, table.to_numpy().tolist())
