@@ -362,13 +362,13 @@ def _completed(stated: dict[str, Any], test: Measurement, relaxing: bool) -> Rig
     )  # fmt: skip
 
 
-def beyond(rig: Rig) -> Iterator[tuple[str, Rig]]:
-    """Yield rigs that could do more, with what they have more, in words."""
+def beyond(rig: Rig, springs: int) -> Iterator[tuple[str, Rig]]:
+    """Yield rigs that could do more with a model of some springs; what they have more, in words."""
     none = {"force": math.inf, "displacement": math.inf}
     if rig.masses:
         high = rig.velocity[1], 3.0 * rig.velocity[1]
         yield "a faster or heavier striker", replace(rig, velocity=high, **none)  # type: ignore[arg-type]
-        if not rig.interior:
+        if springs > 1 and not rig.interior:
             yield "the displacement of an interior mass", replace(rig, interior=True)
     if not rig.rates[0] > 0.0:
         slow: Any = {"strain": (0.5, 0.8), "rates": (0.01, 1.0), "masses": (), "sampling": None}

@@ -3,7 +3,8 @@
 A fit with residuals r, slopes J and noise of covariance Σ has the covariance H⁻¹ (JᵀΣJ) H⁻¹ with
 H = JᵀJ (`trust.covariance`), with contact time and zeros eliminated from J. H and JᵀΣJ of several
 tests add up. Where the law misses the record, the range due to model error is expected by the rule
-of `trust.ranges`: all values whose cost rises by at most `tolerance`, to first order.
+of `trust.ranges`: all values whose cost rises by at most `tolerance`, to first order, times the
+factor by which the ranges of the tests at hand exceed this.
 """
 
 from __future__ import annotations
@@ -40,9 +41,10 @@ class Known:
     """What the tests at hand say about the k varied parameters of the springs.
 
     Parameters are scaled by `sizes` (k,). `bread` (k, k) is JᵀJ and `meat` JᵀΣJ, `missed` the sum
-    of squares of the model error, `share` its RMS over the range of each curve, `reached` (k,)
-    whether the branch of each parameter was reached. `draws` (d, n) are vectors of parameters that
-    follow the tests about equally well.
+    of squares of the model error, `share` its RMS over the range of each curve, `stretch` (k,) the
+    ranges of the fits over those to first order, at least 1, `reached` (k,) whether the branch of
+    each parameter was reached. `draws` (d, n) are vectors of parameters that follow the tests about
+    equally well.
     """
 
     problem: Problem
@@ -53,6 +55,7 @@ class Known:
     meat: Array
     missed: float
     share: dict[str, float]
+    stretch: Array
     reached: Mask
     draws: Array
 
@@ -138,6 +141,7 @@ def look(
     bread, meat = np.zeros((2, d, k, k))
     reached, broken = np.zeros((d, k), dtype=bool), np.ones(d, dtype=bool)
     missed, forces, apart = np.zeros(d), list[float](), dict[str, list[float]]()
+    usual = max(known.share.values(), default=0.0)  # of curves that no test at hand has
     others = {name: Rival.of(one, candidate, rig, each) for name, one in (rivals or {}).items()}
     for i, drawn in enumerate(known.draws):
         values = known.with_springs(drawn, problem)
@@ -156,7 +160,8 @@ def look(
         within = forces[-1] <= rig.force and most <= rig.displacement
         broken[i] = not (within and strain <= rig.largest_strain)
         for curve, size in zip(counted, objective.sizes, strict=True):
-            off = known.share.get(curve, 0.0) * float(np.ptp(shown.curves[curve]))
+            share = known.share.get(curve, usual)
+            off = share * float(np.ptp(shown.curves[curve]))
             missed[i] += each * size * (off * objective.factor(curve)) ** 2
         for name, rival in others.items():
             if rival is not None:
@@ -219,6 +224,7 @@ def covariance(known: Known, seen: Sequence[Seen], floor: float = TINY) -> tuple
     axes = axes / least[:, None, :]
     noise = np.einsum("dij,djk,dlk->dil", axes, inner, axes) * scale
     law = np.einsum("dij,dj,dkj->dik", axes, least, axes) * scale
+    law = law * np.outer(known.stretch, known.stretch)
     return noise, (ALIKE**2 - 1.0) * missed[:, None, None] * law
 
 

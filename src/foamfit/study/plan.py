@@ -36,6 +36,7 @@ from foamfit.study.gain import (
     Known,
     Seen,
     Target,
+    covariance,
     expected,
     look,
     problem_for,
@@ -121,10 +122,15 @@ def plan(
         progress(0.05 + 0.85 * i / len(asked), f"{counted(len(asked), 'candidate')}, {i} done")
         seen.append(look(known, one, limits, others))
 
+    fits = [one.fit for one in tests if one.fit is not None]
+    contradicted = known.missed > 0.0 and any(fit.contradictions for fit in fits)
+
     def outcome(one: Candidate, *more: Seen) -> Outcome:
         risk = np.any([each.broken for each in more], axis=0)
         error = None if target is None else target.error(known, more)
         found = expected(known, more)
+        if contradicted and one.drive == "impact":  # as in a fit, where the law errs as well
+            found = {name: x.capped() for name, x in found.items()}
         return Outcome(one, float(np.mean(risk)), found, more[0].force, error, more[0].apart)
 
     outcomes = [outcome(one, what) for one, what in zip(asked, seen, strict=True)]
@@ -134,7 +140,8 @@ def plan(
     pair = _pair(known, outcomes, seen, safe)
     progress(0.92, "what no test of this rig determines")
     shown = {name for i in safe for name in outcomes[i].determined}
-    never = _beyond(known, [name for name in known.names if name not in shown], limits)
+    left = [name for name in known.names if name not in shown]
+    never = _beyond(known, left, limits, impacts=not contradicted)
     progress(0.97, "the velocity that closes the loop")
     return Plan(
         tests=tuple(one.problem.measurement for one in tests),
@@ -150,6 +157,7 @@ def plan(
         quantity=None if target is None else target.shown(known),
         rivals=tuple(others),
         missed=known.missed > 0.0,
+        contradicted=contradicted,
         seed=seed,
     )
 
@@ -233,8 +241,24 @@ def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Kno
         values = first.space().decode(first.space().encode(values))
     means = {curve: float(np.mean(each)) for curve, each in share.items()}
     both = breads.sum(axis=0), meats.sum(axis=0)
-    known = Known(first, values, names, sizes, *both, missed, means, reached, values[None])
+    known = Known(
+        first, values, names, sizes, *both, missed, means, np.ones(k), reached, values[None]
+    )
+    known = replace(known, stretch=_stretch(known, tests))
     return replace(known, draws=_draws(known, tests, rng, draws)) if draws else known
+
+
+def _stretch(known: Known, tests: Sequence[Test]) -> Array:
+    """Return the widest range of each parameter in the fits over that to first order, (k,)."""
+    law = np.sqrt(np.maximum(np.diagonal(covariance(known, [])[1][0]), 0.0))
+    out = np.ones(law.size)
+    for one in tests:
+        for i, name in enumerate(known.names):
+            found = None if one.fit is None else one.fit.parameters[name].range
+            if found is not None and law[i] > 0.0:
+                half = 0.5 * (found[1] - found[0]) / known.sizes[i]
+                out[i] = max(out[i], half / law[i])
+    return out
 
 
 def _draws(known: Known, tests: Sequence[Test], rng: np.random.Generator, count: int) -> Array:
@@ -356,7 +380,7 @@ def _thinned(seen: Seen) -> Seen:
     )  # fmt: skip
 
 
-def _beyond(known: Known, left: Sequence[str], rig: Rig) -> dict[str, str]:
+def _beyond(known: Known, left: Sequence[str], rig: Rig, *, impacts: bool) -> dict[str, str]:
     """Return, for parameters that no test of the rig determines, what other rig would."""
     out, test, springs = (
         dict.fromkeys(left, ""),
@@ -364,8 +388,9 @@ def _beyond(known: Known, left: Sequence[str], rig: Rig) -> dict[str, str]:
         len(known.problem.model.kinds),
     )
     few = replace(known, draws=known.draws[: DRAWS // 4])
-    for what, other in beyond(rig) if left else ():
+    for what, other in beyond(rig, springs) if left else ():
         made = [one for one in candidates(other, test, springs) if not one.repeat]
+        made = [one for one in made if impacts or one.drive != "impact"]
         for one in made[:: max(len(made) // 12, 1)]:
             found = expected(few, [look(few, one, other)])
             new = [name for name in left if found[name].state == "determined" and not out[name]]

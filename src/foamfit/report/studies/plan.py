@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,7 @@ from foamfit.report.render import page, sentences, words
 from foamfit.results import law_in_words, plain
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import unit_of
+from foamfit.text import engineering
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,6 +49,11 @@ class Expected:
     share: float
     state: str
     chance: float
+
+    def capped(self) -> Expected:
+        """Return the same, but not determined."""
+        state = "weak" if self.state == "determined" else self.state
+        return replace(self, state=state, chance=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +122,9 @@ class Plan:
     quantity: Quantity | None
     rivals: tuple[str, ...]  #: laws of further results, which the test should tell apart
     missed: bool  #: whether the law misses the record by more than the noise
+    #: whether force, mass and motion of the record contradict each other as well; an impact of the
+    #: same rig then determines nothing
+    contradicted: bool
     seed: int
 
     @property
@@ -345,7 +354,7 @@ def _map(ax: Axes, plan: Plan) -> None:
         row = int(np.argmin(np.abs(y - mass)))
         if edges[0] < half < edges[-1]:
             ax.plot([half] * 2, [row - 0.5, row + 0.5], color="black", linewidth=1.0, ls="--")
-    labels = [f"{1e3 * b:.4g} g" if impact else f"{b:.2g}" for b in y]
+    labels = [engineering(1e3 * b, "g") if impact else f"{b:.2g}" for b in y]
     ax.set(xscale="log", yticks=range(y.size), yticklabels=labels, xlim=(edges[0], edges[-1]))
     ax.set(ylabel="striker mass" if impact else "largest strain")
     ax.set_xlabel("velocity (m/s)" if impact else "strain rate (1/s)")
