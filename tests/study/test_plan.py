@@ -289,3 +289,26 @@ def test_what_the_rig_does_not_state_is_taken_from_the_record_and_said():
     assert rig.sampling == pytest.approx(1e5)
     assert rig.noise == {"stress": 1e4, "displacement": 1e-6}
     assert len(rig.notes) == 5
+
+
+def test_what_a_contradictory_record_promises_is_capped():
+    from foamfit.report.studies.plan import Expected
+
+    one = Expected(1.0, (0.9, 1.1), 0.1, "determined", 0.9)
+    assert (one.capped().state, one.capped().chance, one.capped().width) == ("weak", 0.0, 1.0)
+    other = Expected(1.0, (0.9, 1.1), 5.0, "not determined", 0.1)
+    assert other.capped().state == "not determined"
+
+
+def test_where_the_law_errs_ranges_are_expected_and_no_test_removes_them(tmp_path):
+    """A microscale foam that is fitted by the bistable law: its kinks are not in the record."""
+    result = ff.fit(slow_test(), model="bistable")
+    found = ff.plan(result)
+    assert found.missed
+    assert any("no test removes it" in sentence for sentence in found.sentences)
+    again = next(one for one in found.outcomes if one.candidate.repeat)
+    wide = {
+        name: one.range for name, one in result.parameters.items()
+        if one.range and one.vary and name in found.now and one.state == "not determined"
+    }  # fmt: skip
+    assert all(again.expected[name].state != "determined" for name in wide)
