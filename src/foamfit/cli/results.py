@@ -191,7 +191,8 @@ def plan(
     """
     output.check(without_report=False)
     name = Path(results[0]).resolve()
-    default = name.parent.name if name.is_dir() else results[0].replace("/", "-")
+    own = name.name if (name / "joint.json").is_file() else name.parent.name
+    default = own if name.is_dir() else results[0].replace("/", "-")
     given = [path for path in map(Path, results) if path.exists()]
     folder = output.folder(Path("plans", default), [*given, *([rig] if rig else [])])
     with options.compiling(output.silent) as compile_rest:
