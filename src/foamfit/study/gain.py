@@ -72,7 +72,7 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a test would show in each of d draws."""
+    """What a test would show in each of d draws; nothing where it exceeds a limit."""
 
     bread: Array  # (d, k, k)
     meat: Array  # (d, k, k)
@@ -149,16 +149,18 @@ def look(
             shown = objective.simulate(values, everything=True)
         except SimulationError:
             continue
-        rows = rows_of(problem, values, known.names, known.sizes) * weigh[:, None]
-        rows = without_nuisance(rows, k)
-        bread[i], meat[i] = rows.T @ rows, (noise[:, None] * rows).T @ (noise[:, None] * rows)
-        silent = unreached(problem, shown)
-        reached[i] = [name not in silent for name in known.names]
         forces.append(float(shown.motion.base_stress.max()) * test.specimen.area)
         most = float(shown.motion.displacement[-1].max())
         strain = most / test.specimen.height
         within = forces[-1] <= rig.force and most <= rig.displacement
         broken[i] = not (within and strain <= rig.largest_strain)
+        if broken[i]:  # no record
+            continue
+        rows = rows_of(problem, values, known.names, known.sizes) * weigh[:, None]
+        rows = without_nuisance(rows, k)
+        bread[i], meat[i] = rows.T @ rows, (noise[:, None] * rows).T @ (noise[:, None] * rows)
+        silent = unreached(problem, shown)
+        reached[i] = [name not in silent for name in known.names]
         for curve, size in zip(counted, objective.sizes, strict=True):
             share = known.share.get(curve, usual)
             off = share * float(np.ptp(shown.curves[curve]))

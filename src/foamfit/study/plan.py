@@ -52,7 +52,7 @@ from foamfit.trust.ranges import ALIKE, tolerance
 Progress = Callable[[float, str], None]
 DRAWS = 40  # number of drawn foams
 TRIES = 60  # attempts per draw
-NEARLY = 0.05  # tests that determine this many parameters fewer, on average, count as equal
+NEARLY = 0.1  # tests that determine this many parameters fewer, on average, count as equal
 PAIRED = 40  # number of tests whose pairs are compared
 TOLD_APART = 9.0  # rise of χ² at which a test tells two laws apart
 HALVINGS = 12  # of the interval in which the closing velocity is sought
