@@ -96,7 +96,7 @@ def plan(
     Returns
     -------
     Plan
-        With `.table()`, `.plot()` and `.save()`.
+        The advice, with a table, a plot and `foamfit.Plan.save`.
 
     Raises
     ------
