@@ -256,8 +256,8 @@ def draw_figure(rows: pd.DataFrame, found: pd.DataFrame, path: Path) -> None:
 
 
 def write_page(out: Path) -> None:
-    """Write README.md and plan.png from foams.csv, plan.csv and real.csv."""
-    rows, found = (pd.read_csv(out / name) for name in ("foams.csv", "plan.csv"))
+    """Write README.md and plan.png from foams.csv.gz, plan.csv and real.csv."""
+    rows, found = (pd.read_csv(out / name) for name in ("foams.csv.gz", "plan.csv"))
     draw_figure(rows, found, out / "plan.png")
     head = ["springs", "second test", "foams", "determined", "could be", "broke the rig",
             "fewer than random", "velocity over closing", "width over expected",
@@ -303,7 +303,8 @@ def main() -> None:
         for column in ("broke", "error", "expected width", "force (N)", "velocity over closing"):
             if column not in table:
                 table[column] = math.nan
-        table.to_csv(asked.out / "foams.csv", index=False, float_format="%.6g")
+        raw: dict[str, Any] = {"compression": {"method": "gzip", "mtime": 0}}
+        table.to_csv(asked.out / "foams.csv.gz", index=False, float_format="%.4g", **raw)
         summary(table).to_csv(asked.out / "plan.csv", index=False, float_format="%.4g")
     if (asked.out / "real.csv").is_file():
         write_page(asked.out)
