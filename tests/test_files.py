@@ -145,7 +145,12 @@ def test_a_link_to_a_result_stays_a_link(here: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("loop", "link|levels"), ("x" * 300, "too long"), ("file", "is a file"), ("file/r", "a file")],
+    [
+        ("loop", "link|levels|is a file"),
+        ("x" * 300, "too long"),
+        ("file", "is a file"),
+        ("file/r", "a file"),
+    ],
 )
 def test_what_cannot_be_a_folder_is_said_before_the_fit(here: Path, name: str, words: str) -> None:
     (here / "loop").symlink_to("loop")

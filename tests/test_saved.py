@@ -223,3 +223,23 @@ def test_a_measurement_shows_what_it_holds_without_its_samples():
     assert shown.startswith("Measurement ")
     assert "rows of stress" in shown
     assert len(shown) < 300
+
+
+def test_an_array_is_read_back_if_its_type_is_an_alias(monkeypatch):
+    """From NumPy 2.5 on, `NDArray[kind]` is a type alias with a parameter."""
+    import types
+    from typing import Any
+
+    import numpy as np
+
+    from foamfit import codec
+
+    plain = np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
+    alias = types.SimpleNamespace(__value__={(np.float64,): plain})
+    found = {"alias": (alias, (np.float64,))}
+    monkeypatch.setattr(codec, "get_origin", lambda hint: found.get(hint, (None,))[0]
+                        if isinstance(hint, str) else np.ndarray)  # fmt: skip
+    own = codec.get_args
+    monkeypatch.setattr(codec, "get_args", lambda hint: found[hint][1] if isinstance(hint, str)
+                        else own(hint))  # fmt: skip
+    np.testing.assert_array_equal(codec.decode("alias", [1.0, "nan"], {}), [1.0, np.nan])

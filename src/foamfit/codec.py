@@ -73,6 +73,9 @@ def encode(value: Any, columns: Columns | None = None) -> Any:
 def decode(hint: Any, value: Any, columns: Columns) -> Any:
     """Invert `encode` for a value of type `hint`; raises the errors of `build`."""
     origin, inner = get_origin(hint), get_args(hint)
+    if hasattr(origin, "__value__"):  # NDArray of NumPy 2.5 is a type alias with a parameter
+        hint = origin.__value__[inner]
+        origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         arms = [arm for arm in inner if arm is not type(None)]
         hint = arms[0] if len(arms) == 1 else Any

@@ -203,7 +203,7 @@ def test_keywords_and_options_are_one_list_and_all_are_documented():
     fields = get_type_hints(Options)
     assert get_type_hints(Keywords) == fields
     for name in fields:
-        assert re.search(rf"^    {name} : ", ff.fit.__doc__, re.MULTILINE), name
+        assert re.search(rf"^ *{name} : ", ff.fit.__doc__, re.MULTILINE), name
 
 
 def test_a_path_is_no_measurement():

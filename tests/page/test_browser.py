@@ -365,6 +365,8 @@ def test_a_raw_file_is_drawn_prompts_for_its_specimen_and_offers_its_columns(
         api.expect(prompt).to_be_visible()
         api.expect(page.get_by_role("alert")).to_have_count(0)
         page.get_by_label("Drop a CSV").set_input_files(raw)
+        page.get_by_text("raw.csv").first.wait_for()
+        page.wait_for_timeout(2000)  # reading it clears the fields of the test before
         for label, value in (("Specimen height", "10 mm"), ("Specimen diameter", "8 mm")):
             page.get_by_label(label).fill(value)
             page.keyboard.press("Tab")
