@@ -176,16 +176,20 @@ class Output:
         """Say where a result is and which page of it to look at; with --open open that."""
         if not self.silent:
             say(f"\nwritten to {page.parent}" + (f": open {page}" if page.is_file() else ""))
-        if not self.opening:
-            return
-        import webbrowser
+        if self.opening:
+            open_page(page)
 
-        try:
-            opened = webbrowser.open(page.resolve().as_uri())
-        except (webbrowser.Error, OSError):
-            opened = False
-        if not opened:
-            say(f"foamfit: no browser could be opened; open {page} by hand", err=True)
+
+def open_page(page: Path) -> None:
+    """Open a page in the browser, or say that it cannot be opened."""
+    import webbrowser
+
+    try:
+        opened = webbrowser.open(page.resolve().as_uri())
+    except (webbrowser.Error, OSError):
+        opened = False
+    if not opened:
+        say(f"foamfit: no browser could be opened; open {page} by hand", err=True)
 
 
 def output(folder: str, printed: str) -> Callable[[Command], Command]:

@@ -67,8 +67,6 @@ def list_results(folder: Path, opening: bool) -> None:
         foamfit list
         foamfit list runs --open
     """
-    import webbrowser
-
     from foamfit.report.listing import lines, results_in, write_index
 
     found = results_in(folder)
@@ -77,7 +75,7 @@ def list_results(folder: Path, opening: bool) -> None:
     if page is not None:
         say(f"\nthe same with loops and links: {page}")
         if opening:
-            webbrowser.open(page.resolve().as_uri())
+            options.open_page(page)
 
 
 @main.command()

@@ -363,7 +363,7 @@ def _completed(stated: dict[str, Any], test: Measurement, relaxing: bool) -> Rig
 
 
 def beyond(rig: Rig, springs: int) -> Iterator[tuple[str, Rig]]:
-    """Yield rigs that could do more with a model of some springs; what they have more, in words."""
+    """Yield more capable rigs, each with the name of what it adds."""
     none = {"force": math.inf, "displacement": math.inf}
     if rig.masses:
         high = rig.velocity[1], 3.0 * rig.velocity[1]

@@ -50,7 +50,7 @@ class Listed:
 
     @property
     def report(self) -> Path | None:
-        """The page of the result, relative to the folder, if there is one."""
+        """The report of the result, if it was written."""
         names = ("report.html", "joint.html")
         return next((self.place / name for name in names if (self.place / name).is_file()), None)
 
@@ -62,11 +62,8 @@ class Listed:
     @property
     def row(self) -> list[str]:
         """The cells of the line in the terminal; of the misfits the largest."""
-        number, most = (
-            f"{self.determined} of {self.varied}",
-            max(self.misfits.values(), default=None),
-        )
-        shown = "–" if most is None else percent(most)
+        shown = percent(max(self.misfits.values())) if self.misfits else "–"
+        number = f"{self.determined} of {self.varied}"
         known = [self.damaged, "", ""] if self.damaged else [self.options, shown, number]
         return [tail(self.test, LONGEST), self.model, self.status, *known, self.date]
 
@@ -87,7 +84,7 @@ def lines(results: Sequence[Listed]) -> str:
 def results_in(folder: str | Path) -> list[Listed]:
     """Return the results of fits and joint fits in a folder and below, by place.
 
-    Raises InputError if there is none.
+    Raises InputError if the folder contains no result.
     """
     top = Path(folder)
     if not top.is_dir():

@@ -26,10 +26,10 @@ from foamfit.report.studies.plan import Expected, Quantity
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Impact
 from foamfit.springs.parameters import NUISANCE
+from foamfit.study.identified import NORMAL
 from foamfit.trust.covariance import NOTHING, WEAK
 from foamfit.trust.ranges import ALIKE
 
-NORMAL = 1.959964  # half the 95 % interval of a normal distribution, in standard deviations
 TINY, ROUNDING = 1e-6, 1e-12  # least information on a scaled parameter, and over the largest one
 LONGEST = 30.0  # longest contact, in times that the striker takes over the height of the specimen
 TIMED = 20  # number of draws from which the duration of an impact is taken
