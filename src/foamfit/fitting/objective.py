@@ -43,6 +43,7 @@ OF_DRIVE = ("those of the drive",)  # default of `Objective.nuisance`
 # the other, as the residuals of both are then errors of the law.
 MODEL_ERROR = 0.005
 NORMAL = 1.4826  # standard deviation of normal residuals over their median absolute value
+RANKING = 1e-3  # allowed error of the simulations that rank starts on a thinned record
 THIN = 0.8  # a record is thinned if at most this fraction of its samples is left
 
 
@@ -158,7 +159,9 @@ class Objective:
             return self
         followed = (motion,) if self.driven else self.followed
         gap = float(np.median(np.diff(self.time)))
-        few = replace(self, measurement=test, followed=followed, weighing=None, averaged=gap)
+        few = replace(
+            self, measurement=test, followed=followed, weighing=None, averaged=gap, rtol=RANKING
+        )
         pairs = zip(self.counted, self.sizes, few.sizes, strict=True)
         more = {name: self.weights[name] * size / left for name, size, left in pairs}
         return replace(few, weights=self.weights | more)

@@ -101,9 +101,10 @@ PUSH, SPREAD, DRIVES = range(9, 12)
 # length of the piece, steps, growth of the next step, largest stress, whether the base stress has
 # risen, last error, next sample, number of the piece, switches; of implicit steps: length of the
 # one before, least length that the error can enforce, length of a short step, short steps in a row,
-# size of all vibrations that were damped out, and of those in the last steps.
+# size of all vibrations that were damped out, and of those in the last steps; of explicit steps
+# along a drive: steps without an attempt at order 3.
 NOW, BEGUN, STEP, HORIZON, TAKEN, GROW, LARGEST, PRESSED, LAST, SAMPLE, PIECE, LOGGED = range(12)
-BEFORE, FLOOR, BRIEF, IN_ROW, DAMPED, DAMPING, RUN = range(12, 19)
+BEFORE, FLOOR, BRIEF, IN_ROW, DAMPED, DAMPING, PAUSED, RUN = range(12, 20)
 BATCH = 64  # samples that are computed together
 # Rows of the stages; the row with the rates at the end of a step; rows of the dense output.
 STAGES, STEPPED, LINE = 16, 12, 7
