@@ -491,7 +491,10 @@ def test_refuses_too_few_rows(tmp_path):
             SPECIMEN + '[columns]\nforce = { column = "F", units = "N" }\n',
             ["no key 'units'", "unit"],
         ),
-        (SPECIMEN + '[columns]\nforce = { column = "F", unit = "Q!" }\n', ["'Q!' is unknown"]),
+        (
+            SPECIMEN + '[columns]\nforce = { column = "F", unit = "Q!" }\n',
+            ["'Q!' must be a known unit"],
+        ),
         (SPECIMEN + '[columns]\nforce = { column = "F", scale = "0" }\n', ["scale = '0'"]),
         (
             SPECIMEN + '[columns]\nforce = { column = "stress (MPa)", scale = "2 N/V" }\n',

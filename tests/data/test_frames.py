@@ -284,8 +284,8 @@ def test_a_motion_is_no_test_of_its_own(tmp_path):
     ("toml", "words"),
     [
         ('[motion]\nfile = "film.csv"\n', ["film.csv: no such file", "[motion] file of test.toml"]),
-        ("[motion]\nfile = 3\n", ["test.toml: [motion] must name a file"]),
-        ('[motion]\nfile = "a\\u0000"\n', ["test.toml: [motion] must name a file"]),
+        ("[motion]\nfile = 3\n", ["test.toml: [motion] file = 3 must be a file"]),
+        ('[motion]\nfile = "a\\u0000"\n', ["test.toml: [motion] file", "must be a file"]),
         ('[motion]\nfile = "."\n', ["cannot be read", "[motion] file of test.toml"]),
         ('[motion]\ndelay = "1 us"\n', ["[motion] must name a file"]),
         ('[motion]\nfile = "test.csv"\n', ["test.toml: [motion] file", "is the file of the force"]),

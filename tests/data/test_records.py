@@ -477,7 +477,7 @@ def test_the_unit_of_the_header_may_be_said_again(tmp_path):
         ("a = " + 5000 * "{ a = " + "1" + 5000 * "}", ["nested too deeply"]),
         ('name = "' + 10_000_000 * "a" + '"', ["has 10", "characters"]),
         (10_000_000 * "a" + " = 1", ["has 10", "characters"]),
-        ('name = "' + 500_000 * "a" + '"\n' + SPECIMEN, ["name has 500000 characters"]),
+        ('name = "' + 500_000 * "a" + '"\n' + SPECIMEN, ["name = ", "200 characters at most"]),
         (500_000 * "a" + " = 1\n" + SPECIMEN, ["no key"]),
         ('name = "a\\u001b[31mb"\n' + SPECIMEN, ["name", "printable"]),
         ('[specimen]\nheight = "1_000 mm"\narea = "1 mm^2"\n', ["height", "without separators"]),
