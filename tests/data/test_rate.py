@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from conftest import HEIGHT, synthetic_loop
+from foamfit.data.cycles import loading_rate, rate_error
 from foamfit.data.noise import with_noise
-from foamfit.data.rate import loading_rate, rate_error
 
 _, LOOP = synthetic_loop(noise=0.0)
 

@@ -13,6 +13,7 @@ import numpy as np
 from foamfit.arrays import Array, means
 from foamfit.data import contact, cycles, frames, zeros
 from foamfit.data import outliers as repair
+from foamfit.data.contact import Rise, rise_of
 from foamfit.data.measurement import (
     MEASURED,
     MIN_ROWS,
@@ -27,8 +28,14 @@ from foamfit.data.measurement import (
     Window,
     interior_channel,
 )
-from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, noise_level, smooth
-from foamfit.data.rise import Rise, rise_of
+from foamfit.data.noise import (
+    averaged,
+    estimated_noise,
+    integrated_twice,
+    noise_before_contact,
+    noise_level,
+    smooth,
+)
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
@@ -254,12 +261,10 @@ def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> Re
     else:
         start, rate = gravity, gravity + np.where(time < 0.0, 0.0, rate)
     t, r = np.insert(time, at, 0.0), np.insert(rate, at, start)
-    dt = np.diff(t)
-    w = np.append(0.0, np.cumsum(0.5 * dt * (r[1:] + r[:-1])))
+    w, twice = integrated_twice(t, r)
     if source != "velocity":
         assert striker.velocity
-        v = striker.velocity + w - w[at]
-        w = np.append(0.0, np.cumsum(v[:-1] * dt + dt**2 * (2 * r[:-1] + r[1:]) / 6))
+        w = (striker.velocity - w[at]) * (t - t[0]) + twice
         record = replace(record, derived=(*record.derived, "displacement"))
     w = np.delete(w - w[at], at)
     return replace(record, displacement=w, motion=f"integrated from {source}")

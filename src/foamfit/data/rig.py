@@ -24,9 +24,9 @@ from foamfit.data.checks import (
     checked_tables,
     load_toml,
 )
+from foamfit.data.cycles import loading_rate
 from foamfit.data.measurement import Measurement, Noise, NoiseLevel, Striker, interior_channel
 from foamfit.data.noise import with_noise
-from foamfit.data.rate import loading_rate
 from foamfit.errors import InputError, naming
 from foamfit.text import engineering, listed
 
