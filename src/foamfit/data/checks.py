@@ -194,7 +194,7 @@ def checked(
     table: Mapping[str, Any], keys: Mapping[str, Check], where: str, needed: Iterable[str] = ()
 ) -> dict[str, Any]:
     """Return the checked values of a table by key; keys that are not `needed` may be missing."""
-    check_keys(where, table, keys)
+    check_keys(where.removesuffix(":"), table, keys)
     for key in needed:
         if key not in table:
             check = keys[key]
