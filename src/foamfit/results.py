@@ -13,9 +13,8 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.codec import encode
 from foamfit.data.calibration import Contradiction
-from foamfit.data.cycles import cycles_of
+from foamfit.data.cycles import cycles_of, loading_rate
 from foamfit.data.measurement import Measurement, interior_channel
-from foamfit.data.rate import loading_rate
 from foamfit.springs.chain import Chain
 from foamfit.springs.options import OPTIONS
 from foamfit.springs.spring import Spring

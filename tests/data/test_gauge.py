@@ -1,18 +1,14 @@
 """A gauge that sticks and then jumps is detected and bridged, without false detections."""
 
 import csv
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex
 
-import fabricated
 from conftest import DATA
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Record, Specimen
 from foamfit.data.prepare import condition
-from foamfit.report.plots import STOOD, plot_fit
 
 HEIGHT = 10.0  # mm
 SPECIMEN = f'[specimen]\nheight = "{HEIGHT} mm"\narea = "100 mm^2"\n'
@@ -168,15 +164,6 @@ def test_a_true_hold_is_no_standstill(ramps, every, digit, noise):
     assert not notes(conditioned(shown, stress, noise))
 
 
-@pytest.mark.parametrize("late", [-8, -3, 3, 8])
-@pytest.mark.parametrize("every", [1, 5])
-def test_a_hold_with_a_force_beside_its_time_is_no_standstill(late, every):
-    w = motion((TOP, 600), (TOP, 250), (0.0, 613))
-    stress = relaxing_stress(w)
-    at = np.clip(np.arange(w.size) - late, 0, w.size - 1)
-    assert not notes(conditioned(held(w, every), stress[at], 0.001))
-
-
 @pytest.mark.parametrize("digit", [0.0, 0.03, 0.3])
 @pytest.mark.parametrize("samples", [60, 400, 4000])
 @pytest.mark.parametrize("every", [1, 5])
@@ -196,20 +183,6 @@ def test_a_gauge_that_slips_after_a_hold_at_constant_stress_has_not_stood_still(
     true = motion((4.0, 300), (4.0, 60), (TOP, 150), (0.0, 450))
     shown = true + np.where(np.arange(true.size) > 360, 0.3, 0.0)
     assert notes(conditioned(shown, 20.0 * true, noise)) == []
-
-
-def test_the_stretch_is_shaded_in_every_panel_and_has_a_key():
-    result = fabricated.result()
-    time = result.measurement.time
-    spans = ((float(time[20]), float(time[40])),)
-    figure = plot_fit(replace(result, measurement=replace(result.measurement, standstills=spans)))
-    key = "gauge stands still, bridged"
-    assert key in [text.get_text() for text in figure.legends[0].get_texts()]
-    for ax in figure.axes[:3]:
-        (shade,) = (a for a in (*ax.lines, *ax.patches) if a.get_label() == key)
-        color = shade.get_facecolor() if shade in ax.patches else shade.get_color()
-        assert to_hex(color).upper() == STOOD
-    assert key not in [text.get_text() for text in plot_fit(result).legends[0].get_texts()]
 
 
 # ------------------------------------------------------------------------------------ real records

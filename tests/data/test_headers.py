@@ -56,14 +56,6 @@ def test_a_header_may_have_several_rows(
     refused(written(tmp_path, [*lines, *broken], end, encoding), f"row {count + 8}, column")
 
 
-@pytest.mark.parametrize("end", ["\n", "\r", "\r\n", "\r\r\n"])
-def test_line_ends(tmp_path: Path, end: str) -> None:
-    test = read_test(written(tmp_path, [PLAIN, *ROWS], end))
-    assert (test.rows.rows, test.stress.max()) == (T.size, pytest.approx(2e6))
-    path = written(tmp_path, [PLAIN, *ROWS[:20], "1,x,1", *ROWS[21:]], end)
-    refused(path, "row 22, column 'force (N)' is 'x'")
-
-
 @pytest.mark.parametrize(
     ("content", "what"),
     [

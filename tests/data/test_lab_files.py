@@ -462,10 +462,6 @@ def test_a_unit_that_is_far_off_is_questioned(tmp_path, lines, toml, words):
         assert any(word in note for note in told), told
 
 
-def test_a_usual_test_is_not_questioned(tmp_path):
-    assert asked(read_test(write(tmp_path, PLAIN))) == []
-
-
 def test_a_record_that_runs_backwards(tmp_path):
     refused(write(tmp_path, [PLAIN[0], *PLAIN[:0:-1]]), "runs backwards", "order of its rows")
     header, *body = (line.partition(",")[2] for line in PLAIN)
@@ -497,15 +493,6 @@ def test_strain_and_displacement_are_compared(tmp_path, header, factor, told):
     test = read_test(write(tmp_path, lines))
     expect(test)
     assert any(told in note for note in test.notes)
-
-
-def test_the_travel_that_is_left_out_is_compared_with_the_strain(tmp_path):
-    lines = ["time (s),force (N),strain (%),Extension (mm)"]
-    lines += rows(TIME, FORCE, 10 * MOTION, 7 - 1.1 * MOTION)
-    test = read_test(write(tmp_path, lines))
-    expect(test)
-    told = "The displacement 'Extension (mm)' is left out; it differs by up to 10 % of the range."
-    assert told in test.notes
 
 
 def test_a_striker_without_a_time_is_warned_of(tmp_path):

@@ -115,25 +115,11 @@ def test_data_without_noise_stay_as_they_are(shape, rounding):
     assert reversal(motion, t) == 0.0
 
 
-def test_a_sharp_turn_between_samples_without_noise_is_where_the_lines_meet():
-    t = np.linspace(0.0, 1.0, 700)
-    motion = follow(t, truth("triangle", t), given(0.0))
-    np.testing.assert_allclose(motion.turns, 0.4873, atol=1e-9)
-    np.testing.assert_allclose(motion.at(motion.turns), 1.0, atol=1e-9)
-
-
 def test_an_unknown_noise_is_found():
     for shape in ("triangle", "haversine", "trapezoid"):
         t, _, noisy = measured(shape, 1000, 0.002, 1)
         for level in (estimated_noise(noisy), NoiseLevel(0.006, False, ""), given(0.0005)):
             assert follow(t, noisy, level).sigma == pytest.approx(0.002, rel=0.12)
-
-
-def test_a_motion_of_equal_steps_is_not_taken_for_a_digitised_one():
-    t = np.linspace(0.0, 1.0, 301)
-    values = 1.0 - np.abs(2.0 * t - 1.0)
-    motion = follow(t, values, NoiseLevel(t[1] / 12**0.5, False, "steps of a digitiser"))
-    assert np.abs(motion.at(t) - values).max() < 1e-6
 
 
 def test_steps_of_a_digitiser_are_noise():

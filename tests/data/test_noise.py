@@ -135,19 +135,6 @@ def test_noise_of_a_held_channel_is_that_of_its_fresh_samples():
     assert "fresh samples" in level.how
 
 
-def test_thinned_noise_is_that_of_the_means():
-    rng = np.random.default_rng(5)
-    n = 20_000
-    stress = 1e6 * signal("stress", n) + 1e4 * rng.standard_normal(n)
-    motion = 4e-4 * signal("displacement", n) + 1e-6 * rng.standard_normal(n)
-    time = np.linspace(0, 0.75e-3, n)
-    done = condition(Record(time, stress, motion), SPECIMEN, striker=Striker(7e-3, 2.0))
-    block = -(-n // len(done.stress))
-    sigma, _ = residual_noise(done.stress)
-    assert block > 10
-    assert sigma == pytest.approx(1e4 / np.sqrt(block), rel=0.25)
-
-
 def test_stated_noise_is_kept_and_the_rest_is_completed():
     _, test = synthetic_impact()
     whole = with_noise(replace(test, noise=Noise(stress=2e4)))
@@ -204,30 +191,6 @@ def test_uneven_times_make_no_outliers(kind):
                 samples += n
     assert flagged / samples < 2e-4
     assert by_number > 3 * flagged  # without the times, more samples are flagged
-
-
-@pytest.mark.parametrize(("size", "least"), [(10.0, 0.9), (20.0, 0.98)])
-def test_spikes_at_uneven_times_are_found(size, least):
-    rng = np.random.default_rng(7)
-    found = []
-    for _ in range(100):
-        n = int(rng.choice([300, 600]))
-        clock = uneven(rng, n, "machine")
-        values = np.interp(clock, np.linspace(0.0, 1.0, 6000), signal(rng.choice(CHANNELS), 6000))
-        values += 0.01 * rng.standard_normal(n)
-        at = int(rng.integers(8, n - 8))
-        values[at] += size * 0.01 * rng.choice([-1, 1])
-        found.append(find_outliers(values, clock)[at])
-    assert np.mean(found) >= least
-
-
-@needs_data
-def test_a_machine_that_records_unevenly_has_no_outliers():
-    path = DATA / "lattice-cycles" / "tpu87-20_raw.csv"
-    table = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 7, 8, 9), encoding="utf-8-sig")
-    clock, *channels = table[:1000].T
-    assert sum(int(find_outliers(values).sum()) for values in channels) > 20
-    assert not any(find_outliers(values, clock).any() for values in channels)
 
 
 @pytest.mark.parametrize(("size", "least"), [(5.0, 0.4), (7.0, 0.85), (10.0, 0.97), (20.0, 0.99)])

@@ -8,18 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from conftest import EXPERIMENTS
 from foamfit import read_test
 from foamfit.data.cycles import find_turns
 from foamfit.data.energy import audit
 from foamfit.data.measurement import Record, Specimen, Striker, Window
-from foamfit.data.noise import noise_level
 from foamfit.data.outliers import fill_staircase
 from foamfit.data.prepare import condition, thin
 from foamfit.errors import InputError
-from foamfit.text import engineering
 
 sys.path.insert(0, str(EXPERIMENTS / "recovery"))
 import rig
@@ -101,19 +98,6 @@ def test_contact_is_found_after_a_pretrigger(noise, w):
     assert any("are cut" in note for note in conditioned.notes)
 
 
-def test_contact_starts_between_samples():
-    done = run(impact(before=0.4, after=0.2, origin=5e-3))
-    assert done.origins["contact_time"] == pytest.approx(5e-3, abs=0.05 * DURATION / 600)
-
-
-def test_a_drifting_sensor_is_left_alone_and_noted():
-    record = impact(before=0.4, after=0.2)
-    drift = np.where(record.time < 0, 0.2 * PEAK * (record.time - record.time[0]) / DURATION, 0)
-    conditioned = run(Record(record.time, record.stress + drift, record.displacement))
-    assert any("drifts" in note for note in conditioned.notes)
-    assert conditioned.stress.max() == pytest.approx(PEAK, rel=1e-3)
-
-
 # Records of the recovery study: random springs, 1 % noise, contact at the first sample. With these
 # seeds branch a is so soft that its stress lies below the noise. `CLASSES` contains pairs of
 # correlation time and record length, both in samples.
@@ -183,54 +167,6 @@ def test_the_zero_at_the_end_of_a_record_is_as_far_off_as_it_says(tau, samples):
     assert np.sqrt(np.mean(np.square(off))) < 1.4
 
 
-@pytest.mark.parametrize("off", [-6.0, 6.0])
-def test_one_sample_is_no_rest(off):
-    """One or three wrong displacements at the start do not change the zero."""
-    for wrong in (1, 3):
-        record = impact(300, noise=0.01)
-        w = record.displacement.copy()
-        w[:wrong] += off * 4e-6
-        done = run(replace(record, displacement=w))
-        assert done.contact == "file"
-        assert not any("taken off" in note for note in done.notes)
-        np.testing.assert_array_equal(done.displacement, w[: len(done.stress)])
-
-
-def test_what_is_taken_off_stands_with_its_size_against_the_noise():
-    record = impact(before=0.4, after=0.3, noise=0.01, offset=0.03, w="at rest before contact")
-    random = np.random.default_rng(3)
-    offset, sigma = 5e-4, 4e-6
-    w = np.where(record.time < 0, sigma * random.normal(size=len(record)), record.displacement)
-    done = run(replace(record, displacement=w + offset))
-    assert done.contact == "motion"
-    words = r"displacement at contact, (\S+) µm, is taken off \((\d+) noise standard deviations; "
-    told = re.search(words + r"mean of (\d+) samples at rest before contact\)", str(done.notes))
-    assert float(told[1]) == pytest.approx(500, abs=1)
-    assert float(told[2]) == pytest.approx(offset / sigma, rel=0.15)
-    assert int(told[3]) == pytest.approx(180, abs=3)  # 60 further samples are kept
-    assert done.origins["displacement_zero"] == pytest.approx(offset, abs=5 * sigma / 180**0.5)
-    assert done.zeros["displacement"] == pytest.approx(sigma / 180**0.5, rel=0.3)
-    told = re.search(
-        r"The stress before contact, (\S+) (\S)Pa, is taken off as the sensor's offset \((\d+) "
-        r"samples at rest with a standard deviation of .*?, (\S+) times that; ",
-        str(done.notes),
-    )
-    assert float(told[4]) == pytest.approx(3, rel=0.2)
-    assert int(told[3]) == pytest.approx(180, abs=3)
-    assert done.zeros["stress"] == pytest.approx(0.01 * PEAK / 180**0.5, rel=0.3)
-
-
-@pytest.mark.parametrize(("before", "seed"), [(0.1, 1), (0.1, 9), (0.2, 6), (0.2, 7)])
-def test_a_rest_is_found_in_slow_noise(before, seed):
-    record = impact(1000, before=before, after=0.1)
-    random = np.random.default_rng(seed)
-    noise = lfilter([0.6], [1.0, -0.8], random.normal(size=(2, len(record))))  # unit variance
-    w = np.where(record.time < 0, 0.0, record.displacement) + 4e-6 * noise[0]
-    done = run(replace(record, displacement=w, stress=record.stress + 0.01 * PEAK * noise[1]))
-    assert done.contact in ("motion", "stress")
-    assert done.origins["contact_time"] == pytest.approx(0.0, abs=0.012 * DURATION)
-
-
 @pytest.mark.parametrize("missing", [3, 30])
 @pytest.mark.parametrize("origin", [0.0, -4.0, 1.7e3])
 def test_the_rise_is_extrapolated_back_where_the_first_samples_are_missing(missing, origin):
@@ -297,11 +233,6 @@ def test_heavy_noise_does_not_stall_the_search_for_the_end(noise):
         run(record)
 
 
-def test_a_record_that_ends_too_early_is_noted():
-    record = impact().rows(slice(0, 450))
-    assert any("ends before the stress has returned" in note for note in run(record).notes)
-
-
 # Displacement.
 
 
@@ -342,11 +273,6 @@ def test_a_true_hold_stays_a_hold():
     assert np.abs(filled.displacement - w)[:-5].max() < 1e-3 * w.max()
 
 
-def test_a_smooth_displacement_is_no_staircase():
-    record = impact()
-    assert fill_staircase(record) is record
-
-
 # Masses inside.
 
 
@@ -371,27 +297,11 @@ def test_a_mass_inside_goes_through_the_same_steps(before, n, noise):
     assert any("displacement_1 at contact, 3 mm, is taken off" in n for n in conditioned.notes)
 
 
-def test_a_mass_inside_that_starts_at_zero_keeps_its_zero():
-    record = followed(impact(noise=0.01), zero=0.0, noise=0.01)
-    np.testing.assert_array_equal(
-        run(record).interior[1], record.interior[1][: len(run(record).stress)]
-    )
-
-
 def test_a_later_cycle_starts_at_zero_inside_too():
     record = cycles()
     half = replace(record, interior={1: 0.5 * record.displacement + 7e-3})
     later = condition(half, SPECIMEN, window=Window(cycle=3))
     np.testing.assert_allclose(later.interior[1], 0.5 * later.displacement, atol=2e-9)
-
-
-def test_a_staircase_of_a_camera_becomes_its_ramp():
-    record = followed(impact(1000))
-    inside = record.interior[1]
-    held = inside[np.arange(inside.size) // 10 * 10]
-    filled = fill_staircase(replace(record, interior={1: held}))
-    assert np.abs(filled.interior[1] - inside)[:-10].max() < 0.1 * np.abs(held - inside).max()
-    assert filled.notes[0].startswith("displacement_1 is held for about 10 samples")
 
 
 def test_a_mass_inside_that_overtakes_the_top_is_noted():
@@ -549,11 +459,6 @@ def test_thinning_keeps_the_peak_and_lowers_the_noise(n):
     assert str(n) in thinned.notes[0]
 
 
-def test_short_records_are_not_thinned():
-    record = impact(1400)
-    assert thin(record) is record
-
-
 @pytest.mark.parametrize(
     ("specimen", "striker", "words"),
     [
@@ -568,28 +473,9 @@ def test_what_smells_wrong_is_noted(specimen, striker, words):
     assert not any(note.startswith("Check:") for note in run(impact()).notes)
 
 
-def test_a_start_under_load_is_noted():
-    notes = run(impact().rows(slice(60, None))).notes
-    assert any(note.startswith("Check: the record starts under load") for note in notes)
-
-
 def test_strain_beyond_one_is_refused():
     with pytest.raises(InputError, match="beyond one"):
         condition(impact(), Specimen(3e-4, 1.9635e-5), striker=STRIKER)
-
-
-def test_noise_is_estimated_from_the_signal():
-    random = np.random.default_rng(0)
-    stress = pulse(np.linspace(0, DURATION, 4000))[0] + 1e4 * random.normal(size=4000)
-    assert noise_level(stress) == pytest.approx(1e4, rel=0.1)
-
-
-@pytest.mark.parametrize(
-    ("value", "unit", "text"),
-    [(3.839e6, "Pa", "3.839 MPa"), (0, "Pa", "0 Pa"), (1.19e-3, "m", "1.19 mm"), (-5, "s", "-5 s")],
-)
-def test_values_for_people(value, unit, text):
-    assert engineering(value, unit) == text
 
 
 @pytest.mark.parametrize("n", [1, 2, 50, 3000, 40_000])

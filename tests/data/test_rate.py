@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from conftest import HEIGHT, synthetic_loop
+from foamfit.data.cycles import loading_rate, rate_error
 from foamfit.data.noise import with_noise
-from foamfit.data.rate import loading_rate, rate_error
 
 _, LOOP = synthetic_loop(noise=0.0)
 
@@ -51,17 +51,8 @@ def test_a_hold_at_the_largest_strain_is_no_loading():
     assert loading_rate(moved(time, noisy)) == pytest.approx(0.25, rel=0.02)
 
 
-def test_without_time_there_is_no_rate():
-    assert loading_rate(LOOP) is None
-
-
 def test_a_fitted_motion_has_its_peak_between_samples():
     time = np.linspace(0.0, 1e-3, 24)
     strain = 0.4 * np.sin(np.pi * time / time[-1])
     noisy = moved(time, strain + 0.01 * np.random.default_rng(0).standard_normal(24))
     assert loading_rate(noisy, HEIGHT * strain) == pytest.approx(800.0, rel=2e-3)
-
-
-def test_without_motion_there_is_no_rate():
-    time = np.linspace(0.0, 8.0, 801)
-    assert loading_rate(replace(moved(time, time), displacement=None)) is None

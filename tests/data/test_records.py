@@ -2,20 +2,17 @@
 
 import itertools
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import fabricated
-import foamfit as ff
-from conftest import refused, synthetic_impact
+from conftest import refused
 from foamfit.cli import main
 from foamfit.data.csv_file import read_test
 from foamfit.data.describe import describe
 from foamfit.data.energy import audit
-from foamfit.data.measurement import Outliers
 from foamfit.errors import InputError
 from foamfit.fitting.curves import check_drive
 from foamfit.report.summary import render_report, summary_text
@@ -56,11 +53,6 @@ def accounted(test):
 # ---------------------------------------------------------------------------------- every row
 
 
-def test_all_rows_are_used_where_nothing_is_wrong(tmp_path):
-    count = accounted(read_test(write(tmp_path, table(*loop()))))
-    assert (count.rows, count.used, count.dropped) == (101, 101, ())
-
-
 @pytest.mark.parametrize("at", [60, 800])  # inside and outside of the header search
 def test_a_repeated_header_is_refused_with_both_rows(tmp_path, at):
     lines = table(*loop(1284))
@@ -99,17 +91,6 @@ def test_rows_without_a_cell_are_counted(tmp_path):
     count = accounted(read_test(write(tmp_path, lines)))
     assert (count.rows, count.used) == (104, 101)
     assert (count.dropped[0].first, count.dropped[0].last) == (51, 105)
-
-
-def test_row_numbers_are_lines_of_the_file(tmp_path):
-    clock, stress, displacement = loop()
-    for values in (clock, stress, displacement):
-        values[7] = values[6]
-    lines = ["A title", "", *table(clock, stress, displacement)]
-    lines[5:5] = ["", ""]
-    (item,) = accounted(read_test(write(tmp_path, lines))).dropped
-    assert lines[item.first - 1].startswith("6,")
-    assert lines[item.first - 2].startswith("6,")
 
 
 def triangles(tops, n=80, low=0.02):
@@ -182,11 +163,6 @@ def test_the_rows_stand_in_the_terminal_and_in_the_result(tmp_path):
     (item,) = data["dropped"]
     assert item == {"rows": 1, "first": 9, "last": 9, "why": item["why"]}
     assert "101 in the file" in render_report(result, fabricated.no_figures())
-
-
-def test_a_test_that_is_not_read_from_a_file_uses_all_samples():
-    data = fabricated.result().to_json_dict()["data"]
-    assert (data["rows"], data["used"], data["dropped"]) == (601, 601, [])
 
 
 # ------------------------------------------------------------------------ what a record can be
@@ -307,28 +283,6 @@ def test_a_motion_is_not_integrated_from_a_clipped_force(tmp_path):
     lines = [line.rsplit(",", 1)[0] for line in clipped_impact(0.8)]
     path = write(tmp_path, lines, SPECIMEN + STRIKER)
     refused(path, "the force is clipped, so the motion cannot be integrated from it")
-
-
-def test_a_clipped_force_is_no_shift_of_the_clocks():
-    _, test = synthetic_impact(samples=201)
-    top = 0.5 * test.stress.max()
-    at_top = test.stress > top
-    none = np.zeros(0)
-    found = Outliers(at_top, none, none, clipped_at=top)
-    stress = np.minimum(test.stress, top)
-    clipped = replace(test, stress=stress, outliers={"stress": found})
-    results = [
-        ff.fit(each, drive="impact", starts=2, intervals="local")
-        for each in (clipped, replace(clipped, outliers={}))
-    ]
-    for result in results:
-        assert not any("--time-shift" in warning for warning in result.warnings)
-    check, unaware = (
-        next(c for c in result.checklist if c.key == "time_shift") for result in results
-    )
-    assert check.answer is None
-    assert "clipped" in check.sentence
-    assert "do not agree" in unaware.sentence  # without knowledge of clipping
 
 
 # ------------------------------------------------------------------------- names and units
@@ -477,7 +431,7 @@ def test_the_unit_of_the_header_may_be_said_again(tmp_path):
         ("a = " + 5000 * "{ a = " + "1" + 5000 * "}", ["nested too deeply"]),
         ('name = "' + 10_000_000 * "a" + '"', ["has 10", "characters"]),
         (10_000_000 * "a" + " = 1", ["has 10", "characters"]),
-        ('name = "' + 500_000 * "a" + '"\n' + SPECIMEN, ["name has 500000 characters"]),
+        ('name = "' + 500_000 * "a" + '"\n' + SPECIMEN, ["name = ", "200 characters at most"]),
         (500_000 * "a" + " = 1\n" + SPECIMEN, ["no key"]),
         ('name = "a\\u001b[31mb"\n' + SPECIMEN, ["name", "printable"]),
         ('[specimen]\nheight = "1_000 mm"\narea = "1 mm^2"\n', ["height", "without separators"]),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from foamfit.data.contact import rise_of
 from foamfit.data.noise import estimated_noise
-from foamfit.data.rise import rise_of
 
 CONTACT, PEAK = 0.37, 1.0  # s, and the largest stress, one second later
 

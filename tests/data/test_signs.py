@@ -98,16 +98,6 @@ def test_a_slow_test_of_any_convention_is_the_same_test(
             same(plain, test)
 
 
-@pytest.mark.parametrize("offset", [-0.2, 0.2])
-def test_an_offset_of_the_force_does_not_matter(tmp_path: Path, offset: float) -> None:
-    w = motions()["cycles"]
-    force, t = foam(w), 0.01 * np.arange(len(w))
-    for sign, way in COMBINATIONS:
-        values = noisy(sign * force + offset * force.max())
-        test = read_test(written(tmp_path, time_s=t, force_N=values, displacement_mm=way * w))
-        assert ("force" in test.turned, "displacement" in test.turned) == (sign < 0, way < 0)
-
-
 @pytest.mark.parametrize("at", ["after the test", "before the test", "in the test"])
 def test_samples_that_are_no_part_of_the_test_have_no_say(tmp_path: Path, at: str) -> None:
     """Five of 961 rows are lower than the peak is high, as when an evaluation ends."""
@@ -289,13 +279,6 @@ def test_a_force_that_is_never_positive_is_refused(tmp_path: Path) -> None:
     columns = {"time_s": t, "force_N": -3.0 * t, "displacement_mm": 10 - 4 * np.sin(np.pi * t / 10)}
     path = written(tmp_path, SPECIMEN + STRIKER, **columns)
     refused(path, "the stress is never positive in the part that is used, only -300 kPa to 0 Pa")
-
-
-def test_a_sign_that_the_toml_states_is_not_reversed_again(tmp_path: Path) -> None:
-    w = path_through([0, 5, 0])
-    columns = {"time_s": 0.01 * np.arange(len(w)), "force_N": foam(w), "displacement_mm": w}
-    toml = SPECIMEN + '[columns]\nforce = { column = "force_N", scale = -1 }\n'
-    refused(written(tmp_path, toml, **columns), "leave the minus sign of scale = -1 out")
 
 
 # ---------------------------------------------------------------------- what is said

@@ -5,12 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from foamfit.cli import main
 from foamfit.data.csv_file import read_test
 from foamfit.data.describe import describe
 from foamfit.data.energy import audit
 from foamfit.errors import InputError
-from foamfit.page.desk import join_toml, split_toml
 
 LOOP = np.sin(np.linspace(0.0, np.pi, 41))
 TIME = np.arange(41) * 1e-3
@@ -50,11 +48,6 @@ def test_ways_to_write_a_standard_deviation(tmp_path, text, sigma):
     test = read_test(written(tmp_path, specimen(f'"{text}"')))
     assert test.specimen.height == pytest.approx(0.01)
     assert test.uncertainties == {"height": pytest.approx(sigma)}
-
-
-def test_without_a_standard_deviation_a_quantity_is_exact(tmp_path):
-    assert read_test(written(tmp_path, specimen())).uncertainties == {}
-    assert read_test(written(tmp_path, specimen('"10 ± 0 mm"'))).uncertainties == {}
 
 
 EVERYTHING = """
@@ -186,19 +179,3 @@ def test_a_wrong_scale_is_refused(tmp_path, scale):
     entry = f'[columns]\nforce = {{ column = "Load", unit = "V", scale = "{scale}" }}\n'
     with pytest.raises(InputError, match=r"\[columns\] force: scale = .*: the ± "):
         read_test(written(tmp_path, specimen() + entry, **columns))
-
-
-def test_nothing_is_written(tmp_path, capsys):
-    path = written(tmp_path, specimen('"10 ± 20 mm"'))
-    with pytest.raises(SystemExit) as end:
-        main(["fit", str(path), "--model", "bistable", "--out", str(tmp_path / "out")])
-    assert end.value.code == 1
-    assert not (tmp_path / "out").exists()
-    assert len(capsys.readouterr().err.strip().splitlines()) <= 3
-
-
-def test_the_page_keeps_what_is_typed():
-    text = specimen('"10 ± 0.1 mm"') + '[striker]\nvelocity = "1.75 ± 0.01 m/s"\n'
-    again = join_toml(*split_toml(text))
-    assert '"10 ± 0.1 mm"' in again
-    assert '"1.75 ± 0.01 m/s"' in again

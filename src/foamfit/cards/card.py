@@ -25,7 +25,7 @@ from foamfit.cards.curves import (
     loading_curves,
     unloading_curve,
 )
-from foamfit.data.rate import loading_rate
+from foamfit.data.cycles import loading_rate
 from foamfit.data.units import factor
 from foamfit.errors import InputError
 from foamfit.files import check_file, write_file

@@ -16,7 +16,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import GRAVITY, INTEGRATED, Entry, Measurement, is_clipped
-from foamfit.data.noise import residual_time, with_noise
+from foamfit.data.noise import integrated_twice, residual_time, with_noise
 from foamfit.text import engineering, rounded
 
 # Two numbers contradict each other if they differ by more than this many standard deviations. A
@@ -178,7 +178,9 @@ def _fitted(
     if np.count_nonzero(kept) < _FEWEST:
         return None
     per_mass, gravity = test.specimen.area / mass, test.striker and test.striker.gravity
-    integrals = _integrals(time, stress * per_mass)
+    lead = [0.0] * int(time[0] > 0.0)  # from time zero on, the stress rises from zero
+    whole = np.append(lead, time), np.append([0.0] * len(lead), stress * per_mass)
+    integrals = [part[len(lead) :] for part in integrated_twice(*whole)]
     # Priors of the zero of the force, which acts like an unknown gravity, and of the delay.
     peak, loaded = float(stress.max()), float(np.ptp(time[stress > 0.02 * stress.max()]))
     zero = max(min(test.zeros.get("stress", np.inf), ZERO * peak), 1e-6 * peak) * per_mass
@@ -208,14 +210,6 @@ def _fitted(
     error = math.hypot(errors[1], inertia * speed)
     force = factor, math.hypot(errors[2], inertia, summed)
     return (speed, error), force, (late, float(errors[4]) / factor)
-
-
-def _integrals(time: Array, rate: Array) -> tuple[Array, Array]:
-    """Return first and second integral of a rate from time zero on, linear between samples."""
-    dt, lead = np.diff(time), max(float(time[0]), 0.0)
-    first = np.append(0.0, np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))) + 0.5 * lead * rate[0]
-    steps = first[:-1] * dt + dt**2 * (2.0 * rate[:-1] + rate[1:]) / 6.0
-    return first, np.append(0.0, np.cumsum(steps)) + lead**2 * rate[0] / 6.0
 
 
 def _solved(

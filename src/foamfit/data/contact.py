@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import NoiseLevel, Record
-from foamfit.data.noise import MIN_REST, level_on_line
+from foamfit.data.noise import MIN_REST, level_on_line, noise_about, smooth
 
 # A signal is at rest if its slope is less than this share of the slope that follows. The slopes of
 # the loading branches differ by a smaller factor (6 in the published sets), so a soft start is not
@@ -27,6 +28,14 @@ _SHARES = 0.025, 0.05, 0.1, 0.2  # shares of the peak up to which a rise is take
 _CLEAR = 8.0  # the smallest share of at least this many standard deviations of noise is used
 _LARGEST = 0.5  # else this share
 ELSEWHERE = 5.0  # standard errors of a displacement that is significantly not zero
+_RISE_SHARE = 0.05  # least share of the peak at which the first rise ends
+_WINDOWS = 64  # moving means up to the peak, which show this level above the noise
+_LOW = 0.25  # share of that level from which the duration of the rise is measured
+_BEFORE, _ROWS_BEFORE = 6, 60  # rows before the rise: multiples of its duration, and more
+_TRIALS, _ROWS = 80, 240  # trial times, and most rows (means of blocks)
+_UNLIKELY = 1e-4  # trial times of less probability, relative to the best, are left out
+_FREE = 0.02  # of the peak: standard deviation of the zero of a channel without a rest
+_RISE_FEWEST = 8  # rows
 
 Levels = dict[str, NoiseLevel]
 Kink = tuple[float, float]  # where a signal starts to rise: time and standard error, s
@@ -89,14 +98,19 @@ def _kink(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
     return float(fine[int(np.argmin(near))]), error
 
 
+def _first_above(values: Array, level: float) -> int:
+    """Return the first of three samples above a level, or else the first one."""
+    above = values > level
+    three = above[:-2] & above[1:-1] & above[2:]
+    return int(np.argmax(three if three.any() else above))
+
+
 def _reached(values: Array, share: float) -> tuple[int, int]:
     """Return the first of three samples above a share of the rise, and samples since a third."""
     up = values[: int(np.argmax(values)) + 1]
     base = float(np.percentile(up, 5))
     level = (up - base) / ((up[-1] - base) or 1.0)
-    above = level > share
-    three = above[:-2] & above[1:-1] & above[2:]
-    high = int(np.argmax(three if three.any() else above))
+    high = _first_above(level, share)
     return high, 1 + int(np.argmin(level[high::-1] > share / 3.0))
 
 
@@ -230,3 +244,86 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
         how = "where the displacement passes zero"
         return Start(how, float(time[crossing]), crossing, by="motion", gauge="other")
     return _at_first(time)
+
+
+class Rise(NamedTuple):
+    """Contact time by the first rise, s (or sample number), and its standard error."""
+
+    time: float
+    error: float
+
+
+def rise_of(
+    time: Array, values: Array, noise: NoiseLevel, rest: int, zero: float | None
+) -> Rise | None:
+    """Estimate the contact time from the first rise of a channel; None with too few rows.
+
+    For every trial time of contact, least squares fits a level before it and, from it on, a jump, a
+    slope, a parabola and a cubic, none of them negative. The probability of each trial time follows
+    from its sum of squares: a rise that begins softly leaves the contact open, a kink does not.
+
+    Parameters
+    ----------
+    time, values : (n,) array
+        s (or sample numbers) and the channel, positive in compression, zero taken off.
+    noise : NoiseLevel
+        Noise of the channel; the scatter at rest is used instead if it is larger.
+    rest : int
+        Number of rows before any contact.
+    zero : float, optional
+        Standard error of the zero; None if it was not measured.
+    """
+    top = int(np.argmax(values))
+    up, sigma, tau = values[: top + 1], noise.sigma, noise.time
+    base = float(up[:rest].mean()) if rest >= MIN_REST else float(np.percentile(up, 5.0))
+    if rest >= MIN_REST and (scatter := noise_about(values[:rest], 1))[0] > sigma:
+        sigma, tau = scatter
+    size = float(up[-1]) - base
+    width = 1 + up.size // _WINDOWS  # a soft start may be hidden by noise in single samples
+    clear = _CLEAR * sigma * np.sqrt(min(tau / width, 1.0))
+    level = min(max(_RISE_SHARE * size, clear), _LARGEST * size)
+    part = _first_rise(smooth(up, width) - base, level)
+    if part.stop - part.start < _RISE_FEWEST:
+        return None
+    rows = part.stop - part.start
+    block = max(1, rows // _ROWS)
+    part = slice(part.stop - rows // block * block, part.stop)
+    t, y = (x[part].reshape(-1, block).mean(axis=1) for x in (time, values))
+    white = sigma**2 * min(tau / block, 1.0)
+    known = np.sqrt(white) / (_FREE * size if zero is None else max(zero, 1e-6 * size))
+
+    def likely(trials: Array) -> Array:
+        squares = np.array([_squares(t, y, trial, float(known)) for trial in trials])
+        best = float(squares.min())
+        variance = max(best / max(t.size - 4, 1), white, 1e-300) * max(tau / block, 1.0)
+        return np.asarray(np.exp(-0.5 * (squares - best) / variance))
+
+    early = 0.0 if part.start else 0.5  # the record may begin in contact
+    trials = np.linspace(t[0] - early * (t[-1] - t[0]), t[-1], _TRIALS)
+    near = np.flatnonzero(likely(trials) > _UNLIKELY)
+    first, last = max(near[0] - 1, 0), min(near[-1] + 1, _TRIALS - 1)
+    trials = np.linspace(trials[first], trials[last], _TRIALS)
+    weights = likely(trials)
+    mean = float(weights @ trials / weights.sum())
+    grid, step = float(trials[1] - trials[0]), float(np.median(np.diff(time)))
+    spread = weights @ (trials - mean) ** 2 / weights.sum() + (grid**2 + step**2) / 12.0
+    return Rise(mean, float(np.sqrt(spread)))
+
+
+def _first_rise(values: Array, level: float) -> slice:
+    """Return the rows of the first rise up to a level, and as many before it as tell its start."""
+    high = _first_above(values, level)
+    below = np.flatnonzero(values[: high + 1] < _LOW * level)
+    low = int(below[-1]) if below.size else 0
+    return slice(max(0, low - _BEFORE * max(high - low, 2) - _ROWS_BEFORE), high + 2)
+
+
+def _squares(time: Array, values: Array, start: float, known: float) -> float:
+    """Return the sum of squares about the best rise from `start`; `known` weighs a zero level."""
+    from scipy.optimize import nnls
+
+    x = np.maximum(time - start, 0.0) / (time[-1] - time[0])
+    one = np.ones_like(time)
+    columns = np.column_stack([one, -one, (time >= start).astype(float), x, x**2, x**3])
+    columns = np.vstack([columns, [known, -known, 0.0, 0.0, 0.0, 0.0]])
+    return float(nnls(columns, np.append(values, 0.0), maxiter=1000)[1] ** 2)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.checks import RANGE
 from foamfit.data.frames import Frames, join
 from foamfit.data.measurement import (
     Measurement,
@@ -37,7 +38,7 @@ from foamfit.data.tables.columns import TWINS, Source, si_factor
 from foamfit.data.tables.csv_table import read_numbers, read_text
 from foamfit.data.tables.draft import without_toml
 from foamfit.data.tables.headers import CHANNELS, example
-from foamfit.data.toml_file import Column, Settings, is_range, read_settings, toml_beside
+from foamfit.data.toml_file import Column, Settings, read_settings, toml_beside
 from foamfit.errors import InputError, naming
 from foamfit.text import engineering, percent
 
@@ -50,11 +51,8 @@ def _with_cycles(window: Window, cycle: int | None, cycles: tuple[int, int] | No
         return window if cycle is None else replace(window, cycle=cycle, last=None)
     if cycle is not None:
         raise InputError("give either cycle or cycles, not both")
-    if not is_range(cycles):
-        raise InputError(
-            f"cycles = {cycles!r} must be the numbers of the first and the last one, like (1, 3)"
-        )
-    return replace(window, cycle=cycles[0], last=cycles[1])
+    first, last = RANGE(cycles, "cycles")
+    return replace(window, cycle=first, last=last)
 
 
 def read_test(

@@ -1,7 +1,8 @@
-"""Find the cycles of a slow test from the turns of its motion, and select those to use."""
+"""Find the cycles of a slow test from the turns of its motion, and the rate of its loading."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +28,12 @@ _PLACES = 400  # number of trial values for the start of that rise
 _SURE = 4.0  # standard errors for a stress significantly below zero
 _STRETCH = 1000  # samples in which the next turn is searched first
 _BEGUN = 3.0  # multiple of the least load above which the first rise has certainly started
+
+# Rate
+_AT_PEAK = 3.0  # samples within this many standard deviations below the largest may be the peak
+_CLOSE = 0.95  # share of the peak; a motion is held if it takes longer from there than up to there
+_COPIES = 30  # number of copies with additional noise
+_NORMAL = 0.6745  # median magnitude of a standard normal variable
 
 
 @dataclass(frozen=True)
@@ -316,3 +323,57 @@ def inner_reversals(displacement: Array) -> list[str]:
         "no inner loops runs back along the branch it came along, so a loop there stays in the "
         "residuals of its fit."
     ]
+
+
+def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None:
+    """Return the mean strain rate from contact to the largest strain, 1/s; None without a time.
+
+    The peak is the middle of the samples that may be the largest in view of the noise, or the start
+    of a hold. If given, the `fitted` displacement (m) is used instead; it has no noise.
+    """
+    if test.time is None or test.displacement is None:
+        return None
+    time = test.time - test.time[0]
+    if fitted is None:
+        noise = test.noise.of("displacement")
+        velocity = _velocity(time, test.displacement, noise.sigma if noise else 0.0)
+        return None if velocity is None else velocity / test.specimen.height
+    motion, at = fitted - fitted[0], int(np.argmax(fitted))
+    if motion[at] <= 0.0 or time[at] <= 0.0:
+        return None
+    # The peak of a smooth motion lies between samples.
+    at = int(np.clip(at, 1, motion.size - 2))
+    near = slice(at - 1, at + 2)
+    t = time[near] - time[at]
+    bend, slope, most = np.polyfit(t, motion[near], 2)
+    apex = float(np.clip(-slope / (2.0 * bend), t[0], t[2])) if bend < 0.0 else 0.0
+    return float((most + 0.5 * slope * apex) / (time[at] + apex)) / test.specimen.height
+
+
+def rate_error(test: Measurement) -> float:
+    """Return the standard error of the logarithm of the rate due to noise of the displacement.
+
+    It is the scatter over copies of the record with added noise of the same size. Estimated noise
+    is limited to the deviation of samples from a parabola through their neighbours.
+    """
+    w, level = test.displacement, test.noise.of("displacement")
+    sigma = level.sigma if level else 0.0
+    if test.time is None or w is None or w.size < 5 or sigma <= 0.0:
+        return 0.0
+    third = float(np.median(np.abs(np.diff(w, 3)))) / (_NORMAL * math.sqrt(20.0))
+    scatter = min(sigma, third) if test.noise.displacement is None else sigma
+    noise = scatter * np.random.default_rng(0).standard_normal((_COPIES, w.size))
+    copies = [_velocity(test.time - test.time[0], w + added, sigma) for added in noise]
+    rates = [rate for rate in copies if rate is not None]
+    return float(np.std(np.log(rates), ddof=1)) if len(rates) > 1 else 0.0
+
+
+def _velocity(time: Array, motion: Array, sigma: float) -> float | None:
+    """Return the mean velocity up to the peak of a measured motion; None if it never rises."""
+    motion = motion - motion[0]
+    most = float(motion.max())
+    if most <= 0.0 or time[np.argmax(motion)] <= 0.0:
+        return None
+    when = float(np.mean(time[motion >= most - _AT_PEAK * sigma]))
+    reached = float(time[np.argmax(motion >= _CLOSE * most)]) / _CLOSE
+    return most / (reached if when > 2.0 * reached > 0.0 else when)

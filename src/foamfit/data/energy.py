@@ -19,38 +19,20 @@ from foamfit.text import engineering, percent
 
 @dataclass(frozen=True)
 class EnergyAudit:
-    """Energy and momentum of one test; a value is None if the data for it are missing.
+    """Energy and momentum of one test; a value is None if the data for it are missing."""
 
-    Attributes
-    ----------
-    striker_energy
-        Kinetic energy of the striker at contact per volume of foam, J/m³.
-    absorbed_energy, dissipated_energy
-        ∫σ dε up to the largest strain, and over the whole history, J/m³.
-    dissipated_fraction, absorbed_over_striker
-        Ratios of dissipated to absorbed energy, and of absorbed energy to the striker's energy.
-    rebound_velocity
-        Velocity of the top at the end of contact, m/s, positive away from the specimen.
-    impulse, momentum_change, impulse_ratio
-        ∫F dt over contact and m (v_in + v_out), N·s, and their ratio.
-    motion, missing
-        Source of the displacement; one sentence for each quantity that could not be computed.
-    contradictions
-        Numbers that the record contradicts.
-    """
-
-    striker_energy: float | None = None
-    absorbed_energy: float | None = None
-    dissipated_energy: float | None = None
-    dissipated_fraction: float | None = None
-    absorbed_over_striker: float | None = None
-    rebound_velocity: float | None = None
-    impulse: float | None = None
-    momentum_change: float | None = None
-    impulse_ratio: float | None = None
-    motion: str | None = None
-    missing: tuple[str, ...] = ()
-    contradictions: tuple[Contradiction, ...] = ()
+    striker_energy: float | None = None  #: kinetic, at contact, per volume of foam, J/m³
+    absorbed_energy: float | None = None  #: ∫σ dε up to the largest strain, J/m³
+    dissipated_energy: float | None = None  #: ∫σ dε over the whole history, J/m³
+    dissipated_fraction: float | None = None  #: of the absorbed energy
+    absorbed_over_striker: float | None = None  #: ratio of energies
+    rebound_velocity: float | None = None  #: of the top at the end of contact, m/s
+    impulse: float | None = None  #: ∫F dt over contact, N·s
+    momentum_change: float | None = None  #: m (v_in + v_out), N·s
+    impulse_ratio: float | None = None  #: impulse over change of momentum
+    motion: str | None = None  #: source of the displacement
+    missing: tuple[str, ...] = ()  #: a sentence for each quantity that could not be computed
+    contradictions: tuple[Contradiction, ...] = ()  #: numbers that the record contradicts
 
     def as_dict(self) -> dict[str, float | str | None]:
         """Return the audit as plain values; `missing` and `warnings` are joined to one text."""

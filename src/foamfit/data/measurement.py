@@ -124,6 +124,15 @@ class Dropped:
         return f"{part}rows {self.first} to {self.last} ({self.rows}): {self.why}"
 
 
+def entry_line(
+    channel: str, column: str, unit: str | None = None, scale: str = "", counts_down: bool = False
+) -> str:
+    """Return a line of [columns]; `column` and `scale` are written as in the TOML."""
+    more = f', unit = "{unit}"' if unit else ""
+    more += f", scale = {scale}" if scale else ""
+    return f"{channel} = {{ column = {column}{more}{', counts_down = true' * counts_down} }}"
+
+
 @dataclass(frozen=True)
 class Entry:
     """Entry of [columns] by which a channel is read: `column` is written as in the TOML.
@@ -144,9 +153,7 @@ class Entry:
         """Return the line for a channel larger by a factor, rounded `within` a share of it."""
         scale = rounded(self.scale * factor ** (-1.0 if self.inverse else 1.0), within)
         scale = f'"{scale} {self.scale_unit}"' if self.scale_unit else scale
-        unit = f', unit = "{self.unit}"' if self.unit else ""
-        down = ", counts_down = true" * self.counts_down
-        return f"{self.channel} = {{ column = {self.column}{unit}, scale = {scale}{down} }}"
+        return entry_line(self.channel, self.column, self.unit, scale, self.counts_down)
 
 
 @dataclass(frozen=True)
@@ -298,87 +305,49 @@ class Record(Samples):
 class Measurement(Samples):
     """One test, prepared for the fit, in SI: compression positive, time zero at contact.
 
-    Attributes
-    ----------
-    name, path, data_sha256
-        Name of the test, its file (None without one) and the digest of that file.
-    time, stress, displacement, acceleration : (n,) array or None
-        s, increasing; nominal base stress, Pa; displacement of the top, m; deceleration of the
-        striker, m/s², only for an impact without a measured displacement.
-    specimen, striker, noise
-        Data from the TOML; `noise` also contains the estimated noise.
-    motion
-        Source of the displacement: "measured", "integrated from force", …
-    notes
-        One sentence for each step of the preparation, done or impossible.
-    interior
-        Displacements of the interior masses, m: 1 is the mass above spring 1.
-    outliers, sampled
-        By channel: samples left out, and a mask of the measured samples if others are interpolated.
-    contact
-        What set time zero: "stress" (the displacement is then zero there too), "motion" or "file".
-    count
-        Rows of the file, None without one.
-    cycle, cycles, last_cycle
-        Number of the cycle in use, numbers of all cycles in the record, and number of the last
-        cycle if several are used as one history.
-    start_strain
-        Strain at which contact of a later cycle starts, relative to first contact; subtracted.
-    zeros, origins
-        Standard error of the zero of a channel if determined from samples; and the values
-        subtracted: "contact_time", s, "stress_zero", Pa, "acceleration_zero", m/s²,
-        "displacement_zero", m.
-    derived
-        Channels that were computed from others and are not independent measurements.
-    braked
-        Whether the stress is the striker's mass times its deceleration over the area.
-    rise
-        Contact time by the first rise of the stress alone, s (or sample number) after time zero,
-        and its standard error; None if the record does not show it.
-    block
-        Number of rows of the file averaged in each sample.
-    uncertainties
-        Standard deviations from the TOML: "height", "height_1", … (m), "area" (m²),
-        "specimen_mass", "striker_mass" (kg), "velocity" (m/s), "delay" (s) of a motion with its own
-        clock, and relative ones of scales: "stress_scale", "displacement_scale", ….
-    standstills
-        First and last time, s (or sample), of each interval with a stuck gauge.
-    turned
-        Channels of the file that were negative in compression; their sign is reversed.
-    priors
-        Prior knowledge of parameters from the TOML, like "5.5 ± 0.1 MPa".
-    entries
-        Entries of [columns] by which "stress" and "displacement" are read.
-    flight
-        Velocity of the striker at contact by its motion before contact, and standard error, m/s;
-        None if the gauge did not follow it.
+    `interior` contains the displacements, m, of the interior masses, 1 above spring 1; `sampled` a
+    mask of the measured samples of a channel whose others are interpolated; `zeros` the standard
+    error of the zero of a channel if determined from samples; `origins` the values subtracted:
+    "contact_time", s, "stress_zero", Pa, "acceleration_zero", m/s², "displacement_zero", m.
+    `derived` channels were computed from others; with `braked` the stress is the striker's mass
+    times its deceleration over the area. A note is a sentence on a step of the preparation.
     """
 
     name: str
-    path: Path | None
-    data_sha256: str
-    time: Array | None
-    stress: Array | None
-    displacement: Array | None
+    path: Path | None  #: None without a file
+    data_sha256: str  #: digest of the file
+    time: Array | None  #: s, increasing, (n,)
+    stress: Array | None  #: nominal base stress, Pa, (n,)
+    displacement: Array | None  #: of the top, m, (n,)
     specimen: Specimen
     striker: Striker | None = None
-    noise: Noise = field(default_factory=Noise)
-    motion: str | None = None
-    outliers: dict[str, Outliers] = field(default_factory=dict)
+    noise: Noise = field(default_factory=Noise)  #: from the TOML, and estimated
+    motion: str | None = None  #: source of the displacement: "measured", "integrated from force", …
+    outliers: dict[str, Outliers] = field(default_factory=dict)  #: samples left out, by channel
+    #: what set time zero: "stress" (the displacement is then zero there too), "motion" or "file"
     contact: str = "file"
-    count: RowCount | None = None
-    cycle: int = 1
-    cycles: tuple[int, ...] = (1,)
-    last_cycle: int | None = None
-    start_strain: float = 0.0
+    count: RowCount | None = None  #: rows of the file
+    cycle: int = 1  #: number of the cycle in use
+    cycles: tuple[int, ...] = (1,)  #: numbers of all cycles in the record
+    last_cycle: int | None = None  #: number of the last of several used as one history
+    start_strain: float = 0.0  #: not recovered before a later cycle, relative to first contact
+    #: deceleration of the striker, m/s², only of an impact without a measured displacement
     acceleration: Array | None = None
+    #: contact time by the first rise of the stress alone, s (or sample number) after time zero, and
+    #: its standard error; None if the record does not show it
     rise: tuple[float, float] | None = None
-    block: int = 1
+    block: int = 1  #: rows of the file averaged in each sample
+    #: standard deviations from the TOML: "height", "height_1", … (m), "area" (m²), "specimen_mass",
+    #: "striker_mass" (kg), "velocity" (m/s), "delay" (s) of a motion with its own clock, and
+    #: relative ones of scales: "stress_scale", "displacement_scale", …
     uncertainties: dict[str, float] = field(default_factory=dict)
-    standstills: tuple[tuple[float, float], ...] = ()
-    turned: tuple[str, ...] = ()
-    priors: dict[str, str] = field(default_factory=dict)
+    standstills: tuple[tuple[float, float], ...] = ()  #: first and last time (or sample) of each
+    turned: tuple[str, ...] = ()  #: channels that were negative in compression
+    priors: dict[str, str] = field(default_factory=dict)  #: of parameters, like "5.5 ± 0.1 MPa"
+    #: entries of [columns] by which "stress" and "displacement" are read
     entries: dict[str, Entry] = field(default_factory=dict)
+    #: velocity of the striker by its motion before contact, and standard error, m/s; None if the
+    #: gauge did not follow it
     flight: tuple[float, float] | None = None
 
     def __repr__(self) -> str:

@@ -198,6 +198,14 @@ def level_on_line(time: Array, values: Array, at: float, noise: NoiseLevel) -> t
     return Level(level, float(error), n), Level(slope, float(scatter / np.sqrt(spread)), n)
 
 
+def integrated_twice(time: Array, rate: Array) -> tuple[Array, Array]:
+    """Return first and second integral of a rate that is linear between samples, shape (n,)."""
+    dt = np.diff(time)
+    first = np.append(0.0, np.cumsum(0.5 * dt * (rate[1:] + rate[:-1])))
+    steps = first[:-1] * dt + dt**2 * (2.0 * rate[:-1] + rate[1:]) / 6.0
+    return first, np.append(0.0, np.cumsum(steps))
+
+
 def smooth(values: Array, width: int) -> Array:
     """Return the moving mean over `width` samples, shape (n,)."""
     from scipy.ndimage import uniform_filter1d

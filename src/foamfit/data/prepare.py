@@ -6,12 +6,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from foamfit.arrays import Array, means
 from foamfit.data import contact, cycles, frames, zeros
 from foamfit.data import outliers as repair
+from foamfit.data.contact import Rise, rise_of
 from foamfit.data.measurement import (
     MEASURED,
     MIN_ROWS,
@@ -26,8 +28,14 @@ from foamfit.data.measurement import (
     Window,
     interior_channel,
 )
-from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, noise_level, smooth
-from foamfit.data.rise import Rise, rise_of
+from foamfit.data.noise import (
+    averaged,
+    estimated_noise,
+    integrated_twice,
+    noise_before_contact,
+    noise_level,
+    smooth,
+)
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
@@ -60,34 +68,29 @@ def condition(
     is estimated from samples before contact or from those of a held channel.
     """
     window, given = window or Window(), striker or Striker()
-    impact, flight = striker is not None and record.time is not None, None
+    impact = striker is not None and record.time is not None
     if impact and window.cycle not in (None, 1):
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     record = repair.cut_strays(cut_to_window(record, window))
     record = repair.mark_clipped(repair.bridge_outliers(record))
-    spikes = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
     held = repair.noise_of_held(record)
     still = [] if impact else repair.find_standstills(record)
     record = repair.bridge_standstills(repair.fill_staircase(record), still, specimen.height)
+    excess = record.excess
     found = [] if impact else cycles.find_cycles(record)
     chosen = cycles.choose_cycles(found, window.cycle, window.last)
+    used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record), turn=0)
+    # Contact starts in the first cycle.
     first = cycles.cut_to_cycle(record, found, found[0]) if found else record
     curves = first.curves("acceleration")
     levels = {c: estimated_noise(v) for c, v in curves.items()} | held
-    used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record), turn=0)
+    flight = None
     if impact:
-        start = contact.start_of_impact(first, levels)
-        straight = zeros.without_drift(first, start, levels)
-        if straight is not first:
-            record = first = straight
-            start = contact.start_of_impact(first, levels)
-        if first.stress[start.first :].max() == 0.0:
-            raise _never_positive(first.stress)
-        start = replace(start, gauge=zeros.gauge_before(first, start, levels, given))
-        span = zeros.span_of_impact(first, start, levels)
-        striker, flight, notes = zeros.flight_of(first, start, span, levels, given, spread)
+        record, start, span = _contact_of_impact(record, levels, given)
+        first = record
+        given, flight, notes = zeros.flight_of(record, start, span, levels, given, spread)
         record = record.noted(*notes)
-    else:  # contact starts in the first cycle
+    else:
         start = contact.start_of_slow_test(first, levels)
         end = len(first) if used.place else used.end - used.first
         span = zeros.Span(start.first, end, start.resting, end)
@@ -100,44 +103,80 @@ def condition(
         record = cycles.zero_between(record, found, used)
         record = cycles.cut_to_cycle(record, found, chosen) if chosen else record
         record = cut_to_contact(record, start, span)
-    if impact:
-        record = zeros.mark_flight(record, start, span)
-    given = striker or given
+    record = zeros.mark_flight(record, start, span) if impact else record
     record = integrate_motion(record, specimen, given)
     if impact:
         record = start_within_height(record, specimen, given)
+    else:
+        record = replace(record, acceleration=None)
     whole = checks(record, specimen, given, several=used.last is not None)
     record = thin(whole)
     block = -(-len(whole) // len(record))
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
-    outliers = repair.outliers_of_blocks(whole, block)
-    instants = whole.instants if whole.time is not None else whole.instants // block
-    stood = [instants[rows] for rows in whole.standstills.values() if rows.any()]
-    channels = record.time, record.stress, record.displacement
-    return Measurement(
-        *("", None, "", *channels, specimen, striker),  # name, path and digest follow later
+    contact_time = whole.origins.get("contact_time", 0.0)
+    return _measured(
+        whole,
+        record,
+        block,
+        excess,
+        specimen=specimen,
+        striker=striker and given,
         noise=Noise(estimated=noise),
-        motion=whole.motion,
-        notes=(*record.notes, *repair.notes_on(whole, spikes, outliers)),
-        interior=record.interior,
-        outliers=outliers,
         contact="stress" if used.place else start.by,
-        count=count_rows(whole, outliers, block),
         cycle=used.number,
         cycles=tuple(cycle.number for cycle in found) or (1,),
         last_cycle=used.last,
-        start_strain=whole.origins.pop("start_strain", 0.0),
-        sampled=record.sampled,
+        rise=rise and rise._replace(time=rise.time - contact_time),
+        flight=flight,
+    )
+
+
+def _contact_of_impact(
+    record: Record, levels: contact.Levels, striker: Striker
+) -> tuple[Record, contact.Start, zeros.Span]:
+    """Return the record of an impact without drift, its start of contact, and its rows to keep."""
+    start = contact.start_of_impact(record, levels)
+    straight = zeros.without_drift(record, start, levels)
+    if straight is not record:
+        record, start = straight, contact.start_of_impact(straight, levels)
+    if record.stress[start.first :].max() == 0.0:
+        raise _never_positive(record.stress)
+    start = replace(start, gauge=zeros.gauge_before(record, start, levels, striker))
+    return record, start, zeros.span_of_impact(record, start, levels)
+
+
+def _measured(
+    whole: Record, thinned: Record, block: int, excess: dict[str, Array], **known: Any
+) -> Measurement:
+    """Return the test in a record, averaged in blocks, with what else is known of it."""
+    outliers = repair.outliers_of_blocks(whole, block)
+    instants = whole.instants if whole.time is not None else whole.instants // block
+    stood = [instants[rows] for rows in whole.standstills.values() if rows.any()]
+    spikes = {name: int(np.count_nonzero(values)) for name, values in excess.items()}
+    origins = dict(whole.origins)
+    return Measurement(
+        name="",  # name, file and digest follow later
+        path=None,
+        data_sha256="",
+        time=thinned.time,
+        stress=thinned.stress,
+        displacement=thinned.displacement,
+        acceleration=thinned.acceleration,
+        motion=whole.motion,
+        notes=(*thinned.notes, *repair.notes_on(whole, spikes, outliers)),
+        interior=thinned.interior,
+        outliers=outliers,
+        count=count_rows(whole, outliers, block),
+        start_strain=origins.pop("start_strain", 0.0),
+        sampled=thinned.sampled,
         zeros=whole.zeros,
-        origins=whole.origins,
-        acceleration=record.acceleration if impact else None,
+        origins=origins,
         derived=whole.derived,
         braked=whole.braked,
-        rise=rise and rise._replace(time=rise.time - whole.origins.get("contact_time", 0.0)),
         block=block,
-        flight=flight,
         standstills=tuple((float(at[0]), float(at[-1])) for at in stood),
+        **known,
     )
 
 
@@ -222,12 +261,10 @@ def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> Re
     else:
         start, rate = gravity, gravity + np.where(time < 0.0, 0.0, rate)
     t, r = np.insert(time, at, 0.0), np.insert(rate, at, start)
-    dt = np.diff(t)
-    w = np.append(0.0, np.cumsum(0.5 * dt * (r[1:] + r[:-1])))
+    w, twice = integrated_twice(t, r)
     if source != "velocity":
         assert striker.velocity
-        v = striker.velocity + w - w[at]
-        w = np.append(0.0, np.cumsum(v[:-1] * dt + dt**2 * (2 * r[:-1] + r[1:]) / 6))
+        w = (striker.velocity - w[at]) * (t - t[0]) + twice
         record = replace(record, derived=(*record.derived, "displacement"))
     w = np.delete(w - w[at], at)
     return replace(record, displacement=w, motion=f"integrated from {source}")

@@ -12,32 +12,50 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.checks import (
+    COUNT,
+    FLAG,
+    Check,
+    Quantity,
+    Several,
+    Span,
+    Table,
+    check_keys,
+    checked_tables,
+    load_toml,
+)
+from foamfit.data.cycles import loading_rate
 from foamfit.data.measurement import Measurement, Noise, NoiseLevel, Striker, interior_channel
 from foamfit.data.noise import with_noise
-from foamfit.data.rate import loading_rate
-from foamfit.data.toml_file import COUNT, FLAG, check_keys, load_toml
-from foamfit.data.units import parse_quantity, split_quantity
 from foamfit.errors import InputError, naming
 from foamfit.text import engineering, listed
 
 Range = tuple[float, float]
-# Each quantity of the file: its unit, an example, and whether it is a range.
-_QUANTITIES: dict[str, dict[str, tuple[str, str, bool]]] = {
-    "striker": {"velocity": ("m/s", "0.5 to 6 m/s", True)},
+_RIG: dict[str, dict[str, Check]] = {
+    "striker": {
+        "velocity": Span("m/s", "0.5 to 6 m/s"),
+        "masses": Several(Quantity("kg", "7 g"), 'like ["7 g", "14 g"]'),
+    },
     "machine": {
-        "rate": ("1/s", "0.01 to 10 1/s", True),
-        "strain": ("", "0.1 to 0.7", True),
-        "hold": ("s", "10 s", False),
+        "rate": Span("1/s", "0.01 to 10 1/s"),
+        "strain": Span("", "0.1 to 0.7"),
+        "cycles": COUNT,
+        "hold": Quantity("s", "10 s"),
     },
     "limits": {
-        "force": ("N", "500 N", False),
-        "displacement": ("m", "1 mm", False),
-        "strain": ("", "0.9", False),
+        "force": Quantity("N", "500 N"),
+        "displacement": Quantity("m", "1 mm"),
+        "strain": Quantity("", "0.9"),
     },
-    "record": {"rate": ("1/s", "1 MHz", False)},
-    "noise": {"stress": ("Pa", "20 kPa", False), "displacement": ("m", "2 um", False)},
+    "record": {
+        "rate": Quantity("1/s", "1 MHz"),
+        "noise": Table(
+            {"stress": Quantity("Pa", "20 kPa"), "displacement": Quantity("m", "2 um")},
+            '{ stress = "20 kPa" }',
+        ),
+        "interior": FLAG,
+    },
 }
-_OTHERS = {"striker": ["masses"], "machine": ["cycles"], "record": ["noise", "interior"]}
 VELOCITIES, STRAINS, RATES = 24, 5, 5  # numbers of candidates over each range
 LOCK_UP = 0.95  # largest strain, if no limit is stated
 # Ranges, relative to the record, that a rig is assumed to have if it states none.
@@ -249,117 +267,71 @@ def read_rig(path: Path | None, test: Measurement, *, relaxing: bool = False) ->
     the file and the key that is wrong.
     """
     if path is None:
-        return _completed({}, test, relaxing)
+        return _completed({name: {} for name in _RIG}, test, relaxing)
     document = load_toml(path, "a rig is a TOML with [striker], [limits], …; foamfit init --rig")
     with naming(path):
-        return _completed(_stated(document), test, relaxing)
+        check_keys("a rig", document, _RIG)
+        return _completed(checked_tables(document, _RIG), test, relaxing)
 
 
-def _stated(document: dict[str, Any]) -> dict[str, Any]:
-    """Return the quantities of the file in SI, by table and key."""
-    check_keys("a rig", document, [table for table in _QUANTITIES if table != "noise"])
-    out = dict[str, Any]()
-    for table, content in document.items():
-        if not isinstance(content, dict):
-            raise InputError(f"{table} must be a table, [{table}].")
-        check_keys(f"[{table}]", content, [*_QUANTITIES[table], *_OTHERS.get(table, ())])
-        for key, value in content.items():
-            where = f"[{table}] {key}"
-            if key in _QUANTITIES[table]:
-                out[f"{table}.{key}"] = _quantity(value, where, *_QUANTITIES[table][key])
-            elif key == "masses":
-                if not isinstance(value, list) or not value:
-                    raise InputError(f'{where} must be a list like ["7 g", "14 g"].')
-                out["masses"] = tuple(_quantity(one, where, "kg", "7 g", False) for one in value)
-            elif key == "noise":
-                if not isinstance(value, dict):
-                    raise InputError(f'{where} must be like {{ stress = "20 kPa" }}.')
-                check_keys(where, value, _QUANTITIES["noise"])
-                shown = _QUANTITIES["noise"]
-                out |= {
-                    f"noise.{channel}": _quantity(one, f"{where}.{channel}", *shown[channel])
-                    for channel, one in value.items()
-                }
-            else:
-                rule = COUNT if key == "cycles" else FLAG
-                if not rule.valid(value):
-                    raise InputError(f"{where} = {value!r} must be {rule.right}.")
-                out[key] = value
-    return out
-
-
-def _quantity(value: Any, where: str, unit: str, example: str, several: bool) -> Any:
-    """Return a positive quantity, or a range like "0.5 to 6 m/s", in SI."""
-    text = f"{value:g}" if isinstance(value, int | float) and not unit else value
-    ends = text.split(" to ") if isinstance(text, str) and several else [text]
-    if several and len(ends) == 2:
-        last = split_quantity(ends[1])
-        first = split_quantity(ends[0])
-        if first and last and not first[1]:
-            ends[0] = f"{ends[0]} {last[1]}"
-    numbers = [parse_quantity(end, unit, where, example) for end in ends]
-    if len(numbers) > 2 or min(numbers) <= 0.0 or numbers != sorted(numbers):
-        wanted = "a range of positive values" if several else "positive"
-        raise InputError(f'{where} = "{value}" must be {wanted}, like "{example}".')
-    return (numbers[0], numbers[-1]) if several else numbers[0]
-
-
-def _completed(stated: dict[str, Any], test: Measurement, relaxing: bool) -> Rig:
+def _completed(stated: dict[str, dict[str, Any]], test: Measurement, relaxing: bool) -> Rig:
     """Return the rig, completed from a record."""
-    notes, test = list[str](), with_noise(test)
+    test, notes = with_noise(test), list[str]()
+    hits, machine, limits, record = (stated[name] for name in _RIG)
 
-    def of_record(key: str, value: Any, said: str) -> Any:
-        if key in stated:
-            return stated[key]
-        notes.append(said)
-        return value
+    def assume(table: dict[str, Any], key: str, value: Any, said: str) -> None:
+        if key not in table:
+            table[key] = value
+            notes.append(said)
 
-    striker, rate, masses = test.striker, loading_rate(test), stated.get("masses", ())
-    velocity, known = stated.get("striker.velocity", (0.0, 0.0)), striker and striker.velocity
-    if striker is not None and striker.mass and not masses:
-        masses = of_record("masses", (striker.mass,), "the mass of the striker")
-    if known and masses:
-        scaled = FASTER[0] * known, FASTER[1] * known
-        said = f"velocities from {scaled[0]:.3g} to {scaled[1]:.3g} m/s"
-        velocity = of_record("striker.velocity", scaled, said)
-    if masses and not velocity[0] > 0.0:
+    striker, rate = test.striker or Striker(), loading_rate(test)
+    if striker.mass and "masses" not in hits:
+        assume(hits, "masses", (striker.mass,), "the mass of the striker")
+    if striker.velocity and "masses" in hits:
+        low, high = (factor * striker.velocity for factor in FASTER)
+        said = f"velocities from {low:.3g} to {high:.3g} m/s"
+        assume(hits, "velocity", (low, high), said)
+    if "masses" in hits and "velocity" not in hits:
         raise InputError('[striker] velocity is missing; give it like "0.5 to 6 m/s".')
-    strain, rates, hold = (0.0, 0.0), (0.0, 0.0), 0.0
-    machine = any(key.startswith("machine.") for key in stated)
-    slow = not masses and rate is not None and test.displacement is not None
+    slow = "masses" not in hits and rate is not None and test.displacement is not None
     if machine or slow:
-        most = 0.5 if test.displacement is None else float(test.displacement.max())
-        most = most if test.displacement is None else most / test.specimen.height
-        top = min(FARTHER[1] * most, 0.9)
-        said = f"strains from {FARTHER[0] * most:.2g} to {top:.2g}"
-        strain = of_record("machine.strain", (FARTHER[0] * most, top), said)
-        near = rate if rate is not None and not masses else 0.1
-        scaled = RATE_RANGE[0] * near, RATE_RANGE[1] * near
-        said = f"strain rates from {scaled[0]:.3g} to {scaled[1]:.3g} 1/s"
-        rates = of_record("machine.rate", scaled, said)
-        hold = stated.get("machine.hold", 0.0)
-        if relaxing and not hold and test.time is not None and slow:
-            lasts = LONG_HOLD * float(test.time[-1] - test.time[0])
-            hold = of_record("machine.hold", lasts, f"a hold of {engineering(lasts, 's')}")
-    sampling = stated.get("record.rate")
-    if sampling is None and masses and test.time is not None:
-        sampling = 1.0 / float(np.median(np.diff(test.time)))
-        sampling = of_record("record.rate", sampling, f"{engineering(sampling, 'Hz')} sampling")
-    noise = dict[str, float]()
-    for channel, unit, least in (("stress", "Pa", test.stress), ("displacement", "m", None)):
+        w, most = test.displacement, 0.5
+        most = most if w is None else float(w.max()) / test.specimen.height
+        low, high = FARTHER[0] * most, min(FARTHER[1] * most, 0.9)
+        assume(machine, "strain", (low, high), f"strains from {low:.2g} to {high:.2g}")
+        near = rate if rate is not None and "masses" not in hits else 0.1
+        low, high = (factor * near for factor in RATE_RANGE)
+        said = f"strain rates from {low:.3g} to {high:.3g} 1/s"
+        assume(machine, "rate", (low, high), said)
+    if relaxing and slow and test.time is not None:
+        lasts = LONG_HOLD * float(test.time[-1] - test.time[0])
+        assume(machine, "hold", lasts, f"a hold of {engineering(lasts, 's')}")
+    if "masses" in hits and test.time is not None:
+        rate = 1.0 / float(np.median(np.diff(test.time)))
+        assume(record, "rate", rate, f"{engineering(rate, 'Hz')} sampling")
+    noise = record.get("noise", {})
+    usual = {"displacement": 1e-3 * test.specimen.height}
+    if test.stress is not None:
+        usual["stress"] = 0.01 * float(np.ptp(test.stress))
+    for channel, unit in (("stress", "Pa"), ("displacement", "m")):
         level = test.noise.of(channel)
-        usual = 1e-3 * test.specimen.height if least is None else 0.01 * float(np.ptp(least))
-        sigma = usual if level is None or not level.sigma else level.sigma
-        said = f"noise of {engineering(sigma, unit)} ({channel})"
-        noise[channel] = of_record(f"noise.{channel}", sigma, said)
+        sigma = level.sigma if level and level.sigma else usual.get(channel, usual["displacement"])
+        assume(noise, channel, sigma, f"noise of {engineering(sigma, unit)} ({channel})")
     return Rig(
-        velocity=velocity, masses=masses, strain=strain, rates=rates,
-        cycles=stated.get("cycles", max(len(test.cycles), 1)), hold=hold,
-        force=stated.get("limits.force", math.inf),
-        displacement=stated.get("limits.displacement", math.inf),
-        largest_strain=stated.get("limits.strain", LOCK_UP), sampling=sampling, noise=noise,
-        interior=stated.get("interior", bool(test.interior)), notes=tuple(notes),
-    )  # fmt: skip
+        velocity=hits.get("velocity", (0.0, 0.0)),
+        masses=hits.get("masses", ()),
+        strain=machine.get("strain", (0.0, 0.0)),
+        rates=machine.get("rate", (0.0, 0.0)),
+        cycles=machine.get("cycles", max(len(test.cycles), 1)),
+        hold=machine.get("hold", 0.0),
+        force=limits.get("force", math.inf),
+        displacement=limits.get("displacement", math.inf),
+        largest_strain=limits.get("strain", LOCK_UP),
+        sampling=record.get("rate"),
+        noise=noise,
+        interior=record.get("interior", bool(test.interior)),
+        notes=tuple(notes),
+    )
 
 
 def beyond(rig: Rig, springs: int) -> Iterator[tuple[str, Rig]]:

@@ -12,14 +12,30 @@ contains prior knowledge of parameters, "5.5 ± 0.1 MPa".
 
 from __future__ import annotations
 
-import difflib
 import math
-import tomllib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+from foamfit.data.checks import (
+    COUNT,
+    FLAG,
+    LONGEST,
+    RANGE,
+    Check,
+    Quantity,
+    Rule,
+    Several,
+    Stated,
+    Uncertain,
+    anything,
+    check_keys,
+    checked,
+    checked_tables,
+    load_toml,
+    table_of,
+)
 from foamfit.data.measurement import GRAVITY, Noise, Specimen, Striker, Window, interior_node
 from foamfit.data.units import (
     is_unit,
@@ -29,54 +45,25 @@ from foamfit.data.units import (
     split_uncertain,
 )
 from foamfit.errors import InputError, naming
-from foamfit.files import read_whole
 from foamfit.terminal import printable
 
-_LARGEST = 1_000_000  # characters of a TOML
-LONGEST = 200  # characters of a name
-
-
-class _Quantity(NamedTuple):
-    """SI unit, an example, and the name of its ± in `Settings.uncertainties` ("": no ±)."""
-
-    si: str
-    example: str
-    spread: str = ""
-
-
-class Rule(NamedTuple):
-    """Check of a value without a unit, and description of the valid values for messages."""
-
-    valid: Callable[[Any], bool]
-    right: str
-
-
-def is_range(cycles: Any) -> bool:
-    """Return whether a value is a pair of cycle numbers."""
-    pair = isinstance(cycles, tuple | list) and len(cycles) == 2
-    return pair and all(type(number) is int and number > 0 for number in cycles)
-
-
-COUNT = Rule(lambda v: type(v) is int and v > 0, "a whole number from 1 up")
-RANGE = Rule(is_range, "the numbers of the first and the last one, like [1, 3]")
-FLAG = Rule(lambda v: type(v) is bool, "true or false")
-_SECTIONS: dict[str, dict[str, _Quantity | Rule]] = {
+_SECTIONS: dict[str, dict[str, Check]] = {
     "specimen": {
-        "height": _Quantity("m", "1.19 mm", "height"),
-        "diameter": _Quantity("m", "5 mm", "diameter"),
-        "area": _Quantity("m**2", "19.6 mm^2", "area"),
-        "mass": _Quantity("kg", "5.56 mg", "specimen_mass"),
-        "heights": _Quantity("m", "0.7 mm", "height"),
+        "height": Uncertain("m", "1.19 mm"),
+        "diameter": Uncertain("m", "5 mm"),
+        "area": Uncertain("m**2", "19.6 mm^2"),
+        "mass": Uncertain("kg", "5.56 mg"),
+        "heights": Several(Uncertain("m", "0.7 mm"), 'like ["0.700 mm", "0.490 mm"], base first'),
     },
     "striker": {
-        "mass": _Quantity("kg", "7 g", "striker_mass"),
-        "velocity": _Quantity("m/s", "1.75 m/s", "velocity"),
+        "mass": Uncertain("kg", "7 g"),
+        "velocity": Uncertain("m/s", "1.75 m/s"),
         "gravity": FLAG,
     },
-    "noise": {"stress": _Quantity("Pa", "20 kPa"), "displacement": _Quantity("m", "2 um")},
+    "noise": {"stress": Quantity("Pa", "20 kPa"), "displacement": Quantity("m", "2 um")},
     "window": {
-        "start": _Quantity("s", "0.5 ms"),
-        "end": _Quantity("s", "2 ms"),
+        "start": Quantity("s", "0.5 ms", positive=False),
+        "end": Quantity("s", "2 ms", positive=False),
         "cycle": COUNT,
         "cycles": RANGE,
     },
@@ -85,6 +72,17 @@ _SECTIONS: dict[str, dict[str, _Quantity | Rule]] = {
         "sheet": Rule(lambda v: isinstance(v, str), 'a name, like "Sheet1"'),
     },
 }
+_NAME = Rule(
+    lambda v: isinstance(v, str) and v.strip() != "" and v.isprintable() and len(v) <= LONGEST,
+    f"a printable text of {LONGEST} characters at most, in quotation marks",
+)
+_PRIOR = Rule(lambda v: isinstance(v, str), 'like "5.5 ± 0.1 MPa"')
+_FILE = Rule(
+    lambda v: isinstance(v, str) and v.strip() != "" and "\0" not in v, 'a file, like "camera.csv"'
+)
+_DELAY = Uncertain("s", "0 ± 50 us", positive=False)
+# Names in `Settings.uncertainties` that differ from the key.
+_SPREADS = {"specimen mass": "specimen_mass", "striker mass": "striker_mass"}
 _SCALE = "4444.4 N/V"
 # Channels of a [motion] file, in addition to displacements of interior masses.
 MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
@@ -132,47 +130,6 @@ class Settings:
     priors: dict[str, str] = field(default_factory=dict)
 
 
-def toml_beside(test: Path) -> Path:
-    """Return the path of the TOML next to a test file: a.toml for a.csv or a.csv.gz."""
-    plain = test.with_suffix("") if test.suffix.lower() == ".gz" else test
-    return plain.parent / f"{plain.stem}.toml"
-
-
-def read_bytes(path: Path, otherwise: str) -> bytes:
-    """Read a file; `otherwise` ends the message of an error with what would be right."""
-    try:
-        return read_whole(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; {otherwise}.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {otherwise}.") from None
-
-
-def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
-    """Load a TOML file; `otherwise` ends the message if the file is missing or unreadable."""
-    raw = read_bytes(path, otherwise)
-    if len(raw) > _LARGEST:
-        raise InputError(f"{path}: has {len(raw)} characters; a TOML must have {_LARGEST} at most.")
-    try:
-        return tomllib.loads(raw.decode("utf-8-sig"))
-    except RecursionError:
-        raise InputError(f"{path}: is nested too deeply; write a TOML of few levels.") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: is not UTF-8 text; a TOML file must be.") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: is not valid TOML: {error}.") from None
-
-
-def check_keys(where: str, given: Iterable[str], valid: Iterable[str]) -> None:
-    """Raise InputError for an invalid key, and suggest similar valid ones."""
-    valid = list(valid)
-    for key in given:
-        if key not in valid:
-            key = key[:LONGEST]
-            near = difflib.get_close_matches(key, valid, n=2, cutoff=0.4) or valid
-            raise InputError(f"{where} has no key {key!r}; meant may be {', '.join(near)}.")
-
-
 def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Settings:
     """Read and check the TOML at `path` that describes the file `test`.
 
@@ -182,68 +139,49 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
     check_keys(f"{path}:", document, ["name", "columns", "motion", "priors", *_SECTIONS])
     with naming(path):
-        spreads: dict[str, float] = {}
-        values: dict[str, dict[str, Any]] = {}
-        for section, keys in _SECTIONS.items():
-            table = _table(document, section)
-            check_keys(f"[{section}]", table, keys)
-            values[section] = {k: _value(section, k, v, spreads) for k, v in table.items()}
-        name = document.get("name", printable(toml_beside(test).stem))
-        if not (isinstance(name, str) and name.strip() and name.isprintable()):
-            raise InputError(f"name = {name!r} must be a printable text in quotation marks.")
-        if len(name) > LONGEST:
-            raise InputError(f"name has {len(name)} characters; it must have {LONGEST} at most.")
-        priors, window, striker = _table(document, "priors"), values["window"], values["striker"]
-        for key, value in priors.items():  # the keys depend on the model; the fit checks them
-            if not isinstance(value, str):
-                raise InputError(f'[priors] {key} = {value!r} must be like "5.5 ± 0.1 MPa".')
+        values, spreads = _split(checked_tables(document, _SECTIONS))
+        window, striker, priors = values["window"], values["striker"], table_of(document, "priors")
         if {"cycle", "cycles"} <= window.keys():
             raise InputError("[window] has both cycle and cycles; give one of them.")
         if "cycles" in window:
             window["cycle"], window["last"] = window.pop("cycles")
         if "gravity" in striker:
             striker["gravity"] = GRAVITY if striker["gravity"] else 0.0
+        motion, delay = _motion(path, document)
         return Settings(
-            name=name,
+            name=_NAME(document.get("name", printable(toml_beside(test).stem)), "name"),
             specimen=_specimen(values["specimen"], spreads),
             striker=Striker(**striker) if striker else None,
             noise=Noise(**values["noise"]),
             window=Window(**window),
-            columns=_columns(_table(document, "columns"), channels),
-            uncertainties=spreads,
-            motion=_motion(path, document, spreads),
-            priors=priors,
+            columns=_columns(table_of(document, "columns"), channels),
+            uncertainties=spreads | ({"delay": delay} if delay else {}),
+            motion=motion,
+            # Its keys depend on the model; the fit checks them.
+            priors={key: _PRIOR(value, f"[priors] {key}") for key, value in priors.items()},
             **values["data"],
         )
 
 
-def _table(document: dict[str, Any], name: str, within: str = "") -> dict[str, Any]:
-    table = document.get(name, {})
-    if not isinstance(table, dict):
-        raise InputError(f"{within}{name} must be a table, [{within}{name}].")
-    return table
+def _split(
+    tables: dict[str, dict[str, Any]],
+) -> tuple[dict[str, dict[str, Any]], dict[str, float]]:
+    """Separate the values of the tables from the standard deviations."""
+    spreads = dict[str, float | None]()
 
+    def value(found: Any, name: str) -> Any:
+        if isinstance(found, Stated):
+            spreads[_SPREADS.get(name, name.partition(" ")[2])] = found.sigma
+            return found.value
+        if isinstance(found, tuple) and name == "specimen heights":
+            return tuple(value(one, f"specimen height_{i}") for i, one in enumerate(found, 1))
+        return found
 
-def _value(section: str, key: str, value: Any, spreads: dict[str, float]) -> Any:
-    """Check a value and return it in SI; its ± is stored in `spreads`."""
-    where, several, kind = f"[{section}] {key}", key == "heights", _SECTIONS[section][key]
-    if isinstance(kind, Rule):
-        if not kind.valid(value):
-            raise InputError(f"{where} = {value!r} must be {kind.right}.")
-        return value
-    if several and (not isinstance(value, list) or not value):
-        raise InputError(f'{where} must be a list like ["0.700 mm", "0.490 mm"], base first.')
-    (si, example, spread), numbers = kind, []
-    for i, v in enumerate(value if several else [value], 1):
-        if spread:
-            number, sigma = parse_uncertain(v, si, where, example)
-            spreads |= {f"{spread}_{i}" if several else spread: sigma} if sigma else {}
-        else:
-            number = parse_quantity(v, si, where, example)
-        if section != "window" and not 0.0 < number < math.inf:
-            raise InputError(f'{where} = "{v}" must be positive.')
-        numbers.append(number)
-    return tuple(numbers) if several else numbers[0]
+    values = {
+        name: {key: value(found, f"{name} {key}") for key, found in table.items()}
+        for name, table in tables.items()
+    }
+    return values, {name: sigma for name, sigma in spreads.items() if sigma}
 
 
 def _specimen(values: dict[str, Any], spreads: dict[str, float]) -> Specimen:
@@ -265,35 +203,44 @@ def _specimen(values: dict[str, Any], spreads: dict[str, float]) -> Specimen:
     return Specimen(**values)
 
 
+def toml_beside(test: Path) -> Path:
+    """Return the path of the TOML next to a test file: a.toml for a.csv or a.csv.gz."""
+    plain = test.with_suffix("") if test.suffix.lower() == ".gz" else test
+    return plain.parent / f"{plain.stem}.toml"
+
+
 def motion_file(toml: Path) -> Path | None:
     """Return the file named in [motion]; None if none is named or the TOML cannot be read."""
     try:
-        return _file(toml, load_toml(toml, "").get("motion"))
-    except InputError:  # `read_settings` reports the error
+        table = load_toml(toml, "").get("motion")
+        return toml.parent / _FILE(table["file"], "") if isinstance(table, dict) else None
+    except (InputError, KeyError):  # `read_settings` reports the error
         return None
 
 
-def _file(toml: Path, table: Any) -> Path | None:
-    """Resolve the file of the table [motion] relative to the TOML."""
-    name = table.get("file") if isinstance(table, dict) else None
-    named = isinstance(name, str) and name.strip() and "\0" not in name
-    return toml.parent / str(name) if named else None
-
-
-def _motion(path: Path, document: dict[str, Any], spreads: dict[str, float]) -> Motion | None:
+def _motion(path: Path, document: dict[str, Any]) -> tuple[Motion | None, float | None]:
+    """Return the motion in a file of its own, and the standard deviation of its delay, s."""
     if "motion" not in document:
-        return None
+        return None, None
     table = document["motion"]
-    file = _file(path, table)
-    if isinstance(table, dict):
-        check_keys("[motion]", table, ["file", "delay", "columns"])
-    if file is None:
+    if not isinstance(table, dict) or "file" not in table:
         raise InputError('[motion] must name a file, like file = "camera.csv".')
-    columns = _columns(_table(table, "columns", "motion."), MOTION_CHANNELS, "motion.columns")
-    given = table.get("delay", "0 s")
-    delay, sigma = parse_uncertain(given, "s", "[motion] delay", "0 ± 50 us", zero=True)
-    spreads |= {"delay": sigma} if sigma else {}
-    return Motion(file, columns, delay)
+    keys: dict[str, Check] = {"file": _FILE, "delay": _DELAY, "columns": anything}
+    found = {"delay": Stated(0.0, None)} | checked(table, keys, "[motion]")
+    columns = _columns(table_of(found, "columns", "motion."), MOTION_CHANNELS, "motion.columns")
+    delay = found["delay"]
+    return Motion(path.parent / found["file"], columns, delay.value), delay.sigma
+
+
+_COLUMN: dict[str, Check] = {
+    "column": Rule(
+        lambda v: isinstance(v, str) or (type(v) is int and v > 0),
+        'a header or a number, like column = "Load" or column = 2',
+    ),
+    "unit": Rule(lambda v: isinstance(v, str) and is_unit(v), 'a known unit, like unit = "mm"'),
+    "scale": lambda value, where: _scale(value, where),
+    "counts_down": FLAG,
+}
 
 
 def _columns(
@@ -301,27 +248,27 @@ def _columns(
 ) -> dict[str, Column]:
     check_keys(f"[{name}]", table, [*channels, *filter(interior_node, table)])
     columns: dict[str, Column] = {}
-    for channel, spec in table.items():
+    right = '{ column = "Load", unit = "V" }, or with a number, column = 2'
+    for channel, entry in table.items():
         where, inside = f"[{name}] {channel}", interior_node(channel) is not None
-        column = spec.get("column") if isinstance(spec, dict) else None
-        if not (isinstance(column, str) or (type(column) is int and column > 0)):
-            right = '{ column = "Load", unit = "V" }, or with a number, column = 2'
+        if not isinstance(entry, dict) or "column" not in entry:
             raise InputError(f"{where} must be like {right}.")
-        more = ["counts_down"] if inside or channel == "displacement" else []
-        check_keys(where, spec, ["column", "unit", "scale", *more])
-        down, unit, scale = (spec.get(key) for key in ("counts_down", "unit", "scale"))
-        if not isinstance(down, bool | None):
-            raise InputError(f"{where}: counts_down = {down!r} must be true or false.")
-        if unit is not None and (not isinstance(unit, str) or not is_unit(unit)):
-            raise InputError(f'{where}: unit = {unit!r} is unknown; give it like unit = "mm".')
-        text = "1" if scale is None else str(scale)
-        parts = split_quantity(split_uncertain(text)[0])
-        if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not is_unit(parts[1]):
-            raise InputError(f'{where}: scale = {scale!r} must be like -1 or "{_SCALE}".')
-        if inside or channel in ("time", "cycle"):  # a ± has no meaning there
-            parse_quantity(text, parts[1], f"{where}: scale", _SCALE)
-            sigma = 0.0
-        else:
-            sigma = parse_uncertain(text, parts[1], f"{where}: scale", _SCALE)[1] or 0.0
-        columns[channel] = Column(column, unit, *parts, bool(down), sigma / abs(parts[0]))
+        down = inside or channel == "displacement"
+        keys = _COLUMN if down else {key: _COLUMN[key] for key in ("column", "unit", "scale")}
+        found = checked(entry, keys, f"{where}:")
+        number, unit, sigma = found.pop("scale", (1.0, "", None))
+        if sigma is not None and (inside or channel in ("time", "cycle")):
+            parse_quantity(entry["scale"], unit, f"{where}: scale", _SCALE)  # refuses the ±
+        columns[channel] = Column(
+            **found, scale=number, scale_unit=unit, spread=(sigma or 0.0) / abs(number)
+        )
     return columns
+
+
+def _scale(value: Any, where: str) -> tuple[float, str, float | None]:
+    """Return number, unit and standard deviation of a scale, such as "4444.4 ± 5 N/V"."""
+    text = str(value)
+    parts = split_quantity(split_uncertain(text)[0])
+    if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not is_unit(parts[1]):
+        raise InputError(f'{where} = {value!r} must be like -1 or "{_SCALE}".')
+    return *parts, parse_uncertain(text, parts[1], where, _SCALE)[1]

@@ -87,8 +87,10 @@ def parse_uncertain(
     """Convert a quantity and its standard deviation (None without one) to the unit `si`.
 
     Examples: "1.75 ± 0.01 m/s", "1.19 mm +/- 5 um", "5 mm ± 1 %" (of the value). The standard
-    deviation must be less than the value, unless `zero` is a valid value.
+    deviation must be less than the value, unless `zero` is a valid value. A quantity without a
+    unit may also be a number.
     """
+    value = repr(value) if type(value) in (int, float) and not si else value
     text, spread = split_uncertain(value)
     number = _in_si(text, si)
     if isinstance(number, str):

@@ -14,8 +14,8 @@ import numpy as np
 
 from foamfit.arrays import Array, single_threaded
 from foamfit.data.csv_file import read_test
+from foamfit.data.cycles import loading_rate, rate_error
 from foamfit.data.measurement import Measurement
-from foamfit.data.rate import loading_rate, rate_error
 from foamfit.errors import InputError, SimulationError, naming
 from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.links import KINDS, RATES, Links

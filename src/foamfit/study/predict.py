@@ -11,10 +11,9 @@ import numpy as np
 
 from foamfit.arrays import Array, single_threaded
 from foamfit.data.csv_file import read_test
-from foamfit.data.cycles import cycles_of
+from foamfit.data.cycles import cycles_of, loading_rate
 from foamfit.data.measurement import Measurement
 from foamfit.data.noise import with_noise
-from foamfit.data.rate import loading_rate
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.curves import check_drive, check_time_shift, choose_drive, driving_motion
 from foamfit.fitting.problem import Problem, make_problem

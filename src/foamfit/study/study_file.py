@@ -8,7 +8,7 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from foamfit.data.toml_file import COUNT, FLAG, RANGE, Rule, check_keys, load_toml
+from foamfit.data.checks import COUNT, FLAG, RANGE, Rule, check_keys, load_toml
 from foamfit.errors import InputError
 from foamfit.fitting.curves import DRIVES
 from foamfit.fitting.links import KINDS
@@ -31,7 +31,7 @@ _RULES = {
     "specimen": Rule(_is_text, 'text, like specimen = "foam.toml"'),
     "seed": Rule(lambda v: type(v) is int and v >= 0, "a whole number from 0 up"),
     "cycle": COUNT,
-    "cycles": RANGE._replace(right=f"{RANGE.right}, without cycle"),
+    "cycles": Rule(RANGE.valid, f"{RANGE.right}, without cycle"),
     "starts": COUNT,
     "drive": Rule(lambda v: v in DRIVES, f"one of {', '.join(DRIVES)}"),
     **dict.fromkeys(OPTIONS, FLAG),

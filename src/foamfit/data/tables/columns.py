@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from foamfit.data.measurement import Entry, Striker, interior_channel, interior_node
+from foamfit.data.measurement import Entry, Striker, entry_line, interior_channel, interior_node
 from foamfit.data.tables.csv_table import Table, Text, find_table, read_numbers
 from foamfit.data.tables.headers import CHANNELS, WEAK, WEIGHTS, channel_of, example, in_si
 from foamfit.data.toml_file import Column, Settings
@@ -172,9 +172,8 @@ class Source:
         """Return the entry of the TOML that reverses the sign of a channel."""
         given = self.given.get(channel, _NONE)
         by = f'"{-given.scale:g} {given.scale_unit}"' if given.scale_unit else f"{-given.scale:g}"
-        down = "counts_down = true" if channel.startswith("displacement") else f"scale = {by}"
-        column = quoted(self.table, self.columns[channel])
-        return f"{channel} = {{ column = {column}, {down} }}"
+        down, column = channel.startswith("displacement"), quoted(self.table, self.columns[channel])
+        return entry_line(channel, column, scale="" if down else by, counts_down=down)
 
     def stated_sign(self, channel: str) -> str:
         """Return what reverses the sign of a channel in the TOML; "" if nothing does."""
@@ -210,7 +209,7 @@ def assign_columns(
             continue
         if unclear is None:
             both = " and ".join(map(table.name, best))
-            entry = f"{channel} = {{ column = {quoted(table, best[0])} }}"
+            entry = entry_line(channel, quoted(table, best[0]))
             raise InputError(
                 f"columns {both} could both be the {channel}; keep one, or write {entry} in "
                 "[columns]."
@@ -291,14 +290,15 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
     if unit is None and over and in_si(channel, over, given.scale_unit) is not None:
         unit = over
     if unit is None and in_si(channel, "", given.scale_unit) is None:
-        usual, more = channel_of(channel).unit, ""
+        usual, scale = channel_of(channel).unit, ""
         if given.scale_unit:
             over, _, under = given.scale_unit.rpartition("/")
             usual = under if in_si(channel, under) is None else over  # of N/mV or mV/N
-            more = f', scale = "{given.scale:g} {given.scale_unit}"'
+            scale = f'"{given.scale:g} {given.scale_unit}"'
+        entry = entry_line(channel, quoted(table, k), usual, scale)
         raise InputError(
             f"{where} has no unit; write it in the header like '{right}' or in [columns] like "
-            f'{channel} = {{ column = {quoted(table, k)}, unit = "{usual}"{more} }}.'
+            f"{entry}."
         )
     unit = unit or ""
     if not is_unit(unit, any_case=True):
@@ -333,14 +333,11 @@ def _inverse(channel: str, unit: str, given: Column) -> float | None:
 
 def entries_of(table: Table, has: set[str], *channels: str) -> str:
     """Suggest entries of [columns] for missing channels; a column only if its unit is unique."""
-    entries = []
-    for channel in channels:
-        fits = [
-            k
-            for k, header in enumerate(table.headers)
-            if header.nameless and header.unit and in_si(channel, header.unit) is not None
-        ]
-        column = quoted(table, fits[0]) if len(fits) == 1 else '"…"'
-        unit = "" if len(fits) == 1 else f', unit = "{channel_of(channel).unit}"'
-        entries += [f"{channel} = {{ column = {column}{unit} }}"] if channel not in has else []
+    entries, headers = [], [(k, h) for k, h in enumerate(table.headers) if h.nameless and h.unit]
+    for channel in (c for c in channels if c not in has):
+        fits = [k for k, header in headers if in_si(channel, header.unit or "") is not None]
+        if len(fits) == 1:
+            entries.append(entry_line(channel, quoted(table, fits[0])))
+        else:
+            entries.append(entry_line(channel, '"…"', channel_of(channel).unit))
     return listed(entries)

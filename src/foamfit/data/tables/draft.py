@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from foamfit.data.measurement import MIN_ROWS
+from foamfit.data.checks import LONGEST
+from foamfit.data.measurement import MIN_ROWS, entry_line
 from foamfit.data.tables.columns import Source, entries_of, quoted, si_factor
 from foamfit.data.tables.csv_table import Table, Text, read_numbers
 from foamfit.data.tables.headers import channel_of
-from foamfit.data.toml_file import LONGEST, toml_beside
+from foamfit.data.toml_file import toml_beside
 from foamfit.data.units import factor
 from foamfit.errors import InputError, naming
 from foamfit.terminal import printable
@@ -79,16 +80,16 @@ def _columns(text: Text) -> list[str]:
     source = Source.of(text, {}, unclear)
     lines, table = [], source.table
     for channel, k in (source.columns | {c: places[0] for c, places in unclear.items()}).items():
-        name = f"{channel} = {{ column = {quoted(table, k)}"
+        unit, why = "", ""
         try:
             si_factor(table, channel, k, None)
-            unit, why = "", ""
         except InputError as error:
-            unit = f', unit = "{channel_of(channel).unit}"'
+            unit = channel_of(channel).unit
             why = str(error).removeprefix("column ").partition(";")[0]
         if channel in unclear:
             why = f"which of {listed(map(table.name, unclear[channel]))} is it?"
-        lines.append(f"# {name}{unit} }}  # needed: {why}" if why else f"{name} }}")
+        line = entry_line(channel, quoted(table, k), unit)
+        lines.append(f"# {line}  # needed: {why}" if why else line)
     known = {*source.columns.values(), *(k for places in unclear.values() for k in places)}
     others = [k for k, h in enumerate(table.headers) if h.text and k not in known]
     present = source.columns.keys() | unclear.keys()
@@ -117,12 +118,12 @@ def _proposal(table: Table, names: tuple[str, ...], columns: list[int]) -> str:
             return entry
     volts = [k for k in nameless if factor(table.headers[k].unit or "", "V") is not None]
     if len(volts) == 1 and "force" in names:
-        return f'force = {{ column = {quoted(table, volts[0])}, scale = "100 N/V" }}'
+        return entry_line("force", quoted(table, volts[0]), scale='"100 N/V"')
     plain = [k for k in nameless if table.headers[k].unit is None]
     clocks = {k: _is_clock(table, k) for k in plain}
     fits = [k for k, clock in clocks.items() if clock == ("time" in names)]
     column = quoted(table, fits[0]) if len(fits) == 1 else '"…"'
-    return f'{names[0]} = {{ column = {column}, unit = "{channel_of(names[0]).unit}" }}'
+    return entry_line(names[0], column, channel_of(names[0]).unit)
 
 
 def _is_clock(table: Table, column: int) -> bool | None:
