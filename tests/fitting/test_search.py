@@ -12,8 +12,16 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import DATA, EXPERIMENTS, needs_data, synthetic_impact, synthetic_loop, thinned
-from foamfit.data.measurement import Measurement, Noise, Specimen
+from conftest import (
+    DATA,
+    EXPERIMENTS,
+    loop_measurement,
+    needs_data,
+    synthetic_impact,
+    synthetic_loop,
+    thinned,
+)
+from foamfit.data.measurement import Noise, Specimen
 from foamfit.fitting import levenberg
 from foamfit.fitting.minima import in_order
 from foamfit.fitting.problem import make_params
@@ -39,14 +47,6 @@ def test_an_impact_is_recovered_within_three_standard_errors(impact_fit):
     assert impact_fit.statistics["redchi"] == pytest.approx(1.0, abs=0.15)
     assert impact_fit.status in ("ok", "warnings")
     assert impact_fit.visited == {"s1": ("a", "d", "c", "e")}
-
-
-def test_the_result_speaks_lmfit(impact_fit):
-    assert isinstance(impact_fit.params, lmfit.Parameters)
-    item = impact_fit.parameters["s1_kc"]
-    assert impact_fit.params["s1_kc"].value == item.value
-    assert impact_fit.params["s1_kc"].stderr == item.stderr
-    assert impact_fit.chain.springs[0].kc == item.value
 
 
 def test_same_test_and_seed_give_the_same_numbers(impact_fit):
@@ -228,17 +228,9 @@ def two_springs(*springs, noise=0.005):
         y + noise * np.ptp(y) * rng.standard_normal(y.size)
         for y in (run.base_stress, run.displacement[0])
     ]
-    return Measurement(
-        name="synthetic loop of two springs",
-        path=None,
-        data_sha256="",
-        time=None,
-        stress=noisy[0],
-        displacement=strain * height,
-        specimen=Specimen(height, 1.9635e-5, heights=(0.5 * height,) * 2),
-        motion="measured",
-        interior={1: noisy[1]},
-    )
+    specimen = Specimen(height, 1.9635e-5, heights=(0.5 * height,) * 2)
+    made = loop_measurement(noisy[0], strain * height, specimen)
+    return replace(made, interior={1: noisy[1]})
 
 
 def test_a_mass_inside_shows_which_spring_is_at_the_base():
@@ -277,17 +269,6 @@ def test_where_no_motion_is_measured_another_contact_time_is_tried(tmp_path):
     result = ff.fit(ff.read_test(rig.write(record, tmp_path)), intervals="local")
     assert result.statistics["chisqr"] < 1790.0
     assert result.parameters["s1_eps_a"].value == pytest.approx(record.truth["s1_eps_a"], rel=0.2)
-
-
-def test_the_result_says_that_a_motion_was_integrated_from_the_force():
-    _, impact = synthetic_impact()
-    result = ff.fit(replace(impact, motion="integrated from force"), starts=2, intervals="local")
-    content = result.to_json_dict()
-    assert content["misfit"]["stress_time"] < 0.02
-    assert content["misfit"]["displacement_time"] is None
-    assert content["misfit"]["stress_strain"] is None
-    note = next(note for note in result.notes if "integrated from the force" in note)
-    assert re.search(r"displacement-time curve deviates from it by \d+\.\d% of its range", note)
 
 
 @pytest.mark.parametrize(

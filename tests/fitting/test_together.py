@@ -121,18 +121,6 @@ def test_a_shared_parameter_stays_one_value_where_its_limit_is_another_for_each_
     assert found.value("s1_k0") == pytest.approx([4e5, 2e5], rel=0.02)
 
 
-def test_a_test_costs_as_many_simulations_however_many_there_are(tests):
-    problems, starts = tests
-    counts = []
-    for n in (1, 3):
-        few = [problem(p.measurement) for p in problems[:n]]
-        found = fit_together(few, ["s1_kh_plus"], [starts[:n]])
-        assert len({one.objective.evaluations for one in few}) == 1
-        counts.append(few[0].objective.evaluations)
-        assert found.cost < sum(one.objective.n_data for one in few)
-    assert max(counts) < 1.6 * min(counts)
-
-
 def test_tests_that_cannot_be_fitted_together_are_refused(tests):
     problems, starts = tests
     other = problem(problems[1].measurement, "bistable+bistable")

@@ -12,10 +12,16 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import AREA, HEIGHT, small_pictures, synthetic_impact, synthetic_loop
-from foamfit.data.measurement import Measurement, Noise, Specimen
+from conftest import (
+    AREA,
+    HEIGHT,
+    loop_measurement,
+    small_pictures,
+    synthetic_impact,
+    synthetic_loop,
+)
+from foamfit.data.measurement import Measurement, Specimen
 from foamfit.fitting.problem import make_problem
-from foamfit.report.summary import conclusions
 from foamfit.results import SOURCES
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import responses
@@ -68,27 +74,6 @@ def test_height_and_scale_of_the_motion_are_one_and_the_same_strain(loop):
     for name in (*STRESSES, *STRAINS):
         one, other = (moved(loop, q, name) for q in ("height", "displacement_scale"))
         assert one == pytest.approx(-other, rel=1e-3)
-
-
-def test_a_dashpot_scales_with_the_area():
-    """With a given motion, η is a stress divided by a rate and scales like a stress."""
-    time = np.linspace(0.0, 2.0, 301)
-    motion = 0.4 * HEIGHT * np.sin(0.5 * np.pi * time)
-    spring = ff.BistableSpring(*SPRING.seven, eta=2e5)
-    chain = ff.Chain([spring], [HEIGHT], AREA)
-    stress = ff.simulate(chain, ff.DisplacementDrive(motion), time).base_stress
-    test = Measurement(
-        "synthetic", None, "", time, stress, motion, Specimen(HEIGHT, AREA), motion="measured",
-        noise=Noise(stress=1e4), uncertainties={"area": 0.01 * AREA},
-    )  # fmt: skip
-    problem = make_problem(test, "bistable", "displacement", None, None, interior_mass=False)
-    problem.params["s1_eta"].set(vary=True, max=1e9)
-    values = problem.vector()
-    values[:8] = [*SPRING.seven, 2e5]
-    best = BestPoint(problem, values)
-    assert "s1_eta" in best.names
-    for name in (*STRESSES, "s1_eta"):
-        assert moved(best, "area", name) == pytest.approx(-0.01, rel=1e-3)
 
 
 def written(folder: Path, *, height: str, area: str, velocity: str = "2 m/s", mass: str = "7 g",
@@ -153,13 +138,6 @@ def test_systematic_is_in_no_interval(plain, stated):
     for name in (*STRESSES, *STRAINS):
         assert stated.parameters[name].ci95 == pytest.approx(plain.parameters[name].ci95)
         assert stated.parameters[name].stderr == pytest.approx(plain.parameters[name].stderr)
-
-
-def test_the_summary_says_how_far_it_goes(plain, stated):
-    (told,) = [text for text in conclusions(stated) if "in the TOML" in text]
-    assert told.startswith("The ± of area in the TOML moves s1_k")
-    assert " by 3 %, others by less" in told
-    assert not any("in the TOML" in text for text in conclusions(plain))
 
 
 def test_velocity_and_mass_with_a_deviation_are_fitted_within_it(tmp_path):
@@ -244,10 +222,8 @@ def test_heights_of_a_chain(tmp_path):
     chain = ff.Chain([ff.LinearSpring(2e6), MICRO], [4e-3, 6e-3], AREA)
     stress = ff.simulate(chain, ff.DisplacementDrive(motion), time).base_stress
     stress += 50.0 * np.random.default_rng(0).standard_normal(time.size)
-    test = Measurement(
-        "synthetic", None, "", time, stress, motion, Specimen(0.01, AREA, heights=(4e-3, 6e-3)),
-        motion="measured", uncertainties={"height": 1e-4, "height_1": 4e-5},
-    )  # fmt: skip
+    test = loop_measurement(stress, motion, Specimen(0.01, AREA, heights=(4e-3, 6e-3)), time)
+    test = replace(test, uncertainties={"height": 1e-4, "height_1": 4e-5})
     problem = make_problem(
         test, "linear+microscale", "displacement", None, None, interior_mass=False
     )

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 import foamfit as ff
-from conftest import DATA, EXPERIMENTS, needs_data, synthetic_loop, without_pictures
+from conftest import DATA, EXPERIMENTS, needs_data, without_pictures
 from foamfit.cli import main
 from foamfit.trust.contested import judged
 
@@ -194,11 +194,6 @@ def test_what_the_record_cannot_show_is_refused(
     with pytest.raises(ff.InputError, match=words) as caught:
         ff.fit(test, **kw)
     assert "\n" not in str(caught.value)
-
-
-def test_a_slow_test_has_no_striker_to_vary() -> None:
-    with pytest.raises(ff.InputError, match="needs no striker"):
-        ff.fit(synthetic_loop()[1], vary=["velocity"])
 
 
 def test_force_and_acceleration_show_a_wrong_scale_of_the_force(tmp_path: Path) -> None:
