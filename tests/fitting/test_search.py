@@ -288,8 +288,6 @@ def test_interior_masses_that_are_not_there_are_said_to_change_nothing(model, dr
     assert not any(why in note for note in plain.notes)
     assert asked.params.valuesdict() == plain.params.valuesdict()
     assert asked.warnings == plain.warnings
-    states = [{n: p.state for n, p in fit.parameters.items()} for fit in (asked, plain)]
-    assert states[0] == states[1]
 
 
 def test_a_mass_inside_is_left_out_of_a_single_spring_and_refused_as_the_top():
@@ -321,46 +319,6 @@ def test_one_spring_follows_the_first_cycle_of_a_shoe_foam(name, tmp_path):
     result = ff.fit(measurement, intervals="local")
     assert result.drive == "displacement"
     assert result.misfit["stress_strain"] <= 0.035
-
-
-CARTILAGE = """\
-[specimen]
-height = "0.563 mm"
-diameter = "8.5 mm"
-[striker]
-mass = "358.39 g"
-velocity = "0.785 m/s"
-"""
-VOLTS = """\
-[columns]
-time = { column = "X_Value", unit = "s" }
-acceleration = { column = "Acceleration", unit = "V", scale = "9586.5 m/s^2/V" }
-force = { column = "Load", unit = "V", scale = "4444.4 N/V" }
-"""
-
-
-@needs_data
-@pytest.mark.parametrize(
-    ("name", "columns", "motion", "ratio", "drive"),
-    [
-        # the 8 rows at rest give a zero 90 kPa above that of the raw file, 2 % of the impulse
-        ("test_1_impact.csv", "", "measured", 0.755, "displacement"),
-        ("test_1_raw.txt", VOLTS, "integrated from acceleration", 0.775, "impact"),
-    ],
-)
-def test_a_striker_on_cartilage_is_fitted_and_its_impulse_doubted(
-    name, columns, motion, ratio, drive, tmp_path
-):
-    """Data of JoVE 64450, as published in a CSV file and as raw text in volts."""
-    toml = tmp_path / "cartilage.toml"
-    toml.write_text(CARTILAGE + columns)
-    measurement = ff.read_test(DATA / "cartilage-impact" / name, toml)
-    assert measurement.motion == motion
-    result = ff.fit(measurement, starts=1, intervals="local")
-    assert result.drive == drive
-    assert result.energy["impulse_ratio"] == pytest.approx(ratio, abs=0.01)
-    assert any("momentum" in warning for warning in result.warnings)
-    assert result.misfit["stress_time"] < 0.2
 
 
 @pytest.mark.parametrize(

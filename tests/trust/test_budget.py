@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -16,13 +15,11 @@ from conftest import (
     AREA,
     HEIGHT,
     loop_measurement,
-    small_pictures,
     synthetic_impact,
     synthetic_loop,
 )
 from foamfit.data.measurement import Measurement, Specimen
 from foamfit.fitting.problem import make_problem
-from foamfit.results import SOURCES
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import responses
 
@@ -237,23 +234,3 @@ def test_heights_of_a_chain(tmp_path):
     # A change in height of a linear spring is compensated by its stiffness.
     assert moved(best, "height_1", "s1_k0") == pytest.approx(0.01, rel=2e-3)
     assert moved(best, "height_1", "s2_k0") == pytest.approx(0.0, abs=2e-5)
-
-
-def test_it_is_in_the_files(stated, tmp_path, monkeypatch):
-    small_pictures(monkeypatch)
-    folder = stated.save(tmp_path / "result")
-    content = json.loads((folder / "fit.json").read_text(encoding="utf-8"))
-    assert set(content["budget"]["s1_kc"]) == set(SOURCES)
-    assert content["budget"]["s1_kc"]["area"] == pytest.approx(
-        content["parameters"]["s1_kc"]["systematic"]
-    )
-    head, *lines = (folder / "parameters.csv").read_text(encoding="utf-8").splitlines()
-    column = head.split(",").index("systematic")
-    systematic = {line.split(",")[0]: float(line.split(",")[column]) for line in lines}
-    assert systematic["s1_kc"] == pytest.approx(0.03 * stated.parameters["s1_kc"].value, rel=1e-3)
-    rows = (folder / "budget.csv").read_text(encoding="utf-8").splitlines()
-    assert rows[0].startswith("name,noise,contact and zero,velocity,mass,height,area,")
-    assert len(rows) == 1 + len(stated.budget.contributions)
-    page = (folder / "report.html").read_text(encoding="utf-8")
-    assert "Uncertainty budget" in page
-    assert "contact time t₀" in page

@@ -222,13 +222,6 @@ def test_the_terminal_prints_whole_lines(tmp_path: Path, monkeypatch: pytest.Mon
     assert any("[striker] and [columns]" in line for line in lines)
     assert max(map(len, lines[:-3])) <= 80
     assert len(lines) <= 24
-    again = CliRunner().invoke(
-        main, [*call, "--vary", "velocity", "--vary", "force_scale", "--out", str(tmp_path / "b")]
-    )
-    assert again.exit_code == 0
-    assert "impact drive" in again.stdout
-    assert "velocity v₀" in again.stdout
-    assert "force scale s_F" in again.stdout
 
 
 def test_tests_of_a_joint_fit_and_a_batch_have_the_same_default(

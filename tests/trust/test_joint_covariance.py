@@ -109,17 +109,6 @@ def test_one_test_alone_has_the_covariance_of_its_own_fit():
     assert freedom == pytest.approx(alone.spread.freedom, rel=0.05)
 
 
-def test_four_tests_of_one_foam_have_half_the_error_of_one():
-    ratios = []
-    for seed in range(20):
-        problems, vectors = loops_of([{}] * 4, 2e4, seed)
-        kinds = dict.fromkeys(problems[0].free(), "shared")
-        four = fit_jointly(problems, Links(kinds), [vectors]).point
-        one = fit_jointly(problems[:1], Links(kinds), [vectors[:1]]).point
-        ratios.append([four.of_common(n)[0] / one.of_common(n)[0] for n in kinds])
-    assert np.mean(ratios) == pytest.approx(0.5, rel=0.05)
-
-
 def test_beside_an_error_of_the_law_tests_add_up_as_well():
     """One spring cannot follow the wave in these three tests; errors still decrease by √3."""
     problems, vectors = loops_of([{}] * 3, 5e2)

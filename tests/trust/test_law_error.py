@@ -275,16 +275,12 @@ def test_the_result_says_what_was_decided(tmp_path):
     assert check.answer is False
     assert "the law misses" in check.warnings[0]
     folder = FitResult(**vars(result)).save(tmp_path / "out")
-    content = load_result(folder)
-    kept = content["parameters"]["s1_kc"]
+    kept = load_result(folder)["parameters"]["s1_kc"]
     assert kept["range"] == pytest.approx(result.parameters["s1_kc"].range)
-    header, row = (folder / "parameters.csv").read_text().splitlines()[:2]
+    header = (folder / "parameters.csv").read_text().splitlines()[0]
     assert header.split(",")[3:7] == ["ci95_low", "ci95_high", "range_low", "range_high"]
-    assert float(row.split(",")[5]) == result.parameters["s1_k0"].range[0]
     report = (folder / "report.html").read_text()
     assert all(line.replace("'", "&#39;") in report for line in RULE)
-    assert '<th class="num">range</th>' in report
-    assert " to " in readable("s1_kc", result.parameters["s1_kc"]).range
 
 
 def test_there_is_no_range_where_the_law_follows_the_curves():

@@ -77,34 +77,29 @@ class Refit:
         start: Array,
         hold: tuple[int, float] | None = None,
         *,
-        weights: Array | float = 1.0,
         iterations: int = STEPS,
         near: Iterate | None = None,
     ) -> Iterate | None:
         """Descend from a point; `hold` is the column and the value of a fixed parameter, if any.
 
-        `weights` (n_data,) multiply the squares. The Jacobian of a point `near` the start saves one
-        of its own. Returns None if the start cannot be simulated.
+        The Jacobian of a point `near` the start saves one of its own. Returns None if the start
+        cannot be simulated.
         """
-        best, sizes = self.best, self.best.sizes
-        root, box = np.sqrt(weights), best.box.copy()
+        best, sizes, box = self.best, self.best.sizes, self.best.box.copy()
         if hold is not None:
             box[:, hold[0]] = hold[1]
 
         def residual(scaled: Array) -> Array:
-            if scaled is begin:
-                return np.asarray(root * first)
-            return np.asarray(root * self.tracker.residual(self.point(scaled, box)))
+            return self.tracker.residual(self.point(scaled, box))
 
         def jacobian(scaled: Array) -> Array:
-            slopes = best.problem.slopes(self.point(scaled, box), best.names)
-            return np.asarray(slopes * np.reshape(root, (-1, 1)) * sizes)
+            return np.asarray(best.problem.slopes(self.point(scaled, box), best.names) * sizes)
 
         begin = np.clip(start[best.places], *box) / sizes
         first = self.residual(self.point(begin, box))
         if first is None:
             return None
-        at = begin if near is None else Iterate(begin, first, near.jacobian)
+        at = Iterate(begin, first, jacobian(begin) if near is None else near.jacobian)
         end = descend(
             residual, jacobian, at, box / sizes, iterations, least=self.enough, damping=1e-6,
             stale=near is not None,
