@@ -12,6 +12,7 @@ import foamfit as ff
 from conftest import AREA, EXPERIMENTS, HEIGHT, loop_measurement, synthetic_impact, synthetic_loop
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.fitting.branches import FLIGHT, sections
+from foamfit.fitting.objective import Spent
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.report.comparison import published_side
@@ -249,7 +250,7 @@ def test_each_question_is_answered_no_by_what_deserves_it(key: str) -> None:
 def test_trials_that_fail_and_masses_that_ring_are_asked_after() -> None:
     spring, test = synthetic_impact(samples=201)
     problem = problem_of(test)
-    problem.objective.evaluations, problem.objective.failures = 10, 90
+    problem.objective.spent = Spent(10, 90)
     result = conclude(best_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
     assert answers(result)["simulated"] is False
     item = ff.published["foam-1/model-3"]

@@ -385,7 +385,6 @@ def _search_loop(
         ends = halve(inner, own, spread_out(own, points, starts), step)
         ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
     finally:
-        objective.add_counts(inner.objective)
         if inner.best_values is not None:
             tracker.consider(inner.best_values)
     return ends
@@ -403,7 +402,7 @@ def _along(objective: Objective, loop: Measurement) -> Objective:
     """Return the objective of the stress along the motion of a loop."""
     return Objective(
         loop, objective.model, "displacement", {"stress_strain": 1.0},
-        time_shift=objective.time_shift, nuisance=objective.nuisance,
+        time_shift=objective.time_shift, nuisance=objective.nuisance, spent=objective.spent,
     )  # fmt: skip
 
 

@@ -103,8 +103,8 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         problem=problem,
         effort=Effort(
             objective.evaluations,
-            objective.sloped,
-            objective.seconds,
+            objective.spent.sloped,
+            objective.spent.seconds,
             SPENT.seconds - record.compiled,
             total,
         ),
