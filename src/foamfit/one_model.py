@@ -429,7 +429,5 @@ def _search(
             tracker.consider(coarse.best_values)
         ensure_feasible(tracker, problem.space(), np.random.default_rng(record.seed))
         return problem, replace(record, stopped=what_stopped(error))
-    finally:
-        problem.objective.add_counts(thinned.objective)
     progress(1.0, "done")
     return problem, record

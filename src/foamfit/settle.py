@@ -142,16 +142,12 @@ def follow_samples(problem: Problem, tracker: Tracker) -> Problem:
         return problem
     rough = sampled(problem)
     trial = Tracker(rough.objective, tracker.deadline, ends=[values])
-    try:
+    descend_again(rough, trial)
+    if trial.best_cost * WORSE**2 < cost:
+        trial.ends = [*trial.ends, *ends]
         descend_again(rough, trial)
-        if trial.best_cost * WORSE**2 < cost:
-            trial.ends = [*trial.ends, *ends]
-            descend_again(rough, trial)
-    finally:
-        smooth.add_counts(rough.objective)
     if trial.best_values is None or trial.best_cost * WORSE**2 >= cost:
         return problem
-    rough.objective.counts = smooth.counts
     tracker.objective, tracker.ends = rough.objective, trial.ends
     tracker.best_values, tracker.best_cost = trial.best_values, trial.best_cost
     return rough

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import foamfit as ff
+from conftest import loop_measurement
 from foamfit.data.cycles import inner_loops
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.report.summary import summary_text
@@ -21,12 +24,9 @@ def record(corners: tuple[float, ...] = CORNERS, between: int = 60) -> Measureme
     time = np.linspace(0.0, ends[-1], between * (len(corners) - 1) + 1)
     strain = np.interp(time, ends, corners)
     noise = SIGMA * np.random.default_rng(3).standard_normal(time.size)
-    return Measurement(
-        name="synthetic foam", path=None, data_sha256="", time=time,
-        stress=np.asarray(SPRING.stress(strain)) + noise, displacement=strain * HEIGHT,
-        specimen=Specimen(height=HEIGHT, area=5e-5), noise=Noise(stress=SIGMA),
-        motion="measured",
-    )  # fmt: skip
+    stress = np.asarray(SPRING.stress(strain)) + noise
+    made = loop_measurement(stress, strain * HEIGHT, Specimen(HEIGHT, 5e-5), time)
+    return replace(made, noise=Noise(stress=SIGMA))
 
 
 @pytest.mark.parametrize(
@@ -74,8 +74,3 @@ def test_a_bistable_fit_says_what_partial_unloading_leaves() -> None:
     assert f"these 45 % of the samples account for {100.0 * inside:.2g} % of the squared" in told
     assert "microscale springs do" in told
     assert told in " ".join(summary_text(fit, verbose=True).split())
-
-
-def test_a_record_that_never_turns_back_is_not_told_of_inner_loops() -> None:
-    fit = ff.fit(record((0.0, 0.6, 0.0)), model="bistable", starts=1, intervals="local")
-    assert not any("inner loops" in note for note in fit.notes)

@@ -55,23 +55,6 @@ def test_confidence_intervals_of_lmfit_are_the_profile_intervals(result):
         assert [ends[0], ends[-1]] == pytest.approx([low, high], abs=0.03 * (high - low))
 
 
-def test_the_derivative_given_to_lmfit_is_that_of_the_residual():
-    result = ff.fit(synthetic_impact(samples=201)[1], starts=2, intervals="local")
-    minimizer, params = result.minimizer, result.lmfit.params.copy()
-    slopes = minimizer.kws["Dfun"](params)
-    names = [name for name, one in params.items() if one.vary]
-    assert slopes.shape == (minimizer.userfcn(params).size, len(names))
-    for name, column in zip(names, slopes.T, strict=True):
-        value, step = params[name].value, 1e-5 * params[name].stderr
-        sides = []
-        for side in (-1.0, 1.0):
-            params[name].value = value + side * step
-            sides.append(minimizer.userfcn(params))
-        params[name].value = value
-        off = (sides[1] - sides[0]) / (2.0 * step) - column
-        assert np.median(np.abs(off)) <= 1e-3 * np.abs(column).max()
-
-
 def test_a_result_read_back_has_the_same_objects(result, tmp_path):
     again = ff.load(result.save(tmp_path / "result", report=False))
     assert lmfit.fit_report(again.lmfit) == lmfit.fit_report(result.lmfit)

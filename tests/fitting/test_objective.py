@@ -6,19 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import savgol_filter
 
 import foamfit as ff
 from conftest import synthetic_impact, synthetic_loop
 from foamfit.data.measurement import Measurement, Noise, Outliers, Striker
 from foamfit.fitting.curves import (
     check_drive,
-    check_interior,
     choose_drive,
     default_weights,
-    smoothed,
 )
-from foamfit.fitting.objective import MODEL_ERROR, PENALTY, Objective
+from foamfit.fitting.objective import PENALTY, Objective
 from foamfit.one_model import Options
 from foamfit.springs.model import Model
 
@@ -46,13 +43,6 @@ def test_the_true_parameters_leave_nothing_without_noise():
     assert np.max(np.abs(usual.residual(known(usual, values_of(spring))))) < 1e-3
 
 
-def test_residuals_in_units_of_stated_noise_have_unit_variance():
-    spring, measurement = synthetic_impact()
-    one = objective(measurement)
-    residual = one.residual(known(one, values_of(spring)))
-    assert np.std(residual) == pytest.approx(1.0, abs=0.1)
-
-
 def test_estimated_noise_is_the_scale_as_long_as_it_is_not_tiny():
     spring, measurement = synthetic_impact()
     plain = objective(replace(measurement, noise=Noise()))
@@ -61,27 +51,6 @@ def test_estimated_noise_is_the_scale_as_long_as_it_is_not_tiny():
         measurement.noise.displacement, rel=0.15
     )
     assert np.std(plain.residual(known(plain, values_of(spring)))) == pytest.approx(1.0, abs=0.15)
-
-
-def test_tiny_noise_counts_as_a_share_of_the_range():
-    spring, measurement = synthetic_impact(noise=0.0)
-    plain = objective(measurement)
-    values = known(plain, values_of(spring) * np.r_[1.01, np.ones(8)])
-    off = plain.residual(values)
-    n = measurement.time.size
-    simulated = plain.simulate(values)
-    unit = MODEL_ERROR * np.ptp(measurement.stress)
-    expected = (simulated.curves["stress_time"] - measurement.stress) / unit
-    np.testing.assert_allclose(off[:n], expected, rtol=1e-14)
-    assert off.size == 2 * n
-
-
-@pytest.mark.parametrize(("n", "window"), [(600, 21), (5000, 201), (9, 9)])
-def test_smoothing_by_parabolas_is_that_of_scipy(n, window):
-    values = np.random.default_rng(n).normal(size=n).cumsum()
-    np.testing.assert_allclose(
-        smoothed(values, window), savgol_filter(values, window, 2), rtol=0.0, atol=1e-12
-    )
 
 
 def test_a_weight_multiplies_squares():
@@ -262,17 +231,6 @@ def test_nuisance_parameters_of_an_impact_act_as_their_names_say(shown, eta):
     assert np.all(off <= 2e-3 * np.sort(np.abs(wanted), axis=0)[-5])
 
 
-def test_a_shift_that_is_not_wanted_gives_no_column():
-    spring, test = synthetic_impact(samples=101)
-    plain = objective(test)
-    shifted = Objective(test, BISTABLE, "impact", plain.weights, time_shift=True)
-    values = known(plain, values_of(spring))
-    places = np.array([0, 5, 3])
-    one = plain.jacobian(values, places)
-    two = shifted.jacobian(np.append(values, 0.0), places)
-    np.testing.assert_array_equal(one, two)
-
-
 def followed_chain(drive, noise=None):
     """Return the true parameters of two springs and a test in which the mass inside was tracked."""
     spring, loop = synthetic_loop()
@@ -326,27 +284,6 @@ def test_a_mass_inside_counts_in_every_drive(drive, counted):
     assert misfit["displacement_1_time"] == pytest.approx(np.sqrt(np.mean(in_ranges**2)), rel=1e-12)
 
 
-def test_stated_noise_is_the_scale_of_a_mass_inside_too():
-    values, measurement = followed_chain("displacement", Noise(displacement=1.5e-6))
-    one = Objective(measurement, TWO, "displacement", {"displacement_1_time": 1.0})
-    np.testing.assert_allclose(one.residual(known(one, values)), -2.0, rtol=1e-3)
-
-
-def test_a_mass_inside_tells_springs_apart():
-    values, measurement = followed_chain("displacement")
-    other = np.concatenate([values[8:16], values[:8], values[16:]])
-    blind = Objective(measurement, TWO, "displacement", {"stress_strain": 1.0})
-    values, other = known(blind, values), known(blind, other)
-    np.testing.assert_allclose(blind.residual(values), blind.residual(other), atol=1e-9)
-    seeing = Objective(
-        measurement, TWO, "displacement", default_weights(measurement, "displacement", 2)
-    )
-    off = np.abs(seeing.residual(values) - seeing.residual(other)).max()
-    assert off > 0.1
-    assert "displacement_1_time" in blind.misfit(blind.simulate(values, everything=True))
-    assert blind.misfit(blind.simulate(values))["displacement_1_time"] is None
-
-
 def test_a_single_spring_has_nothing_inside():
     _, measurement = followed_chain("displacement")
     one = objective(measurement, "displacement")
@@ -354,18 +291,6 @@ def test_a_single_spring_has_nothing_inside():
     assert "displacement_1_time" not in one.weights
     with pytest.raises(ff.InputError, match="displacement_1_time"):
         objective(measurement, "displacement", {"displacement_1_time": 1.0})
-
-
-def test_a_node_beyond_the_chain_is_refused():
-    _, measurement = followed_chain("displacement")
-    check_interior(measurement, 1)
-    check_interior(measurement, 2)
-    beyond = replace(measurement, interior={1: measurement.stress, 2: measurement.stress})
-    with pytest.raises(ff.InputError, match="node 2 of a 2-spring chain is the top") as caught:
-        check_interior(beyond, 2)
-    assert "displacement_2" in str(caught.value)
-    assert "'displacement' column" in str(caught.value)
-    check_interior(beyond, 3)
 
 
 def test_the_drive_is_chosen_by_what_the_test_has():
@@ -393,11 +318,6 @@ def test_unknown_and_negative_weights_are_refused():
     for weights in ({"stress": 1.0}, {"stress_strain": -1.0}, {"stress_strain": 0.0}):
         with pytest.raises(ff.InputError):
             objective(loop, "displacement", weights)
-
-
-def test_an_unknown_spring_in_a_model_is_refused():
-    with pytest.raises(ff.InputError, match="'elastic' is not a spring"):
-        Model.parse("linear+elastic")
 
 
 def of_two_loops() -> SystemError:

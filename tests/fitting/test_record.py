@@ -171,30 +171,3 @@ def test_a_time_limit_does_not_lose_the_best_point_when_zeros_become_free(tmp_pa
     with pytest.raises(SearchStoppedError):
         descend_again(problem, tracker)
     assert tracker.best_cost == pytest.approx(cost, rel=1e-6)
-
-
-def test_points_are_drawn_in_the_coordinates_of_the_measured_curve(tmp_path):
-    """A fitted zero moves the points of the springs with the curve that they lie on."""
-    test = ff.read_test(crushed(tmp_path)[0])
-    result = ff.fit(test, starts=4, intervals="local")
-    moved = replace(result.parameters["displacement_zero"], value=OFFSET + 0.1 * HEIGHT)
-    raised = replace(result.parameters["stress_zero"], value=BIAS + 2e6)
-    changed = {"displacement_zero": moved, "stress_zero": raised}
-    other = replace(result, parameters=result.parameters | changed)
-
-    def marks(of):
-        axes = of.plot()
-        lines = [one for one in axes.lines if str(one.get_label()) in ("_A1", "_C1", "_C2")]
-        return np.array([one.get_xydata()[0] for one in lines]), axes
-
-    before, axes = marks(result)
-    unit = float(axes.get_ylabel() and {"MPa": 1e6, "kPa": 1e3}[axes.get_ylabel()[-4:-1]])
-    after, _ = marks(other)
-    assert len(before) >= 2
-    origin = test.origins
-    shift = [
-        (OFFSET + 0.1 * HEIGHT - result.parameters["displacement_zero"].value) / HEIGHT,
-        (BIAS + 2e6 - result.parameters["stress_zero"].value) / unit,
-    ]
-    assert origin["displacement_zero"] == pytest.approx(OFFSET, abs=2e-4)
-    assert after - before == pytest.approx(np.tile(shift, (len(before), 1)), rel=1e-6)

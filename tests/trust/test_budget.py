@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +11,15 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import AREA, HEIGHT, small_pictures, synthetic_impact, synthetic_loop
-from foamfit.data.measurement import Measurement, Noise, Specimen
+from conftest import (
+    AREA,
+    HEIGHT,
+    loop_measurement,
+    synthetic_impact,
+    synthetic_loop,
+)
+from foamfit.data.measurement import Measurement, Specimen
 from foamfit.fitting.problem import make_problem
-from foamfit.report.summary import conclusions
-from foamfit.results import SOURCES
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import responses
 
@@ -68,27 +71,6 @@ def test_height_and_scale_of_the_motion_are_one_and_the_same_strain(loop):
     for name in (*STRESSES, *STRAINS):
         one, other = (moved(loop, q, name) for q in ("height", "displacement_scale"))
         assert one == pytest.approx(-other, rel=1e-3)
-
-
-def test_a_dashpot_scales_with_the_area():
-    """With a given motion, η is a stress divided by a rate and scales like a stress."""
-    time = np.linspace(0.0, 2.0, 301)
-    motion = 0.4 * HEIGHT * np.sin(0.5 * np.pi * time)
-    spring = ff.BistableSpring(*SPRING.seven, eta=2e5)
-    chain = ff.Chain([spring], [HEIGHT], AREA)
-    stress = ff.simulate(chain, ff.DisplacementDrive(motion), time).base_stress
-    test = Measurement(
-        "synthetic", None, "", time, stress, motion, Specimen(HEIGHT, AREA), motion="measured",
-        noise=Noise(stress=1e4), uncertainties={"area": 0.01 * AREA},
-    )  # fmt: skip
-    problem = make_problem(test, "bistable", "displacement", None, None, interior_mass=False)
-    problem.params["s1_eta"].set(vary=True, max=1e9)
-    values = problem.vector()
-    values[:8] = [*SPRING.seven, 2e5]
-    best = BestPoint(problem, values)
-    assert "s1_eta" in best.names
-    for name in (*STRESSES, "s1_eta"):
-        assert moved(best, "area", name) == pytest.approx(-0.01, rel=1e-3)
 
 
 def written(folder: Path, *, height: str, area: str, velocity: str = "2 m/s", mass: str = "7 g",
@@ -153,13 +135,6 @@ def test_systematic_is_in_no_interval(plain, stated):
     for name in (*STRESSES, *STRAINS):
         assert stated.parameters[name].ci95 == pytest.approx(plain.parameters[name].ci95)
         assert stated.parameters[name].stderr == pytest.approx(plain.parameters[name].stderr)
-
-
-def test_the_summary_says_how_far_it_goes(plain, stated):
-    (told,) = [text for text in conclusions(stated) if "in the TOML" in text]
-    assert told.startswith("The ± of area in the TOML moves s1_k")
-    assert " by 3 %, others by less" in told
-    assert not any("in the TOML" in text for text in conclusions(plain))
 
 
 def test_velocity_and_mass_with_a_deviation_are_fitted_within_it(tmp_path):
@@ -244,10 +219,8 @@ def test_heights_of_a_chain(tmp_path):
     chain = ff.Chain([ff.LinearSpring(2e6), MICRO], [4e-3, 6e-3], AREA)
     stress = ff.simulate(chain, ff.DisplacementDrive(motion), time).base_stress
     stress += 50.0 * np.random.default_rng(0).standard_normal(time.size)
-    test = Measurement(
-        "synthetic", None, "", time, stress, motion, Specimen(0.01, AREA, heights=(4e-3, 6e-3)),
-        motion="measured", uncertainties={"height": 1e-4, "height_1": 4e-5},
-    )  # fmt: skip
+    test = loop_measurement(stress, motion, Specimen(0.01, AREA, heights=(4e-3, 6e-3)), time)
+    test = replace(test, uncertainties={"height": 1e-4, "height_1": 4e-5})
     problem = make_problem(
         test, "linear+microscale", "displacement", None, None, interior_mass=False
     )
@@ -261,23 +234,3 @@ def test_heights_of_a_chain(tmp_path):
     # A change in height of a linear spring is compensated by its stiffness.
     assert moved(best, "height_1", "s1_k0") == pytest.approx(0.01, rel=2e-3)
     assert moved(best, "height_1", "s2_k0") == pytest.approx(0.0, abs=2e-5)
-
-
-def test_it_is_in_the_files(stated, tmp_path, monkeypatch):
-    small_pictures(monkeypatch)
-    folder = stated.save(tmp_path / "result")
-    content = json.loads((folder / "fit.json").read_text(encoding="utf-8"))
-    assert set(content["budget"]["s1_kc"]) == set(SOURCES)
-    assert content["budget"]["s1_kc"]["area"] == pytest.approx(
-        content["parameters"]["s1_kc"]["systematic"]
-    )
-    head, *lines = (folder / "parameters.csv").read_text(encoding="utf-8").splitlines()
-    column = head.split(",").index("systematic")
-    systematic = {line.split(",")[0]: float(line.split(",")[column]) for line in lines}
-    assert systematic["s1_kc"] == pytest.approx(0.03 * stated.parameters["s1_kc"].value, rel=1e-3)
-    rows = (folder / "budget.csv").read_text(encoding="utf-8").splitlines()
-    assert rows[0].startswith("name,noise,contact and zero,velocity,mass,height,area,")
-    assert len(rows) == 1 + len(stated.budget.contributions)
-    page = (folder / "report.html").read_text(encoding="utf-8")
-    assert "Uncertainty budget" in page
-    assert "contact time t₀" in page

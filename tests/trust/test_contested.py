@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 import foamfit as ff
-from conftest import DATA, EXPERIMENTS, needs_data, synthetic_loop, without_pictures
+from conftest import DATA, EXPERIMENTS, needs_data, without_pictures
 from foamfit.cli import main
 from foamfit.trust.contested import judged
 
@@ -196,11 +196,6 @@ def test_what_the_record_cannot_show_is_refused(
     assert "\n" not in str(caught.value)
 
 
-def test_a_slow_test_has_no_striker_to_vary() -> None:
-    with pytest.raises(ff.InputError, match="needs no striker"):
-        ff.fit(synthetic_loop()[1], vary=["velocity"])
-
-
 def test_force_and_acceleration_show_a_wrong_scale_of_the_force(tmp_path: Path) -> None:
     """Without a measured displacement the impact drive remains, with the contradiction first."""
     made = record_of(3, force=0.85, channels=("force", "acceleration"))
@@ -227,13 +222,6 @@ def test_the_terminal_prints_whole_lines(tmp_path: Path, monkeypatch: pytest.Mon
     assert any("[striker] and [columns]" in line for line in lines)
     assert max(map(len, lines[:-3])) <= 80
     assert len(lines) <= 24
-    again = CliRunner().invoke(
-        main, [*call, "--vary", "velocity", "--vary", "force_scale", "--out", str(tmp_path / "b")]
-    )
-    assert again.exit_code == 0
-    assert "impact drive" in again.stdout
-    assert "velocity v₀" in again.stdout
-    assert "force scale s_F" in again.stdout
 
 
 def test_tests_of_a_joint_fit_and_a_batch_have_the_same_default(

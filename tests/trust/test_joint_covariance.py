@@ -74,14 +74,6 @@ def test_the_covariance_is_the_sandwich_of_all_residuals(point):
     )
 
 
-def test_the_slope_of_a_law_has_its_error(point):
-    error, freedom = point.of_common("s1_k0:b")
-    assert 1e-4 < error < 0.02
-    assert 20 < freedom < 600
-    assert point.of_common("s1_eps_c")[0] != point.of_common("s1_eps_c")[0]
-    assert point.of_test(0, "s1_eps_c")[0] > 0.0
-
-
 @pytest.mark.parametrize("kind", ["log rate", "power rate"])
 def test_the_error_of_a_rate_is_in_that_of_the_slope(kind):
     """The added variance agrees with refits in which the rate of each test is shifted."""
@@ -115,33 +107,6 @@ def test_one_test_alone_has_the_covariance_of_its_own_fit():
     assert errors == pytest.approx(alone.spread.stderr, rel=1e-3)
     freedom = [joint.point.of_common(name)[1] for name in alone.names]
     assert freedom == pytest.approx(alone.spread.freedom, rel=0.05)
-
-
-def test_four_tests_of_one_foam_have_half_the_error_of_one():
-    ratios = []
-    for seed in range(20):
-        problems, vectors = loops_of([{}] * 4, 2e4, seed)
-        kinds = dict.fromkeys(problems[0].free(), "shared")
-        four = fit_jointly(problems, Links(kinds), [vectors]).point
-        one = fit_jointly(problems[:1], Links(kinds), [vectors[:1]]).point
-        ratios.append([four.of_common(n)[0] / one.of_common(n)[0] for n in kinds])
-    assert np.mean(ratios) == pytest.approx(0.5, rel=0.05)
-
-
-def test_what_no_test_reaches_has_no_error():
-    strain = np.concatenate([np.linspace(0, 0.12, 60), np.linspace(0.12, 0.0, 60)[1:]])
-    problems, vectors = loops_of([{}, {}], 2e3)
-    small = replace(
-        LOOP, displacement=strain * HEIGHT,
-        stress=SPRING.stress(strain) + 2e3 * np.random.default_rng(0).standard_normal(strain.size),
-    )  # fmt: skip
-    problems = [
-        make_problem(small, "bistable", None, None, None, interior_mass=False) for _ in range(2)
-    ]
-    kinds = dict.fromkeys(problems[0].free(), "shared")
-    joint = fit_jointly(problems, Links(kinds), [vectors])
-    assert np.isfinite(joint.point.of_common("s1_k0")[0])
-    assert np.isnan(joint.point.of_common("s1_kc")[0])
 
 
 def test_beside_an_error_of_the_law_tests_add_up_as_well():

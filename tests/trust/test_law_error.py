@@ -13,17 +13,14 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 import foamfit as ff
-from conftest import EXPERIMENTS, needs_data
+from conftest import EXPERIMENTS, loop_measurement, needs_data
 from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
-from foamfit.fitting.box import Scales
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker
 from foamfit.one_model import Options, identify, judge
 from foamfit.report.folder import load_result
 from foamfit.report.readable import readable
-from foamfit.springs.laws.bistable import read_off
-from foamfit.springs.loop import Loop
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import (
     NOTHING,
@@ -34,7 +31,6 @@ from foamfit.trust.covariance import (
     covariance,
     half_width,
 )
-from foamfit.trust.intervals import Choice
 from foamfit.trust.profile import Refit
 from foamfit.trust.ranges import ALIKE, alike, left_open, tolerance
 from foamfit.trust.residuals.law_error import curve_errors
@@ -140,11 +136,8 @@ def micro(draw: int | None, law: str = "microscale and relaxation") -> Measureme
     if draw is not None:
         white = np.random.default_rng([4, draw]).standard_normal(stress.size)
         stress = stress + 0.005 * np.ptp(stress) * white
-    return Measurement(
-        name="microscale", path=None, data_sha256="", time=curves.time[::2], stress=stress,
-        displacement=curves.displacement[::2], specimen=Specimen(curves.height, curves.area),
-        motion="measured",
-    )  # fmt: skip
+    specimen = Specimen(curves.height, curves.area)
+    return loop_measurement(stress, curves.displacement[::2], specimen, curves.time[::2])
 
 
 @cache
@@ -157,11 +150,9 @@ def fitted(draw: int | None):
 def strikes(kind: str) -> Problem:
     """Return the problem of a noise-free impact on a foam of another law or of the fitted law."""
     curves = law_error.curves(kind)
-    test = Measurement(
-        name=kind, path=None, data_sha256="", time=curves.time[::2], stress=curves.stress[::2],
-        displacement=curves.displacement[::2], specimen=Specimen(curves.height, curves.area),
-        striker=Striker(*curves.striker), motion="measured",
-    )  # fmt: skip
+    stress, motion, time = (x[::2] for x in (curves.stress, curves.displacement, curves.time))
+    test = loop_measurement(stress, motion, Specimen(curves.height, curves.area), time)
+    test = replace(test, striker=Striker(*curves.striker))
     return make_problem(test, "bistable", "impact", None, None, False)
 
 
@@ -260,24 +251,6 @@ def test_every_description_in_the_range_follows_the_curves_about_as_well():
             assert item.ci95 is None or np.ptp(item.range) > 0.0
 
 
-def test_local_intervals_look_for_no_further_minima():
-    """Only profiles and chains use further minima; the ranges are the same without them."""
-    _, best, found = fitted(0)
-    objective, ends = found.problem.objective, found.tracker.ends
-    counts = [objective.evaluations]
-    whole = left_open(best, ends, found.tracker)
-    counts.append(objective.evaluations)
-    alone = left_open(best, ends, found.tracker, descents=False)
-    counts.append(objective.evaluations)
-    judge(found, Choice("local"), lambda _: None)
-    counts.append(objective.evaluations)
-    whole_cost, _, local_cost = np.diff(counts)
-    assert alone.ranges == whole.ranges
-    assert whole.minima
-    assert alone.minima == ()
-    assert local_cost < 0.6 * whole_cost
-
-
 def test_the_range_decides_where_it_is_wider():
     result, best, _ = fitted(0)
     for name, item in result.parameters.items():
@@ -302,16 +275,12 @@ def test_the_result_says_what_was_decided(tmp_path):
     assert check.answer is False
     assert "the law misses" in check.warnings[0]
     folder = FitResult(**vars(result)).save(tmp_path / "out")
-    content = load_result(folder)
-    kept = content["parameters"]["s1_kc"]
+    kept = load_result(folder)["parameters"]["s1_kc"]
     assert kept["range"] == pytest.approx(result.parameters["s1_kc"].range)
-    header, row = (folder / "parameters.csv").read_text().splitlines()[:2]
+    header = (folder / "parameters.csv").read_text().splitlines()[0]
     assert header.split(",")[3:7] == ["ci95_low", "ci95_high", "range_low", "range_high"]
-    assert float(row.split(",")[5]) == result.parameters["s1_k0"].range[0]
     report = (folder / "report.html").read_text()
     assert all(line.replace("'", "&#39;") in report for line in RULE)
-    assert '<th class="num">range</th>' in report
-    assert " to " in readable("s1_kc", result.parameters["s1_kc"]).range
 
 
 def test_there_is_no_range_where_the_law_follows_the_curves():
@@ -327,21 +296,6 @@ def test_there_is_no_range_where_the_law_follows_the_curves():
     assert result.noise["stress_strain"]["law_error"] is None
     report = readable("s1_kc", result.parameters["s1_kc"])
     assert report.range == ""
-
-
-def test_a_loop_has_two_branches_c():
-    """Both pass through the points C1 and C2 read off the loop; the soft one is near its pole."""
-    spring = ff.BistableSpring(6.8e5, 5.9e4, -1.3e4, 0.088, 0.19, 3.35e5, 2.6e5)
-    strain = np.concatenate([np.linspace(0, 0.5, 200), np.linspace(0.5, 0, 200)[1:]])
-    loop, scales = Loop(strain, spring.stress(strain)), Scales(2e5, 0.5, 1.0, 0.01)
-    marks = np.array([0.2, 0.9, 0.4, 0.5, 0.0])
-    stiff, soft = (read_off(loop, marks, scales, way) for way in (0, 1))
-    others = np.arange(8) != 1
-    assert soft[others] == pytest.approx(stiff[others])
-    assert soft[1] < stiff[1]
-    one, two = (ff.BistableSpring(*seven[:7]) for seven in (stiff, soft))
-    assert two.sigma_hat_c == pytest.approx(one.sigma_hat_c, rel=1e-6)
-    assert two.eps_hat_c == pytest.approx(one.eps_hat_c, rel=1e-6)
 
 
 def test_the_search_finds_the_soft_branch_c():

@@ -7,8 +7,7 @@ from numbers import Real
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
-from scipy.linalg import lstsq
-from scipy.ndimage import convolve1d
+from scipy.signal import savgol_filter
 
 from foamfit.arrays import Array
 from foamfit.data.calibration import contradictions
@@ -140,20 +139,6 @@ def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> d
     return weights
 
 
-def smoothed(values: Array, window: int) -> Array:
-    """Smooth samples by a parabola through each (odd) window (Savitzky & Golay 1964).
-
-    Analytical Chemistry 36, 1627. Same result as `scipy.signal.savgol_filter`, whose package takes
-    longer to import than a search. Half a window at each end lies on the parabola of that window.
-    """
-    half, clock = window // 2, np.arange(float(window))
-    weights, *_ = lstsq(np.vander(half - clock, 3, increasing=True).T, np.array([1.0, 0.0, 0.0]))
-    out = convolve1d(values, weights, mode="constant")
-    for edge, part in ((slice(half), slice(window)), (slice(-half, None), slice(-window, None))):
-        out[edge] = np.polyval(np.polyfit(clock, values[part], 2), clock[edge])
-    return np.asarray(out)
-
-
 def driving_stress(stress: Array, model: Model) -> Array:
     """Smooth a measured stress (Pa) that drives a model.
 
@@ -161,7 +146,7 @@ def driving_stress(stress: Array, model: Model) -> Array:
     a twenty-fifth of the samples removes it. Chains with a unilateral spring carry no tension.
     """
     window = 2 * (stress.size // 50) + 1
-    smooth = smoothed(stress, window) if window > 3 else stress
+    smooth = savgol_filter(stress, window, 2) if window > 3 else stress
     return np.maximum(smooth, 0.0) if "unilateral" in model.kinds else smooth
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg.lapack import dposv
 
 from foamfit.arrays import Array
@@ -22,33 +23,7 @@ LITTLE = 100.0
 # Damping of the trial steps in `following`.
 FOLLOWING = (1e-9, 1e-6, 1e-3, 0.1)
 
-
-@dataclass(frozen=True, eq=False)
-class Blocks:
-    """Jacobian of the stacked residuals of several tests, stored by test.
-
-    For each test: the derivatives (n_t, c_t) of its residual by the coordinates that it depends on,
-    and their indices among all `count` coordinates.
-    """
-
-    tests: Sequence[tuple[Array, NDArray[np.intp]]]
-    count: int
-
-    def gradient(self, residual: Array) -> Array:
-        """Return Jᵀr."""
-        out, first = np.zeros(self.count), 0
-        for slopes, places in self.tests:
-            out[places] += slopes.T @ residual[first : first + len(slopes)]
-            first += len(slopes)
-        return out
-
-    @property
-    def normal(self) -> Array:
-        """JᵀJ."""
-        out = np.zeros((self.count, self.count))
-        for slopes, places in self.tests:
-            out[np.ix_(places, places)] += slopes.T @ slopes
-        return out
+Jacobian = Any  # an array, or a csr_array of several tests
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +32,7 @@ class Iterate:
 
     point: Array
     residual: Array
-    jacobian: Any  # (n, k), or the Blocks of several tests
+    jacobian: Jacobian  # (n, k)
     damping: float | None = None  # with which a descent from here goes on
 
     @property
@@ -68,16 +43,13 @@ class Iterate:
     @cached_property
     def gradient(self) -> Array:
         """Half the gradient of the cost, Jᵀr."""
-        if isinstance(self.jacobian, Blocks):
-            return self.jacobian.gradient(self.residual)
         return np.asarray(self.jacobian.T @ self.residual)
 
     @cached_property
     def normal(self) -> Array:
         """Normal matrix JᵀJ."""
-        if isinstance(self.jacobian, Blocks):
-            return self.jacobian.normal
-        return np.asarray(self.jacobian.T @ self.jacobian)
+        normal = self.jacobian.T @ self.jacobian
+        return np.asarray(normal if isinstance(normal, np.ndarray) else normal.toarray())
 
     def expected(self, step: Array) -> float:
         """Return the decrease of the cost that the Jacobian predicts for a step."""
@@ -124,7 +96,7 @@ def following(at: Iterate, shift: Array, held: NDArray[np.bool_]) -> list[Array]
 
 def descend(
     residual: Callable[[Array], Array],
-    jacobian: Callable[[Array], Array | Blocks],
+    jacobian: Callable[[Array], Jacobian],
     start: Array | Iterate,
     box: tuple[Array, Array] | Array,
     iterations: int,
@@ -142,9 +114,9 @@ def descend(
     follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). The descent ends after two consecutive
     steps that lower the cost by less than the fraction `enough`, when the predicted gain is below
     `least`, or when a step fails that promised little more. Points with an infinite residual are
-    rejected; the start must have a finite one. The Jacobian of a single test, which is expensive,
-    is updated while steps gain what it predicts; a descent ends with an exact Jacobian unless it
-    runs out of `iterations`.
+    rejected; the start must have a finite one. A dense Jacobian, that of a single test, is updated
+    while steps gain what it predicts; a descent ends with an exact one unless it runs out of
+    `iterations`.
     """
     low, high = box
     fixed = low == high
@@ -170,7 +142,7 @@ def descend(
                 if small >= 2 and not updates:
                     return replace(at, point=trial, residual=found, damping=damping)
                 close = abs(ratio - 1.0) < PREDICTED and updates < UPDATES and small < 2
-                if close and not isinstance(at.jacobian, Blocks):
+                if close and not sparse.issparse(at.jacobian):
                     updates += 1
                     at = at.updated(trial, found)
                 else:

@@ -68,6 +68,16 @@ class Effort(NamedTuple):
     total: float  # s
 
 
+@dataclass
+class Spent:
+    """Simulations so far; an objective made from another one by `replace` counts with it."""
+
+    evaluations: int = 0
+    failures: int = 0  # of these
+    sloped: int = 0  # with derivatives
+    seconds: float = 0.0
+
+
 @dataclass(eq=False)
 class Objective:
     """Residuals of a model under a drive against a measurement.
@@ -89,12 +99,9 @@ class Objective:
     given: tuple[nuisances.Prior, ...] = ()  # Priors of spring parameters
     followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is already known
     averaged: float = np.inf  # longest time that a sample averages, s, if the samples are thinned
+    spent: Spent = field(default_factory=Spent)
     # Largest amplitude, in standard deviations, of the motion that would explain the residual
     unexplained: float | None = field(default=None, init=False)
-    evaluations: int = field(default=0, init=False)  # Number of simulated sets of parameters
-    failures: int = field(default=0, init=False)  # Number of failed simulations
-    sloped: int = field(default=0, init=False)  # Number of simulations with derivatives
-    seconds: float = field(default=0.0, init=False)  # spent on simulations
 
     def __post_init__(self) -> None:
         """Prepare the scenes and the scale of each curve."""
@@ -217,7 +224,6 @@ class Objective:
         for column, mode in zip(out.T, modes.T, strict=True):
             sides = [self._moved_by(side * mode).residual(values) for side in (-0.5, 0.5)]
             column[:] = (sides[1] - sides[0])[: self.n_data]
-        self.evaluations += 2 * modes.shape[1]
         return out
 
     def _moved_by(self, change: Array | float) -> Objective:
@@ -259,16 +265,16 @@ class Objective:
     ) -> tuple[dict[str, Array], Motion]:
         """Return curves stacked on their derivatives; count the evaluation and its failure."""
         began = time.perf_counter()
-        self.evaluations += 1
-        self.sloped += places.size > 0
+        self.spent.evaluations += 1
+        self.spent.sloped += places.size > 0
         try:
             with as_signalled():
                 return self.scenes.rows(values, places, self.counted, everything)
         except SimulationError:
-            self.failures += 1
+            self.spent.failures += 1
             raise
         finally:
-            self.seconds += time.perf_counter() - began
+            self.spent.seconds += time.perf_counter() - began
 
     def simulate(
         self, values: Array, *, everything: bool = False, places: Places = NOWHERE
@@ -284,22 +290,14 @@ class Objective:
         return Simulated(curves, motion, slopes)
 
     @property
-    def counts(self) -> tuple[int, int, int, float]:
-        """Simulations, those that failed, those with derivatives, and the seconds they took."""
-        return self.evaluations, self.failures, self.sloped, self.seconds
+    def evaluations(self) -> int:
+        """Number of simulated sets of parameters."""
+        return self.spent.evaluations
 
-    @counts.setter
-    def counts(self, counts: tuple[int, int, int, float]) -> None:
-        self.evaluations, self.failures, self.sloped, self.seconds = counts
-
-    def add_counts(self, other: Objective) -> None:
-        """Add the counts of another objective."""
-        if other is not self:
-            simulated, failed, sloped, seconds = other.counts
-            self.evaluations += simulated
-            self.failures += failed
-            self.sloped += sloped
-            self.seconds += seconds
+    @property
+    def failures(self) -> int:
+        """Number of failed simulations."""
+        return self.spent.failures
 
     def residual(self, values: Array) -> Array:
         """Return the weighted residuals of all counted curves and of the priors, dimensionless.
@@ -307,7 +305,7 @@ class Objective:
         The first `n_data` belong to the curves: simulated minus measured, divided by the scale of
         the curve, times the square root of its weight, without outliers. One residual per prior
         follows, divided by its standard deviation. If the simulation fails, the residuals are a
-        finite penalty, and `failures` is increased.
+        finite penalty, and `spent.failures` is increased.
         """
         try:
             rows, _ = self._simulated(values, NOWHERE)
@@ -416,13 +414,12 @@ class Objective:
 
     def look(self, values: Array) -> dict[str, float | None] | None:
         """Return the misfits of all curves, without counting the evaluation; None if it fails."""
-        counts = self.counts
+        uncounted = copy(self)
+        uncounted.spent = Spent()
         try:
-            return self.misfit(self.simulate(values, everything=True))
+            return self.misfit(uncounted.simulate(values, everything=True))
         except SimulationError:
             return None
-        finally:
-            self.counts = counts
 
     def off(self, curves: Simulated, name: str) -> float | None:
         """Return the misfit of one curve; None if it was not measured or simulated."""

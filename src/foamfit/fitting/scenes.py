@@ -392,16 +392,6 @@ class Scenes:
         when = self.time + late
         return np.array([np.interp(when, self.time, row) for row in rows])
 
-    def shifted(self, curves: dict[str, Array], late: float) -> dict[str, Array]:
-        """Return the curves that channels with a motion `late` seconds late would show."""
-        moved = "displacement" if self.drive == "impact" else " "
-        return {
-            name: later(self.time, curve, late)
-            if name.startswith(moved)
-            else self._late(name, curve[None], late)[0]
-            for name, curve in curves.items()
-        }
-
     def _acceleration(
         self, motion: Motion, drag: float, at: dict[str, float], by_site: tuple[int, ...]
     ) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter, itemgetter
 
@@ -21,9 +21,19 @@ from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.starts import CURVE_STARTS, box_starts, curve_starts, thinned
+from foamfit.fitting.starts import (
+    CURVE_STARTS,
+    apart,
+    around,
+    box_starts,
+    curve_starts,
+    far_off,
+    neighbours,
+    off_edges,
+    thinned,
+)
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import NUISANCE, family, relaxation_names
+from foamfit.springs.parameters import NUISANCE
 
 Progress = Callable[[float, str], None]
 
@@ -36,23 +46,12 @@ ATTEMPTS = 3
 IN_SERIES = 3  # least number of rounds for several hysteretic springs
 LOST = 30.0  # cost, in noise floors, above which a second round always follows
 NOISY = 0.005  # noise of a motion, as a fraction of its range, above which it is smoothed
-AROUND = 200  # random points around the best one at the start of a further round
-# Width of the edge of the box, and a wider one used above the noise floor, as fractions of the box;
-# start points inside the box for a coordinate at its edge.
-EDGE, EDGE_MISSING, INSIDE = 0.02, 0.1, (0.35, 0.5, 0.65)
-# Changes of the logarithm of a parameter, and of a relaxation time, to leave a wrong minimum. They
-# are tried if the cost exceeds this fraction of the noise floor.
-APART, APART_IN_TIME, MISSING = 1.2, (3.0, -3.0, 4.8, -4.8), 0.8
-# Strength of each new relaxation term, and the scales of parameters adjusted to it.
-ANEW, STIFF = 0.3, ("stress", "slope")
-# Points away from the best one are tried again if the cost has fallen by more than this fraction.
+# Points beside the best one are tried if the cost exceeds this fraction of the noise floor.
+MISSING = 0.8
+# They are tried again if the cost has fallen by more than this fraction.
 NEWS = 1e-5
 # Minima of the loop are continued if their cost on the curves is within this factor of the best.
 PROMISING = 100.0
-# Factors of the stiffness in the scan of the vibration of an interior mass; also their inverses.
-STIFFER = np.geomspace(1.0, 2.0, 71)[1:]
-
-
 # Stages of successive halving: iterations, the share of the starts that then goes on, and that of
 # the work.
 STAGES = ((12, 0.5, 0.5), (12, 0.25, 0.25), (36, 0.25, 0.25))
@@ -261,9 +260,6 @@ def search(
         ranked = rank(tracker, space, points)
         if attempt == 0 and tracker.objective.drive != "impact":  # else the loop has other curves
             tracker.look()
-        if tracker.objective.interior_mass:
-            progress(ON_CURVES, "vibration")
-            ranked = sorted(ranked + _scan_vibration(tracker, space, points[0]), key=itemgetter(0))
         promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
         points = [point for _, point in distinct(promising)][: max(3, starts // 4)]
         for i, point in enumerate(points):
@@ -280,7 +276,9 @@ def search(
         least = IN_SERIES if several else max(attempts // 2, 2 if edges else 1)
         if attempt + 1 == attempts or _settled(tracker, out, attempt, least):
             break
-        points = box_starts(space, rng, CURVE_STARTS // 3) + _around_best(tracker, space, rng)
+        points = box_starts(space, rng, CURVE_STARTS // 3)
+        if tracker.best_values is not None:
+            points += around(space, space.encode(tracker.best_values), rng)
     return sorted(out)
 
 
@@ -289,15 +287,23 @@ def leave_minimum(tracker: Tracker, space: Space) -> tuple[list[float], list[tup
 
     The costs are those of `search`.
     """
-    edges = list[float]()
+    if tracker.best_values is None:
+        return [], []
+    edges, floor = list[float](), tracker.objective.floor
     for _ in range(ATTEMPTS):
-        before = tracker.best_cost
-        edges += _off_edges(tracker, space)
+        before, best = tracker.best_cost, space.encode(tracker.best_values)
+        starts = off_edges(space, best, anywhere=before > floor and len(space.model.kinds) > 1)
+        if before > floor:
+            starts += neighbours(space, space.decode(best))
+        edges += _descended(tracker, space, starts)
         if tracker.best_cost >= (1.0 - NEWS) * before:
             break
-    apart = _descended(tracker, space, _apart(tracker, space))
-    out, reached = [(cost, 1) for cost in edges + apart], tracker.best_cost
-    _descended(tracker, space, _far_off(tracker, space))
+    out = [(cost, 1) for cost in edges]
+    if tracker.best_cost >= MISSING * floor:
+        starts = apart(space, space.encode(tracker.best_values))
+        out += [(cost, 1) for cost in _descended(tracker, space, starts)]
+    if (reached := tracker.best_cost) >= MISSING * floor:
+        _descended(tracker, space, far_off(space, space.encode(tracker.best_values)))
     if tracker.best_cost < reached:  # counts once, as these descents are not independent
         out.append((tracker.best_cost, 1))
     return edges, out
@@ -308,126 +314,18 @@ def has_several(model: Model) -> bool:
     return sum(law.hysteretic for law in model.laws) > 1
 
 
-def _around_best(tracker: Tracker, space: Space, rng: np.random.Generator) -> list[Array]:
-    """Return random points around the best one, with about half of the coordinates changed."""
-    if tracker.best_values is None:
-        return []
-    low, high = space.box
-    best, out = space.encode(tracker.best_values), []
-    for _ in range(AROUND):
-        far = 10.0 ** rng.uniform(-2.0, -0.5) * rng.standard_normal(best.size)
-        moved = best + np.where(rng.random(best.size) < 0.5, far, 0.0) * (high - low)
-        out.append(np.clip(moved, low, high))
-    return out
-
-
-def _off_edges(tracker: Tracker, space: Space) -> list[float]:
-    """Move coordinates at an edge of the box inside, and descend; return the costs.
-
-    A stiffness that affects few samples may run to an edge and stay there while the rest converges.
-    In a chain above the noise floor any stiffness may be far off.
-    """
-    low, high = space.box
-    best = space.encode(tracker.best_values) if tracker.best_values is not None else low
-    span = high - low
-    edges = (best - low < EDGE * span) | (high - best < EDGE * span)
-    edges |= len(space.model.kinds) > 1 and tracker.best_cost > tracker.objective.floor
-    starts = []
-    for at in np.flatnonzero(edges & [one.is_logarithmic for one in space.coordinates]):
-        for share in INSIDE:
-            start = best.copy()
-            start[at] = low[at] + share * span[at]
-            starts.append(start)
-    if tracker.best_cost > tracker.objective.floor:
-        starts += _neighbours(space, space.decode(best))
-    return _descended(tracker, space, starts)
-
-
-def _descended(tracker: Tracker, space: Space, starts: Iterable[Array]) -> list[float]:
+def _descended(tracker: Tracker, space: Space, starts: list[Array]) -> list[float]:
     """Descend from each start; return the costs of the ends, which the tracker keeps.
 
     Far from a minimum a descent may begin badly and end well, so only the many starts of several
     springs are halved: on a slow mycelium test, halving misses the best minimum of one spring.
     """
     if has_several(space.model):
-        ends = halve(tracker, space, list(starts))
+        ends = halve(tracker, space, starts)
     else:
         ends = [descend(tracker, space, start, 60) for start in starts]
     tracker.ends += [space.decode(end) for _, end in ends]
     return [cost for cost, _ in ends]
-
-
-def _apart(tracker: Tracker, space: Space) -> Iterator[Array]:
-    """Yield the best point with one positive parameter multiplied or divided by a factor.
-
-    All descents may have ended in the same wrong minimum. At the noise floor nothing is yielded.
-    """
-    if tracker.best_values is None or tracker.best_cost < MISSING * tracker.objective.floor:
-        return
-    (low, high), best = space.box, space.encode(tracker.best_values)
-    for at, one in enumerate(space.coordinates):
-        for step in (APART, -APART) if one.is_logarithmic else ():
-            if low[at] < best[at] + step < high[at]:
-                start = best.copy()
-                start[at] += step
-                yield start
-
-
-def _far_off(tracker: Tracker, space: Space) -> Iterator[Array]:
-    """Yield points farther from the best one than those of `_off_edges` and `_apart`.
-
-    They have other relaxation times (far off, the cost is flat along them), new relaxation terms,
-    or coordinates in the outer tenth of the box moved inside.
-    """
-    if tracker.best_values is None or tracker.best_cost < MISSING * tracker.objective.floor:
-        return
-    (low, high), best = space.box, space.encode(tracker.best_values)
-    for at, one in enumerate(space.coordinates):
-        off, span = min(best[at] - low[at], high[at] - best[at]), high[at] - low[at]
-        places: list[float] = []
-        if family(one.short) == "tau":
-            places = [best[at] + step for step in APART_IN_TIME]
-        if one.is_logarithmic and EDGE * span <= off < EDGE_MISSING * span:
-            places += [low[at] + share * span for share in INSIDE]
-        for place in places:
-            if low[at] < place < high[at]:
-                start = best.copy()
-                start[at] = place
-                yield start
-    yield from _relaxing_anew(space, space.decode(best))
-
-
-def _relaxing_anew(space: Space, values: Array) -> Iterator[Array]:
-    """Yield a point with new relaxation terms, of 1/100 to 1/10 of the time under load.
-
-    The springs keep their instantaneous stiffness k (1 + Σ g). Large strengths with long times form
-    a wide wrong minimum.
-    """
-    model, moved, count = space.model, values.copy(), space.model.relaxation
-    times = space.scales.duration * 10.0 ** ((np.arange(count) + 0.5) / max(count, 1) - 2.0)
-    for spring, law in enumerate(model.laws if count else ()):
-        names = [f"s{spring + 1}_{short}" for short in relaxation_names(count)]
-        stiff = [f"s{spring + 1}_{one.name}" for one in law.params if one.scale in STIFF]
-        if not law.hysteretic or not set(space.free).issuperset(names + stiff):
-            continue
-        places = [model.index[name] for name in names]
-        before = 1.0 + float(values[places[::2]].sum())
-        moved[places] = np.ravel(np.column_stack([np.full(count, ANEW), times]))
-        moved[[model.index[name] for name in stiff]] *= before / (1.0 + ANEW * count)
-    if np.any(moved != values):
-        yield space.encode(moved)
-
-
-def _neighbours(space: Space, values: Array) -> Iterator[Array]:
-    """Yield points with nearly the same loop, from `Law.neighbours` of each spring."""
-    for spring, law in enumerate(space.model.laws):
-        own = space.model.own(spring, values)[:-1]
-        for near in law.neighbours(own, space.scales.stress):
-            changed = [f"s{spring + 1}_{law.own[at]}" for at in np.flatnonzero(near != own)]
-            if all(name in space.free for name in changed):
-                moved = values.copy()
-                space.model.own(spring, moved)[:-1] = near
-                yield space.encode(moved)
 
 
 def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int, least: int) -> bool:
@@ -487,7 +385,6 @@ def _search_loop(
         ends = halve(inner, own, spread_out(own, points, starts), step)
         ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
     finally:
-        objective.add_counts(inner.objective)
         if inner.best_values is not None:
             tracker.consider(inner.best_values)
     return ends
@@ -505,7 +402,7 @@ def _along(objective: Objective, loop: Measurement) -> Objective:
     """Return the objective of the stress along the motion of a loop."""
     return Objective(
         loop, objective.model, "displacement", {"stress_strain": 1.0},
-        time_shift=objective.time_shift, nuisance=objective.nuisance,
+        time_shift=objective.time_shift, nuisance=objective.nuisance, spent=objective.spent,
     )  # fmt: skip
 
 
@@ -516,31 +413,3 @@ def _is_noisy(objective: Objective) -> bool:
     if objective.drive != "impact" or motion is None or level is None:
         return objective.drive == "displacement"
     return bool(level.sigma > NOISY * np.ptp(motion))
-
-
-def _scan_vibration(tracker: Tracker, space: Space, start: Array) -> list[tuple[float, Array]]:
-    """Fit the massless chain for many stiffnesses of a linear spring, and rank with its masses.
-
-    With interior masses the cost has a minimum for each number of vibration cycles of a mass on a
-    stiff spring, and no descent leads from one to the next.
-    """
-    objective = replace(tracker.objective, interior_mass=False)
-    massless = Tracker(objective, tracker.deadline)
-    _, start = descend(massless, space, start, 40)
-    out: list[tuple[float, Array]] = []
-    for spring, law in enumerate(space.model.laws, start=1):
-        name = f"s{spring}_k0"
-        if law.hysteretic or name not in space.free:
-            continue
-        at = space.model.index[name]
-        for factors in (STIFFER, 1.0 / STIFFER):
-            values = space.decode(start)
-            for stiffness in values[at] * factors:
-                values[at] = np.clip(stiffness, space.low[at], space.high[at])
-                free = tuple(other for other in space.free if other != name)
-                held = replace(space, values=values.copy(), free=free)
-                _, point = descend(massless, held, held.encode(values), 3, enough=1e-3)
-                values = held.decode(point)
-                out += rank(tracker, space, [space.encode(values)])
-    tracker.objective.add_counts(objective)
-    return out

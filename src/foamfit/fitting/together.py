@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
@@ -362,10 +363,14 @@ class _Layout:
         """Return the stacked residuals of the tests; infinite for a failed simulation."""
         return np.concatenate([term.residual_at(point) for term in self.terms])
 
-    def jacobian(self, point: Array) -> levenberg.Blocks:
+    def jacobian(self, point: Array) -> sparse.csr_array:
         """Return the derivative of the residual by the coordinates."""
         found = [(term.jacobian_at(point), term.all_places) for term in self.terms]
-        return levenberg.Blocks(found, point.size)
+        places = np.concatenate([np.tile(places, len(slopes)) for slopes, places in found])
+        lengths = np.concatenate([np.full(len(slopes), places.size) for slopes, places in found])
+        content = np.concatenate([slopes.ravel() for slopes, _ in found])
+        ends = np.append(0, np.cumsum(lengths))
+        return sparse.csr_array((content, places, ends), shape=(lengths.size, point.size))
 
     def start(self, vectors: Sequence[Array]) -> Array:
         """Return the point with these own parameters and the nearest common values."""

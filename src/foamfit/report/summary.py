@@ -221,9 +221,6 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
     drawn = dict(draw_all(result)) if figures is None else figures
     plain, springs, insight = result.to_json_dict(), result.springs, result.insight
     parts, shares = ((), None) if insight is None else (insight.parts, insight.shares())
-    correlation = None if insight is None else insight.correlation
-    if result.correlation is not None:  # more accurate
-        correlation = result.correlation.matrix
     return page(
         "report",
         result=result,
@@ -240,7 +237,7 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
         energy_sentences=plain["energy"].get("sentences") or [],
         answers=ANSWERS,
         parts=[] if shares is None else list(zip(parts, shares.T.tolist(), strict=True)),
-        correlation=[] if correlation is None else correlation.tolist(),
+        correlation=[] if result.correlation is None else result.correlation.matrix.tolist(),
         **tables(result),
         figures=drawn,
     )

@@ -286,7 +286,12 @@ class JointPoint:
                 through[i, at] = scales[at] / best.sizes[i]
             if kind not in ("own", "shared"):
                 room[i] = np.inf
-        return replace(block, through=through, given=given, room=room)
+        if given.any():
+            column = (block.jacobian @ given)[:, None]
+            block = replace(
+                block, shifts=np.hstack([s for s in (block.shifts, column) if s is not None])
+            )
+        return replace(block, through=through, room=room)
 
     def _drawn(self) -> tuple[Array, Array] | None:
         """Return the slopes and variances of the residuals that draw values to a common one."""

@@ -20,6 +20,7 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import SimulationError
 from foamfit.fitting import nuisance
+from foamfit.fitting.curves import later
 from foamfit.fitting.objective import Objective
 from foamfit.results import SOURCES, Budget, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE
@@ -67,8 +68,12 @@ def _value(test: Measurement, quantity: str) -> float:
 
 
 def response(best: BestPoint, quantity: str, share: float) -> Array:
-    """Return the change of all parameters (n_values,), SI, by a relative change of a quantity."""
-    problem, step = best.problem, min(share, STEP)
+    """Return the change of all parameters (n_values,), SI, by a relative change of a quantity.
+
+    The quantity "time_shift" is the delay of the motion, s; the motion is then moved back by it.
+    NaN if the changed test cannot be simulated.
+    """
+    problem, step = best.problem, math.copysign(min(abs(share), STEP), share)
     try:
         (low, before), (high, after) = (_changed(best, quantity, by) for by in (-step, step))
     except SimulationError:
@@ -123,6 +128,10 @@ def changed(test: Measurement, quantity: str, share: float) -> Measurement:
         if quantity == "area":
             return _scaled(test, "stress", 1.0 / by)
         return _scaled(test, "stress", by) if quantity == "striker_mass" and test.braked else test
+    if quantity == nuisance.TIME_SHIFT:
+        assert test.time is not None
+        assert test.displacement is not None
+        return replace(test, displacement=later(test.time, test.displacement, -share))
     if not quantity.endswith("_scale"):
         return test
     channel = quantity.removesuffix("_scale").replace("velocity", "displacement")

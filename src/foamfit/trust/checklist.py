@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from itertools import chain, groupby
 from typing import Any
 
@@ -90,7 +90,7 @@ def make_checklist(
         _visited(best, estimates),
         *_of_intervals(best, estimates, intervals, with_error),
         *_of_test(best, balance, contradictions),
-        _time_shift(best, estimates, with_error, contradictions),
+        _time_shift(best, estimates, contradictions),
         _damping(best, with_error),
     )
     by_key = {check.key: check for check in checks}
@@ -274,13 +274,12 @@ def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
     return _check("damping", eta == 0.0, eta=eta)
 
 
-def _time_shift(
-    best: BestPoint, estimates: Estimates, with_error: Sequence[str], found: Sequence[Contradiction]
-) -> Check:
+def _time_shift(best: BestPoint, estimates: Estimates, found: Sequence[Contradiction]) -> Check:
+    """Check what the equation of motion of the striker says of the clocks (`data.calibration`)."""
     test, objective = best.problem.measurement, best.problem.objective
     clocks = [one for one in found if one.quantity == "time_shift"]
     contradicted = len(found) > len(clocks) and objective.drive == "impact"
-    facts: dict[str, Any] = {"held": False, "shift": None}
+    facts: dict[str, Any] = {"held": False, "shift": None, "moving": True}
     facts |= {"clipped": is_clipped(test), "contradicted": contradicted}
     if objective.time_shift:
         shift = estimates.get("time_shift")
@@ -289,30 +288,13 @@ def _time_shift(
     if clocks:
         warning = say("contradiction", "said", one=clocks[0], drive=objective.drive)
         return _check("time_shift", False, warnings=[warning], late=clocks[0].ratio, **facts)
+    moving = test.striker is not None and test.striker.mass and test.striker.velocity
+    facts["moving"] = bool(moving)
     with suppress(InputError):
         check_time_shift(test, objective.drive)
-        if not (facts["clipped"] or contradicted):
-            late = _shift_hint(best, with_error) or 0.0
-            return _check("time_shift", late == 0.0, late=late, **facts)
+        fine = moving and not (facts["clipped"] or contradicted)
+        return _check("time_shift", True if fine else None, **facts)
     return _check("time_shift", None, **facts)
-
-
-def _shift_hint(best: BestPoint, with_error: Sequence[str]) -> float | None:
-    """Return the delay (s) of the motion channel if the test shows it clearly, else None.
-
-    The delay is estimated by one linear step from the residuals, and accepted above a quarter of
-    the sampling interval. A large one contradicts the striker's equation of motion; see
-    `data.calibration`. The test must have both channels in time; see
-    `fitting.curves.check_time_shift`.
-    """
-    objective, simulated = best.problem.objective, best.simulated
-    gap = float(np.median(np.diff(objective.time)))
-    shifted = (objective.scenes.shifted(simulated.curves, side * gap) for side in (-0.5, 0.5))
-    early, late = (
-        objective.compare(replace(simulated, curves=curves), best.values) for curves in shifted
-    )
-    shift = _one_step(best, with_error, (late - early) / gap, gap)
-    return shift if shift is not None and abs(shift) > 0.25 * gap else None
 
 
 def _one_step(

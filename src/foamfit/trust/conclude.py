@@ -36,6 +36,7 @@ from foamfit.trust.residuals.law_error import CurveError
 
 # If an interval and the local one differ by more than this factor, the local one is misleading.
 ASTRAY = 2.0
+CLOSE = 0.9  # smallest correlation that is named
 
 
 def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None = None) -> Fit:
@@ -54,7 +55,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         correlation = Correlation(best.names, spread.correlation, spread.stderr)
     balance, misfit = audit(measurement), objective.misfit(simulated)
     contradictions = unsettled(best, balance.contradictions)
-    settled = settle(best, contradictions, stopped=record.stopped is not None)
+    settled = settle(best, contradictions)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals, settled))
     checklist = make_checklist(best, estimates, misfit, record, balance, intervals, contradictions)
     springs = best.values[: len(problem.model.names)]
@@ -102,8 +103,8 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         problem=problem,
         effort=Effort(
             objective.evaluations,
-            objective.sloped,
-            objective.seconds,
+            objective.spent.sloped,
+            objective.spent.seconds,
             SPENT.seconds - record.compiled,
             total,
         ),
@@ -294,8 +295,17 @@ def _state_of(
     past = ends[0] <= limits[0], ends[1] >= limits[1]
     if any(past) and "open" not in why:
         why = say("why", "open", why=why, limit=limits[past.index(True)], unit=unit)
-    together = insight.combination(name, covariance.WEAK / 1.96) or insight.companion(name)
+    together = insight.combination(name, covariance.WEAK / 1.96) or _companion(best, name)
     return state, f"{why}; {together}" if together else why
+
+
+def _companion(best: BestPoint, name: str) -> str:
+    """Name the most correlated parameter; "" if no correlation reaches `CLOSE`."""
+    me = best.names.index(name)
+    row = np.nan_to_num(best.spread.correlation[me])
+    row[me] = 0.0
+    at = int(np.argmax(np.abs(row)))
+    return say("why", "correlated", name=best.names[at], r=row[at]) if abs(row[at]) >= CLOSE else ""
 
 
 def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int | None]:

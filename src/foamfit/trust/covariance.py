@@ -48,10 +48,7 @@ class Covariance:
     # (k,): variance of each parameter over its variance under white noise of unit variance. A rise
     # of the sum of squares along a profile, divided by this, is a χ².
     inflation: Array
-    # (k,): degrees of freedom of each variance, which express how uncertain the estimated noise
-    # makes it (Satterthwaite 1946, Biometrics Bull. 2, 110); at most the number of effective
-    # samples less the number of parameters, because model error has no known noise spectrum.
-    freedom: Array
+    freedom: Array  # (k,): degrees of freedom: effective samples less the number of parameters
     effective: float  # effective number of samples
     noise: tuple[NoiseProcess, ...]  # noise of each curve, in units of the residual
 
@@ -98,10 +95,8 @@ class Block:
     # residual is noise only, so that the curvature is JᵀJ.
     gradient: Callable[[NDArray[np.intp], Array], Array] | None = None
     room: Array | None = None  # (k, 2): distances to the lower and upper limits
-    # (k,): change of its parameters by one standard error of a quantity that the fit takes as exact
-    given: Array | None = None
-    # (n, q): change of the residual by one standard error of each parameter held where the record
-    # shows it
+    # (n, q): change of the residual by one standard error of each quantity that the fit takes as
+    # exact, like a parameter held where the record shows it
     shifts: Array | None = None
 
     @cached_property
@@ -132,7 +127,6 @@ class Block:
             jacobian=self.jacobian[:, rows],
             through=self.through[np.ix_(rows, ~held)],
             gradient=full and (lambda places, step: full(rows[places], step)),
-            given=None if self.given is None else self.given[rows],
         )
 
     def curvature(self, spread: Array) -> Array:
@@ -222,12 +216,7 @@ class Uncertainty:
         """Covariance of the scaled unknowns, (m, m); NaN for undetermined ones."""
         spread = self.root @ self._bread @ self.axes
         out = spread @ spread.T
-        for t, (left, block) in enumerate(zip(self.lefts, self.blocks, strict=False)):
-            if block.given is not None and block.given.any():
-                moved = block.axes[1] @ block.given
-                moved = moved if self.curvatures is None else self.curvatures[t] @ moved
-                pull = self.root @ self._bread @ left.T @ moved
-                out = out + np.outer(pull, pull)
+        for left, block in zip(self.lefts, self.blocks, strict=False):
             if block.shifts is not None:
                 # So far away the curvature of a cost with kinks is unknown, and JᵀJ is used.
                 pulls = self.root @ left.T @ (block.axes[0].T @ block.shifts)
@@ -267,27 +256,15 @@ class Uncertainty:
     @cached_property
     def sandwich(self) -> Covariance:
         """Covariance, SI, with H as it is here."""
-        back, m = self._bread @ self.root.T, self.scales.size
-        variance, doubt, most = np.zeros((3, m))
+        effective = [sum(len(x) / one.tau for one, x in block.curves) for block in self.blocks]
         used = np.array([(block.through != 0.0).any(axis=0) for block in self.blocks])
-        own = used & (used.sum(axis=0) == 1)
-        effective = [
-            sum(len(columns) / one.tau for one, columns in block.curves) for block in self.blocks
-        ]
-        most[:] = sum(effective) - m
-        for t, (left, block) in enumerate(zip(self.lefts, self.blocks, strict=False)):
-            mix = left @ back
-            variance += np.einsum("ij,ij->j", mix, block.meat @ mix)
-            doubt += sum(one.doubt(columns, mix) for one, columns in block.curves)
-            most[own[t]] = effective[t] - np.count_nonzero(own[t])
-        if self.drawn is not None:
-            mix = self.lefts[-1] @ back
-            variance += self.drawn[1] @ mix**2
-        freedom = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
+        freedom = np.full(self.scales.size, sum(effective) - self.scales.size)
+        for own, count in zip(used & (used.sum(axis=0) == 1), effective, strict=True):
+            freedom[own] = count - np.count_nonzero(own)
         return Covariance(
             self.matrix * np.outer(self.scales, self.scales),
             np.diag(self.matrix) / np.where(self.lost, np.nan, np.diag(self.inverse)),
-            np.minimum(freedom, np.maximum(most, 1.0)),
+            np.maximum(freedom, 1.0),
             float(sum(effective)),
             tuple(process for block in self.blocks for process in block.noise),
         )

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 PART = 0.05  # smallest component of a direction that counts
 NAMED = 0.3  # smallest component, relative to the largest, that is named in a sentence
-CLOSE = 0.9  # smallest correlation that is named
 MOST = 3  # largest number of parameters named in a joint change
 # Times and zeros have an arbitrary origin, so that powers of them are meaningless.
 OF_NO_POWER = set(NUISANCE) - set(POSITIVE)
@@ -59,22 +58,6 @@ class Insight:
         with np.errstate(divide="ignore"):
             return np.where(singular > tiny, 1.0 / singular, np.inf), vt
 
-    @cached_property
-    def covariance(self) -> Array:
-        """Covariance of the relative values, (k, k); NaN for undetermined parameters."""
-        errors, vt = self._directions
-        seen = np.isfinite(errors)
-        out = (vt[seen].T * errors[seen] ** 2) @ vt[seen]
-        lost = np.any(np.abs(vt[~seen]) > 1e-3, axis=0)
-        out[lost, :] = out[:, lost] = np.nan
-        return np.asarray(out)
-
-    @property
-    def correlation(self) -> Array:
-        """Correlation of the estimates, (k, k); NaN for undetermined parameters."""
-        scale = np.sqrt(np.diag(self.covariance))
-        return np.asarray(self.covariance / np.outer(scale, scale))
-
     def shares(self) -> Array:
         """Return the share (k, n_parts) of each of the `parts` in the information on a parameter.
 
@@ -87,7 +70,8 @@ class Insight:
         # The rows of the pseudo-inverse are the projected columns, up to a factor.
         projected = np.linalg.pinv(self.triangles.reshape(-1, k), rcond=1e-12)
         shares = np.sum(projected.reshape(k, -1, k) ** 2, axis=2)
-        shares[np.isnan(np.diag(self.covariance))] = np.nan
+        errors, vt = self._directions
+        shares[np.any(np.abs(vt[np.isinf(errors)]) > 1e-3, axis=0)] = np.nan
         with np.errstate(invalid="ignore"):
             return np.asarray(shares / shares.sum(axis=1, keepdims=True))
 
@@ -145,18 +129,6 @@ class Insight:
         parts = [i for i in order if abs(change[i]) > NAMED * abs(change[order[0]])]
         return say(
             "why", "compensated", most=MOST, parts=[(self.names[i], change[i]) for i in parts]
-        )
-
-    def companion(self, name: str) -> str:
-        """Name the most correlated parameter; "" if no correlation reaches `CLOSE`."""
-        me = self.names.index(name)
-        row = np.nan_to_num(self.correlation[me])
-        row[me] = 0.0
-        at = int(np.argmax(np.abs(row)))
-        return (
-            say("why", "correlated", name=self.names[at], r=row[at])
-            if abs(row[at]) >= CLOSE
-            else ""
         )
 
 

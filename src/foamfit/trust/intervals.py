@@ -18,13 +18,13 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
-from foamfit.results import Intervals
+from foamfit.results import Intervals, Profile
 from foamfit.springs.parameters import NUISANCE
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import WEAK
 from foamfit.trust.markov_chain import mcmc, walkers
-from foamfit.trust.profile import BETTER, PLACED, STEPS, Refit, Tracing, departures
+from foamfit.trust.profile import BETTER, PLACED, STEPS, Refit, departures, trace
 
 METHODS = ("auto", "local", "profile", "mcmc")
 # "auto" profiles a parameter if the root of the cost departs from a straight line by this share at
@@ -103,9 +103,9 @@ def assess(
         announce(say("interval", "cost", by=method, count=count, seconds=_seconds(best, count)))
     if method == "mcmc":
         return _by_mcmc(best, choice, tracker)
-    if method == "profile":
-        return _by_profiles(best, known, minima, tracker, math.inf)
     others = [(point, tracker.consider(point)) for point in minima]
+    if method == "profile":
+        return _with_minima(best, _by_profiles(best, known, tracker), others)
     far = np.abs(departures(best)).max(axis=1, initial=0.0)
     for point, residual in others:  # a minimum within the cut but outside the local interval
         apart = np.abs(point - best.values)[best.places] / best.spread.stderr
@@ -114,7 +114,7 @@ def assess(
     bent = [name for name in order if far[best.names.index(name)] > BENT]
     # Where the range is wider, model error outweighs noise, and a local interval is enough.
     local = [n for n in bent if n in ranges and np.ptp(ranges[n]) > np.ptp(best.local(n))]
-    made = _by_profiles(best, [n for n in bent if n not in local], minima, tracker, budget)
+    made = _by_profiles(best, [n for n in bent if n not in local], tracker, budget)
     made = _with_minima(best, replace(made, doubtful=(*made.doubtful, *local)), others)
     return made if best.misfits or made.better is not None else _with_far(best, made, tracker)
 
@@ -215,49 +215,25 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
 
 
 def _by_profiles(
-    best: BestPoint, names: Sequence[str], minima: Sequence[Array], tracker: Tracker, budget: float
+    best: BestPoint, names: Sequence[str], tracker: Tracker, budget: float = math.inf
 ) -> Intervals:
-    """Profile some parameters, until all are done, a better point is found or time is up.
-
-    A point within the cut that one profile has met must be in the intervals of all parameters:
-    each profile goes on beyond the points of the others, and a parameter for which one of these is
-    outside its local interval is profiled too.
-    """
+    """Profile some parameters, until all are done, a better point is found or time is up."""
     allowed = tracker.objective.evaluations + budget
-    tracings: dict[str, Tracing] = {}
-    wanted, better = list(names), None
-    for name in (*names, *best.known):
-        met = _met(best, name, [tracing for key, tracing in tracings.items() if key != name])
-        if name not in wanted:
-            at, half = best.index[name], best.halves[best.names.index(name)] * (1.0 + PLACED)
-            if not any(abs(point[at] - best.values[at]) > half for point in met):
-                continue
-            wanted.append(name)
-        begun = name in tracings
-        if tracker.objective.evaluations >= allowed and not begun:
-            continue
-        tracing = tracings.setdefault(name, Tracing(best, name, tracker))
-        tracing.follow(met if begun else [*minima, *met])
-        better = tracing.better
-        if better is not None or tracing.stopped:
+    profiles, better = list[Profile](), None
+    for name in names:
+        if tracker.objective.evaluations >= allowed:
             break
-    profiles = tuple(tracing.profile for tracing in tracings.values())
-    ends = {p.name: p.ci95 for p in profiles if p.complete}
-    left = tuple(name for name in wanted if name not in ends)
-    facts = {"done": len(ends), "count": len(wanted), "names": ", ".join(left)}
-    stopped = (p.stopped for p in profiles if p.stopped)
+        profile, better = trace(best, name, tracker)
+        profiles.append(profile)
+        if better is not None or profile.stopped:
+            break
+    ends = {one.name: one.ci95 for one in profiles if one.complete}
+    left = tuple(name for name in names if name not in ends)
+    facts = {"done": len(ends), "count": len(names), "names": ", ".join(left)}
+    stopped = (one.stopped for one in profiles if one.stopped)
     warnings = tuple(say("interval", "profiles", by=by, **facts) for by in stopped)
     methods = dict.fromkeys(ends, "profile likelihood")
-    return Intervals(ends, methods, profiles, left, warnings=warnings, better=better)
-
-
-def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]:
-    """Return the points within its cut, met by profiles, with a parameter's extreme values."""
-    highest, at = best.cuts[best.names.index(name)], best.index[name]
-    refits = [refit for tracing in tracings for refit in tracing.refits]
-    points = [refit.point for refit in refits if refit.cost - best.cost < highest]
-    points.sort(key=lambda point: float(point[at]))
-    return [points[0], points[-1]] if points else []
+    return Intervals(ends, methods, tuple(profiles), left, warnings=warnings, better=better)
 
 
 def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:

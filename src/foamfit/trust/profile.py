@@ -7,7 +7,6 @@ cost is a parabola, profile and local interval are therefore the same.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,11 +29,6 @@ BEYOND = 2.0
 OUTWARD, INWARD = 14, 6
 # The root of χ² at a crossing differs from the root of the cut by at most this share.
 PLACED = 0.02
-# Two values are nearly the same if they differ by this share of their distance from the best one.
-NEARLY = 0.01
-# The end of a descent whose cost is above the cut by this factor is a minimum of its own, and a
-# refit beside it would not come below the cut.
-FARTHER = 10.0
 # A profile that falls below the best point by this share of the cut has found a better minimum.
 BETTER = 0.01
 
@@ -83,34 +77,29 @@ class Refit:
         start: Array,
         hold: tuple[int, float] | None = None,
         *,
-        weights: Array | float = 1.0,
         iterations: int = STEPS,
         near: Iterate | None = None,
     ) -> Iterate | None:
         """Descend from a point; `hold` is the column and the value of a fixed parameter, if any.
 
-        `weights` (n_data,) multiply the squares. The Jacobian of a point `near` the start saves one
-        of its own. Returns None if the start cannot be simulated.
+        The Jacobian of a point `near` the start saves one of its own. Returns None if the start
+        cannot be simulated.
         """
-        best, sizes = self.best, self.best.sizes
-        root, box = np.sqrt(weights), best.box.copy()
+        best, sizes, box = self.best, self.best.sizes, self.best.box.copy()
         if hold is not None:
             box[:, hold[0]] = hold[1]
 
         def residual(scaled: Array) -> Array:
-            if scaled is begin:
-                return np.asarray(root * first)
-            return np.asarray(root * self.tracker.residual(self.point(scaled, box)))
+            return self.tracker.residual(self.point(scaled, box))
 
         def jacobian(scaled: Array) -> Array:
-            slopes = best.problem.slopes(self.point(scaled, box), best.names)
-            return np.asarray(slopes * np.reshape(root, (-1, 1)) * sizes)
+            return np.asarray(best.problem.slopes(self.point(scaled, box), best.names) * sizes)
 
         begin = np.clip(start[best.places], *box) / sizes
         first = self.residual(self.point(begin, box))
         if first is None:
             return None
-        at = begin if near is None else Iterate(begin, first, near.jacobian)
+        at = Iterate(begin, first, jacobian(begin) if near is None else near.jacobian)
         end = descend(
             residual, jacobian, at, box / sizes, iterations, least=self.enough, damping=1e-6,
             stale=near is not None,
@@ -160,41 +149,8 @@ class _Side:
         share = (self.quantile - self.root(inner)) / (self.root(outer) - self.root(inner))
         return self.value(inner) + share * (self.value(outer) - self.value(inner))
 
-    def follow(self, minima: Sequence[Array]) -> None:
-        """Go outward until well beyond the cut, place the crossing, and go on beyond the minima.
-
-        A second call continues from the refits of the first.
-        """
-        if len(self.refits) == 1:
-            self._outward()
-        met = list[Iterate]()
-        far = FARTHER * self.quantile**2 * float(self.refit.best.spread.inflation[self.column])
-        for point in sorted(minima, key=lambda point: -self.sign * float(point[self.place])):
-            value = float(point[self.place])
-            edge = self.bound if self.bracket[1] else self.value(self.refits[-1])
-            if self.better or self.sign * (value - edge) <= PLACED * self.half:
-                break
-            rise = self.refit.rise(point)
-            if rise > far or self._known(rise, value, met):
-                continue
-            if (found := self.refit.run(point, (self.column, value))) is None:
-                continue
-            met.append(found)
-            if self.rise(found) < self.quantile**2:
-                # Refits farther out belong to another minimum or have stalled.
-                inside = [at for at in self.refits if self.sign * (self.value(at) - value) < 0.0]
-                self.refits = [*inside, found]
-                self._outward()
-
-    def _known(self, rise: float, value: float, met: Sequence[Iterate]) -> bool:
-        """Whether an earlier refit has a lower cost at nearly this value; many descents agree."""
-        start = self.value(self.refits[0])
-        near = [at for at in met if abs(self.value(at) - value) < NEARLY * abs(value - start)]
-        least = min((at.cost for at in near), default=0.0)
-        return bool(near) and rise >= least - self.refit.best.cost
-
-    def _outward(self) -> None:
-        """Go on from the outermost refit until well beyond the cut, and place the crossing."""
+    def follow(self) -> None:
+        """Go outward until well beyond the cut, and place the crossing."""
         step, refused = 0.5 * self.half, 0
         for _ in range(OUTWARD):
             last = self.refits[-1]
@@ -240,60 +196,37 @@ class _Side:
         return self.refit.run(start, (self.column, value), near=near)
 
 
-class Tracing:
-    """A profile in progress; a side not yet begun ends at the best point.
+def trace(best: BestPoint, name: str, tracker: Tracker) -> tuple[Profile, Array | None]:
+    """Follow the least cost along a parameter to both sides, past the 95 % cut.
 
     It uses the adjusted likelihood ratio: the rise of the cost over `Covariance.inflation` is a χ²
     of one degree of freedom even if noise is correlated (Chandler & Bate 2007, Biometrika 94, 167).
+    If the deadline or Ctrl-C ends it early, it is incomplete and `ci95` covers only the part
+    computed so far. A point of clearly lower cost than the best one, if there is one, is returned
+    too.
     """
-
-    def __init__(self, best: BestPoint, name: str, tracker: Tracker) -> None:
-        """Start at the best point."""
-        refit = Refit(best, tracker)
-        self.name, self.low, self.high = name, _Side(refit, name, -1.0), _Side(refit, name, 1.0)
-        self.stopped: str | None = None
-        self._turned = False
-
-    def follow(self, minima: Sequence[Array] = ()) -> None:
-        """Follow the least cost to both sides, past the 95 % cut.
-
-        `minima` are other points at which descents ended. The profile goes on beyond those within
-        the cut, whatever barrier lies between. If the deadline or Ctrl-C ends it early, it is
-        incomplete and `ci95` covers only the part computed so far.
-        """
-        try:
-            self.low.follow(minima)
-            self._turned = True
-            self.high.follow(minima)
-        except STOPPING as error:
-            self.stopped = what_stopped(error)
-
-    @property
-    def refits(self) -> list[Iterate]:
-        """All refits in the order of the parameter."""
-        return self.low.refits[::-1] + self.high.refits[1:]
-
-    @property
-    def better(self) -> Array | None:
-        """A point of clearly lower cost than the best one, if there is one."""
-        least = min(self.refits, key=lambda at: at.cost)
-        return least.point if self.low.better or self.high.better else None
-
-    @property
-    def profile(self) -> Profile:
-        """The profile so far."""
-        low, high, refits = self.low, self.high, self.refits
-        return Profile(
-            name=self.name,
-            values=np.array([low.value(at) for at in refits]),
-            rises=np.array([low.rise(at) for at in refits]),
-            points=np.array([at.point for at in refits]),
-            cut=low.quantile**2,
-            ci95=(low.bound, high.bound if self._turned else high.value(high.refits[0])),
-            open_low=low.bracket[1] is None,
-            open_high=high.bracket[1] is None or not self._turned,
-            stopped=self.stopped,
-        )
+    refit, stopped = Refit(best, tracker), None
+    low, high = _Side(refit, name, -1.0), _Side(refit, name, 1.0)
+    try:
+        low.follow()
+        high.follow()
+    except STOPPING as error:
+        stopped = what_stopped(error)
+    refits = low.refits[::-1] + high.refits[1:]
+    better = min(refits, key=lambda at: at.cost).point if low.better or high.better else None
+    begun = stopped is None or len(high.refits) > 1
+    profile = Profile(
+        name=name,
+        values=np.array([low.value(at) for at in refits]),
+        rises=np.array([low.rise(at) for at in refits]),
+        points=np.array([at.point for at in refits]),
+        cut=low.quantile**2,
+        ci95=(low.bound, high.bound if begun else best.value(name)),
+        open_low=low.bracket[1] is None,
+        open_high=high.bracket[1] is None,
+        stopped=stopped,
+    )
+    return profile, better
 
 
 def departures(best: BestPoint) -> Array:

@@ -1,14 +1,14 @@
 """Ranges of the parameters due to model error: values that fit almost equally well.
 
-With model error, the best point depends on the weights of the samples, on the fitted time window
-and on the minimum that the search finds. The range of a parameter is the hull of its values over
-such points.
+With model error, the best point depends on the weights of the samples and on the minimum that the
+search finds. The range of a parameter is the hull of its values over points that follow the curves
+about as well.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
 
@@ -22,10 +22,6 @@ from foamfit.trust.residuals.law_error import CurveError
 
 # A point fits almost equally well if its RMS model error is larger by at most this factor.
 ALIKE = 1.2
-# Weight of emphasised samples relative to the others.
-HEAVIER = 4.0
-# Number of time windows that are de-emphasised in turn.
-WINDOWS = 3
 ITERATIONS = 6  # of a refit
 TRIALS = 4  # refits until one fits almost equally well
 DESCENT = 15  # iterations of a descent to another minimum
@@ -43,9 +39,8 @@ def alike(
 ) -> list[Array]:
     """Return points that fit almost as well as the best point, which is the first of them.
 
-    They are the ends of the search's descents (`minima`); refits with each parameter fixed as far
-    from the best point as possible, starting from the linear prediction; and refits with other
-    weights of the samples, moved back towards the best point if they fit worse. After `budget`
+    They are the ends of the search's descents (`minima`), and refits with each parameter fixed as
+    far from the best point as possible, starting from the linear prediction. After `budget`
     evaluations no further refit is begun.
     """
     most, refit = tolerance(best), Refit(best, tracker)
@@ -55,9 +50,6 @@ def alike(
     for column, sign in product(range(len(best.names)), (-1.0, 1.0)):
         if tracker.objective.evaluations < allowed:
             out += _held(refit, column, sign, inverse[column], most)
-    for weights in _weights(best):
-        if tracker.objective.evaluations < allowed:
-            out += _towards(refit, weights, most)
     return out
 
 
@@ -107,34 +99,6 @@ def _with_other_zeros(best: BestPoint) -> Array:
     moves = best.sizes[:, None] * (np.linalg.pinv(best.scaled, rcond=1e-10) @ best.shifts)
     sides = np.concatenate([moves, -moves], axis=1).T
     return np.asarray(np.clip(best.values[best.places] + sides, *best.box))
-
-
-def _weights(best: BestPoint) -> Iterator[Array]:
-    """Yield weights that emphasise loading, unloading, low or high stress, or some windows."""
-    objective = best.problem.objective
-    stress, sample = objective.stress, np.arange(objective.time.size)
-    loading, low = sample <= int(np.argmax(stress)), stress < 0.5 * float(np.max(stress))
-    heavy = [loading, ~loading, low, ~low]
-    heavy += [sample * WINDOWS // stress.size != window for window in range(WINDOWS)]
-    for samples in heavy:
-        kept = [samples[objective.kept(name)] for name in objective.counted]
-        priors = np.zeros(len(objective.priors), dtype=bool)
-        yield np.where(np.concatenate([*kept, priors]), HEAVIER, 1.0)
-
-
-def _towards(refit: Refit, weights: Array, most: float) -> list[Array]:
-    """Refit with other weights, then move towards the best point until the rise is small enough."""
-    best, share = refit.best, 1.0
-    found = refit.run(best.values, weights=weights, iterations=ITERATIONS)
-    assert found is not None  # the best point can be simulated
-    step = (found.point - best.values)[best.places] / best.sizes
-    for _ in range(TRIALS):
-        point = refit.moved(best.values, share * step)
-        rise = refit.rise(point)
-        if rise <= most:
-            return [point]
-        share *= nearer(most, rise, 0.9)
-    return []
 
 
 def _held(refit: Refit, column: int, sign: float, along: Array, most: float) -> list[Array]:

@@ -197,9 +197,9 @@ def _curve_error(residual: Array, basis: Array, own: NoiseProcess) -> CurveError
 
 def _process(seen: _Spectrum, found: _Sum) -> NoiseProcess:
     """Return autoregressive noise with a spectrum given in bands."""
-    noise, samples = found.noise, max(float(seen.count @ (found.law < found.noise)), 1.0)
+    noise = found.noise
     if np.ptp(noise) < 1e-9 * float(noise.max()):
-        return NoiseProcess(np.empty(0), float(noise[0]), samples)
+        return NoiseProcess(np.empty(0), float(noise[0]))
     spectrum = np.exp(np.interp(np.arange(seen.samples), seen.frequency, np.log(noise)))
     lags = np.fft.irfft(np.append(spectrum, spectrum[-1]))[: ORDER + 1]
-    return NoiseProcess(levinson(lags)[-1][0], float(lags[0]), samples)
+    return NoiseProcess(levinson(lags)[-1][0], float(lags[0]))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import orth, toeplitz
+from scipy.linalg import orth
 
 from foamfit.arrays import Array
 
@@ -32,8 +32,6 @@ class NoiseProcess:
 
     coefficients: Array  # (p,): φ_1 … φ_p; empty for white noise
     variance: float  # of the process itself, not of the white noise that drives it
-    # Number of samples of the estimate less those absorbed by the parameters; infinite if known
-    samples: float = math.inf
 
     def autocovariance(self, n: int) -> Array:
         """Return the autocovariance at the lags 0 … n-1."""
@@ -70,37 +68,9 @@ class NoiseProcess:
         )
         return product[:n]
 
-    def forms(self, columns: Array, mix: Array | None = None) -> Array:
-        """Return the variance lᵀΣl along each column l of `columns` (n, k), times `mix` (k, m)."""
-        inner = columns.T @ self.times(columns)
-        if mix is None:
-            return np.diag(inner)
-        return np.asarray(np.einsum("ij,ij->j", mix, inner @ mix))
-
-    def doubt(self, columns: Array, mix: Array) -> Array:
-        """Return the variance of `forms` due to the estimate from `samples`, (m,).
-
-        By the delta method. Estimates of the white-noise variance w and of φ are independent for
-        large n. The former has variance 2w²/n if the noise is normal; the latter has covariance
-        w Γ⁻¹/n, with Γ the covariance of p successive samples (Brockwell & Davis 1991, Time Series:
-        Theory and Methods, theorem 8.1.1).
-        """
-        if math.isinf(self.samples):
-            return np.zeros(mix.shape[1])
-        forms = self.forms(columns, mix)
-        out = 2.0 * forms**2
-        order = self.coefficients.size
-        if order:
-            white = self.variance * self.white
-            step = 1e-4 * (1.0 - _radius(self.coefficients))
-            moved = [
-                NoiseProcess(phi, white / NoiseProcess(phi, 1.0).white)
-                for phi in self.coefficients + step * np.eye(order)
-            ]
-            slopes = np.array([(other.forms(columns, mix) - forms) / step for other in moved])
-            gamma = toeplitz(self.autocovariance(order))
-            out += white * np.einsum("ik,ik->k", slopes, np.linalg.solve(gamma, slopes))
-        return np.asarray(out / self.samples)
+    def forms(self, columns: Array) -> Array:
+        """Return the variance lᵀΣl along each column l of `columns`, (n, k)."""
+        return np.asarray(np.einsum("ij,ij->j", columns, self.times(columns)))
 
 
 def levinson(lags: Array) -> list[tuple[Array, float]]:
@@ -149,8 +119,7 @@ def noise_processes(
         scores = [n * math.log(max(white, 1e-300)) + len(f) * math.log(n) for f, white in fits]
         order = int(np.argmin(scores))
         sums.append(lag_sums[: order + 1])
-        left = max(n - float(np.sum(basis[part] ** 2)), 1.0)
-        processes.append(NoiseProcess(_damped(fits[order][0], n), float(lag_sums[0] / n), left))
+        processes.append(NoiseProcess(_damped(fits[order][0], n), float(lag_sums[0] / n)))
     if not basis.shape[1]:
         return processes
     for _ in range(CORRECTIONS):
