@@ -14,9 +14,8 @@ import numpy as np
 
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
-from foamfit.report.figures import image
+from foamfit.report.figures import write_both
 from foamfit.report.render import page, words
-from foamfit.report.studies.parameters import DPI as SUMMARY_DPI
 from foamfit.report.studies.parameters import panels_of, plot_parameters
 from foamfit.report.summary import CURVES
 from foamfit.report.tables import (
@@ -156,7 +155,7 @@ def write_comparison(
 ) -> bytes | None:
     """Write the parameters of all tests as summary.tex and, with `pictures`, as figures.
 
-    Return the PNG, if there is one.
+    Return the figure as SVG, if there is one.
     """
     fitted = [row for row in rows if row.has_fit]
     tests = [row.test for row in fitted]
@@ -168,14 +167,11 @@ def write_comparison(
     figure = plot_parameters(
         f"{title} · {counts_in_words(rows)}", tests, panels_of(tests, found), width=width
     )
-    png = image(figure, "png", SUMMARY_DPI)
-    write_file(folder / "summary.png", png)
-    write_file(folder / "summary.pdf", image(figure, "pdf"))
-    return png
+    return write_both(figure, folder / "summary")
 
 
 def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | None = None) -> None:
-    """Write summary.html, a self-contained page, with a figure (PNG)."""
+    """Write summary.html, a self-contained page, with a figure (SVG)."""
     shown = rows
     if len(rows) > MOST_ON_PAGE:  # tests without a fit are always shown
         first = {id(row) for row in rows[:MOST_ON_PAGE]}

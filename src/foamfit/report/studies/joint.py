@@ -11,7 +11,7 @@ import numpy as np
 
 from foamfit.fitting.links import RATES, law_values
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, GREY, MEASURED, TWO, VERMILION, image
+from foamfit.report.figures import FITTED, GREY, SEEN, TWO, VERMILION, image
 from foamfit.report.folder import save_whole, write_json, write_result, write_text
 from foamfit.report.readable import in_unit, own_name, readable, readable_unit, symbol
 from foamfit.report.render import page, words
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-DPI = 180  # of the figures
 MOST_ROWS = 60  # of the table of tests on the terminal
 LOOPS, LOOP = 6, (1.25, 1.15)  # loops per row, and size of a loop in inches
 COLUMNS, PANEL = 3, (2.5, 1.6)  # parameters per row, and size of a panel in inches
@@ -129,9 +128,9 @@ def save_joint(
         if report:
             pictures = []
             for name, draw in (("joint", plot_joint), ("parameters", plot_compared)):
-                png = figures.write_both(draw(found, width=width), fresh / name, DPI)
+                svg = figures.write_both(draw(found, width=width), fresh / name)
                 # The page has room for two columns.
-                pictures.append(png if width == TWO else image(draw(found), "png", DPI))
+                pictures.append(svg if width == TWO else image(draw(found), "svg"))
             write_text(fresh / "joint.html", joint_page(found, *pictures))
         for _ in written:
             pass
@@ -174,7 +173,7 @@ def joint_text(found: Joint) -> str:
 
 
 def joint_page(found: Joint, loops: bytes, compared: bytes) -> str:
-    """Return the page with its two figures (PNG)."""
+    """Return the page with its two figures (SVG)."""
     common = _common(found)
     each = [
         (one, "".join(symbol(name)), *readable_unit(max(abs(at.value) for at in own), one.unit))
@@ -232,8 +231,7 @@ def plot_joint(found: Joint, *, width: str = TWO) -> Figure:
     heights = [rows * LOOP[1], low * PANEL[1]]
     more = f"; {len(shown)} of {len(names)} drawn" if len(shown) < len(names) else ""
     title = f"{found.name} · {found.model} · {len(names)} tests together{more}"
-    lines = figures.title_lines(wide, title, titled=figures.is_titled(width))
-    with figures.drawing(wide, sum(heights) + 0.6 + 0.13 * len(lines), lines) as figure:
+    with figures.drawing(wide, sum(heights) + 0.6, *figures.title(width, title)) as figure:
         parts = [height for height in heights if height]
         top, *bottom = figure.subfigures(len(parts), 1, height_ratios=parts, squeeze=False)[:, 0]
         axes = figures.grid_of(top, rows, across, len(shown))
@@ -290,9 +288,9 @@ def _draw_loops(axes: list[Axes], found: Joint, titles: Mapping[str, str]) -> No
     for ax, (test, title) in zip(axes, titles.items(), strict=True):
         if (one := loops.get(test)) is None:
             continue
-        ax.plot(one.along, one.measured / factor, color=MEASURED, lw=1.5, label="measured")
+        ax.plot(one.along, one.measured / factor, **SEEN)
         if one.fitted is not None:
-            ax.plot(one.along, one.fitted / factor, color=BLUE, lw=0.7, label="fitted")
+            ax.plot(one.along, one.fitted / factor, **FITTED)
         ax.set_label(one.name)
         ax.set_title(title, fontsize=6)
         ax.tick_params(labelsize=5.5, length=2, pad=1.5)

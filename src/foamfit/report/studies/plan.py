@@ -239,16 +239,16 @@ class Plan:
                 )
                 (fresh / "joint.toml").write_text(self._study(Path(folder)), encoding="utf-8")
             if report:
-                png = figures.write_both(plot_plan(self, width=figure_width), fresh / "plan")
-                (fresh / "plan.html").write_text(self._page(png), encoding="utf-8")
+                svg = figures.write_both(plot_plan(self, width=figure_width), fresh / "plan")
+                (fresh / "plan.html").write_text(self._page(svg), encoding="utf-8")
 
         results.check_target(folder, of="plan.json")
         return results.save_whole(folder, write)
 
-    def _page(self, png: bytes) -> str:
+    def _page(self, svg: bytes) -> str:
         """Return plan.html."""
         ranked = sorted(self.outcomes, key=lambda one: (one.breaks > RISKY, -one.number))
-        return page("plan", plan=self, png=png, best=ranked[:BEST], risky=RISKY, unit_of=unit_of)
+        return page("plan", plan=self, svg=svg, best=ranked[:BEST], risky=RISKY, unit_of=unit_of)
 
     def _study(self, folder: Path) -> str:
         """Return joint.toml, the study of the tests at hand and the next one."""
@@ -303,10 +303,9 @@ def plot_plan(plan: Plan, *, width: str = TWO) -> Figure:
     title = [f"{plan.name}: {plan.law}. Expected by simulation, not measured."]
     if best is not None:
         title.append(f"Advised: {best.candidate}.")
-    lines = figures.title_lines(wide, *title, titled=figures.is_titled(width))
     stacked = wide < 5.0
     tall = (5.6 if stacked else 2.9) + 0.16 * max(len(plan.now) - 8, 0)
-    with figures.drawing(wide, tall + 0.15 * len(lines), lines) as figure:
+    with figures.drawing(wide, tall, *figures.title(width, *title)) as figure:
         left, right = figure.subplots(2, 1) if stacked else figure.subplots(1, 2)
         _map(left, plan)
         _intervals(right, plan)

@@ -15,7 +15,7 @@ from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
 from foamfit.report import figures
 from foamfit.report import folder as results
-from foamfit.report.figures import BLUE, INSIDE, MEASURED, TWO, VERMILION
+from foamfit.report.figures import BLUE, FITTED, INSIDE, SEEN, TWO, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import words
 from foamfit.results import law_in_words, plain
@@ -36,9 +36,7 @@ COLOURS: dict[str, tuple[str, Any]] = {
     "motion": (VERMILION, (0, (1, 1.2))),
     "law_error": (INSIDE[0], (0, (5, 1.2, 1, 1.2))),
 }
-# Styles of the lines and of the band, with their labels in the legend.
-SEEN: Any = {"color": MEASURED, "linewidth": 1.4, "label": "measured"}
-PREDICTED: Any = {"color": VERMILION, "linewidth": 0.9, "label": "predicted"}
+PREDICTED: Any = FITTED | {"label": "predicted"}
 BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0, "label": "95 % band"}
 
 
@@ -256,14 +254,12 @@ def plot_prediction(found: Prediction, *, width: str = TWO) -> Figure:
     across = figures.abreast(wide, 1 + len(curves))
     bands = -(-(1 + len(curves)) // across)  # each has an upper and a lower row of panels
     inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in curves)
-    lines = figures.title_lines(
-        wide,
+    title = figures.title(
+        width,
         f"{found.measurement.name}, predicted from {found.source}; {words('rates', found=found)}",
         f"inside the 95 % band: {inside}",
-        titled=figures.is_titled(width),
     )
-    tall = bands * 1.7 * PANEL[1] + 0.4 + 0.15 * max(len(lines) - 2, 0)
-    with figures.drawing(wide, tall, lines) as figure:
+    with figures.drawing(wide, bands * 1.7 * PANEL[1] + 0.1, *title) as figure:
         grid = {"hspace": 0.06, "height_ratios": (1.0, 0.6) * bands}
         axes = figure.subplots(2 * bands, across, squeeze=False, gridspec_kw=grid)
         loop, *above = axes[::2].ravel()
