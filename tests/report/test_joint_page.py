@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,8 +72,15 @@ def found(tmp_path_factory) -> JointResult:
     )  # fmt: skip
 
 
-def test_the_page_needs_nothing_else_and_escapes_names(found):
-    page = joint_page(found, *2 * [b"\x89PNG"])
+@pytest.fixture(scope="module")
+def page(found, tmp_path_factory) -> str:
+    folder = tmp_path_factory.mktemp("joint")
+    (folder / "<i>third</i>").mkdir(parents=True)
+    (folder / "<i>third</i>" / "report.html").write_text("")
+    return joint_page(found, folder, b"<svg/>", b"<svg/>")
+
+
+def test_the_page_needs_nothing_else_and_escapes_names(page):
     assert not re.search(r'(src|href)="(?!data:|[^"]*report\.html)', page)
     assert "<i>third</i>" not in page
     assert "a &amp; b" in page
@@ -80,46 +88,39 @@ def test_the_page_needs_nothing_else_and_escapes_names(found):
     assert 'href="%3Ci%3Ethird%3C/i%3E/report.html"' in page
 
 
-def test_the_page_has_every_parameter_and_test(found):
-    page = joint_page(found, *2 * [b"\x89PNG"])
+def test_the_page_has_every_parameter_and_test(found, page):
     for name, one in found.parameters.items():
         assert (f"<code>{name}</code>" in page) == (one.kind != "fixed")
     body = page.split('<table class="sortable">')[1]
     assert body.count("<tr>") == 1 + 3
     # values of individual tests have the unit in the heading
     value = found.parameters["s1_kc"].tests["first"].value
-    assert f'data-v="{value:.8g}">{value / 1e3:.1f}<' in body
-    assert "scatters by" in page
+    assert re.search(rf'data-v="{value / 1e3:.0f}(\.\d)?">', body)
     assert re.search(r"b = 0\.0\d+ \(0\.0\d+ to 0\.0\d+\)", page)
     assert page.count("<td>log rate</td>") == 2  # in the parameter and evidence tables
 
 
-def test_the_page_tells_the_noise_of_each_test_beside_its_share_of_chi2(found):
-    page = joint_page(found, *2 * [b"\x89PNG"])
+def test_the_page_tells_the_noise_of_each_test_beside_its_share_of_chi2(found, page):
     body = page.split('<table class="sortable">')[1]
     heads = re.findall(r"<th><button>(.*?)</button>", body)
     at = heads.index("noise loop (Pa)")
     assert heads[at - 1] == "share of χ² (%)"
     row = re.findall(r"<td[^>]*>(.*?)</td>", body.split("<tr>")[2])
-    assert row[at] == '400.0<i class="ends">stated</i>'
+    assert row[at] == "400.0<i>stated</i>"
     # an estimated noise level is increased to account for correlation
     level = {"sigma": 250.0, "given": False, "time": 2.5, "scale": 1e3, "range": 1e5}
     one, *others = found.noise
     vars(found)["noise"] = ({"stress_strain": level}, *others)
-    told = joint_page(found, *2 * [b"\x89PNG"])
+    told = joint_page(found, Path(), b"<svg/>", b"<svg/>")
     vars(found)["noise"] = (one, *others)
-    assert "250.0<i" in told
-    assert "estimated, correlated over 2.5 samples, counted as 1000" in told
+    assert "250.0<i>estimated, correlated over 2.5 samples, counted as 1000<" in told
 
 
-def test_ranges_are_told_where_there_are_some(found):
-    assert "<th>range</th>" not in joint_page(found, *2 * [b"\x89PNG"])
+def test_ranges_are_told_where_there_are_some(found, page):
+    assert "<th>range</th>" not in page
     k0 = replace(found.parameters["s1_k0"], range=(5.2e5, 5.8e5))
     ranged = replace(found, parameters={**found.parameters, "s1_k0": k0})
-    page = joint_page(ranged, *2 * [b"\x89PNG"])
-    assert "<th>range</th>" in page
-    assert ">520 to 580 kPa<" in page
-    assert "where the value would lie (95 %)" in page
+    assert ">520 to 580 kPa<" in joint_page(ranged, Path(), b"<svg/>", b"<svg/>")
     assert "520.0 to 580.0 kPa" in joint_text(ranged)
 
 

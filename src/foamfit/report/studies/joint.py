@@ -13,7 +13,8 @@ from foamfit.fitting.links import RATES, law_values
 from foamfit.report import figures
 from foamfit.report.figures import FITTED, GREY, SEEN, TWO, VERMILION, image
 from foamfit.report.folder import save_whole, write_json, write_result, write_text
-from foamfit.report.readable import in_unit, own_name, readable, readable_unit, symbol
+from foamfit.report.listing import Listed, table_of
+from foamfit.report.readable import in_unit, own_name, readable, readable_unit
 from foamfit.report.render import page, words
 from foamfit.report.shown import Joint
 from foamfit.report.studies.parameters import Panel, plot_parameters
@@ -21,7 +22,7 @@ from foamfit.report.tables import MISFITS, formula, parameters_tex, symbols
 from foamfit.results import Fit, ParameterEstimate, law_in_words
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import percent
+from foamfit.text import number, percent
 from foamfit.trust.covariance import RULE
 
 if TYPE_CHECKING:
@@ -125,15 +126,16 @@ def save_joint(
         folders, n = [fresh / name for name in found.tests], len(found.tests)
         # If other processes write these folders, the common figures are drawn at the same time.
         written = each(_write_test, found.test_fits(), folders, [report] * n, [width] * n)
+        pictures = list[bytes]()
         if report:
-            pictures = []
             for name, draw in (("joint", plot_joint), ("parameters", plot_compared)):
                 svg = figures.write_both(draw(found, width=width), fresh / name)
                 # The page has room for two columns.
                 pictures.append(svg if width == TWO else image(draw(found), "svg"))
-            write_text(fresh / "joint.html", joint_page(found, *pictures))
         for _ in written:
             pass
+        if report:
+            write_text(fresh / "joint.html", joint_page(found, fresh, *pictures))
 
     return save_whole(folder, write)
 
@@ -172,18 +174,28 @@ def joint_text(found: Joint) -> str:
     return words("joint", **more, **_common(found))
 
 
-def joint_page(found: Joint, loops: bytes, compared: bytes) -> str:
-    """Return the page with its two figures (SVG)."""
+def joint_page(found: Joint, folder: Path, loops: bytes, compared: bytes) -> str:
+    """Return the page in a folder, with its two figures (SVG)."""
     common = _common(found)
-    each = [
-        (one, "".join(symbol(name)), *readable_unit(max(abs(at.value) for at in own), one.unit))
-        for name, one in found.parameters.items()
-        if one.kind != "fixed" and (own := (one.tests or {}).values())
-    ]
-    noise, known = {}, [one["noise"] for one in common["found"]["tests"].values()]
+    shown = {n: one for n, one in found.parameters.items() if one.kind != "fixed"}
+    levels: dict[str, tuple[float, str]] = {}  # factor and unit of the noise of each curve
+    known = [one["noise"] for one in common["found"]["tests"].values()]
     for name in MISFITS:
-        if levels := [one[name]["sigma"] for one in known if name in one]:
-            noise[name] = readable_unit(max(levels), "m" if name.startswith("displ") else "Pa")
+        if sizes := [one[name]["sigma"] for one in known if name in one]:
+            levels[name] = readable_unit(max(sizes), "m" if name.startswith("displ") else "Pa")
+    listed = [
+        Listed(
+            folder / test,
+            test,
+            "",
+            own["misfit"],
+            parameters={
+                n: one.estimate(test) for n, one in shown.items() if one.tests and test in one.tests
+            },
+            more=_more(own, levels),
+        )
+        for test, own in common["found"]["tests"].items()
+    ]
     return page(
         "joint",
         loops=loops,
@@ -193,11 +205,24 @@ def joint_page(found: Joint, loops: bytes, compared: bytes) -> str:
             for name, one in _of_springs(found).items()
         ],
         rule=RULE,
-        of_curve=MISFITS,
-        noise=noise,
-        each=each,
+        table=table_of(listed, folder, loops=False),
         **common,
     )
+
+
+def _more(own: Mapping[str, Any], levels: Mapping[str, tuple[float, str]]) -> dict[str, Any]:
+    """Return the cells of a test that only joint fits have: rate, share of χ² and noise."""
+    rate = "" if own["rate"] is None else f"{own['rate']:.3g}"
+    out = {"rate (1/s)": (rate, ""), "share of χ² (%)": (f"{100 * own['chi2_share']:.1f}", "")}
+    for curve, (factor, unit) in levels.items():
+        if level := own["noise"].get(curve):
+            note = "stated" if level["given"] else "estimated"
+            if level["time"] > 1.05:
+                note += f", correlated over {level['time']:.2g} samples"
+            if level["scale"] > level["sigma"]:
+                note += f", counted as {number(level['scale'] / factor)}"
+            out[f"noise {MISFITS[curve]} ({unit})"] = (number(level["sigma"] / factor), note)
+    return out
 
 
 def between(one: JointParameter) -> str:
