@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import math
 from base64 import b64encode
 from importlib.metadata import version
@@ -33,6 +34,7 @@ def environment() -> Environment:
     made.filters.update(counted=text.counted, listed=text.listed, in_unit=in_unit, exp=math.exp)
     made.filters.update(paragraphs=_paragraphs, aligned=_aligned)
     made.filters["svg"] = lambda svg: "data:image/svg+xml;base64," + b64encode(svg).decode()
+    made.filters["quoted"] = functools.partial(json.dumps, ensure_ascii=False)
     made.filters["spoken"] = lambda name: name.replace("_", "-")
     made.globals["version"] = version("foamfit")
     return made
