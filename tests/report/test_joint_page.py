@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import foamfit as ff
@@ -15,7 +14,7 @@ from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import Together
-from foamfit.report.figures import STYLE, image, laid_out
+from foamfit.report.figures import image
 from foamfit.report.studies.joint import joint_page, joint_text, plot_compared, plot_joint
 from foamfit.study.joint_fit import Alternative, fit_jointly
 from foamfit.study.joint_result import JointResult, common_covariance, parameters_of
@@ -179,32 +178,3 @@ def test_twins_whose_rates_differ_a_little_stand_in_their_order(found):
     assert [ax.get_title() for ax in top.axes] == list(names)
     labels = plot_compared(twins).axes[0].get_yticklabels()
     assert [label.get_text() for label in labels] == list(names)
-
-
-def test_rates_within_a_decade_have_labels_that_do_not_overlap(found):
-    figure = plot_joint(replace(found, rates=(0.1, 0.15, 0.4)))
-    panel = figure.subfigs[1].axes[0]
-    shown = [label.get_text() for label in panel.get_xticklabels()]
-    assert shown == ["0.1", "0.2", "0.4"]
-    assert not len(panel.get_xticks(minor=True))
-
-
-def test_the_words_have_the_same_numbers(found):
-    told = joint_text(found)
-    assert "a & b: microscale: 3 tests together: warnings" in told
-    assert "warning: x.csv is left out" in told
-    assert re.search(r"s1_sigma_plus +log rate +1\d\d\.\d kPa", told)
-    assert "*  log rate" in told
-
-
-def test_in_one_column_nothing_is_wider(found) -> None:
-    narrow, wide = plot_joint(found, width="one"), plot_joint(found)
-    assert (narrow.get_figwidth(), wide.get_figwidth()) == (3.25, 7.0)
-    for figure in (narrow, wide):
-        with laid_out(figure, 100), rc_context(STYLE):
-            figure.dpi = 100
-            for ax in (one for one in figure.axes if one.axison or one.texts):
-                box = ax.get_tightbbox()
-                assert box.x0 > -1.5
-                assert box.x1 < figure.bbox.x1 + 1.5
-    assert [ax.get_title() for ax in narrow.axes][-1] == [ax.get_title() for ax in wide.axes][-1]

@@ -57,25 +57,6 @@ def test_where_processes_end_this_one_draws(
         assert list(drawers.map(str.upper, ["fit", "shown"])) == ["FIT", "SHOWN"]
 
 
-def test_where_no_process_can_be_had_this_one_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*_: object) -> None:
-        raise BlockingIOError("Resource temporarily unavailable")
-
-    monkeypatch.setattr(foamfit.study.processes, "Processes", refused)
-    monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
-    with closing(Drawers()) as drawers:
-        drawers.begin()
-        assert list(drawers.map(str.upper, ["fit"])) == ["FIT"]
-
-
-def test_one_core_draws_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 1)
-    monkeypatch.delattr(foamfit.study.processes, "Processes")
-    with closing(Drawers()) as drawers:
-        drawers.begin()
-        assert list(drawers.map(str.upper, ["fit", "shown"])) == ["FIT", "SHOWN"]
-
-
 def a_process(code: str, *arguments: str) -> tuple[str, set[str]]:
     """Run code in a new process; return its output and the modules that it imported."""
     at_the_end = "import atexit, sys\natexit.register(lambda: print('modules', *sys.modules))\n"

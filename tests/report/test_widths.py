@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -85,17 +84,3 @@ def test_nothing_is_cut_off_and_no_panel_overlaps_another(width: str) -> None:
                 wide = min(one.x1, other.x1) - max(one.x0, other.x0)
                 tall = min(one.y1, other.y1) - max(one.y0, other.y0)
                 assert min(wide, tall) < 2.0 * least, name
-
-
-def test_a_narrow_figure_leaves_the_page_as_it_is(tmp_path: Path) -> None:
-    one = fabricated.result()
-    bare = replace(one, curves=replace(one.curves, displacement=None, time=None), misfit={})
-    pages = []
-    for width in ("one", "two"):
-        folder = bare.save(tmp_path / width, figure_width=width)
-        pages.append((folder / "report.html").read_text(encoding="utf-8"))
-        png = (folder / "fit.png").read_bytes()
-        assert int.from_bytes(png[16:20]) == pytest.approx(
-            250 * {"one": 3.25, "two": 4.0}[width], 2
-        )
-    assert pages[0] == pages[1]
