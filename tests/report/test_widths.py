@@ -15,7 +15,7 @@ import fabricated
 from drawn import figures
 from foamfit.cli import main
 from foamfit.errors import InputError
-from foamfit.report.figures import DPI, STYLE, inches, laid_out
+from foamfit.report.figures import DPI, STYLE, inches
 from foamfit.report.plots import plot_fit
 
 
@@ -50,8 +50,8 @@ def test_panels_stand_above_each_other_in_one_column_and_letters_keep_their_size
     narrow, wide = (plot_fit(fabricated.result(), width=width) for width in ("one", "two"))
     assert (narrow.get_figwidth(), wide.get_figwidth()) == (3.25, 7.0)
     assert narrow.get_figheight() < 9.0  # fits on a page
-    with laid_out(narrow):
-        boxes = [ax.get_position() for ax in narrow.axes[:3]]
+    narrow.draw_without_rendering()
+    boxes = [ax.get_position() for ax in narrow.axes[:3]]
     assert [round(box.x0, 3) for box in boxes] == [round(boxes[0].x0, 3)] * 3
     assert boxes[0].y0 > boxes[1].y1 > boxes[1].y0 > boxes[2].y1
 
@@ -66,8 +66,9 @@ def test_panels_stand_above_each_other_in_one_column_and_letters_keep_their_size
 @pytest.mark.parametrize("width", ["one", "two"])
 def test_nothing_is_cut_off_and_no_panel_overlaps_another(width: str) -> None:
     for name, figure in figures(width):
-        with laid_out(figure, DPI), matplotlib.rc_context(STYLE):
+        with matplotlib.rc_context(STYLE):
             figure.dpi = DPI
+            figure.draw_without_rendering()
             least = DPI / 72.0  # a typographic point
             parts = [ax for ax in figure.axes if ax.axison]
             boxes = [part.get_tightbbox() for part in parts]

@@ -30,7 +30,7 @@ from foamfit.data.units import factor
 from foamfit.errors import InputError
 from foamfit.files import check_file, write_file
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, FITTED, SEEN, image, laid_out
+from foamfit.report.figures import BLUE, FITTED, SEEN, image
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import environment, words
 from foamfit.results import Fit, law_in_words, plain
@@ -211,8 +211,7 @@ class Card:
         for one in files:
             check_file(one)
         figure = draw(self)
-        with laid_out(figure):
-            pictures = (image(figure, "png"), image(figure, "pdf"))
+        pictures = (image(figure, "png"), image(figure, "pdf"))
         text = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
         contents = (self.text.encode(), text.encode(), *pictures)
         for done, (one, content) in enumerate(zip(files, contents, strict=True)):

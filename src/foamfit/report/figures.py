@@ -43,7 +43,6 @@ STYLE: Any = {  # matplotlib types its keys one by one
     "svg.fonttype": "none",
     "svg.hashsalt": "foamfit",  # the same figure gives the same file
 }
-NO_LAYOUT = {"figure.autolayout": False, "figure.constrained_layout.use": False}
 DPI = 250  # of a PNG
 # Width of one and two columns of the Journal of Applied Mechanics, inches.
 TWO = "two"
@@ -146,38 +145,6 @@ def legend_below(figure: Figure, entries: dict[str, Any]) -> None:
     figure.set_figheight(figure.get_figheight() + LINE * (lines - 1))
 
 
-@contextmanager
-def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
-    """Use one layout for all images of a figure that are made in the body.
-
-    By default matplotlib repeats the layout, which draws the figure once more, for every image.
-    Texts are measured at the resolution `dpi`.
-    """
-    import matplotlib
-
-    engine, own_dpi = figure.get_layout_engine(), figure.dpi
-    if engine is None:
-        yield
-        return
-    with matplotlib.rc_context(STYLE | NO_LAYOUT), _unnamed_letters():
-        figure.dpi = dpi
-        engine.execute(figure)
-        figure.dpi = own_dpi
-        figure.set_layout_engine(None)  # "none" would leave a dummy engine
-    try:
-        yield
-    finally:
-        figure.set_layout_engine(engine)
-
-
-@contextmanager
-def _unnamed_letters() -> Iterator[None]:
-    """Suppress warnings about letters, in names of tests, that the font lacks."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing")
-        yield
-
-
 def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) -> bytes:
     """Return the figure as the bytes of a file; `dpi` is that of pixels."""
     import matplotlib
@@ -185,7 +152,8 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
     buffer = io.BytesIO()
     # Without a date the same fit gives the same file.
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
-    with laid_out(figure, dpi), matplotlib.rc_context(STYLE), _unnamed_letters():
+    with matplotlib.rc_context(STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # in names of tests
         figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
     if form != "svg":
         return buffer.getvalue()
@@ -218,10 +186,9 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
 
 def write_both(figure: Figure, place: Path) -> bytes:
     """Write a figure as PNG and PDF; return it as SVG. `place` is a path without suffix."""
-    with laid_out(figure):
-        for form in ("png", "pdf"):
-            write_file(place.with_suffix(f".{form}"), image(figure, form))
-        return image(figure, "svg")
+    write_file(place.with_suffix(".png"), image(figure, "png"))
+    write_file(place.with_suffix(".pdf"), image(figure, "pdf"))
+    return image(figure, "svg")
 
 
 def save(figure: Figure, path: str | Path | None) -> Figure:

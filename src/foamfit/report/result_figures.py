@@ -73,11 +73,9 @@ def _draw(result: Fit, width: str, name: str) -> Images | None:
     if figure is None:
         return None
     wide = float(figure.get_figwidth())
-    with figures.laid_out(figure):
-        if name != "fit":
-            return Images(wide, figures.image(figure, "svg"))
-        png, pdf = figures.image(figure, "png"), figures.image(figure, "pdf")
-        return Images(wide, png=png, pdf=pdf)
+    if name != "fit":
+        return Images(wide, figures.image(figure, "svg"))
+    return Images(wide, png=figures.image(figure, "png"), pdf=figures.image(figure, "pdf"))
 
 
 def plot_profiles(result: Fit) -> Figure:

@@ -146,14 +146,6 @@ class Plan:
         """The advice: next test, what it will determine, what stays open, and remarks."""
         return sentences("plan", plan=self, advice=self.advice, own=self.own)
 
-    @property
-    def by_remedy(self) -> dict[str, list[str]]:
-        """What would determine the parameters that no test of this rig determines."""
-        out = dict[str, list[str]]()
-        for name, what in self.never.items():
-            out.setdefault(what, []).append(name)
-        return out
-
     def own(self, names: Sequence[str]) -> list[str]:
         """Return names of parameters, without the spring if there is only one."""
         return [own_name(name, self.model) for name in names]
