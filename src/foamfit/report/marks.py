@@ -18,13 +18,10 @@ if TYPE_CHECKING:
 
 # Points at which a spring changes between two branches, in either order.
 POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"}
-# Preferred offset of the name of a switching point, in typographic points.
-IN_LOOP = {"A1": (-4, 5), "C1": (-5, 3), "C2": (5, -3), "A2": (4, -7), "σ₊": (-4, 5), "σ₋": (5, -5)}
-IN_TIME = {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4), "σ₊": (5, -4), "σ₋": (5, 4)}
-# The same for branches whose name is not at the upper left.
-BESIDE = {"c": (7.0, -3.0), "e": (4.0, -7.0), "snap-back": (7.0, -6.0)}
-# Position of the name along an elastic branch, as a fraction of its length, and its offset.
-LIGHT = {"a": (0.9, (-4.0, 3.0)), "c": (0.5, (5.0, -4.0))}
+# Offsets of a name from its point, in typographic points: preferred ones first, then further away.
+SIDES = ((-5.0, 4.0), (5.0, -4.0), (5.0, 4.0), (-5.0, -4.0))
+FARTHER = (1.0, 2.5, 4.0)
+LIGHT = {"a": 0.9, "c": 0.5}  # place of the name along an elastic branch, over its length
 STOOD = "#F2DC6B"  # standstill of the gauge
 
 
@@ -101,40 +98,27 @@ class _Labels:
         self.drawn += [places, places]
 
     def write(
-        self,
-        name: str,
-        places: Sequence[Array],
-        wanted: tuple[float, float],
-        *,
-        stay: bool = False,
-        **style: Any,
+        self, name: str, places: Sequence[Array], *, below: bool = False, **style: Any
     ) -> None:
-        """Write a name near one of `places`, offset by `wanted` points or where it covers least.
-
-        Earlier places are preferred. With `stay` the name stays on the wanted side.
-        """
+        """Write a name near one of `places`, where it covers least; earlier ones are preferred."""
+        sides = (*SIDES[1:], SIDES[0]) if below else SIDES
         avoid = (np.concatenate(self.drawn) - self.corner) * self.scale
-        x, y = wanted
-        sides = [(x, y)] if stay else [(x, y), (-x, -y), (x, -y), (-x, y)]
-        candidates = []
-        for place, far, (dx, dy) in product(range(len(places)), (1.0, 2.5, 4.0), sides):
-            size = np.array([4.2 * len(name), 9.0])
-            left = dx - (size[0] if dx < 0 else 0.0)
-            low = (places[place] - self.corner) * self.scale + (left, far * dy - 0.5 * size[1])
+        size, candidates = np.array([4.2 * len(name), 9.0]), []
+        for rank, (place, far, (dx, dy)) in enumerate(product(places, FARTHER, sides)):
+            dy, left = far * dy, dx - (size[0] if dx < 0 else 0.0)
+            low = (place - self.corner) * self.scale + (left, dy - 0.5 * size[1])
             high = low + size
             names = sum(bool(np.all((low < b[2:]) & (b[:2] < high))) for b in self.taken)
             beyond = bool(np.any((low < 0.0) | (high > self.size)))
             inside = int(np.all((avoid > low) & (avoid < high), axis=1).sum())
-            cost = 1000 * names + 50 * beyond + inside + 2.0 * far + 3.0 * place
-            candidates.append((cost, places[place], (dx, far * dy), np.concatenate((low, high))))
+            cost = 1000 * names + 50 * beyond + inside + 0.5 * rank
+            candidates.append((cost, place, (dx, dy), np.concatenate((low, high))))
         _, at, offset, box = min(candidates, key=lambda one: one[0])
         self.taken.append(box)
-        side = "left" if offset[0] > 0 else "right"
-        style |= {"ha": side, "va": "center", "zorder": 6, "annotation_clip": False}
-        back = {"fc": "white", "alpha": 0.75, "lw": 0.0, "pad": 0.5}
-        self.ax.annotate(
-            name, (at[0], at[1]), offset, textcoords="offset points", bbox=back, **style
-        )
+        style |= {"ha": "left" if offset[0] > 0 else "right", "va": "center", "zorder": 6}
+        style |= {"bbox": {"fc": "white", "alpha": 0.75, "lw": 0.0, "pad": 0.5}}
+        style |= {"textcoords": "offset points", "annotation_clip": False}
+        self.ax.annotate(name, (float(at[0]), float(at[1])), offset, **style)
 
 
 def _mark_switches(labels: _Labels, panel: Panel, result: Fit) -> None:
@@ -143,11 +127,10 @@ def _mark_switches(labels: _Labels, panel: Panel, result: Fit) -> None:
     for spring, point, x, y in _points(panel, result):
         name = f"{spring} {point}" if len(result.chain.springs) > 1 else point
         at.setdefault(name, []).append((x / labels.fx, y / labels.fy))
-    wanted = IN_LOOP if panel.is_loop else IN_TIME
     for name, places in at.items():
         labels.mark(name, np.array(places))
     for name, places in at.items():
-        labels.write(name, [np.array(places[0])], wanted.get(name[-2:], (5, 5)), fontsize=7)
+        labels.write(name, [np.array(places[0])], fontsize=7)
 
 
 def _points(panel: Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
@@ -187,9 +170,8 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
         line = line[strain + moved < right]
         if len(line):  # branch c may lie beyond the strains of the test
             ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5, label=f"_branch {name}")
-            along, wanted = LIGHT[name[0]]
-            at = line[int(along * (len(line) - 1))]
-            labels.write(name, [at], wanted, color=GREY, fontsize=7)
+            at = line[int(LIGHT[name[0]] * (len(line) - 1))]
+            labels.write(name, [at], color=GREY, fontsize=7)
     if spring.relaxation and "s1" in result.snapping and result.strain is not None:
         style: Any = {"color": "0.35", "lw": 0.7, "ls": (0, (4, 2)), "zorder": 3.5}
         equilibrium = (result.snapping["s1"].stress + zero) / labels.fy
@@ -206,9 +188,8 @@ def _name_branches(labels: _Labels, panel: Panel, result: Fit) -> None:
         middle = x[evenly(x, y, 3)[1]]
         inner = np.column_stack((x, y))[evenly(x, y, 9)]
         around = sorted(inner, key=lambda at: float(abs(at[0] - middle)))
-        style: Any = {"fontsize": 7.5 if len(branch) == 1 else 7.0, "label": "_on branch"}
-        wanted = BESIDE.get(branch, (-6.0, 5.0))
-        labels.write(branch, around, wanted, stay=True, color=BLUE, **style)
+        style: Any = {"below": x[-1] < x[0], "color": BLUE, "fontsize": 7.0}
+        labels.write(branch, around[:3], label="_on branch", **style)
 
 
 def _longest_visits(result: Fit, fitted: Line) -> dict[str, slice]:
