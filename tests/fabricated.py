@@ -232,8 +232,6 @@ def microscale_result(**changed: Any) -> FitResult:
 
 def no_figures() -> dict[str, Images | None]:
     """Return placeholders for the figures of a report, whose drawing takes most of the time."""
-    few = b"\x89PNG" + bytes(20)
-    there = {"fit": Images(few, 250, b"%PDF")} | dict.fromkeys(
-        ("shown", "narrow"), Images(few, 250)
-    )
+    there = {"fit": Images(7.0, png=b"\x89PNG", pdf=b"%PDF")}
+    there |= dict.fromkeys(("shown", "narrow"), Images(7.0, b"<svg/>"))
     return there | dict.fromkeys(("snapping", "profiles"))

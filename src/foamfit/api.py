@@ -90,9 +90,8 @@ class FitResult(Shown, Fit):
         """Write the result folder and return its path; an older folder is replaced at the end.
 
         Without `report`, neither report.html nor figures are written. `figure_width` is "one" or
-        "two" columns, or a length ("85 mm"). Add ", pdf" to write every figure of the report as
-        PDF as well, and ", untitled" to omit the titles. `mapped` draws the figures; give the `map`
-        of an executor to draw them in parallel.
+        "two" columns, or a length ("85 mm"); ", untitled" after it omits the titles. `mapped` draws
+        the figures; give the `map` of an executor to draw them in parallel.
         """
         inches(figure_width)  # rejects an invalid width
         drawn: Any = {"pages": report, "width": figure_width, "mapped": mapped}

@@ -15,7 +15,7 @@ from foamfit.data.describe import describe
 from foamfit.data.energy import audit
 from foamfit.report.readable import readable
 from foamfit.report.studies.batch import row_of
-from foamfit.report.summary import conclusions, render_report, summary_text
+from foamfit.report.summary import render_report, summary_text
 from foamfit.report.tables import names_of
 from foamfit.results import ParameterEstimate
 
@@ -47,23 +47,6 @@ def test_a_nuisance_parameter_reads_well(name: str) -> None:
     assert (shown.label, shown.unit) == (label, unit)
     assert shown.stderr
     assert "e" not in shown.with_error
-
-
-def test_they_stand_behind_the_springs_by_their_names() -> None:
-    lines = summary_text(with_nuisance()).splitlines()
-    at = {label: i for i, line in enumerate(lines) for *_, label, _ in NUISANCE.values()
-          if line.startswith(f"{label}  ")}  # fmt: skip
-    assert set(at) == {label for *_, label, _ in NUISANCE.values()}
-    last = max(i for i, line in enumerate(lines) if line.startswith("s1_"))
-    assert min(at.values()) > last
-    page = render_report(with_nuisance(), fabricated.no_figures())
-    for name, (*_, label, _) in NUISANCE.items():
-        assert f"<code>{name}</code>" in page
-        assert label in page
-
-
-def test_conclusions_are_about_the_springs_alone() -> None:
-    assert conclusions(with_nuisance()) == conclusions(fabricated.result())
 
 
 def test_in_a_batch_they_are_the_last_columns() -> None:

@@ -12,15 +12,13 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
 import foamfit.report
 from drawn import figures
-from foamfit.report.plots import DASHES, MARKS
-from foamfit.report.studies import cycles, joint, parameters, prediction
+from foamfit.report.figures import BLUE, FITTED, SEEN
 
 EYES = {
     "normal": np.eye(3),
@@ -66,16 +64,6 @@ def is_told(one: Any, other: Any) -> dict[str, float]:
     }  # fmt: skip
 
 
-def test_the_simulation_is_that_of_the_textbooks() -> None:
-    """Red and green are far apart, but much closer without the long or the medium cones."""
-    assert lab("white", "normal") == pytest.approx([100.0, 0.0, 0.0], abs=0.05)
-    assert apart("#ff0000", "#00ff00", "normal") == pytest.approx(170.6, abs=0.5)
-    assert lab("#ff0000", "grey")[1:] == pytest.approx([0.0, 0.0], abs=0.05)
-    for eye in ("protanopia", "deuteranopia"):
-        assert apart("#909000", "#c06000", eye) < 0.6 * apart("#909000", "#c06000", "normal")
-    assert apart("#0080ff", "#00a0a0", "tritanopia") < 0.6 * apart("#0080ff", "#00a0a0", "normal")
-
-
 def cue(line: Any) -> tuple[Any, ...]:
     """Return the features of a line other than colour: marker, dashes and width."""
     width = line.get_linewidth()
@@ -106,29 +94,15 @@ def test_series_of_a_panel_are_told_apart_by_colour_or_shape() -> None:
     assert compared >= 3
 
 
-def test_parts_of_a_band_have_dashes_of_their_own() -> None:
-    dashes = [str(dash) for _, dash in prediction.COLOURS.values()]
-    assert len(set(dashes)) == len(dashes)
-    assert len({str(dash) for dash in DASHES}) == len(set(MARKS)) == 4
-
-
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (prediction.MEASURED, prediction.VERMILION),
-        (joint.MEASURED, joint.BLUE),
-        (parameters.BLUE, "white"),  # hollow marks
+        (SEEN["color"], FITTED["color"]),
+        (BLUE, "white"),  # hollow marks
     ],
 )
 def test_measured_and_simulated_are_told_apart(one: str, other: str) -> None:
     assert not is_told(one, other)
-
-
-def test_cycles_run_from_light_to_dark_for_all_eyes() -> None:
-    colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, cycles.MOST_LOOPS))
-    for eye in EYES:
-        lightness = [lab(colour[:3], eye)[0] for colour in colours]
-        assert np.all(np.diff(lightness) < -2.0), eye
 
 
 TEMPLATES = Path(foamfit.report.__file__).parent / "templates"

@@ -2,10 +2,10 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import foamfit as ff
@@ -14,7 +14,7 @@ from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import Together
-from foamfit.report.figures import STYLE, image, laid_out
+from foamfit.report.figures import image
 from foamfit.report.studies.joint import joint_page, joint_text, plot_compared, plot_joint
 from foamfit.study.joint_fit import Alternative, fit_jointly
 from foamfit.study.joint_result import JointResult, common_covariance, parameters_of
@@ -71,8 +71,15 @@ def found(tmp_path_factory) -> JointResult:
     )  # fmt: skip
 
 
-def test_the_page_needs_nothing_else_and_escapes_names(found):
-    page = joint_page(found, *2 * [b"\x89PNG"])
+@pytest.fixture(scope="module")
+def page(found, tmp_path_factory) -> str:
+    folder = tmp_path_factory.mktemp("joint")
+    (folder / "<i>third</i>").mkdir(parents=True)
+    (folder / "<i>third</i>" / "report.html").write_text("")
+    return joint_page(found, folder, b"<svg/>", b"<svg/>")
+
+
+def test_the_page_needs_nothing_else_and_escapes_names(page):
     assert not re.search(r'(src|href)="(?!data:|[^"]*report\.html)', page)
     assert "<i>third</i>" not in page
     assert "a &amp; b" in page
@@ -80,46 +87,39 @@ def test_the_page_needs_nothing_else_and_escapes_names(found):
     assert 'href="%3Ci%3Ethird%3C/i%3E/report.html"' in page
 
 
-def test_the_page_has_every_parameter_and_test(found):
-    page = joint_page(found, *2 * [b"\x89PNG"])
+def test_the_page_has_every_parameter_and_test(found, page):
     for name, one in found.parameters.items():
         assert (f"<code>{name}</code>" in page) == (one.kind != "fixed")
     body = page.split('<table class="sortable">')[1]
     assert body.count("<tr>") == 1 + 3
     # values of individual tests have the unit in the heading
     value = found.parameters["s1_kc"].tests["first"].value
-    assert f'data-v="{value:.8g}">{value / 1e3:.1f}<' in body
-    assert "scatters by" in page
+    assert re.search(rf'data-v="{value / 1e3:.0f}(\.\d)?">', body)
     assert re.search(r"b = 0\.0\d+ \(0\.0\d+ to 0\.0\d+\)", page)
     assert page.count("<td>log rate</td>") == 2  # in the parameter and evidence tables
 
 
-def test_the_page_tells_the_noise_of_each_test_beside_its_share_of_chi2(found):
-    page = joint_page(found, *2 * [b"\x89PNG"])
+def test_the_page_tells_the_noise_of_each_test_beside_its_share_of_chi2(found, page):
     body = page.split('<table class="sortable">')[1]
     heads = re.findall(r"<th><button>(.*?)</button>", body)
     at = heads.index("noise loop (Pa)")
     assert heads[at - 1] == "share of χ² (%)"
     row = re.findall(r"<td[^>]*>(.*?)</td>", body.split("<tr>")[2])
-    assert row[at] == '400.0<i class="ends">stated</i>'
+    assert row[at] == "400.0<i>stated</i>"
     # an estimated noise level is increased to account for correlation
     level = {"sigma": 250.0, "given": False, "time": 2.5, "scale": 1e3, "range": 1e5}
     one, *others = found.noise
     vars(found)["noise"] = ({"stress_strain": level}, *others)
-    told = joint_page(found, *2 * [b"\x89PNG"])
+    told = joint_page(found, Path(), b"<svg/>", b"<svg/>")
     vars(found)["noise"] = (one, *others)
-    assert "250.0<i" in told
-    assert "estimated, correlated over 2.5 samples, counted as 1000" in told
+    assert "250.0<i>estimated, correlated over 2.5 samples, counted as 1000<" in told
 
 
-def test_ranges_are_told_where_there_are_some(found):
-    assert "<th>range</th>" not in joint_page(found, *2 * [b"\x89PNG"])
+def test_ranges_are_told_where_there_are_some(found, page):
+    assert "<th>range</th>" not in page
     k0 = replace(found.parameters["s1_k0"], range=(5.2e5, 5.8e5))
     ranged = replace(found, parameters={**found.parameters, "s1_k0": k0})
-    page = joint_page(ranged, *2 * [b"\x89PNG"])
-    assert "<th>range</th>" in page
-    assert ">520 to 580 kPa<" in page
-    assert "where the value would lie (95 %)" in page
+    assert ">520 to 580 kPa<" in joint_page(ranged, Path(), b"<svg/>", b"<svg/>")
     assert "520.0 to 580.0 kPa" in joint_text(ranged)
 
 
@@ -178,32 +178,3 @@ def test_twins_whose_rates_differ_a_little_stand_in_their_order(found):
     assert [ax.get_title() for ax in top.axes] == list(names)
     labels = plot_compared(twins).axes[0].get_yticklabels()
     assert [label.get_text() for label in labels] == list(names)
-
-
-def test_rates_within_a_decade_have_labels_that_do_not_overlap(found):
-    figure = plot_joint(replace(found, rates=(0.1, 0.15, 0.4)))
-    panel = figure.subfigs[1].axes[0]
-    shown = [label.get_text() for label in panel.get_xticklabels()]
-    assert shown == ["0.1", "0.2", "0.4"]
-    assert not len(panel.get_xticks(minor=True))
-
-
-def test_the_words_have_the_same_numbers(found):
-    told = joint_text(found)
-    assert "a & b: microscale: 3 tests together: warnings" in told
-    assert "warning: x.csv is left out" in told
-    assert re.search(r"s1_sigma_plus +log rate +1\d\d\.\d kPa", told)
-    assert "*  log rate" in told
-
-
-def test_in_one_column_nothing_is_wider(found) -> None:
-    narrow, wide = plot_joint(found, width="one"), plot_joint(found)
-    assert (narrow.get_figwidth(), wide.get_figwidth()) == (3.25, 7.0)
-    for figure in (narrow, wide):
-        with laid_out(figure, 100), rc_context(STYLE):
-            figure.dpi = 100
-            for ax in (one for one in figure.axes if one.axison or one.texts):
-                box = ax.get_tightbbox()
-                assert box.x0 > -1.5
-                assert box.x1 < figure.bbox.x1 + 1.5
-    assert [ax.get_title() for ax in narrow.axes][-1] == [ax.get_title() for ax in wide.axes][-1]

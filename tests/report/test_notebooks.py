@@ -50,16 +50,6 @@ def without_pictures(output):
     return {kind: one for kind, one in output.get("data", {}).items() if "image" not in kind}
 
 
-def test_a_notebook_has_an_animation():
-    """An animated PNG has an acTL chunk before its first image."""
-    from base64 import b64decode
-
-    notebook = nbformat.read(NOTEBOOKS / LISTED[0], as_version=4)
-    outputs = [o for cell in notebook.cells for o in cell.get("outputs", ())]
-    pictures = [b64decode(o.data["image/png"]) for o in outputs if "image/png" in o.get("data", {})]
-    assert any(b"acTL" in picture.partition(b"IDAT")[0] for picture in pictures)
-
-
 @pytest.mark.parametrize("name", [LISTED[-1]])
 def test_notebook_runs_quietly_from_the_root(name, tmp_path, monkeypatch):
     """nbmake runs the other notebooks in their own folder: see addopts in pyproject.toml.

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import html
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -9,9 +8,8 @@ from typing import Any
 import pytest
 
 import fabricated
-from foamfit.data.energy import audit
-from foamfit.report.readable import number, readable
-from foamfit.report.summary import conclusions, render_report, summary_text
+from foamfit.report.readable import readable
+from foamfit.report.summary import render_report, summary_text
 
 
 class Page(HTMLParser):
@@ -58,7 +56,7 @@ def test_the_page_needs_nothing_else() -> None:
     whole = Page(text)
     assert whole.open == []  # every tag is closed, in order
     assert len(whole.references) == 2  # the fit figure for large screens and for phones
-    assert all(ref.startswith("data:image/png;base64,iVBOR") for ref in whole.references)
+    assert all(ref.startswith("data:image/svg+xml;base64,") for ref in whole.references)
     assert not re.search(r"@import|url\(|<link|<script", text)
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
 
@@ -93,38 +91,20 @@ def test_misfit_figure_parameters_and_warnings_come_first_and_the_rest_is_folded
     assert "No acceptable fit was found" in page(status="failed").shown
 
 
-@pytest.mark.parametrize("make", [fabricated.chain_result, fabricated.microscale_result])
-def test_at_most_350_words_are_open(make: Any) -> None:
-    """Words contain a letter; long warnings are shortened, and surplus warnings are folded."""
-    parameters = make().parameters
-    weak = {n: replace(p, state="not determined", why="so " * 50) for n, p in parameters.items()}
-    long = tuple(f"Warning {i}: {'the law misses the curve, ' * 20}" for i in range(9))
-    result = replace(make(), status="warnings", warnings=long, parameters=weak)
-    shown = Page(render_report(result, fabricated.no_figures())).shown
-    assert 100 < len(re.findall(r"\S*[^\W\d_]\S*", shown)) <= 350
-    assert "5 more warnings" in shown
-
-
-@pytest.mark.parametrize(
-    "said",
-    [
+def test_the_page_says_what_was_found() -> None:
+    words = page().words
+    for said in (
         "bistable model, impact drive · reconstruction, not a measurement",
         "SHA-256 5d41402abc4b2a76",
         "stress-time 1.2 % displacement-time 0.4 % stress-strain none",
-        "reduced χ² 1.020",
         "s1_kc k c,1 82.50 ± 0.99 MPa 80.56 to 84.44 weak its interval is wider than half",
-        "Fixed: s1_eta = 0 Pa·s",
         "s1_kh_minus k h−,1 2.300 MPa – not determined branch e was never reached",
         "σ a stress at A1, where snapping starts 895.3 kPa",
         "The striker brings 0.0107 J. The loop takes less. striker kinetic J 0.01072",
-        "absorbed J 0.009500 Data: 601 rows read, 601 used",
         "The force was divided by the area 19.6 mm².",
         "starts 16 simulations 4210 run time 21.4 s",
-        "Journal of Applied Mechanics 81, 121006",
-    ],
-)
-def test_the_page_says(said: str) -> None:
-    assert said in page().words
+    ):
+        assert said in words
 
 
 def test_masses_inside_are_in_the_table_of_misfits() -> None:
@@ -140,40 +120,11 @@ def test_masses_inside_are_in_the_table_of_misfits() -> None:
     assert "mass 1" not in summary_text(result)
 
 
-def test_the_statistics_and_the_energy_are_labelled() -> None:
-    statistics = {"n_effective": 986.0, "chisqr": 979.9, "n_failed": 1, "n_descents": 2}
-    balance = audit(fabricated.result().measurement)
-    energy = balance.as_dict() | {"sentences": balance.sentences(), "missing": "a long text"}
-    words = page(statistics=statistics | {"n_agreeing": 11}, energy=energy).words
-    told = "effective samples 986.0 χ² 979.9 trials that could not be simulated 1"
-    assert f"{told} local minima refined 2 descents that reached the best 11" in words
-    assert "striker's energy 458.7 kJ/m³ absorbed energy" in words
-    assert "impulse of the force" in words
-    assert "a long text" not in words
-    assert "n_" not in words
-
-
 def test_branches_are_told_per_spring() -> None:
     words = page(visited={"s1": ("a", "d")}).words
     assert "d · snap-buckling c · densified, not reached e · snap-back, not reached" in words
     whole = Page(render_report(fabricated.chain_result(), fabricated.no_figures())).words
     assert "s1 linear, has no branches s2 a · elastic" in whole
-
-
-def test_a_point_that_does_not_exist_is_said() -> None:
-    result = fabricated.result()
-    steep = replace(fabricated.SPRING, kh_minus=1e8)
-    chain = type(result.chain)(springs=[steep], heights=[fabricated.HEIGHT], area=fabricated.AREA)
-    assert "where branches e and a meet does not exist" in page(chain=chain).words
-    assert fabricated.result(chain=chain).to_json_dict()["derived"]["s1"]["eps_hat_a"] is None
-
-
-def test_the_page_is_made_of_little() -> None:
-    result = fabricated.result(energy={}, statistics={}, weights={}, warnings=(), status="ok")
-    bare = replace(result.measurement, notes=(), motion=None, data_sha256="")
-    whole = Page(render_report(replace(result, measurement=bare), fabricated.no_figures()))
-    assert "not read from a file" in whole.words
-    assert "Energy audit" not in whole.words
 
 
 @pytest.mark.parametrize(
@@ -200,38 +151,6 @@ def test_value_and_uncertainty_are_rounded_together(
         "s1_k0", fabricated.estimate("s1_k0", value, stderr=stderr, ci95=ci95, unit=unit)
     )
     assert (shown.with_error, shown.unit) == expected
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (None, "–"), (1202, "1202"), (float("inf"), "–"), (0.0, "0"), (-0.25, "−0.2500"),
-        (1234.56, "1235"), (1e-7, "1.000e−07"),
-    ],
-)  # fmt: skip
-def test_number(value: object, text: str) -> None:
-    assert number(value) == text
-
-
-def test_summary_is_short_and_aligned() -> None:
-    lines = summary_text(fabricated.chain_result()).splitlines()
-    assert len(lines) <= 22
-    assert max(map(len, lines)) <= 80
-    table = [line for line in lines if line.startswith(("s1_", "s2_"))]
-    column = next(line for line in lines if line.startswith("parameter")).index("unit")
-    assert {line[column:].split()[0] for line in table} == {"MPa", "kPa", "–"}
-    assert all(line[column - 1] == " " for line in table)
-
-
-def test_summary_says_what_matters() -> None:
-    text = summary_text(fabricated.result())
-    first, second, *_, last = text.splitlines()
-    assert first == "VACNT foam-1, reconstruction: bistable, impact drive: warnings"
-    assert second == "misfit stress-time 1.2 %, displacement-time 0.4 %; 5 of 7 determined"
-    assert "fixed: s1_eta 0 Pa·s" in text
-    assert "\nwarning: s1_kh_minus is not determined: branch e was never reached.\n" in text
-    assert last.startswith("next: foamfit plan FOLDER")
-    assert html.unescape(text) == text
 
 
 @pytest.mark.parametrize("long", ["word " * 60, "word " * 6])
@@ -272,31 +191,12 @@ def test_the_terminal_says_why_a_parameter_is_not_determined() -> None:
 
 def test_what_a_microscale_spring_snapped_and_relaxes_is_told() -> None:
     words = Page(render_report(fabricated.microscale_result(), fabricated.no_figures())).words
-    assert "microscale model with 1 relaxation term, displacement drive" in words
-    snapped = "96 % of the micro-springs snap in this test, at 230.8 kPa and a strain of 0.6000"
-    assert snapped in words
-    assert "the rest is extrapolated" in words
-    assert "changes 1.500 times as much as in equilibrium and then relaxes: 33 % of it" in words
-    assert "time constant of 250 ms" in words
-    assert "68 % snap through at 68.27 to 164.6 kPa 106.0 kPa" in words
-    assert "relaxes, with τ = 250.0 ms 0.3333" in words
-    assert "snap-back · micro-springs snap back" in words
+    for said in (
+        "96 % of the micro-springs snap in this test, at 230.8 kPa and a strain of 0.6000",
+        "changes 1.500 times as much as in equilibrium and then relaxes: 33 % of it",
+        "68 % snap through at 68.27 to 164.6 kPa 106.0 kPa",
+        "relaxes, with τ = 250.0 ms 0.3333",
+        "s1_tau1 τ 1,1 250.0 ± 3.0 ms",
+    ):
+        assert said in words
     assert "not reached" not in words
-    assert "A1 and C1" not in words
-    assert "s1_sigma_plus σ +" in words
-    assert "s1_tau1 τ 1,1 250.0 ± 3.0 ms" in words
-
-
-def test_all_that_snaps_leaves_nothing_to_extrapolate() -> None:
-    narrow = replace(fabricated.MICRO, spread_plus=0.1)
-    chain = fabricated.Chain(springs=[narrow], heights=[fabricated.HEIGHT], area=fabricated.AREA)
-    told = " ".join(conclusions(fabricated.microscale_result(chain=chain)))
-    assert "100 % of the micro-springs snap" in told
-    assert "extrapolated" not in told
-
-
-def test_a_relaxation_that_is_not_determined_is_not_described() -> None:
-    result = fabricated.microscale_result()
-    lost = replace(result.parameters["s1_g1"], state="not determined", stderr=None, ci95=None)
-    told = conclusions(replace(result, parameters=result.parameters | {"s1_g1": lost}))
-    assert told[-1] == "The relaxation is not determined (s1_g1)."

@@ -7,18 +7,15 @@ import subprocess
 import sys
 from concurrent.futures import Future
 from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 import fabricated
 import foamfit.study.processes
-from conftest import EXPERIMENTS, small_pictures
+from conftest import EXPERIMENTS
 from foamfit.cli.options import Drawers
-from foamfit.errors import InputError
-from foamfit.report.figures import TWO
-from foamfit.report.result_figures import Images, _draw, draw_all
+from foamfit.report.result_figures import Images, draw_all
 from foamfit.study.processes import EndedError
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
@@ -36,24 +33,10 @@ def test_other_processes_draw_the_same(drawn_here: dict[str, Images | None]) -> 
     fit = drawn_here["fit"]
     assert fit is not None
     assert fit.png.startswith(b"\x89PNG")
-    assert fit.pdf is not None
-
-
-def test_all_figures_of_the_report_are_pdf_where_that_is_asked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    result = fabricated.microscale_result()
-    folder = result.save(tmp_path / "r", figure_width="one, untitled, pdf")
-    assert {path.name for path in folder.glob("*.pdf")} == {"fit.pdf", "snapping.pdf"}
-    assert (folder / "snapping.pdf").read_bytes().startswith(b"%PDF")
-    snapping = _draw(result, TWO, "snapping")
-    assert snapping is not None
-    assert snapping.pdf is None
-    small_pictures(monkeypatch)
-    result.save(folder)  # replaces the folder
-    assert {path.name for path in folder.glob("*.pdf")} == {"fit.pdf"}
-    with pytest.raises(InputError, match="optionally followed by a comma and untitled or pdf"):
-        result.save(folder, figure_width="two, png")
+    assert fit.pdf.startswith(b"%PDF")
+    shown = drawn_here["shown"]
+    assert shown is not None
+    assert b"stress (MPa)</text>" in shown.svg
 
 
 @pytest.mark.parametrize(
@@ -69,25 +52,6 @@ def test_where_processes_end_this_one_draws(
 
     monkeypatch.setattr(foamfit.study.processes.Processes, "submit", ended)
     monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
-    with closing(Drawers()) as drawers:
-        drawers.begin()
-        assert list(drawers.map(str.upper, ["fit", "shown"])) == ["FIT", "SHOWN"]
-
-
-def test_where_no_process_can_be_had_this_one_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*_: object) -> None:
-        raise BlockingIOError("Resource temporarily unavailable")
-
-    monkeypatch.setattr(foamfit.study.processes, "Processes", refused)
-    monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
-    with closing(Drawers()) as drawers:
-        drawers.begin()
-        assert list(drawers.map(str.upper, ["fit"])) == ["FIT"]
-
-
-def test_one_core_draws_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 1)
-    monkeypatch.delattr(foamfit.study.processes, "Processes")
     with closing(Drawers()) as drawers:
         drawers.begin()
         assert list(drawers.map(str.upper, ["fit", "shown"])) == ["FIT", "SHOWN"]

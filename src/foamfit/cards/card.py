@@ -30,7 +30,7 @@ from foamfit.data.units import factor
 from foamfit.errors import InputError
 from foamfit.files import check_file, write_file
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, VERMILION, image, laid_out
+from foamfit.report.figures import BLUE, FITTED, SEEN, image
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import environment, words
 from foamfit.results import Fit, law_in_words, plain
@@ -42,12 +42,8 @@ from foamfit.text import percent, significant
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-STYLES: dict[str, Any] = {
-    "measured": {"color": "0.65", "linewidth": 1.8},
-    "fitted": {"color": BLUE, "linewidth": 0.9},
-    "card": {"color": VERMILION, "linewidth": 1.0, "linestyle": (0, (5, 1.2))},
-}
-WIDTH, HEIGHT = 2.7, 2.9  # of a panel, inches
+CARD: Any = {"color": BLUE, "linewidth": 1.0, "linestyle": (0, (5, 1.2)), "label": "card"}
+WIDTH, HEIGHT = 2.7, 2.6  # of a panel, inches
 MOST = 3  # records drawn: the slowest, the middle and the fastest
 
 
@@ -215,8 +211,7 @@ class Card:
         for one in files:
             check_file(one)
         figure = draw(self)
-        with laid_out(figure):
-            pictures = (image(figure, "png"), image(figure, "pdf"))
+        pictures = (image(figure, "png"), image(figure, "pdf"))
         text = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
         contents = (self.text.encode(), text.encode(), *pictures)
         for done, (one, content) in enumerate(zip(files, contents, strict=True)):
@@ -237,27 +232,24 @@ def draw(card: Card) -> Figure:
         shown = [shown[0], shown[len(shown) // 2], shown[-1]]
     width = WIDTH * (len(shown) + 1)
     about = f"{card.name} as {card.format}", f"misfit: {', '.join(misfits)}"
-    title = figures.title_lines(width, *about)
     factor, unit = readable_unit(max(float(one.stress.max()) for one in shown), "Pa")
-    with figures.drawing(width, HEIGHT, title) as figure:
+    with figures.drawing(width, HEIGHT, *about) as figure:
         axes = figure.subplots(1, len(shown) + 1)
         for ax, one in zip(axes, shown, strict=False):
-            loops = ((one.strain, one.stress), (one.motion, one.fitted), (one.motion, one.card))
-            drawn = {
-                name: ax.plot(strain, stress / factor, **style)[0]
-                for (name, style), (strain, stress) in zip(STYLES.items(), loops, strict=True)
-            }
+            ax.plot(one.strain, one.stress / factor, **SEEN)
+            ax.plot(one.motion, one.fitted / factor, **FITTED)
+            ax.plot(one.motion, one.card / factor, **CARD)
             rate = "rate not known" if one.rate is None else f"{significant(one.rate, 3)} 1/s"
             ax.set(title=rate, xlabel="strain", ylabel=f"stress ({unit})")
         ax, inside = axes[-1], curves.measured
         factor, unit = readable_unit(float(curves.stress.max()), "Pa")
         shades = np.linspace(1.0, 0.4, len(curves.rates))[::-1]
         for shade, stress in zip(shades, curves.stress / factor, strict=True):
-            style: Any = {"color": VERMILION, "alpha": float(shade), "linewidth": 1.0}
+            style: Any = {"color": BLUE, "alpha": float(shade), "linewidth": 1.0}
             ax.plot(curves.strain[:inside], stress[:inside], **style)
             ax.plot(curves.strain[inside - 1 :], stress[inside - 1 :], linestyle=":", **style)
         ax.set(title="loading; dotted: extrapolated", xlabel="strain", ylabel=f"stress ({unit})")
-        figures.legend_below(figure, drawn)
+        figures.legend_below(figure, figures.named_in(axes))
     return figure
 
 

@@ -94,7 +94,7 @@ PLOT = option("--plot", "Also draw a PNG, PDF or SVG.", FILE)
 WIDTH = option(
     "--figure-width",
     'Width of figures: one column (3.25 in), two (7 in), or a length like "85 mm". "two, untitled" '
-    'omits titles; "two, pdf" also writes every figure of the report as PDF.',
+    "omits titles.",
     default="two",
     metavar="one|two|LENGTH",
     callback=_width,

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # palette of Okabe and Ito
 INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # interior masses, from the base up
-MEASURED = "0.65"  # wide measured curves; simulated curves are darker, even in greyscale
+# Measured and simulated curves of all small figures; also in greyscale one is darker.
+SEEN: Any = {"color": "0.65", "linewidth": 1.5, "label": "measured"}
+FITTED: Any = {"color": VERMILION, "linewidth": 0.9, "label": "fitted"}
 STYLE: Any = {  # matplotlib types its keys one by one
     "font.family": "DejaVu Sans",  # one upright font: each further font costs 0.1 s per PDF
     "font.size": 7.5,
@@ -39,58 +41,43 @@ STYLE: Any = {  # matplotlib types its keys one by one
     # Keep text editable and searchable: TrueType in a PDF, text elements in an SVG.
     "pdf.fonttype": 42,
     "svg.fonttype": "none",
+    "svg.hashsalt": "foamfit",  # the same figure gives the same file
 }
-NO_LAYOUT = {"figure.autolayout": False, "figure.constrained_layout.use": False}
 DPI = 250  # of a PNG
 # Width of one and two columns of the Journal of Applied Mechanics, inches.
 TWO = "two"
 COLUMNS = {"one": 3.25, TWO: 7.0}
 NARROWEST, WIDEST = 2.5, 20.0
-# Options after a width and a comma: no title; all figures also as PDF.
-UNTITLED, PDF = "untitled", "pdf"
+UNTITLED = "untitled"  # option after a width and a comma
+LINE = 11.0 / 72.0  # height of a line of a title or a legend, inches
 
 
 def inches(width: str) -> float:
     """Return the width of a figure from "one" or "two" columns or a length such as "85 mm"."""
     from foamfit.data.units import parse_quantity
 
-    length, *words = _parts(width)
+    length, _, option = (part.strip().lower() for part in width.partition(","))
     wide = COLUMNS.get(length)
     if wide is None:
         metres = parse_quantity(length, "m", "the width of figures", "85 mm")
         wide = round(metres / 0.0254, 6)
-    if not NARROWEST <= wide <= WIDEST or {*words} - {UNTITLED, PDF}:
+    if not NARROWEST <= wide <= WIDEST or option not in ("", UNTITLED):
         low, high = (f"{25.4 * end:.0f}" for end in (NARROWEST, WIDEST))
         raise InputError(
             f"the width of figures = {width!r} is not admissible; it must be one, two (columns) or "
-            f"a length from {low} to {high} mm, optionally followed by a comma and untitled or pdf"
+            f"a length from {low} to {high} mm, optionally followed by a comma and untitled"
         )
     return wide
 
 
-def _parts(width: str) -> list[str]:
-    """Split "two, untitled" into the width and its options."""
-    return [part.strip().lower() for part in width.split(",")]
-
-
-def is_titled(width: str) -> bool:
-    """Return whether a figure of this width has a title, that is, no option "untitled"."""
-    return UNTITLED not in _parts(width)
-
-
-def all_as_pdf(width: str) -> bool:
-    """Return whether all figures of a report are also written as PDF (option "pdf")."""
-    return PDF in _parts(width)
+def title(width: str, *parts: str) -> tuple[str, ...]:
+    """Return the parts of a title, or none if the width has the option "untitled"."""
+    return () if width.strip().lower().endswith(UNTITLED) else parts
 
 
 def abreast(width: float, panels: int, least: float = 2.1) -> int:
     """Return the number of panels of at least `least` inches that fit side by side."""
     return max(1, min(panels, int(width / least)))
-
-
-def title_lines(wide: float, *parts: str, titled: bool = True) -> list[str]:
-    """Break the parts of a title into lines for a figure of `wide` inches; none if not `titled`."""
-    return [line for part in parts if titled for line in wrapped(part, 0, int(16 * wide))]
 
 
 def tail(name: str, most: int) -> str:
@@ -109,16 +96,17 @@ def grid_of(
 
 
 @contextmanager
-def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[Figure]:
-    """Yield an empty figure of a size in inches, within the common style; `title` is its lines."""
+def drawing(width: float, height: float, *title: str) -> Iterator[Figure]:
+    """Yield an empty figure in the common style; the title adds to its height (inches)."""
     import matplotlib
     from matplotlib.figure import Figure
 
+    lines = [line for part in title for line in wrapped(part, 0, int(16 * width))]
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        if title:  # a dollar sign in a name does not start a formula
+        figure = Figure(figsize=(width, height + LINE * len(lines)), layout="constrained")
+        if lines:  # a dollar sign in a name does not start a formula
             style: Any = {"fontsize": 8, "parse_math": False}
-            figure.suptitle("\n".join(title), x=0.01, ha="left", **style)
+            figure.suptitle("\n".join(lines), x=0.01, ha="left", **style)
         yield figure
 
 
@@ -141,65 +129,36 @@ def named_in(axes: Iterable[Axes]) -> dict[str, Any]:
     return {name: artist for pairs in each for name, artist in pairs}
 
 
-def legend_below(figure: Figure, entries: dict[str, Any]) -> int:
-    """Draw a legend below all panels; return its number of lines."""
+def legend_below(figure: Figure, entries: dict[str, Any]) -> None:
+    """Draw a legend below all panels; every line but the first adds to the figure's height."""
     if not entries:
-        return 0
-    handles, names = list(entries.values()), list(entries)
+        return
     # In points: 4.2 per letter, 33 for a handle with its margins.
-    sizes, room = [4.2 * len(name) + 33.0 for name in names], 72.0 * figure.get_figwidth()
-    for columns in range(len(names), 0, -1):
-        lines = -(-len(names) // columns)
-        widths = [max(sizes[i : i + lines]) for i in range(0, len(names), lines)]
+    sizes, room = [4.2 * len(name) + 33.0 for name in entries], 72.0 * figure.get_figwidth()
+    for columns in range(len(sizes), 0, -1):
+        lines = -(-len(sizes) // columns)
+        widths = [max(sizes[i : i + lines]) for i in range(0, len(sizes), lines)]
         if sum(widths) <= room:
             break
-    escaped = [name.replace("$", r"\$") for name in names]
-    figure.legend(handles, escaped, loc="outside lower center", ncols=len(widths))
-    return lines
-
-
-@contextmanager
-def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
-    """Use one layout for all images of a figure that are made in the body.
-
-    By default matplotlib repeats the layout, which draws the figure once more, for every image.
-    Texts are measured at the resolution `dpi`.
-    """
-    import matplotlib
-
-    engine, own_dpi = figure.get_layout_engine(), figure.dpi
-    if engine is None:
-        yield
-        return
-    with matplotlib.rc_context(STYLE | NO_LAYOUT), _unnamed_letters():
-        figure.dpi = dpi
-        engine.execute(figure)
-        figure.dpi = own_dpi
-        figure.set_layout_engine(None)  # "none" would leave a dummy engine
-    try:
-        yield
-    finally:
-        figure.set_layout_engine(engine)
-
-
-@contextmanager
-def _unnamed_letters() -> Iterator[None]:
-    """Suppress warnings about letters, in names of tests, that the font lacks."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing")
-        yield
+    names = [name.replace("$", r"\$") for name in entries]
+    figure.legend(entries.values(), names, loc="outside lower center", ncols=len(widths))
+    figure.set_figheight(figure.get_figheight() + LINE * (lines - 1))
 
 
 def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) -> bytes:
-    """Return the figure as the bytes of a file; `dpi` is that of a PNG."""
+    """Return the figure as the bytes of a file; `dpi` is that of pixels."""
     import matplotlib
 
     buffer = io.BytesIO()
-    # No date, so that the same fit gives the same file.
+    # Without a date the same fit gives the same file.
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
-    with laid_out(figure, dpi), matplotlib.rc_context(STYLE), _unnamed_letters():
+    with matplotlib.rc_context(STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # in names of tests
         figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
-    return buffer.getvalue()
+    if form != "svg":
+        return buffer.getvalue()
+    # Verdana has nearly the same widths, where a browser lacks the font.
+    return buffer.getvalue().replace(b"'DejaVu Sans'", b"'DejaVu Sans', Verdana, sans-serif")
 
 
 def limits(values: Sequence[float], ends: Sequence[float]) -> tuple[float, float]:
@@ -225,13 +184,11 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
     raise InputError(f"a figure is saved as .png, .pdf or .svg, not {Path(path).name!r}")
 
 
-def write_both(figure: Figure, place: Path, dpi: int = DPI) -> bytes:
-    """Write a figure as PNG and PDF; return the PNG. `place` is a path without suffix."""
-    with laid_out(figure, dpi):
-        png = image(figure, "png", dpi)
-        place.with_suffix(".png").write_bytes(png)
-        place.with_suffix(".pdf").write_bytes(image(figure, "pdf"))
-    return png
+def write_both(figure: Figure, place: Path) -> bytes:
+    """Write a figure as PNG and PDF; return it as SVG. `place` is a path without suffix."""
+    write_file(place.with_suffix(".png"), image(figure, "png"))
+    write_file(place.with_suffix(".pdf"), image(figure, "pdf"))
+    return image(figure, "svg")
 
 
 def save(figure: Figure, path: str | Path | None) -> Figure:

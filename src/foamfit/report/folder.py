@@ -26,8 +26,9 @@ from foamfit.results import SCHEMA, Fit, plain
 # Files of each kind of result, by the file that identifies it. They include files that only older
 # versions wrote, so that older folders can be replaced.
 _OLDER = {"fit.csv", "residuals.csv", "sensitivities.csv", "residuals.pdf", "information.pdf"}
+_OLDER |= {"snapping.pdf", "profiles.pdf"}
 _TABLES = {"fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "budget.csv"}
-_DRAWN = {"fit.png", "fit.pdf", "report.html", "snapping.pdf", "profiles.pdf"}
+_DRAWN = {"fit.png", "fit.pdf", "report.html"}
 _KINDS = ("json", "csv", "html", "tex", "png", "pdf")
 FILES = {
     "fit.json": {*_TABLES, *_DRAWN, *_OLDER, "table.tex", SAMPLES},
@@ -259,10 +260,9 @@ def write_result(
     if result.ladder is not None:
         write_table(folder / "ladder.csv", result.ladder.rows())
     for name, images in (drawn := dict(figures)).items():
-        if images is not None and images.pdf is not None:
-            (folder / f"{name}.pdf").write_bytes(images.pdf)
-        if images is not None and name == "fit":
-            (folder / "fit.png").write_bytes(images.png)
+        for kind in ("png", "pdf"):
+            if content := getattr(images, kind, b""):
+                (folder / f"{name}.{kind}").write_bytes(content)
     if pages:
         write_text(folder / "report.html", render_report(result, drawn))
 

@@ -1,35 +1,35 @@
-"""The results in a folder: a line each in the terminal, and a page with links to their reports."""
+"""The table of fits of `list`, `batch` and `joint`: a page, and a line each in the terminal."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from foamfit.arrays import Array
+from foamfit.codec import build
 from foamfit.errors import InputError
 from foamfit.files import write_file
 from foamfit.report.figures import tail
 from foamfit.report.folder import load_result
 from foamfit.report.render import page
-from foamfit.report.tables import MISFITS
-from foamfit.results import law_in_words
+from foamfit.report.tables import MISFITS, by_test, varied
+from foamfit.results import ParameterEstimate, law_in_words
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import percent
+from foamfit.text import counted, percent
 
 PAGE, MARK = "index.html", b'<meta name="generator" content="foamfit list">'
 LONGEST = 36  # characters of the name of a test in the terminal
 POINTS = 60  # of each curve of a small loop
 WIDE, TALL = 88, 56  # of a small loop, pixels
-AXES = (
-    "measured displacement (m)",
-    "measured stress (Pa)",
-    "stress along measured displacement (Pa)",
-)
+HEAD = ["test", "model", "status", "options", "misfit", "determined", "when"]
+STRAIN, STRESS = "measured displacement (m)", "measured stress (Pa)"
+FITTED = "stress along measured displacement (Pa)"
 
 
 @dataclass(frozen=True)
@@ -38,21 +38,23 @@ class Listed:
 
     place: Path
     test: str
-    model: str
-    options: str
     status: str
-    misfits: dict[str, float]  #: by the names in `tables.MISFITS`
-    determined: int
-    varied: int
-    when: float  #: s since the epoch
-    damaged: str = ""  #: why the file cannot be read
+    misfits: Mapping[str, float | None]  #: by the names in fit.json
+    error: str = ""  #: why there is no result
+    model: str = ""
+    options: str = ""
+    determined: int = 0
+    varied: int = 0
+    when: float | None = None  #: s since the epoch
+    parameters: Mapping[str, ParameterEstimate] = field(default_factory=dict)
+    more: Mapping[str, tuple[str, str]] = field(default_factory=dict)  #: other cells, with notes
     curves: tuple[str, ...] = ()  #: points of the measured and the fitted loop, of an SVG polyline
 
     @property
-    def report(self) -> Path | None:
-        """The report of the result, if it was written."""
+    def report(self) -> str:
+        """The name of its report; "" if none was written."""
         names = ("report.html", "joint.html")
-        return next((self.place / name for name in names if (self.place / name).is_file()), None)
+        return next((name for name in names if (self.place / name).is_file()), "")
 
     @property
     def date(self) -> str:
@@ -62,13 +64,10 @@ class Listed:
     @property
     def row(self) -> list[str]:
         """The cells of the line in the terminal; of the misfits the largest."""
-        shown = percent(max(self.misfits.values())) if self.misfits else "–"
-        number = f"{self.determined} of {self.varied}"
-        known = [self.damaged, "", ""] if self.damaged else [self.options, shown, number]
-        return [tail(self.test, LONGEST), self.model, self.status, *known, self.date]
-
-
-HEAD = ["test", "model", "status", "options", "misfit", "determined", "when"]
+        known = [misfit for misfit in self.misfits.values() if misfit is not None]
+        cells = [percent(max(known)) if known else "–", f"{self.determined} of {self.varied}"]
+        rest = [self.error, "", ""] if self.error else [self.options, *cells]
+        return [tail(self.test, LONGEST), self.model, self.status, *rest, self.date]
 
 
 def lines(results: Sequence[Listed]) -> str:
@@ -105,27 +104,29 @@ def _listed(path: Path) -> Listed:
     try:
         content = load_result(path)
         model = Model.of_result(content)
-        law = law_in_words(model.name, content.get("relaxation", 0))
         given = content.get("options") or {"drive": content.get("drive")}
         rest = {
             k: v for k, v in given.items() if k not in ("model", "relaxation") and v is not None
         }
-        words = ", ".join(k if v is True else f"{k} {v}" for k, v in rest.items())
-        known = [one for name, one in content["parameters"].items() if _varies(name, one)]
-        misfit = content.get("misfit") or _largest(content.get("tests", {}))
-        misfits = {MISFITS[k]: v for k, v in misfit.items() if k in MISFITS and v is not None}
-        number = sum(one.get("state") == "determined" for one in known)
-        test = str(content.get("test") or content.get("name"))
-        about = (test, law, words, content["status"], misfits, number, len(known), when)
-        return Listed(place, *about, curves=tuple(_loop(place / "curves.csv")))
+        every = {name: one for name, one in content["parameters"].items() if name not in NUISANCE}
+        known = [p for p in every.values() if p.get("vary", p.get("kind") != "fixed")]
+        alone = path.name == "fit.json"
+        return Listed(
+            place,
+            str(content.get("test") or content.get("name")),
+            content["status"],
+            content.get("misfit") or _largest(content.get("tests", {})),
+            model=law_in_words(model.name, content.get("relaxation", 0)),
+            options=", ".join(k if v is True else f"{k} {v}" for k, v in rest.items()),
+            determined=sum(one.get("state") == "determined" for one in known),
+            varied=len(known),
+            when=when,
+            parameters={n: build(ParameterEstimate, p, {}) for n, p in every.items() if alone},
+            curves=small_loop(place / "curves.csv"),
+        )
     except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
         why = str(error) if isinstance(error, InputError) else f"{path.name} is damaged"
-        return Listed(place, place.name, "", "", "failed", {}, 0, 0, when, why)
-
-
-def _varies(name: str, one: dict[str, Any]) -> bool:
-    """Return whether a parameter belongs to a spring and was identified."""
-    return name not in NUISANCE and bool(one.get("vary", one.get("kind") != "fixed"))
+        return Listed(place, place.name, "failed", {}, why, when=when)
 
 
 def _largest(tests: dict[str, Any]) -> dict[str, float]:
@@ -137,23 +138,60 @@ def _largest(tests: dict[str, Any]) -> dict[str, float]:
     return {name: value for name, value in out.items() if value}
 
 
-def _loop(path: Path) -> Iterator[str]:
-    """Yield measured and fitted loop of a result as points of SVG polylines, if it has them."""
+def small_loop(path: Path) -> tuple[str, ...]:
+    """Return the measured and the fitted loop of a curves.csv as points of SVG polylines."""
     if not path.is_file():
-        return
+        return ()
     with path.open(encoding="utf-8") as file:
         head = file.readline().strip().split(",")
-    if not set(AXES[:2]) <= set(head):
-        return
-    columns = [head.index(name) for name in AXES if name in head]
-    values = np.loadtxt(path, delimiter=",", skiprows=1, usecols=columns, ndmin=2)
+        if not {STRAIN, STRESS} <= set(head):
+            return ()
+        columns = [head.index(name) for name in (STRAIN, STRESS, FITTED) if name in head]
+        values = np.loadtxt(file, delimiter=",", usecols=columns, ndmin=2)
     values = values[np.unique(np.linspace(0, len(values) - 1, POINTS).astype(int))]
     low, high = values[:, :2].min(axis=0), values[:, :2].max(axis=0)
     span = np.where(high > low, high - low, 1.0)
-    x = 2.0 + (WIDE - 4.0) * (values[:, 0] - low[0]) / span[0]
-    for curve in values[:, 1:].T:
-        y = TALL - 2.0 - (TALL - 4.0) * (curve - low[1]) / span[1]
-        yield " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
+
+    def points(stress: Array) -> str:
+        x = 2.0 + (WIDE - 4.0) * (values[:, 0] - low[0]) / span[0]
+        y = TALL - 2.0 - (TALL - 4.0) * (stress - low[1]) / span[1]
+        return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
+
+    return tuple(map(points, values[:, 1:].T))
+
+
+def table_of(results: Sequence[Listed], top: Path, *, loops: bool = True) -> dict[str, Any]:
+    """Return the values of table.html; with small loops, each with a box to tick.
+
+    Parameters are shown if all fits have the same model.
+    """
+    alike = len({one.model for one in results if not one.error}) <= 1
+    parameters = varied([one.parameters for one in results if alike])
+    found = by_test([one.place.relative_to(top).as_posix() for one in results], parameters)
+    misfits = {name for one in results for name, x in one.misfits.items() if x is not None}
+    return {
+        "rows": [
+            (one, at, cells) for one, (at, *cells) in zip(results, found["rows"], strict=True)
+        ],
+        "heads": found["heads"],
+        "misfits": {curve: name for curve, name in MISFITS.items() if curve in misfits},
+        "more": list(dict.fromkeys(name for one in results for name in one.more)),
+        "loops": loops,
+        "models": not alike,
+        "options": any(one.options for one in results),
+        "states": any(one.status for one in results),
+        "counted": any(one.varied for one in results),
+        "dated": any(one.when is not None for one in results),
+        "size": (WIDE, TALL),
+    }
+
+
+def index_page(results: Sequence[Listed], top: Path, title: str, counts: str, **more: Any) -> bytes:
+    """Return the page of a table of fits; `more` may have a picture, a CSV and `left_out`."""
+    given = {"picture": None, "csv": "", "left_out": False, "mark": MARK.decode()} | more
+    table = table_of(results, top)
+    text = page("index", folder=str(top), title=title, counts=counts, table=table, **given)
+    return text.encode("utf-8", errors="replace")
 
 
 def write_index(folder: str | Path, results: Sequence[Listed]) -> Path | None:
@@ -167,9 +205,7 @@ def write_index(folder: str | Path, results: Sequence[Listed]) -> Path | None:
     path = top / PAGE
     if path.exists() and MARK not in path.read_bytes():
         raise InputError(f"{path} was not written by foamfit and is not replaced; move it")
-    misfits = [name for name in MISFITS.values() if any(name in one.misfits for one in results)]
-    relative = {one.place: one.place.relative_to(top).as_posix() for one in results}
-    text = page("index", folder=str(folder), results=results, misfits=misfits, place=relative,
-                size=(WIDE, TALL), mark=MARK.decode())  # fmt: skip
-    write_file(path, text.encode("utf-8", errors="replace"))
+    laws = {one.model for one in results}
+    law = f" · {laws.pop()}" if len(laws) == 1 else ""
+    write_file(path, index_page(results, top, str(folder), counted(len(results), "result") + law))
     return path

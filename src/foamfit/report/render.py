@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 import functools
+import json
 import math
+from base64 import b64encode
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,8 @@ def environment() -> Environment:
         made.filters[name] = getattr(text, name)
     made.filters.update(counted=text.counted, listed=text.listed, in_unit=in_unit, exp=math.exp)
     made.filters.update(paragraphs=_paragraphs, aligned=_aligned)
-    made.filters["png"] = lambda png: "data:image/png;base64," + base64.b64encode(png).decode()
+    made.filters["svg"] = lambda svg: "data:image/svg+xml;base64," + b64encode(svg).decode()
+    made.filters["quoted"] = functools.partial(json.dumps, ensure_ascii=False)
     made.filters["spoken"] = lambda name: name.replace("_", "-")
     made.globals["version"] = version("foamfit")
     return made

@@ -16,7 +16,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, DPI, GREY, INSIDE, TWO, UNTITLED, VERMILION
+from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, UNTITLED, VERMILION
 from foamfit.report.plots import plot_fit
 from foamfit.report.readable import readable_unit
 from foamfit.results import Fit
@@ -28,10 +28,9 @@ if TYPE_CHECKING:
     from foamfit.results import ParameterEstimate, Profile
 
 Mapped = Callable[..., Iterable[Any]]  # such as the built-in `map`
-SHOWN = 200  # dpi of figures that only the page contains; a low value saves time
-# Figures of the fit on the page, which has its own title, and on a phone.
-_ON_SCREEN = ("shown", "narrow")
-_NAMES = ("fit", *_ON_SCREEN, "snapping", "profiles")  # in the order of drawing
+# Widths of the figure of the fit in its page, which has its own title, and on a phone.
+_ON_PAGE = {"shown": f"{TWO}, {UNTITLED}", "narrow": f"one, {UNTITLED}"}
+_NAMES = ("fit", *_ON_PAGE, "snapping", "profiles")  # in the order of drawing
 
 INSTANTS = 7  # pictures of a foam
 SNAPPED, STANDING = "#7FB2D9", "#E6EEF4"  # shades of the snapped part and of the rest of a spring
@@ -39,16 +38,12 @@ SNAPPED, STANDING = "#7FB2D9", "#E6EEF4"  # shades of the snapped part and of th
 
 @dataclass(frozen=True)
 class Images:
-    """A figure as the bytes of image files; with `pdf` if it is for print."""
+    """A figure as the bytes of image files: SVG in the page, or PNG and PDF beside it."""
 
-    png: bytes
-    dpi: int  # of the PNG
-    pdf: bytes | None = None
-
-    @property
-    def width(self) -> float:
-        """Width in inches, from the pixels in the header of the PNG."""
-        return int.from_bytes(self.png[16:20]) / self.dpi
+    width: float  # inches
+    svg: bytes = b""
+    png: bytes = b""
+    pdf: bytes = b""
 
 
 def draw_all(
@@ -57,8 +52,7 @@ def draw_all(
     """Draw all figures of a result with `mapped`; yield names and images, None if inapplicable.
 
     With the `map` of an executor, drawing starts at once in its processes, and the returned
-    iterator waits for each figure. `width` is that of "fit" (`foamfit.report.plots.plot_fit`); with
-    ", pdf" after it, all figures except those for the screen are also made as PDF.
+    iterator waits for each figure. `width` is that of "fit" (`foamfit.report.plots.plot_fit`).
     """
     drawn: dict[str, Any] = {field.name: getattr(result, field.name) for field in fields(Fit)}
     # No figure needs these, and unpickling them would import lmfit, the slowest import.
@@ -69,21 +63,19 @@ def draw_all(
 
 def _draw(result: Fit, width: str, name: str) -> Images | None:
     """Draw a figure, or return None if the result does not have it."""
-    if name == "profiles":
-        profiled = result.intervals is not None and result.intervals.profiles
-        figure = plot_profiles(result) if profiled else None
-    elif name == "snapping":
+    figure: Figure | None = None
+    if name == "snapping":
         figure = plot_snapping(result)
-    else:
-        columns = {"fit": width, "shown": f"{TWO}, {UNTITLED}", "narrow": f"one, {UNTITLED}"}
-        figure = plot_fit(result, width=columns[name])
+    elif name != "profiles":
+        figure = plot_fit(result, width=_ON_PAGE.get(name, width))
+    elif result.intervals is not None and result.intervals.profiles:
+        figure = plot_profiles(result)
     if figure is None:
         return None
-    dpi = DPI if name == "fit" else SHOWN
-    with figures.laid_out(figure, dpi):
-        printed = name == "fit" or (figures.all_as_pdf(width) and name not in _ON_SCREEN)
-        pdf = figures.image(figure, "pdf") if printed else None
-        return Images(figures.image(figure, "png", dpi), dpi, pdf)
+    wide = float(figure.get_figwidth())
+    if name != "fit":
+        return Images(wide, figures.image(figure, "svg"))
+    return Images(wide, png=figures.image(figure, "png"), pdf=figures.image(figure, "pdf"))
 
 
 def plot_profiles(result: Fit) -> Figure:

@@ -13,6 +13,7 @@ from foamfit.report.plots import origin_word
 from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page, sentences, table, words
 from foamfit.report.result_figures import Images, draw_all
+from foamfit.report.tables import count_determined
 from foamfit.results import STATED, Fit, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, counted, percent, wrapped
@@ -175,9 +176,8 @@ def conclusions(result: Fit) -> tuple[str, ...]:
 
 def determined(result: Fit) -> str:
     """Return how many parameters of the springs are determined, in words; "" if none is varied."""
-    varied = [p for name, p in result.parameters.items() if p.vary and name not in NUISANCE]
-    found = sum(p.state == "determined" for p in varied)
-    return f"{found} of {len(varied)} determined" if varied else ""
+    found, varied = count_determined(result.parameters)
+    return f"{found} of {varied} determined" if varied else ""
 
 
 def _unknown(parameters: dict[str, ParameterEstimate]) -> dict[str, dict[str, list[str]]]:

@@ -14,7 +14,7 @@ import numpy as np
 from foamfit.report.readable import own_symbol, readable, readable_unit
 from foamfit.report.render import environment
 from foamfit.results import ParameterEstimate, plain
-from foamfit.springs.parameters import springs_first
+from foamfit.springs.parameters import NUISANCE, springs_first
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -68,6 +68,12 @@ def parameters_tex(parameters: Parameters, **more: Any) -> str:
     shown = {n: p for n, p in parameters.items() if p.state != "fixed" or p.value}
     rows = list(zip(symbols(shown), itertools.starmap(readable, shown.items()), strict=True))
     return _tex("parameters", rows=rows, **({"kinds": {}, "between": {}} | more))
+
+
+def count_determined(parameters: Parameters) -> tuple[int, int]:
+    """Return how many parameters of the springs are determined, and how many are varied."""
+    varied = [p for name, p in parameters.items() if p.vary and name not in NUISANCE]
+    return sum(p.state == "determined" for p in varied), len(varied)
 
 
 def names_of(each: Iterable[Parameters]) -> list[str]:

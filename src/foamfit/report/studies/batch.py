@@ -14,15 +14,14 @@ import numpy as np
 
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
-from foamfit.report.figures import image
-from foamfit.report.render import page, words
-from foamfit.report.studies.parameters import DPI as SUMMARY_DPI
+from foamfit.report.figures import write_both
+from foamfit.report.listing import Listed, index_page, small_loop
+from foamfit.report.render import words
 from foamfit.report.studies.parameters import panels_of, plot_parameters
 from foamfit.report.summary import CURVES
 from foamfit.report.tables import (
-    MISFITS,
-    by_test,
     by_test_tex,
+    count_determined,
     unit_of_all,
     varied,
     wide,
@@ -156,7 +155,7 @@ def write_comparison(
 ) -> bytes | None:
     """Write the parameters of all tests as summary.tex and, with `pictures`, as figures.
 
-    Return the PNG, if there is one.
+    Return the figure as SVG, if there is one.
     """
     fitted = [row for row in rows if row.has_fit]
     tests = [row.test for row in fitted]
@@ -168,28 +167,31 @@ def write_comparison(
     figure = plot_parameters(
         f"{title} · {counts_in_words(rows)}", tests, panels_of(tests, found), width=width
     )
-    png = image(figure, "png", SUMMARY_DPI)
-    write_file(folder / "summary.png", png)
-    write_file(folder / "summary.pdf", image(figure, "pdf"))
-    return png
+    return write_both(figure, folder / "summary")
 
 
 def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | None = None) -> None:
-    """Write summary.html, a self-contained page, with a figure (PNG)."""
+    """Write summary.html, a self-contained page, with a figure (SVG)."""
     shown = rows
     if len(rows) > MOST_ON_PAGE:  # tests without a fit are always shown
         first = {id(row) for row in rows[:MOST_ON_PAGE]}
         shown = [row for row in rows if id(row) in first or not row.has_fit][: 2 * MOST_ON_PAGE]
-    measured = {name for row in shown for name, x in row.misfit.items() if x is not None}
-    text = page(
-        "summary",
-        title=title,
-        counts=counts_in_words(rows),
-        rows=shown,
-        total=len(rows),
-        reports=[(folder / row.test / "report.html").is_file() for row in shown],
-        parameters=by_test([row.test for row in shown], varied([row.parameters for row in shown])),
-        misfits={curve: name for curve, name in MISFITS.items() if curve in measured},
-        picture=picture,
-    )
-    write_file(folder / "summary.html", text.encode("utf-8", "replace"))
+    listed = [
+        Listed(
+            place := folder / row.test,
+            row.test,
+            row.status,
+            row.misfit,
+            row.error or "",
+            "",
+            "",
+            *count_determined(row.parameters),
+            parameters=row.parameters,
+            more={} if row.runtime_s is None else {"run time (s)": (f"{row.runtime_s:.1f}", "")},
+            curves=small_loop(place / "curves.csv"),
+        )
+        for row in shown
+    ]
+    more: Any = {"picture": picture, "csv": "summary.csv", "left_out": len(shown) < len(rows)}
+    text = index_page(listed, folder, title, counts_in_words(rows), **more)
+    write_file(folder / "summary.html", text)

@@ -36,7 +36,6 @@ SCHEMA = 1
 ENERGY = "dissipated_energy"
 MOST_LOOPS = 12
 MOST_NAMES = 12  # more parameters than this are not printed; all are in cycles.csv
-DPI = 200
 # Panels next to the parameters: columns of cycles.csv (SI), and their factors.
 BY_CYCLE = {
     "start\nstrain (%)": ("start_strain", 100.0),
@@ -157,7 +156,7 @@ def write_cycles(
     numbers = [str(number) for number in sorted(found.results)]
     write_text(folder / "table.tex", by_test_tex("Cycle", numbers, found.varied))
     if pages:
-        figures.write_both(plot_cycles(found, width=width), folder / "cycles", DPI)
+        figures.write_both(plot_cycles(found, width=width), folder / "cycles")
 
 
 def cycles_text(found: CycleFits) -> str:

@@ -11,9 +11,10 @@ import numpy as np
 
 from foamfit.fitting.links import RATES, law_values
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, GREY, MEASURED, TWO, VERMILION, image
+from foamfit.report.figures import FITTED, GREY, SEEN, TWO, VERMILION, image
 from foamfit.report.folder import save_whole, write_json, write_result, write_text
-from foamfit.report.readable import in_unit, own_name, readable, readable_unit, symbol
+from foamfit.report.listing import Listed, table_of
+from foamfit.report.readable import in_unit, own_name, readable, readable_unit
 from foamfit.report.render import page, words
 from foamfit.report.shown import Joint
 from foamfit.report.studies.parameters import Panel, plot_parameters
@@ -21,7 +22,7 @@ from foamfit.report.tables import MISFITS, formula, parameters_tex, symbols
 from foamfit.results import Fit, ParameterEstimate, law_in_words
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import percent
+from foamfit.text import number, percent
 from foamfit.trust.covariance import RULE
 
 if TYPE_CHECKING:
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-DPI = 180  # of the figures
 MOST_ROWS = 60  # of the table of tests on the terminal
 LOOPS, LOOP = 6, (1.25, 1.15)  # loops per row, and size of a loop in inches
 COLUMNS, PANEL = 3, (2.5, 1.6)  # parameters per row, and size of a panel in inches
@@ -126,15 +126,16 @@ def save_joint(
         folders, n = [fresh / name for name in found.tests], len(found.tests)
         # If other processes write these folders, the common figures are drawn at the same time.
         written = each(_write_test, found.test_fits(), folders, [report] * n, [width] * n)
+        pictures = list[bytes]()
         if report:
-            pictures = []
             for name, draw in (("joint", plot_joint), ("parameters", plot_compared)):
-                png = figures.write_both(draw(found, width=width), fresh / name, DPI)
+                svg = figures.write_both(draw(found, width=width), fresh / name)
                 # The page has room for two columns.
-                pictures.append(png if width == TWO else image(draw(found), "png", DPI))
-            write_text(fresh / "joint.html", joint_page(found, *pictures))
+                pictures.append(svg if width == TWO else image(draw(found), "svg"))
         for _ in written:
             pass
+        if report:
+            write_text(fresh / "joint.html", joint_page(found, fresh, *pictures))
 
     return save_whole(folder, write)
 
@@ -173,18 +174,28 @@ def joint_text(found: Joint) -> str:
     return words("joint", **more, **_common(found))
 
 
-def joint_page(found: Joint, loops: bytes, compared: bytes) -> str:
-    """Return the page with its two figures (PNG)."""
+def joint_page(found: Joint, folder: Path, loops: bytes, compared: bytes) -> str:
+    """Return the page in a folder, with its two figures (SVG)."""
     common = _common(found)
-    each = [
-        (one, "".join(symbol(name)), *readable_unit(max(abs(at.value) for at in own), one.unit))
-        for name, one in found.parameters.items()
-        if one.kind != "fixed" and (own := (one.tests or {}).values())
-    ]
-    noise, known = {}, [one["noise"] for one in common["found"]["tests"].values()]
+    shown = {n: one for n, one in found.parameters.items() if one.kind != "fixed"}
+    levels: dict[str, tuple[float, str]] = {}  # factor and unit of the noise of each curve
+    known = [one["noise"] for one in common["found"]["tests"].values()]
     for name in MISFITS:
-        if levels := [one[name]["sigma"] for one in known if name in one]:
-            noise[name] = readable_unit(max(levels), "m" if name.startswith("displ") else "Pa")
+        if sizes := [one[name]["sigma"] for one in known if name in one]:
+            levels[name] = readable_unit(max(sizes), "m" if name.startswith("displ") else "Pa")
+    listed = [
+        Listed(
+            folder / test,
+            test,
+            "",
+            own["misfit"],
+            parameters={
+                n: one.estimate(test) for n, one in shown.items() if one.tests and test in one.tests
+            },
+            more=_more(own, levels),
+        )
+        for test, own in common["found"]["tests"].items()
+    ]
     return page(
         "joint",
         loops=loops,
@@ -194,11 +205,24 @@ def joint_page(found: Joint, loops: bytes, compared: bytes) -> str:
             for name, one in _of_springs(found).items()
         ],
         rule=RULE,
-        of_curve=MISFITS,
-        noise=noise,
-        each=each,
+        table=table_of(listed, folder, loops=False),
         **common,
     )
+
+
+def _more(own: Mapping[str, Any], levels: Mapping[str, tuple[float, str]]) -> dict[str, Any]:
+    """Return the cells of a test that only joint fits have: rate, share of χ² and noise."""
+    rate = "" if own["rate"] is None else f"{own['rate']:.3g}"
+    out = {"rate (1/s)": (rate, ""), "share of χ² (%)": (f"{100 * own['chi2_share']:.1f}", "")}
+    for curve, (factor, unit) in levels.items():
+        if level := own["noise"].get(curve):
+            note = "stated" if level["given"] else "estimated"
+            if level["time"] > 1.05:
+                note += f", correlated over {level['time']:.2g} samples"
+            if level["scale"] > level["sigma"]:
+                note += f", counted as {number(level['scale'] / factor)}"
+            out[f"noise {MISFITS[curve]} ({unit})"] = (number(level["sigma"] / factor), note)
+    return out
 
 
 def between(one: JointParameter) -> str:
@@ -232,8 +256,7 @@ def plot_joint(found: Joint, *, width: str = TWO) -> Figure:
     heights = [rows * LOOP[1], low * PANEL[1]]
     more = f"; {len(shown)} of {len(names)} drawn" if len(shown) < len(names) else ""
     title = f"{found.name} · {found.model} · {len(names)} tests together{more}"
-    lines = figures.title_lines(wide, title, titled=figures.is_titled(width))
-    with figures.drawing(wide, sum(heights) + 0.6 + 0.13 * len(lines), lines) as figure:
+    with figures.drawing(wide, sum(heights) + 0.6, *figures.title(width, title)) as figure:
         parts = [height for height in heights if height]
         top, *bottom = figure.subfigures(len(parts), 1, height_ratios=parts, squeeze=False)[:, 0]
         axes = figures.grid_of(top, rows, across, len(shown))
@@ -290,9 +313,9 @@ def _draw_loops(axes: list[Axes], found: Joint, titles: Mapping[str, str]) -> No
     for ax, (test, title) in zip(axes, titles.items(), strict=True):
         if (one := loops.get(test)) is None:
             continue
-        ax.plot(one.along, one.measured / factor, color=MEASURED, lw=1.5, label="measured")
+        ax.plot(one.along, one.measured / factor, **SEEN)
         if one.fitted is not None:
-            ax.plot(one.along, one.fitted / factor, color=BLUE, lw=0.7, label="fitted")
+            ax.plot(one.along, one.fitted / factor, **FITTED)
         ax.set_label(one.name)
         ax.set_title(title, fontsize=6)
         ax.tick_params(labelsize=5.5, length=2, pad=1.5)

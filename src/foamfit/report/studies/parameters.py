@@ -24,7 +24,6 @@ LEAST_PANEL, LETTER = 0.62, 0.052  # least width of a panel and width of a lette
 TALLEST, ROW, ABOVE = 7.5, 0.17, 2.5  # heights of all panels, a row and the panel above, inches
 MOST_ROWS = 60  # tests that are named
 ROOMY = 0.8  # width of a panel with room for more numbers, inches
-DPI = 200
 # Colours of edge and face of the marks.
 _MARKS = {"determined": (BLUE, BLUE), "weak": (BLUE, "white"), "not determined": (GREY, "white")}
 
@@ -78,8 +77,7 @@ def plot_parameters(
     across = -(-n // rows)  # rows of equal length
     tall = min(max(ROW * count, 0.5), max(TALLEST / rows, 0.1 * len(names))) + 0.55
     heights = [ABOVE if above else 0.0, rows * tall]
-    lines = figures.title_lines(wide, title, titled=figures.is_titled(width))
-    with figures.drawing(wide, sum(heights) + 0.16 * len(lines) + 0.3, lines) as figure:
+    with figures.drawing(wide, sum(heights) + 0.3, *figures.title(width, title)) as figure:
         part: Figure | SubFigure = figure
         if above is not None:
             top, part = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
@@ -95,8 +93,7 @@ def plot_parameters(
             figures.say_nothing_there(axes[0], "no parameter to compare")
         entries, order = figures.named_in(axes), list(_MARKS)
         known = sorted(entries, key=lambda label: order.index(label) if label in order else 9)
-        lines_below = figures.legend_below(figure, {label: entries[label] for label in known})
-        figure.set_figheight(figure.get_figheight() + 0.15 * max(lines_below - 1, 0))
+        figures.legend_below(figure, {label: entries[label] for label in known})
     return figure
 
 

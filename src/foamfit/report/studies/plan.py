@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -147,14 +146,6 @@ class Plan:
         """The advice: next test, what it will determine, what stays open, and remarks."""
         return sentences("plan", plan=self, advice=self.advice, own=self.own)
 
-    @property
-    def by_remedy(self) -> dict[str, list[str]]:
-        """What would determine the parameters that no test of this rig determines."""
-        out = dict[str, list[str]]()
-        for name, what in self.never.items():
-            out.setdefault(what, []).append(name)
-        return out
-
     def own(self, names: Sequence[str]) -> list[str]:
         """Return names of parameters, without the spring if there is only one."""
         return [own_name(name, self.model) for name in names]
@@ -234,39 +225,25 @@ class Plan:
         def write(fresh: Path) -> None:
             results.write_json(fresh / "plan.json", self.to_json_dict())
             if self.advice is not None:
-                (fresh / "next.toml").write_text(
-                    self.advice.candidate.toml(self.tests[0]), encoding="utf-8"
-                )
-                (fresh / "joint.toml").write_text(self._study(Path(folder)), encoding="utf-8")
+                results.write_text(fresh / "next.toml", self.advice.candidate.toml(self.tests[0]))
+                results.write_text(fresh / "joint.toml", self._study(Path(folder)))
             if report:
-                png = figures.write_both(plot_plan(self, width=figure_width), fresh / "plan")
-                (fresh / "plan.html").write_text(self._page(png), encoding="utf-8")
+                svg = figures.write_both(plot_plan(self, width=figure_width), fresh / "plan")
+                results.write_text(fresh / "plan.html", self._page(svg))
 
         results.check_target(folder, of="plan.json")
         return results.save_whole(folder, write)
 
-    def _page(self, png: bytes) -> str:
-        """Return plan.html."""
-        ranked = sorted(self.outcomes, key=lambda one: (one.breaks > RISKY, -one.number))
-        return page("plan", plan=self, png=png, best=ranked[:BEST], risky=RISKY, unit_of=unit_of)
-
     def _study(self, folder: Path) -> str:
         """Return joint.toml, the study of the tests at hand and the next one."""
         files = [os.path.relpath(one.path, folder) for one in self.tests if one.path is not None]
-        model = Model.parse(self.model)
-        lines = [
-            "# Fits the next test together with those at hand, once next.csv is here:",
-            f"#     foamfit joint {folder / 'joint.toml'}",
-            f"name = {json.dumps(f'{self.name} and the next test', ensure_ascii=False)}",
-            f"tests = {json.dumps([*files, 'next.csv'], ensure_ascii=False)}",
-            f'model = "{model.words}"',
-            f"relaxation = {self.relaxation}",
-            *(f"{name} = true" for name, is_set in model.options.items() if is_set),
-            "",
-            "[parameters]",
-            *(f'{name} = "shared"' for name in self.now),
-        ]
-        return "\n".join(lines) + "\n"
+        values = {"files": [*files, "next.csv"], "read": Model.parse(self.model)}
+        return words("next_study", plan=self, folder=folder, **values) + "\n"
+
+    def _page(self, svg: bytes) -> str:
+        """Return plan.html."""
+        ranked = sorted(self.outcomes, key=lambda one: (one.breaks > RISKY, -one.number))
+        return page("plan", plan=self, svg=svg, best=ranked[:BEST], risky=RISKY, unit_of=unit_of)
 
 
 SETTINGS = ("drive", "mass", "velocity", "strain", "rate", "cycles", "hold", "interior", "repeat")
@@ -299,76 +276,59 @@ def plan_text(plan: Plan) -> str:
 
 def plot_plan(plan: Plan, *, width: str = TWO) -> Figure:
     """Draw the expected number of determined parameters over all tests, and the intervals."""
-    wide, best = figures.inches(width), plan.advice
+    wide = figures.inches(width)
     title = [f"{plan.name}: {plan.law}. Expected by simulation, not measured."]
-    if best is not None:
-        title.append(f"Advised: {best.candidate}.")
-    lines = figures.title_lines(wide, *title, titled=figures.is_titled(width))
+    title += [] if plan.advice is None else [f"Advised: {plan.advice.candidate}."]
     stacked = wide < 5.0
-    tall = (5.6 if stacked else 2.9) + 0.16 * max(len(plan.now) - 8, 0)
-    with figures.drawing(wide, tall + 0.15 * len(lines), lines) as figure:
+    tall = (5.8 if stacked else 3.1) + 0.16 * max(len(plan.now) - 8, 0)
+    with figures.drawing(wide, tall, *figures.title(width, *title)) as figure:
         left, right = figure.subplots(2, 1) if stacked else figure.subplots(1, 2)
         _map(left, plan)
         _intervals(right, plan)
+        figures.legend_below(figure, figures.named_in([left, right]))
     return figure
-
-
-def _cells(plan: Plan, impact: bool) -> dict[tuple[float, float], Outcome]:
-    """Return the best test at each velocity and mass, or at each strain rate and strain."""
-    out = dict[tuple[float, float], Outcome]()
-    for one in plan.outcomes:
-        asked = one.candidate
-        pair = (asked.velocity, asked.mass) if impact else (asked.rate, asked.strain)
-        if None in pair or asked.repeat:
-            continue
-        at = float(pair[0] or 0.0), float(pair[1] or 0.0)
-        if at not in out or out[at].number < one.number:
-            out[at] = one
-    return out
 
 
 def _map(ax: Axes, plan: Plan) -> None:
     """Draw the expected number of determined parameters against the settings of the tests.
 
-    Tests that exceed a limit with more than 5 % probability are hatched.
+    Of several tests with the same settings the best counts. Tests that exceed a limit with more
+    than 5 % probability are hatched.
     """
-    from matplotlib.ticker import LogLocator
+    impact = bool(plan.rig.masses)
+    axes = ("velocity", "mass") if impact else ("rate", "strain")
 
-    impact, best = bool(plan.rig.masses), plan.advice
-    table = _cells(plan, impact)
-    x, y = (np.unique([at[i] for at in table]) for i in (0, 1))
-    count = np.array([[table[a, b].number if (a, b) in table else np.nan for a in x] for b in y])
-    edges, rows = _edges(x), np.arange(y.size + 1) - 0.5
-    shown = ax.pcolormesh(edges, rows, count, cmap="Blues", vmin=0.0, vmax=len(plan.now))
+    def settings(one: Outcome) -> tuple[float, float] | None:
+        x, y = (getattr(one.candidate, name) for name in axes)
+        return None if x is None or y is None or one.candidate.repeat else (x, y)
+
+    ranked = sorted(plan.outcomes, key=lambda one: one.number)
+    best = {at: one for one in ranked if (at := settings(one)) is not None}
+    x, y = (sorted({at[i] for at in best}) for i in (0, 1))
+    count = np.full((len(y), len(x)), np.nan)
     style: Any = {"facecolor": "none", "edgecolor": VERMILION, "hatch": "////", "linewidth": 0.0}
-    for (a, b), one in table.items():
+    for at, one in best.items():
+        column, row = x.index(at[0]), y.index(at[1])
+        count[row, column] = one.number
         if one.breaks > RISKY:
-            i, j = int(np.searchsorted(x, a)), int(np.searchsorted(y, b))
-            ax.fill_between(edges[i : i + 2], rows[j], rows[j + 1], **style)
-    if best is not None and (best.candidate.drive == "impact") == impact:
-        asked = best.candidate
-        place = (asked.velocity, asked.mass) if impact else (asked.rate, asked.strain)
-        row = int(np.argmin(np.abs(y - float(place[1] or 0.0))))
-        ax.plot(float(place[0] or 0.0), row, "*", color=VERMILION, ms=11, markeredgecolor="white")
+            ax.fill_between((column - 0.5, column + 0.5), row - 0.5, row + 0.5, **style)
+    shown = ax.imshow(
+        count, cmap="Blues", vmin=0, vmax=len(plan.now), origin="lower", aspect="auto"
+    )
+    if plan.advice is not None and (at := settings(plan.advice)) in best and at is not None:
+        star: Any = {"color": VERMILION, "ms": 11, "mec": "white", "ls": "none"}
+        ax.plot(x.index(at[0]), y.index(at[1]), "*", label="advised test", **star)
     for mass, (half, _) in plan.closing.items():
-        row = int(np.argmin(np.abs(y - mass)))
-        if edges[0] < half < edges[-1]:
-            ax.plot([half] * 2, [row - 0.5, row + 0.5], color="black", linewidth=1.0, ls="--")
-    labels = [engineering(1e3 * b, "g") if impact else f"{b:.2g}" for b in y]
-    ax.set(xscale="log", yticks=range(y.size), yticklabels=labels, xlim=(edges[0], edges[-1]))
-    ax.set(ylabel="striker mass" if impact else "largest strain")
+        if mass in y and x[0] < half < x[-1]:
+            row, place = y.index(mass), np.interp(np.log(half), np.log(x), range(len(x)))
+            ax.plot([place] * 2, [row - 0.5, row + 0.5], color="black", linewidth=1.0, ls="--")
+    few = np.unique(np.linspace(0, len(x) - 1, 5).astype(int))
+    ax.set_xticks(few, [f"{x[column]:.2g}" for column in few])
+    ax.set_yticks(range(len(y)), [engineering(1e3 * b, "g") if impact else f"{b:.2g}" for b in y])
+    ax.set_ylabel("striker mass" if impact else "largest strain")
     ax.set_xlabel("velocity (m/s)" if impact else "strain rate (1/s)")
-    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.xaxis.set_minor_formatter("")
-    bar = ax.figure.colorbar(shown, ax=ax, location="top", aspect=30, pad=0.02)
-    bar.set_label(f"expected number of the {len(plan.now)} parameters determined")
-
-
-def _edges(x: Any) -> Any:
-    """Return the edges of cells about points that are spread evenly in ratio."""
-    ratio = 1.1 if x.size == 1 else (x[-1] / x[0]) ** (0.5 / (x.size - 1))
-    return np.append(x / ratio, x[-1] * ratio)
+    ax.set_title(f"expected number of the {len(plan.now)} parameters determined", fontsize=8)
+    ax.figure.colorbar(shown, ax=ax, aspect=30, pad=0.02)
 
 
 def _intervals(ax: Axes, plan: Plan) -> None:
@@ -383,13 +343,13 @@ def _intervals(ax: Axes, plan: Plan) -> None:
             unknown = one.state == "not determined" or not one.share < SHOWN
             half = SHOWN if unknown else max(one.share, 0.01)
             style: Any = {"color": colour, "linewidth": 2.6, "solid_capstyle": "butt"}
-            style |= {"linestyle": (0, (1, 1))} if unknown else {}
-            ax.plot([-half, half], [i + shift] * 2, label=label if i == 0 else None, **style)
+            style |= {"linestyle": (0, (1, 1)) if unknown else "-"}
+            ax.plot([-half, half], [i + shift] * 2, label=f"{'_' * bool(i)}{label}", **style)
     for edge in (-0.5, 0.5):
         ax.axvline(edge, color="black", linewidth=0.5, linestyle=":")
     ax.set(yticks=range(len(names)), yticklabels=plan.own(names), ylim=(len(names) - 0.5, -0.5))
     ax.set_xscale("symlog", linthresh=0.1)
     ax.set(xticks=(-3, -0.5, 0, 0.5, 3), xlim=(-SHOWN, SHOWN))
     ax.set_xticklabels(["−300 %", "−50 %", "0", "50 %", "300 %"])
-    ax.set_xlabel("95 % interval (dotted: not determined)")
-    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=1)
+    ax.minorticks_off()
+    ax.set_title("95 % interval (dotted: not determined)", fontsize=8)

@@ -15,7 +15,7 @@ from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
 from foamfit.report import figures
 from foamfit.report import folder as results
-from foamfit.report.figures import BLUE, INSIDE, MEASURED, TWO, VERMILION
+from foamfit.report.figures import BLUE, FITTED, INSIDE, SEEN, TWO, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import words
 from foamfit.results import law_in_words, plain
@@ -36,9 +36,7 @@ COLOURS: dict[str, tuple[str, Any]] = {
     "motion": (VERMILION, (0, (1, 1.2))),
     "law_error": (INSIDE[0], (0, (5, 1.2, 1, 1.2))),
 }
-# Styles of the lines and of the band, with their labels in the legend.
-SEEN: Any = {"color": MEASURED, "linewidth": 1.4, "label": "measured"}
-PREDICTED: Any = {"color": VERMILION, "linewidth": 0.9, "label": "predicted"}
+TOLD: Any = FITTED | {"label": "predicted"}
 BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0, "label": "95 % band"}
 
 
@@ -256,20 +254,18 @@ def plot_prediction(found: Prediction, *, width: str = TWO) -> Figure:
     across = figures.abreast(wide, 1 + len(curves))
     bands = -(-(1 + len(curves)) // across)  # each has an upper and a lower row of panels
     inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in curves)
-    lines = figures.title_lines(
-        wide,
+    title = figures.title(
+        width,
         f"{found.measurement.name}, predicted from {found.source}; {words('rates', found=found)}",
         f"inside the 95 % band: {inside}",
-        titled=figures.is_titled(width),
     )
-    tall = bands * 1.7 * PANEL[1] + 0.4 + 0.15 * max(len(lines) - 2, 0)
-    with figures.drawing(wide, tall, lines) as figure:
+    with figures.drawing(wide, bands * 1.7 * PANEL[1] + 0.1, *title) as figure:
         grid = {"hspace": 0.06, "height_ratios": (1.0, 0.6) * bands}
         axes = figure.subplots(2 * bands, across, squeeze=False, gridspec_kw=grid)
         loop, *above = axes[::2].ravel()
         key, *below = axes[1::2].ravel()
         _loop(loop, found)
-        for (upper, lower), curve in zip(zip(above, below, strict=True), curves, strict=False):
+        for upper, lower, curve in zip(above, below, curves, strict=False):
             _in_time(upper, lower, found, curve)
         for ax in (key, *above[len(curves) :], *below[len(curves) :]):
             ax.set_axis_off()
@@ -287,11 +283,10 @@ def _loop(ax: Axes, found: Prediction) -> None:
     if m.displacement is None or motion is None or m.stress is None:
         figures.say_nothing_there(ax, "no motion")
         return
-    fitted = m.stress if stress is None else stress.predicted
     height = m.specimen.height
     factor, unit = readable_unit(float(np.max(m.stress)), "Pa")
     ax.plot(m.displacement / height, m.stress / factor, **SEEN)
-    ax.plot(motion / height, fitted / factor, **PREDICTED)
+    ax.plot(motion / height, (m.stress if stress is None else stress.predicted) / factor, **TOLD)
     if stress is not None and moved is None:
         turn = int(np.argmax(motion))
         for part in (slice(None, turn + 1), slice(turn, None)):
@@ -302,21 +297,21 @@ def _loop(ax: Axes, found: Prediction) -> None:
 
 def _in_time(above: Axes, below: Axes, found: Prediction, curve: PredictedCurve) -> None:
     """Draw a curve with its band, and the half width of each part below."""
-    x, label = np.arange(curve.measured.size, dtype=float), "sample"
+    x, x_label = np.arange(curve.measured.size, dtype=float), "sample"
     if (time := found.measurement.time) is not None:
         scale, unit = readable_unit(float(np.nanmax(np.abs(time))), "s")
-        x, label = time / scale, f"time ({unit})"
+        x, x_label = time / scale, f"time ({unit})"
     factor, unit = readable_unit(float(np.max(np.abs(curve.measured))), curve.unit)
     above.fill_between(x, curve.lo / factor, curve.hi / factor, **BAND)
     above.plot(x, curve.measured / factor, **SEEN)
-    above.plot(x, curve.predicted / factor, **PREDICTED)
-    above.set_ylabel(f"{curve.channel.replace('_', ' ')} ({unit})")
-    style: Any = {"color": "black", "ls": ":", "lw": 0.9, "zorder": 3}
-    below.plot(x, 0.5 * (curve.hi - curve.lo) / factor, label="half width: all", **style)
-    for part, (colour, dashes) in COLOURS.items():
+    above.plot(x, curve.predicted / factor, **TOLD)
+    above.set(xlabel=x_label, ylabel=f"{curve.channel.replace('_', ' ')} ({unit})")
+    parts = {"all": (0.5 * (curve.hi - curve.lo), "black", ":")}
+    for part, look in COLOURS.items():
         if part in curve.parts and np.any(curve.parts[part]):
-            style = {"color": colour, "ls": dashes, "lw": 0.9}
-            label = f"half width: {part.replace('_', ' ')}"
-            below.plot(x, curve.parts[part] / factor, label=label, **style)
+            parts[part.replace("_", " ")] = (curve.parts[part], *look)
+    for part, (half, colour, dashes) in parts.items():
+        style: Any = {"color": colour, "ls": dashes, "lw": 0.9, "label": f"half width: {part}"}
+        below.plot(x, half / factor, **style)
     below.set_ylim(bottom=0.0)
-    below.set(xlabel=label, ylabel=f"half width ({unit})")
+    below.set(xlabel=x_label, ylabel=f"half width ({unit})")
