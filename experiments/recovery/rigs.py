@@ -294,7 +294,7 @@ def coverage(rows: pd.DataFrame, by: str) -> pd.DataFrame:
             "not determined": int((springs["state"] == "not determined").sum()),
             "zeros etc. hold %": percents(known["holds"])[0],
             "zeros etc. far": int(known["far"].sum()),
-            "contradicted": int(each["contradicted"].fillna("").ne("").sum()),
+            "contradicted": int(each["contradicted"].astype(object).fillna("").ne("").sum()),
             "warned": int((each["status"] == "warnings").sum()),
             "seconds": each["seconds"].median(),
         })  # fmt: skip

@@ -23,6 +23,8 @@ from independent import HAT_A, HAT_C, SIG_A, SIG_C, STAR, Truth, bistable_row, f
 Array = NDArray[np.float64]
 Terms = tuple[tuple[float, float], ...]  # pairs (g, tau in s)
 FINE = 10_001  # samples of a motion, which the judge joins by straight lines
+CLOSE = 1e-9  # of a duration
+NONE = np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -176,17 +178,22 @@ class Rig:
         if self.motion is None:
             truth = self.follow(np.array([0.0, last]))
             return Course(self, start, truth.contact_end or last)
-        time = np.union1d(np.linspace(start, last, FINE), self._knots(start, last))
-        stress = self.follow(time).base_stress
+        time, stress = self.pressed(start, last)
         lost = np.flatnonzero((stress[1:] <= 0.0) & (stress[:-1] > 0.0))
         if not lost.size:
             return Course(self, start, last)
         two = slice(lost[0], lost[0] + 2)
         return Course(self, start, float(np.interp(0.0, stress[two][::-1], time[two][::-1])))
 
-    def _knots(self, start: float, last: float) -> list[float]:
-        times = self.motion.times if self.motion else ()
-        return [t for t in times if start < t < last]
+    def pressed(self, start: float, last: float, more: Array = NONE) -> tuple[Array, Array]:
+        """Return times of a motion, at most `CLOSE` from the turns and `more` times, and stresses.
+
+        Of times that are almost equal one is left, because their difference gives a dashpot's rate.
+        """
+        turns = [t for t in self.motion.times if start < t < last] if self.motion else []
+        time = np.union1d(np.linspace(start, last, FINE), [*turns, *more])
+        time = time[np.append(True, np.diff(time) > CLOSE * (last - start))]
+        return time, self.follow(time).base_stress
 
 
 @dataclass(frozen=True)
@@ -208,9 +215,7 @@ class Course:
         out = np.zeros(time.size)
         if self.rig.motion is None:
             return np.where(inside, self.rig.follow(time).base_stress, out)
-        knots = self.rig._knots(self.start, self.end)
-        fine = np.union1d(np.linspace(self.start, self.end, FINE), [*knots, *time[inside]])
-        out[inside] = self.rig.follow(fine).base_stress[np.searchsorted(fine, time[inside])]
+        out[inside] = np.interp(time[inside], *self.rig.pressed(self.start, self.end, time[inside]))
         return out
 
     def top(self, time: Array, gauge: bool) -> Array:
