@@ -111,4 +111,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     studies.arguments(__doc__).parse_args()
-    studies.run(main, HERE)
+    main()

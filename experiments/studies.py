@@ -1,9 +1,10 @@
 """Common code of the studies: command line, tables, pages, figures and files.
 
 A study is one command. Its docstring states question, method and answer. `arguments` reads the
-options, `markdown`, `write_csv` and `write_page` write tables and page, `sheet` draws figures, and
-`run` keeps old files whose numbers have not changed (see `unchanged`). Each study has its own
-seeds: each case draws from `numpy.random.default_rng([seed, ..., case])`.
+options, `in_order` runs the cases, `markdown`, `write_csv` and `write_page` write tables and page,
+and `sheet` draws figures. Each study has its own seeds: each case draws from
+`numpy.random.default_rng([seed, ..., case])`. Once this module is imported, the modules of all
+studies can be.
 """
 
 from __future__ import annotations
@@ -11,8 +12,10 @@ from __future__ import annotations
 import argparse
 import os
 import platform
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -25,8 +28,12 @@ from scipy.stats import binomtest
 
 import foamfit as ff
 from foamfit.report.figures import drawing
-from unchanged import keep_unchanged
 
+HERE = Path(__file__).parent
+sys.path += sorted(str(place) for place in HERE.iterdir() if place.is_dir())
+
+# Parameters of a microscale spring, without stiffening, softening and weakening.
+MICROSCALE = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
 # Columns of third-party measurements: gap of a machine, and printed lattices.
 GAP = 'displacement = { column = "Gap (um)", counts_down = true }'
 LATTICE = """\
@@ -37,12 +44,6 @@ cycle = { column = "Total Cycles" }"""
 # Colours of Okabe and Ito, safe for colour-blind readers.
 BLACK, GREY, BLUE, SKY = "#000000", "#8c8c8c", "#0072B2", "#56B4E9"
 VERMILION, ORANGE, GREEN, PURPLE = "#D55E00", "#E69F00", "#009E73", "#CC79A7"
-
-
-def run(main: Callable[[], Any], place: Path) -> None:
-    """Run a study and keep old files whose numbers have not changed."""
-    with keep_unchanged(place):
-        main()
 
 
 # ------------------------------------------------------------------------------- arguments
@@ -71,6 +72,26 @@ def measurements(*folders: str) -> Path:
         if not (data / folder).is_dir():
             sys.exit(f"there is no {data / folder}; set FOAMFIT_DATA to the folder with {folder}/")
     return data
+
+
+def in_order(
+    work: Callable[..., Any], jobs: Iterable[tuple[Any, ...]], processes: int = 1
+) -> Iterator[Any]:
+    """Yield work(*job) for each job, in order, computed in several processes if there are."""
+    if processes == 1:
+        yield from (work(*job) for job in jobs)
+        return
+    with ProcessPoolExecutor(processes) as pool:
+        yield from (task.result() for task in [pool.submit(work, *job) for job in jobs])
+
+
+def said(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """Collect rows, printing each."""
+    out = []
+    for row in rows:
+        print(row, flush=True)
+        out.append(row)
+    return pd.DataFrame(out)
 
 
 # ------------------------------------------------------------------------------- tables and pages
@@ -106,36 +127,42 @@ def shown(frame: pd.DataFrame, digits: int = 3) -> str:
 def write_csv(
     rows: Iterable[Mapping[str, Any]] | pd.DataFrame, path: Path, digits: int = 4
 ) -> None:
-    """Write rows, or a DataFrame, with `digits` significant digits."""
+    """Write rows, or a DataFrame, with `digits` significant digits; compressed if named .gz."""
     frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows))
-    frame.to_csv(path, index=False, float_format=f"%.{digits}g", lineterminator="\n")
+    raw: Any = {"method": "gzip", "mtime": 0} if path.suffix == ".gz" else None
+    frame.to_csv(
+        path, index=False, float_format=f"%.{digits}g", lineterminator="\n", compression=raw
+    )
 
 
-def write_page(
-    folder: Path, name: str = "README.md", out: Path | None = None, **values: Any
-) -> str:
-    """Fill page.template.md of a folder and write the page there or to `out`; return its text."""
-    text = (folder / "page.template.md").read_text(encoding="utf-8").format(**values)
-    ((out or folder) / name).write_text(text, encoding="utf-8")
+def write_page(folder: Path, out: Path | None = None, **values: Any) -> str:
+    """Fill page.template.md of a folder and write README.md there or to `out`; return its text.
+
+    `values` may leave out {circumstances}.
+    """
+    text = (folder / "page.template.md").read_text(encoding="utf-8")
+    text = text.format(**{"circumstances": circumstances()} | values)
+    ((out or folder) / "README.md").write_text(text, encoding="utf-8")
     return text
 
 
-def circumstances() -> str:
-    """Return versions and machine as text for a page."""
-    return f"foamfit {ff.__version__}, Python {platform.python_version()}, {platform.machine()}"
-
-
-def processor() -> str:
-    """Return the name of the processor."""
+def circumstances(*packages: str) -> str:
+    """Return versions and machine as text for a page; with packages also the processor."""
+    if not packages:
+        return f"foamfit {ff.__version__}, Python {platform.python_version()}, {platform.machine()}"
     info = Path("/proc/cpuinfo")
-    text = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in text if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    text = info.read_text() if info.exists() else ""
+    name = text.partition("model name")[2].partition("\n")[0].strip("\t :") or platform.processor()
+    used = ", ".join(f"{package} {version(package)}" for package in packages)
+    machine = f"{name} ({platform.machine()}, {os.cpu_count()} cores)"
+    return f"{machine}; Python {platform.python_version()}, {used}"
 
 
-def versions(*names: str) -> dict[str, str]:
-    """Return the versions of packages and of Python."""
-    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+def counted(states: pd.Series) -> str:
+    """Return how many parameters are determined, weak and not determined."""
+    return " / ".join(
+        str((states == one).sum()) for one in ("determined", "weak", "not determined")
+    )
 
 
 def share(hits: Sequence[bool]) -> dict[str, float]:
@@ -159,6 +186,19 @@ def gridlines(ax: Any) -> None:
     """Draw faint grid lines below the curves."""
     ax.grid(color="0.93", linewidth=0.5)
     ax.set_axisbelow(True)
+
+
+def at_shares(
+    strain: np.ndarray, stress: np.ndarray, up: np.ndarray, down: np.ndarray, left: float = np.nan
+) -> np.ndarray:
+    """Return a loop's stress at shares of its largest strain: loading `up`, then unloading `down`.
+
+    `left` is the stress below the end of unloading.
+    """
+    turn, share = int(np.argmax(strain)), strain / strain.max()
+    back = np.maximum.accumulate(share[turn:][::-1])
+    loaded = np.interp(up, np.maximum.accumulate(share[: turn + 1]), stress[: turn + 1])
+    return np.concatenate([loaded, np.interp(down, back, stress[turn:][::-1], left=left)])
 
 
 # ------------------------------------------------------------------------------- files of tests
@@ -187,9 +227,10 @@ def write_test(path: Path, toml: str | None = None, **columns: Iterable[float]) 
 def write_study(
     path: Path, tests: Iterable[str | Path], model: str, kinds: Mapping[str, Any], **settings: Any
 ) -> Path:
-    """Write a STUDY.toml: tests, model, kinds of the first spring's parameters, settings.
+    """Write a STUDY.toml: tests, model, kinds of the parameters, settings.
 
-    A mapping among the settings becomes a separate table.
+    Parameters are those of the first spring unless they have a prefix. A mapping among the settings
+    becomes a separate table.
     """
 
     def quoted(value: Any) -> str:
@@ -199,11 +240,21 @@ def write_study(
     plain = {"model": model} | {k: v for k, v in settings.items() if k not in tables}
     text = [f"tests = [{', '.join(quoted(test) for test in tests)}]"]
     text += [f"{name} = {quoted(value)}" for name, value in plain.items()]
-    tables["parameters"] = {f"s1_{name.removeprefix('s1_')}": kind for name, kind in kinds.items()}
+    named = (name if re.match(r"s\d+_", name) else f"s1_{name}" for name in kinds)
+    tables["parameters"] = dict(zip(named, kinds.values(), strict=True))
     for name, table in tables.items():
         text += ["", f"[{name}]", *(f"{key} = {quoted(value)}" for key, value in table.items())]
     path.write_text("\n".join(text) + "\n", encoding="utf-8")
     return path
+
+
+def mycelium(record: Path, folder: Path) -> Path:
+    """Write the TOML of a test of mycelium-rates/, whose header states the height; return its path.
+
+    The test has the name of its file.
+    """
+    gap = record.read_text(encoding="utf-8").splitlines()[1].split("\t")[5].strip()
+    return write_specimen(folder / f"{record.stem}.toml", f"{gap} um", "8 mm")
 
 
 def twins(data: Path) -> Iterator[tuple[str, str, str]]:

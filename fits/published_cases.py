@@ -18,7 +18,6 @@ result folder), fits/comparison.md and fits/comparison.png. It takes half a minu
 
 from __future__ import annotations
 
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -134,8 +133,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(HERE.parent / "experiments"))
-    from unchanged import keep_unchanged
-
-    with keep_unchanged(HERE):
-        main()
+    main()

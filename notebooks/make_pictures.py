@@ -63,8 +63,4 @@ def photograph_page() -> None:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(HERE.parent / "experiments"))
-    from unchanged import keep_unchanged
-
-    with keep_unchanged(HERE):
-        photograph_page()
+    photograph_page()

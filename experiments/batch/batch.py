@@ -6,16 +6,16 @@ Other work on the machine slows everything, so processor times are given with wa
 Answer. 26 ms of processor time per test, constant memory, the same numbers with any number of
 processes. Results go to batch.json; README.md describes them.
 
-    python experiments/batch/batch.py               # all, some 15 minutes on two idle cores python
-    experiments/batch/batch.py speedup       # one of them; see MEASURES
+    python experiments/batch/batch.py               # all, some 15 minutes on two idle cores
+    python experiments/batch/batch.py speedup       # one of them; see MEASURES
 
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -23,17 +23,19 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
 
 import foamfit as ff
+from foamfit.study import batch_work
 from foamfit.study.batch_work import Recipe, Task, fingerprint, put, stored, work
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import studies  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
 
+HERE = Path(__file__).parent
 TESTS, TINY, MANY = 24, 200, 1000
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
 TOML = (
@@ -41,7 +43,6 @@ TOML = (
     '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
 )
 COMMAND = [sys.executable, "-m", "foamfit", "batch"]
-FAST = ["--starts", "1", "--no-report", "--quiet"]
 
 
 def make_tests(folder: Path, count: int, samples: int, linear: bool = False) -> None:
@@ -60,26 +61,28 @@ def make_tests(folder: Path, count: int, samples: int, linear: bool = False) -> 
     (folder.parent / "foam.toml").write_text(TOML)
 
 
-def called(place: Path, *words: object) -> dict[str, float]:
+def watched(
+    place: Path, *words: object, note: Callable[[Any], None] = lambda _: None
+) -> dict[str, float]:
     """Run the command; return wall time and processor times of start and busiest process.
 
-    The start is the command itself and the process that forks the others.
+    The start is the command itself and the process that forks the others. `note` is called with the
+    process of the command, ten times a second.
     """
     import psutil
 
     began, cpu = time.perf_counter(), dict[int, tuple[bool, float]]()
-    command = [*COMMAND, "tests", "--specimen", "foam.toml", *map(str, words)]
+    command = [*COMMAND, "tests", "--specimen", "foam.toml", "--quiet", *map(str, words)]
     with subprocess.Popen(command, cwd=place) as process:
         whole = psutil.Process(process.pid)
         while process.poll() is None:
             time.sleep(0.1)
-            try:
+            with contextlib.suppress(psutil.Error, OSError):
                 first = {whole.pid, *(child.pid for child in whole.children())}
                 for one in (whole, *whole.children(recursive=True)):
                     times = one.cpu_times()
                     cpu[one.pid] = one.pid in first, times.user + times.system
-            except psutil.Error:
-                continue
+                note(whole)
     wall = time.perf_counter() - began
     workers = [used for is_first, used in cpu.values() if not is_first]
     return {
@@ -99,7 +102,7 @@ def measure_speedup(place: Path, *words: str) -> dict[str, Any]:
     make_tests(place / "tests", TESTS, 601)
     took = {}
     for jobs in (1, 2):
-        took[jobs] = called(place, "--jobs", jobs, "--quiet", "--out", f"out-{jobs}", *words)
+        took[jobs] = watched(place, "--jobs", jobs, "--out", f"out-{jobs}", *words)
     one, two = (
         [p.read_bytes() for p in sorted((place / f"out-{j}").glob("*/parameters.csv"))]
         for j in (1, 2)
@@ -115,105 +118,91 @@ def measure_speedup(place: Path, *words: str) -> dict[str, Any]:
     }
 
 
+def task(path: Path, toml: Path, recipe: Recipe, out: Path | None) -> Task:
+    """Return a test as the command hands it to a process; without `out` with its content."""
+    content = path.read_bytes(), toml.read_bytes(), None
+    mark = fingerprint(recipe.key, *content)
+    return Task(path.stem, path, toml, recipe, mark, out, None if out else content)
+
+
 def measure_overhead(place: Path) -> dict[str, Any]:
     """Measure the overhead per test (read, compare, write) and the complete command."""
     make_tests(place / "tests", TINY, 601)
     recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=False)
-    key, spent = recipe.key, [0.0, 0.0]
-    from foamfit.study import batch_work
-
-    real: Callable[..., Any] = batch_work.fit
+    fits, real = [0.0], batch_work.fit
 
     def fit(*words: Any, **options: Any) -> Any:
         began = time.process_time()
         try:
             return real(*words, **options)
         finally:
-            spent[1] += time.process_time() - began
+            fits[0] += time.process_time() - began
 
-    batch_work.fit = fit
-    toml = place / "foam.toml"
-    for i, path in enumerate(sorted((place / "tests").iterdir())):
-        if i == 20:  # everything is loaded
-            spent[:] = [0.0, 0.0]
-        began = time.process_time()
-        mark = fingerprint(key, path.read_bytes(), toml.read_bytes(), None)
-        work(Task(path.stem, path, toml, recipe, mark, place / "out" / path.stem))
-        spent[0] += time.process_time() - began
-    batch_work.fit = real
+    paths = sorted((place / "tests").iterdir())
+    with patch.object(batch_work, "fit", fit):
+        for path in paths[:20]:  # then everything is loaded
+            work(task(path, place / "foam.toml", recipe, place / "out" / path.stem))
+        fits[0], began = 0.0, time.process_time()
+        for path in paths[20:]:
+            work(task(path, place / "foam.toml", recipe, place / "out" / path.stem))
+        spent = time.process_time() - began
     count = TINY - 20
-    out = called(place, *FAST, "--jobs", "1", "--out", "whole")
+    out = watched(place, "--starts", 1, "--no-report", "--jobs", 1, "--out", "whole")
+    fitted = pd.read_csv(place / "whole" / "summary.csv")["runtime_s"].sum()
     return {
         "tests": count,
-        "fit_ms": 1e3 * spent[1] / count,
-        "beside_ms": 1e3 * (spent[0] - spent[1]) / count,
+        "fit_ms": 1e3 * fits[0] / count,
+        "beside_ms": 1e3 * (spent - fits[0]) / count,
         "whole command, beside its fits, per test, start included (clock, ms)": 1e3
-        * (out["wall_s"] - pd.read_csv(place / "whole" / "summary.csv")["runtime_s"].sum())
+        * (out["wall_s"] - fitted)
         / TINY,
     }
 
 
 def measure_memory(place: Path) -> dict[str, Any]:
     """Measure the resident memory of the processes during a batch of many tests."""
-    import psutil
-
     make_tests(place / "tests", MANY, 61, linear=True)
-    quick = ["--starts", "1", "--model", "linear", "--no-report", "--quiet", "--jobs", "2"]
-    command = [*COMMAND, "tests", "--specimen", "foam.toml", *quick, "--out", "out"]
+    words = ("--starts", 1, "--model", "linear", "--no-report", "--jobs", 2, "--out", "out")
     samples: list[tuple[int, float, float]] = []
-    with subprocess.Popen(command, cwd=place) as process:
-        whole = psutil.Process(process.pid)
-        while process.poll() is None:
-            time.sleep(1.0)
-            try:
-                done = len(os.listdir(place / "out"))
-                main = whole.memory_info().rss / 2**20
-                below = (child.memory_info().rss for child in whole.children(recursive=True))
-                samples.append((done, main, max(below, default=0.0) / 2**20))
-            except (psutil.Error, OSError):
-                continue
+
+    def note(whole: Any) -> None:
+        below = [child.memory_info().rss / 2**20 for child in whole.children(recursive=True)]
+        done, own = len(os.listdir(place / "out")), whole.memory_info().rss / 2**20
+        samples.append((done, own, max(below, default=0.0)))
+
+    watched(place, *words, note=note)
     at = {}
     for wanted in (100, 500, MANY - 20):
         done, main, worker = min(samples, key=lambda s, w=wanted: abs(s[0] - w))
         at[str(wanted)] = {"done": done, "command_MiB": main, "largest_process_MiB": worker}
-    again = called(place, *quick, "--out", "out")
+    again = watched(place, *words)
     return {"tests": MANY, "after": at, "called again, nothing to do": again}
 
 
 def measure_parts(place: Path) -> dict[str, Any]:
     """Measure the work of the coordinating process per test (ms) and the disk usage."""
     make_tests(place / "tests", 50, 601)
-    toml, paths = place / "foam.toml", sorted((place / "tests").iterdir())
-    found: dict[str, Any] = {}
+    toml, paths, found = place / "foam.toml", sorted((place / "tests").iterdir()), {}
     for name, pages in {"no report": False, "reports": True}.items():
         recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=pages)
-        key, path = recipe.key, paths[0]
-        mark = fingerprint(key, path.read_bytes(), toml.read_bytes(), None)
-        content = path.read_bytes(), toml.read_bytes(), None
-        outcome = work(Task(path.stem, path, toml, recipe, mark, None, content))
-        assert outcome.files is not None
-        out = place / name
+        first, out = task(paths[0], toml, recipe, None), place / name
+        files = work(first)[1]
+        assert files is not None
+        began = time.process_time()
+        for path in paths:
+            put(files, out / path.stem)
+        written = time.process_time()
+        for path in paths:
+            fingerprint(recipe.key, path.read_bytes(), toml.read_bytes(), None)
+            stored(out / path.stem, first.mark, recipe)
+        again = time.process_time()
         found[name] = {
-            "files": len(outcome.files),
-            "kB": sum(map(len, outcome.files.values())) / 1e3,
-            "write_ms": timed(lambda i, f=outcome.files, o=out: put(f, o / f"t{i}"), 50),
-            "again_ms": timed(
-                lambda i, k=key, o=out, m=mark, r=recipe: (
-                    fingerprint(k, paths[i].read_bytes(), toml.read_bytes(), None),
-                    stored(o / f"t{i}", m, r),
-                ),
-                50,
-            ),
+            "files": len(files),
+            "kB": sum(map(len, files.values())) / 1e3,
+            "write_ms": 1e3 * (written - began) / len(paths),
+            "again_ms": 1e3 * (again - written) / len(paths),
         }
     return found
-
-
-def timed(call: Callable[[int], Any], count: int) -> float:
-    """Return the processor time of a call, ms."""
-    began = time.process_time()
-    for i in range(count):
-        call(i)
-    return 1e3 * (time.process_time() - began) / count
 
 
 MEASURES = {
@@ -228,15 +217,11 @@ MEASURES = {
 def main() -> None:
     parser = studies.arguments(__doc__)
     parser.add_argument("measures", nargs="*", choices=[[], *MEASURES], help="all, if left out")
-    wanted = parser.parse_args().measures or list(MEASURES)
     kept = HERE / "batch.json"
-    found = json.loads(kept.read_text()) if kept.exists() else {}
-    for name in wanted:
-        place = Path(tempfile.mkdtemp(prefix="batch-"))
-        try:
-            found[name] = MEASURES[name](place) | {"load": os.getloadavg()[1]}
-        finally:
-            shutil.rmtree(place)
+    found = json.loads(kept.read_text())
+    for name in parser.parse_args().measures or MEASURES:
+        with tempfile.TemporaryDirectory() as place:
+            found[name] = MEASURES[name](Path(place)) | {"load": os.getloadavg()[1]}
         print(name, json.dumps(found[name], indent=1), flush=True)
         kept.write_text(json.dumps(found, indent=1) + "\n")
 

@@ -6,7 +6,7 @@ mev43/FYP-Cyclic-Compression-Data-Analysis) contains 145 recorded cycles of 1000
 fitted on its own with a microscale spring with relaxation. The measurements are not part of this
 repository.
 
-Answer. Snap-through and relaxation change from cycle to cycle: see damage.md. Also written:
+Answer. Snap-through and relaxation change from cycle to cycle: README.md. Also written:
 twins.csv, lattice.csv and lattice.png.
 
     FOAMFIT_DATA=path/to/data python experiments/damage/damage.py
@@ -24,16 +24,14 @@ import numpy as np
 import pandas as pd
 
 import foamfit as ff
-from foamfit.report.figures import DPI
 from foamfit.text import significant
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import studies  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
 
+HERE = Path(__file__).parent
 MODEL = {"model": "microscale", "relaxation": 1}
-LAW = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
-NAMES = tuple(f"s1_{name}" for name in (*LAW, "g1", "tau1"))
+NAMES = tuple(f"s1_{name}" for name in (*studies.MICROSCALE, "g1", "tau1"))
 SHOWN = ("start_strain", "dissipated_energy", "misfit_stress_strain", *NAMES)
 SHARES = ("start_strain", "misfit_stress_strain")
 LATTICES, LATTICE_CYCLES = ("tpu87-20", "tpu87-35", "tpu87-50"), (1, 2, 10, 100, 1000)
@@ -155,7 +153,7 @@ def lattice_changes(table: pd.DataFrame) -> str:
 
 def draw_lattices(found: dict[str, ff.CycleFits]) -> None:
     colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, len(LATTICE_CYCLES)))
-    with studies.sheet(HERE / "lattice.png", 7.4, 2.3, DPI) as figure:
+    with studies.sheet(HERE / "lattice.png", 7.4, 2.3, 250) as figure:
         axes = figure.subplots(1, 3)
         for ax, (name, one) in zip(axes, found.items(), strict=True):
             for (cycle, result), colour in zip(sorted(one.results.items()), colours, strict=True):
@@ -177,10 +175,10 @@ def main() -> None:
     studies.write_csv(lattices, HERE / "lattice.csv", 6)
     draw_lattices(found)
     studies.write_page(
-        HERE, "damage.md", twins=twin_table(twins), told=twin_changes(twins),
+        HERE, twins=twin_table(twins), told=twin_changes(twins),
         lattice=lattice_table(lattices), lattice_told=lattice_changes(lattices),
     )  # fmt: skip
 
 
 if __name__ == "__main__":
-    studies.run(main, HERE)
+    main()

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+
 from written_law import ETA, branch_at, equilibrate, first_branch, stress_on
 
 VERLET, RK4 = range(2)

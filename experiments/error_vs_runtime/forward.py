@@ -4,13 +4,13 @@ Method. For every scene of `scenes.py`, the errors of foamfit's solver, of fixed
 three SciPy integrators against the judge of the stability study (`independent.py`, some 14 digits)
 are plotted over the median time of many runs. All solvers of a scene alternate in one process, and
 processor time is measured, so that a busy machine affects all of them equally; ratios compare
-medians of one run. A table (CSV, Markdown) and a figure per scene and a summary go to `forward/`.
+medians of one run. A table and a figure per scene and summary.csv go to `forward/`.
 
-Answer. For an error below 2e-6 foamfit takes 24 µs to 17 ms, SciPy 14 to 170 times as long: see
-forward/summary.md.
+Answer. For an error below 2e-6 foamfit takes 24 µs to 17 ms, SciPy 14 to 170 times as long:
+README.md.
 
     python experiments/error_vs_runtime/forward.py                      # all: about 5 minutes
-    python experiments/error_vs_runtime/forward.py one_spring_impact    # some scenes, no summary
+    python experiments/error_vs_runtime/forward.py one_spring_impact    # some scenes, no page
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # processor time of one thread
 
 import contextlib
 import gc
-import platform
 import sys
 import textwrap
 import time
@@ -32,18 +31,16 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import scenes as kinds
-from scenes import KERNEL, PUBLIC, Competitor, Scene
 
 import foamfit as ff
+import scenes as kinds
+from scenes import KERNEL, PUBLIC, Competitor, Scene
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
 from studies import BLUE, GREEN, ORANGE, SKY, VERMILION
-from unchanged import keep_unchanged
 
 HERE = Path(__file__).parent
-REFERENCE = "brute force at 1e-13 (experiments/stability/independent.py)"
 WANTED = 2e-6  # the error at which solvers are compared
 ROUNDS = 40
 SHORTEST = 2e-3  # s; shorter runs are timed in groups
@@ -215,59 +212,34 @@ def compare(scene: Scene, table: pd.DataFrame) -> dict[str, object]:
     return row
 
 
-def write(table: pd.DataFrame, path: Path, heading: list[str]) -> pd.DataFrame:
-    """Write a table as CSV (comments first) and as Markdown; return the kept table.
-
-    If the times have hardly changed, the older table is kept, and so figure and summary stay the
-    same.
-    """
-    written, page = path.with_suffix(".csv"), path.with_suffix(".md")
-    with keep_unchanged(written), written.open("w") as file:
-        file.writelines(f"# {line}\n" for line in heading)
-        table.to_csv(file, index=False, float_format="%.4g")
-    kept = pd.read_csv(written, skiprows=len(heading))
-    title, *others = heading
-    page.write_text(f"# {title}\n\n" + "\n".join(others) + f"\n\n{studies.shown(kept)}\n")
-    return kept
-
-
 def main() -> None:
-    parser = studies.arguments(__doc__, HERE / "forward", budget=(6.0, "seconds of turns a scene"))
-    parser.add_argument("scenes", nargs="*", help="names; left out = all, and the summary")
+    """Measure and draw the scenes; write the page if all were asked for."""
+    parser = studies.arguments(__doc__, HERE, budget=(6.0, "seconds of turns a scene"))
+    parser.add_argument("scenes", nargs="*", help="names; left out = all, and the page")
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    names = studies.versions("numpy", "scipy", "numba", "foamfit")
-    spelled = zip(("Python", "NumPy", "SciPy", "numba", "foamfit"), names.values(), strict=True)
-    machine = f"{studies.processor()} ({platform.machine()}, {os.cpu_count()} cores)"
-    where = f"{machine}; {', '.join(' '.join(one) for one in spelled)}"
+    folder = options.out / "forward"
+    folder.mkdir(parents=True, exist_ok=True)
     compile_all()
-    rows = []
+    rows, figures = [], []
     for scene in kinds.scenes():
         if options.scenes and scene.name not in options.scenes:
             continue
-        began = time.perf_counter()
-        heading = [
-            f"Error against run time: {scene.title}",
-            f"{scene.time.size} samples. Error: largest over range, of displacement and base "
-            f"stress, against {REFERENCE}. Processor time: median and quartiles.",
-            where,
-        ]
-        table = write(measure(scene, options.budget), options.out / scene.name, heading)
-        draw_scene(table, scene.title, options.out / f"{scene.name}.png")
+        table = measure(scene, options.budget)
+        studies.write_csv(table, folder / f"{scene.name}.csv")
+        draw_scene(table, scene.title, folder / f"{scene.name}.png")
+        figures.append(f"![Error against run time: {scene.title}](forward/{scene.name}.png)")
         rows.append(compare(scene, table))
-        ratios = (
-            f"SciPy / {name} {rows[-1][f'SciPy / {name}']:.3g}" for name in ("simulate", "kernel")
-        )
-        print(scene.name, *ratios, f"({time.perf_counter() - began:.0f} s)", file=sys.stderr)
+        ratios = (f"{name} {rows[-1][f'SciPy / {name}']:.3g}" for name in ("simulate", "kernel"))
+        print(scene.name, "SciPy over", *ratios, file=sys.stderr)
     if options.scenes:
         return
-    summary = pd.DataFrame(rows)
-    studies.write_csv(summary, options.out / "summary.csv")
-    text = (HERE / "summary.template.md").read_text(encoding="utf-8").format(
-        wanted=f"{WANTED:g}", where=where, table=studies.shown(summary)
+    studies.write_csv(rows, folder / "summary.csv")
+    studies.write_page(
+        HERE, options.out, wanted=f"{WANTED:g}", table=studies.shown(pd.DataFrame(rows)),
+        where=studies.circumstances("NumPy", "SciPy", "numba", "foamfit"),
+        figures="\n\n".join(figures),
     )  # fmt: skip
-    (options.out / "summary.md").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
-    studies.run(main, HERE)
+    main()

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-import written_law as law
 from numba import njit
 from scipy.integrate import DOP853, LSODA, Radau
 from scipy.optimize import brentq
+
+import written_law as law
 
 METHODS = {"DOP853": DOP853, "LSODA": LSODA, "Radau": Radau}
 TINY = 4 * np.finfo(float).eps

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from restarted import METHODS, along
 
 import foamfit as ff
+from restarted import METHODS, along
 
 compiled = njit(cache=True, error_model="numpy")
 

@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import fixed_step
 import numpy as np
+
+import fixed_step
+import foamfit as ff
 import restarted
 import restarted_memory
 import written_law
-
-import foamfit as ff
 from foamfit.solve.plan import Plan, plan
 from foamfit.springs.chain import Drive
 

@@ -25,13 +25,12 @@ import pandas as pd
 
 import foamfit as ff
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
+from rig import Impact, Slow, impact, slow, write
+
 HERE = Path(__file__).parent
 ROOT = HERE.parent
-sys.path[:0] = [str(ROOT / "recovery"), str(ROOT)]
-from rig import Impact, Slow, impact, slow, write  # noqa: E402
-
-import studies  # noqa: E402
-
 Row = tuple[str, str, str]  # result, quantity, value
 FILE = HERE / "frozen.csv"
 EXACT, OTHER, ERRORS = 1e-9, 1e-3, 0.01

@@ -13,7 +13,7 @@ with white noise of 0.25 % of the largest stress, which the TOML states.
 
 Answer. Four tests have half the standard errors of one; coverage is 92 to 98 %: README.md.
 
-    python experiments/joint/joint.py                 # all; writes joint.csv and joint.md
+    python experiments/joint/joint.py                 # all; writes joint.csv and README.md
     python experiments/joint/joint.py --only log --draws 20 --out FOLDER
 """
 
@@ -30,10 +30,10 @@ import pandas as pd
 
 import foamfit as ff
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import studies  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
 
+HERE = Path(__file__).parent
 HEIGHT, TOP, NOISE, SAMPLES = 10e-3, 0.5, 400.0, 101
 SPRING = {
     "k0": 5.5e5, "kc": 4e5, "eps_star": 0.3, "sigma_plus": 1.1e5, "spread_plus": 0.4,
@@ -65,19 +65,8 @@ def write_study(folder: Path, kinds: dict[str, str]) -> Path:
     )  # fmt: skip
 
 
-def off_and_held(one: Any, slope: float) -> tuple[float, bool]:
-    """Return the error of a slope in standard errors, and whether its interval covers it."""
-    return (one.b - slope) / one.b_stderr, bool(one.b_ci95[0] <= slope <= one.b_ci95[1])
-
-
-def in_errors(study: str, what: str, off: list[float], hits: list[bool]) -> Row:
-    """Return mean and spread of the errors, in standard errors, and interval coverage."""
-    row = {"study": study, "what": what, "draws": len(hits), "mean": float(np.mean(off))}
-    return row | {"spread": float(np.std(off))} | studies.share(hits)
-
-
 def four(draws: int, folder: Path) -> Iterator[Row]:
-    """Return the standard errors of four tests of one specimen over those of one."""
+    """Yield the standard errors of four tests of one specimen over those of one."""
     ratios = []
     for draw in range(draws):
         rng = np.random.default_rng([1, draw])
@@ -87,33 +76,35 @@ def four(draws: int, folder: Path) -> Iterator[Row]:
         test = ff.read_test(folder / "t0.csv", folder / "foam.toml")
         alone = ff.fit(test, model="microscale", drive="displacement", intervals="local")
         pairs = [(joint.parameters[f"s1_{n}"], alone.parameters[f"s1_{n}"]) for n in SPRING]
-        ratios.append([a.stderr / b.stderr for a, b in pairs if a.stderr and b.stderr])
-    mean = float(np.mean([np.mean(one) for one in ratios]))
+        ratios.append(np.mean([a.stderr / b.stderr for a, b in pairs if a.stderr and b.stderr]))
+    mean = float(np.mean(ratios))
     yield {"study": "four", "what": "stderr of four tests over one's", "draws": draws, "mean": mean}
 
 
+def holds(interval: tuple[float, float], truth: float) -> bool:
+    return bool(interval[0] <= truth <= interval[1])
+
+
 def scatter(draws: int, folder: Path, spread: float) -> Iterator[Row]:
-    """Return the coverage of common value and spread over groups of 8 specimens."""
-    common, hits, spreads = [], [], []
-    kinds = SHARED | {"k0": "scatter", "sigma_plus": "own"}
+    """Yield the coverage of common value and spread over groups of 8 specimens."""
+    found, kinds = [], SHARED | {"k0": "scatter", "sigma_plus": "own"}
     for draw in range(draws):
         rng = np.random.default_rng([2, round(1e3 * spread), draw])
         for i in range(8):
             own = SPRING["k0"] * np.exp(spread * rng.standard_normal())
             write_test(folder / f"t{i}.csv", 0.1, rng, k0=own)
-        one = ff.joint(write_study(folder, kinds), jobs=1).parameters["s1_k0"]
-        common.append(bool(one.ci95[0] <= SPRING["k0"] <= one.ci95[1]))
-        hits.append(bool(one.scatter_ci95[0] <= spread <= one.scatter_ci95[1]))
-        spreads.append(one.scatter)
+        found.append(ff.joint(write_study(folder, kinds), jobs=1).parameters["s1_k0"])
     row: Row = {"study": f"scatter {spread:g}", "draws": draws}
-    yield row | {"what": "common value"} | studies.share(common)
-    yield row | {"what": "spread", "mean": float(np.mean(spreads))} | studies.share(hits)
+    common = studies.share([holds(one.ci95, SPRING["k0"]) for one in found])
+    yield row | {"what": "common value"} | common
+    mean = float(np.mean([one.scatter for one in found]))
+    held = studies.share([holds(one.scatter_ci95, spread) for one in found])
+    yield row | {"what": "spread", "mean": mean} | held
 
 
 def rates(draws: int, folder: Path, kind: str, slope: float) -> Iterator[Row]:
-    """Return bias and coverage of value and slope of a rate law, and the kind chosen."""
-    off, hits, value_off, value_hits, chosen = [], [], [], [], []
-    truth = SPRING["sigma_plus"]
+    """Yield bias (in standard errors) and coverage of a rate law, and the kinds chosen."""
+    truth, found, chosen = SPRING["sigma_plus"], [], []
     for draw in range(draws):
         rng = np.random.default_rng([3, len(kind), draw])
         for i, rate in enumerate(RATES):
@@ -121,32 +112,27 @@ def rates(draws: int, folder: Path, kind: str, slope: float) -> Iterator[Row]:
             factor = 1.0 + slope * x if kind == "log rate" else np.exp(slope * x)
             write_test(folder / f"t{i}.csv", rate, rng, sigma_plus=factor * truth)
         result = ff.joint(write_study(folder, SHARED | {"sigma_plus": kind}), jobs=1)
-        one = result.parameters["s1_sigma_plus"]
-        value_off.append((one.value - truth) / one.stderr)
-        value_hits.append(bool(one.ci95[0] <= truth <= one.ci95[1]))
-        for kept, found in zip((off, hits), off_and_held(one, slope), strict=True):
-            kept.append(found)
+        found.append(result.parameters["s1_sigma_plus"])
         chosen.append(min(result.evidence, key=lambda alternative: alternative.bic).kind)
-    yield in_errors(kind, "value", value_off, value_hits)
-    yield in_errors(kind, "slope b", off, hits)
+    for what, off, held in (
+        ("value", [(one.value - truth) / one.stderr for one in found],
+         [holds(one.ci95, truth) for one in found]),
+        ("slope b", [(one.b - slope) / one.b_stderr for one in found],
+         [holds(one.b_ci95, slope) for one in found]),
+    ):  # fmt: skip
+        row = {"study": kind, "what": what, "draws": draws, "mean": float(np.mean(off))}
+        yield row | {"spread": float(np.std(off))} | studies.share(held)
     for name in ("log rate", "power rate", "shared", "own"):
         yield {"study": kind, "what": f"evidence for {name}", "draws": draws,
                "share": chosen.count(name) / draws}  # fmt: skip
 
 
-def write(frame: pd.DataFrame, folder: Path) -> None:
-    """Write joint.csv and joint.md."""
-    frame.to_csv(folder / "joint.csv", index=False, lineterminator="\n")
-    table = studies.shown(frame)
-    (folder / "joint.md").write_text(f"{table}\n\n{studies.circumstances()}\n", encoding="utf-8")
-    print(table)
-
-
-STUDIES: dict[str, tuple[Any, int, tuple[Any, ...]]] = {  # maker, draws, each with one of these
-    "four": (four, 20, ((),)),
-    "scatter": (scatter, 100, ((0.1,), (0.03,))),
-    "log": (rates, 200, (("log rate", 0.05),)),
-    "power": (rates, 200, (("power rate", 0.05),)),
+STUDIES: dict[str, tuple[Any, ...]] = {  # maker, draws and settings of each part
+    "four": (four, 20),
+    "scatter": (scatter, 100, 0.1),
+    "small scatter": (scatter, 100, 0.03),
+    "log": (rates, 200, "log rate", 0.05),
+    "power": (rates, 200, "power rate", 0.05),
 }
 
 
@@ -156,14 +142,13 @@ def main() -> None:
     parser.add_argument("--draws", type=int, help="default: 100 of groups, 200 of laws, 20 else")
     given = parser.parse_args()
     rows = list[Row]()
-    for name, (maker, draws, cases) in STUDIES.items():
-        for case in cases if given.only in (None, name) else ():
-            with tempfile.TemporaryDirectory() as folder:
-                place, count = Path(folder), given.draws or draws
-                for row in maker(count, place, *case):
-                    rows.append(row)
-                    print(row, flush=True)
-    write(pd.DataFrame(rows), given.out)
+    for name in [given.only] if given.only else STUDIES:
+        maker, draws, *settings = STUDIES[name]
+        with tempfile.TemporaryDirectory() as folder:
+            rows += maker(given.draws or draws, Path(folder), *settings)
+    studies.write_csv(rows, given.out / "joint.csv")
+    table = studies.shown(pd.DataFrame(rows))
+    print(studies.write_page(HERE, given.out, table=table))
 
 
 if __name__ == "__main__":

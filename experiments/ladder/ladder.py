@@ -31,10 +31,10 @@ import foamfit as ff
 from foamfit.data.measurement import Measurement, Specimen, Striker
 from foamfit.fitting.problem import make_params
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import studies  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
 
+HERE = Path(__file__).parent
 HEIGHT, AREA, MASS, SAMPLES = 1.2e-3, 1.9635e-5, 7e-3, 401
 CLEAR_MISFIT, CLEAR_DAMPING = 0.5, 0.05
 # The models of linear and bistable springs, from the simplest up.
@@ -200,7 +200,7 @@ def write_page(folder: Path) -> None:
     table = pd.read_csv(folder / "structures.csv")
     clear = table[table["clear"]]
     studies.write_page(
-        HERE, out=folder, machine=studies.circumstances(), samples=SAMPLES,
+        HERE, folder, samples=SAMPLES,
         damping=100 * CLEAR_DAMPING, misfit=CLEAR_MISFIT, structures=structure_table(table),
         found=int(clear["found"].sum()), clear=len(clear), rate=100 * clear["found"].mean(),
         confusion=confusion(table),
@@ -225,4 +225,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    studies.run(main, HERE)
+    main()

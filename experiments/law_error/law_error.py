@@ -14,7 +14,6 @@ Answer. Yes, in 92 to 98 % of the draws of each kind: README.md.
 
 from __future__ import annotations
 
-import platform
 import sys
 import tempfile
 import time
@@ -31,12 +30,11 @@ from scipy.signal import lfilter
 
 import foamfit as ff
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
+from truth import Microscale, Motion, Rig
+
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE.parent / "recovery"), str(HERE.parent)]
-from truth import Microscale, Motion, Rig  # noqa: E402
-
-import studies  # noqa: E402
-
 NOISE = 0.005  # of the range
 
 
@@ -114,7 +112,7 @@ def curves(kind: str) -> Curves:
         clock = np.linspace(0.0, 5.0, 1000)
         turn, most = clock[499:501], 2e-3 * clock[499]  # the samples next to the turning point
         motion = Motion((0.0, *turn, 5.0), (0.0, most, most, 0.0), ("line",) * 3)
-        foam = Microscale(5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77, terms=((0.5, 0.2),))
+        foam = Microscale(5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77, relaxation=((0.5, 0.2),))
         course = Rig((foam,), (height,), area, motion=motion).run(0.0, 5.0)
         clock = clock[:930]
         return Curves(clock, course.stress(clock), course.top(clock, False), height, area)
@@ -172,14 +170,12 @@ def draws_of(kind: str, draws: int) -> pd.DataFrame:
         for name, item in result.parameters.items():
             if item.vary and name.startswith("s1_"):  # not of the record
                 low, high = item.ci95 or (np.nan, np.nan)
-                rows.append(
-                    {
-                        "kind": kind, "draw": draw, "parameter": name, "value": item.value,
-                        "best without noise": without.parameters[name].value, "low": low,
-                        "high": high, "ranged": item.range is not None, "state": item.state,
-                        "found": found, "seconds": seconds,
-                    }
-                )  # fmt: skip
+                rows.append({
+                    "kind": kind, "draw": draw, "parameter": name, "value": item.value,
+                    "best without noise": without.parameters[name].value, "low": low,
+                    "high": high, "ranged": item.range is not None, "state": item.state,
+                    "found": found, "seconds": seconds,
+                })  # fmt: skip
     return pd.DataFrame(rows)
 
 
@@ -226,21 +222,14 @@ def summary_of(table: pd.DataFrame) -> pd.DataFrame:
 def main() -> None:
     parser = studies.arguments(__doc__, HERE, draws=200)
     options = parser.parse_args()
-    tables = []
-    for kind in KINDS:
-        began = time.perf_counter()
-        tables.append(pd.DataFrame(coverage(draws_of(kind, options.draws))))
-        print(f"{kind}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
-        print(tables[-1].round(3).to_string(index=False), file=sys.stderr, flush=True)
-    table = pd.concat(tables)
+    table = studies.said(row for kind in KINDS for row in coverage(draws_of(kind, options.draws)))
     studies.write_csv(table, options.out / "law_error.csv")
     summary = summary_of(table)
     studies.write_page(
-        HERE, out=options.out, foamfit=ff.__version__, python=platform.python_version(),
-        machine=platform.machine(), noise=f"{100 * NOISE:g} %",
+        HERE, options.out, noise=f"{100 * NOISE:g} %",
         summary=studies.markdown(summary.columns, summary.to_numpy()),
     )  # fmt: skip
 
 
 if __name__ == "__main__":
-    studies.run(main, HERE)
+    main()

@@ -27,16 +27,14 @@ import pandas as pd
 
 import foamfit as ff
 from foamfit.data.cycles import cycles_of, find_turns
-from foamfit.data.measurement import Measurement
 from foamfit.data.noise import noise_level
-from foamfit.report.figures import DPI, GREY
 from foamfit.results import Fit
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import real_foams  # noqa: E402
-import studies  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import real_foams
+import studies
 
+HERE = Path(__file__).parent
 TABLE, PARAMETERS, BACK = (HERE / f"{name}.csv" for name in ("memory", "parameters", "ways_back"))
 SHOWN = "new-heel-comp-3"  # in the picture
 FIRST, HISTORY, PREDICTED = "first cycle", "cycles 1 to 3", "predicted"
@@ -62,7 +60,7 @@ def histories(data: Path, folder: Path) -> Iterator[tuple[str, Path, Path]]:
         yield name, place / f"{name}_raw.txt", toml
 
 
-def misfits(test: Measurement, result: Fit) -> dict[int, float]:
+def misfits(test: ff.Measurement, result: Fit) -> dict[int, float]:
     """Return the misfit of each cycle relative to the range of that cycle."""
     fitted, measured = result.curves.stress, test.stress
     assert fitted is not None
@@ -103,7 +101,7 @@ def turned_back_table(table: pd.DataFrame) -> str:
     return studies.markdown("folder | records | loadings, unloadings | most taken back", rows)
 
 
-def fitted(test: Measurement, **more: Any) -> tuple[Fit, float]:
+def fitted(test: ff.Measurement, **more: Any) -> tuple[Fit, float]:
     began = time.process_time()  # the machine may be shared
     return ff.fit(test, **MEMORY, **more), time.process_time() - began
 
@@ -150,7 +148,7 @@ def draw(later: ff.Prediction, path: Path) -> None:
     curve, test = next(iter(later.curves.values())), later.measurement
     assert test.displacement is not None
     strain, spans = test.displacement / test.specimen.height, cycles_of(test)
-    with studies.sheet(path, 7.0, 3.3, DPI) as figure:
+    with studies.sheet(path, 7.0, 3.3, 250) as figure:
         axes = figure.subplots(1, 2, sharey=True)
         for ax, fits, title in zip(axes, (True, False), ("fitted", "predicted"), strict=True):
             for number, part in spans.items():
@@ -163,7 +161,7 @@ def draw(later: ff.Prediction, path: Path) -> None:
                 if not fits:
                     ends = curve.lo[part] / 1e3, curve.hi[part] / 1e3
                     ax.fill_between(x, *ends, color=line.get_color(), alpha=0.15, lw=0)
-            ax.plot([], [], "o", ms=2.4, mfc="none", mec=GREY, mew=0.5, label="measured")
+            ax.plot([], [], "o", ms=2.4, mfc="none", mec=studies.GREY, mew=0.5, label="measured")
             ax.set(title=title, xlabel="strain (–)")
             ax.legend(loc="upper left")
         axes[0].set_ylabel("stress (kPa)")
@@ -232,9 +230,7 @@ def values_table(values: pd.DataFrame) -> str:
         for _, foam in group.groupby("foam", sort=False):
             scatter = f" ± {foam['value'].std(ddof=1):.2g}" if len(foam) > 1 else ""
             cells.append(f"{foam['value'].mean():.3g}{scatter}")
-        states = group["state"].value_counts()
-        counts = " / ".join(str(states.get(s, 0)) for s in ("determined", "weak", "not determined"))
-        rows.append([name, *cells, counts])
+        rows.append([name, *cells, studies.counted(group["state"])])
     head = ["parameter", *own["foam"].unique(), "determined / weak / not"]
     return studies.markdown(head, rows)
 

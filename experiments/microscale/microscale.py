@@ -21,12 +21,11 @@ from numpy.typing import NDArray
 
 import foamfit as ff
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
+from cycles import Ensemble
+
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE.parent), str(HERE.parent / "recovery")]
-from cycles import Ensemble  # noqa: E402
-
-import studies  # noqa: E402
-
 Array = NDArray[np.float64]
 
 VALUES = {
@@ -114,4 +113,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     studies.arguments(__doc__).parse_args()
-    studies.run(main, HERE)
+    main()

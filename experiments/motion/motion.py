@@ -12,7 +12,6 @@ no false turning points. README.md has the tables.
 
 from __future__ import annotations
 
-import platform
 import sys
 import tempfile
 import time
@@ -23,14 +22,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-import foamfit as ff
 from foamfit.data.measurement import NoiseLevel
 from foamfit.data.motion import follow
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import studies  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
 
+HERE = Path(__file__).parent
 ROWS, NOISE = (300, 1000, 5000), (0.0005, 0.001, 0.003)
 NEAR = 0.01  # of the duration, on both sides of a turning point
 Z95 = 1.959964
@@ -282,12 +280,10 @@ def main() -> None:
     values |= {
         "draws": str(options.draws * len(ROWS) * len(NOISE)),
         "sigma": f"{sigma.quantile(0.025):.2f} to {sigma.quantile(0.975):.2f}",
-        "python": platform.python_version(), "machine": platform.machine(),
-        "foamfit": ff.__version__,
     }  # fmt: skip
     whole = options.draws >= 25 and options.seed == 0
     with tempfile.TemporaryDirectory() as folder:
-        print(studies.write_page(HERE, out=HERE if whole else Path(folder), **values))
+        print(studies.write_page(HERE, HERE if whole else Path(folder), **values))
 
 
 if __name__ == "__main__":

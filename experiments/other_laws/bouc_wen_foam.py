@@ -10,9 +10,9 @@ Eng. 16, 161.
 """
 
 import numpy as np
-from ogden import CURVE, curve, is_curve, read_curve
 
 import foamfit as ff
+from ogden import CURVE, curve, is_curve, read_curve
 
 
 def admissible(p):

@@ -18,9 +18,9 @@ Koeller 1984, J. Appl. Mech. 51, 299; Doehring, Freed, Carew & Vesely 2005, J. B
 import math
 
 import numpy as np
-from ogden import CURVE, curve, is_curve, near, read_curve
 
 import foamfit as ff
+from ogden import CURVE, curve, is_curve, near, read_curve
 
 N, SLOWEST, RATIO = 17, 1e-4, 4.0
 

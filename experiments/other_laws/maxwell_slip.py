@@ -12,11 +12,11 @@ Iwan 1966, J. Appl. Mech. 33, 893; Segalman 2005, J. Appl. Mech. 72, 752.
 """
 
 import numpy as np
-from bouc_wen_foam import admissible, ends
 from numba import njit
-from ogden import CURVE, curve, read_curve
 
 import foamfit as ff
+from bouc_wen_foam import admissible, ends
+from ogden import CURVE, curve, read_curve
 
 N = 24  # sliders; their elastic strains at the last turn, and the strain there, are internal
 

@@ -12,9 +12,9 @@ Ogden & Roxburgh 1999, Proc. R. Soc. A 455, 2861, equation (51).
 import math
 
 import numpy as np
-from ogden import CURVE, curve, is_curve, near, read_curve, real_curve
 
 import foamfit as ff
+from ogden import CURVE, curve, is_curve, near, read_curve, real_curve
 
 
 def admissible(p):

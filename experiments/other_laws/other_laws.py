@@ -23,7 +23,6 @@ import importlib
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,15 +30,15 @@ import numpy as np
 import pandas as pd
 
 import foamfit as ff
-from foamfit.data.measurement import Measurement
 from foamfit.springs import laws
 from foamfit.springs.parameters import NUISANCE
 
-HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent.parent / "notebooks")]
-import studies  # noqa: E402
-from real_foams import SHOE_FOAM  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
+from real_foams import SHOE_FOAM
 
+HERE = Path(__file__).parent
+sys.path.append(str(HERE.parents[1] / "notebooks"))  # of bouc_wen.py
 ROWS = 320  # of a thinned record
 MEASURES = ("misfit", "predicted", "scaled")  # over the range of the measured stress
 
@@ -94,7 +93,7 @@ VELOCITY = {"test_1_impact": 0.785, "test_3_impact": 0.905}  # m/s
 # ------------------------------------------------------------------------------- the tests
 
 
-def read(group: str, name: str, data: Path, folder: Path) -> Measurement:
+def read(group: str, name: str, data: Path, folder: Path) -> ff.Measurement:
     """Read a test like a user, and thin it."""
     toml, cycle = folder / "specimen.toml", None
     if name in SHOE_FOAM:
@@ -106,8 +105,7 @@ def read(group: str, name: str, data: Path, folder: Path) -> Measurement:
         studies.write_specimen(toml, *sizes[name])
     elif group == MYCELIUM:
         path = data / "mycelium-rates" / f"{name}_raw.txt"
-        gap = path.read_text(encoding="utf-8").splitlines()[1].split("\t")[5].strip()
-        studies.write_specimen(toml, f"{gap} um", "8 mm")
+        toml = studies.mycelium(path, folder)
     elif group == LATTICE:
         stem, _, number = name.split()
         path, cycle = data / "lattice-cycles" / f"{stem}_raw.csv", int(number)
@@ -119,10 +117,8 @@ def read(group: str, name: str, data: Path, folder: Path) -> Measurement:
     return thinned(ff.read_test(path, toml, cycle=cycle), folder / f"{name}.csv")
 
 
-def thinned(test: Measurement, path: Path) -> Measurement:
+def thinned(test: ff.Measurement, path: Path) -> ff.Measurement:
     """Keep every n-th row of a test, at most `ROWS`, as a test without a striker."""
-    assert test.time is not None
-    assert test.displacement is not None
     some = slice(None, None, -(-test.time.size // ROWS))
     own = test.specimen
     toml = f'name = "{test.name}"\n[specimen]\nheight = "{own.height} m"\narea = "{own.area} m^2"\n'
@@ -165,7 +161,7 @@ def fit_all(case: tuple[str, str, str], data: Path, starts: int) -> list[dict[st
     return rows
 
 
-def predicted(result: Any, test: Measurement) -> dict[str, float]:
+def predicted(result: Any, test: ff.Measurement) -> dict[str, float]:
     """Return the misfit of an unseen test: as predicted, and after scaling the stress."""
     one = ff.predict(result, test).curves["stress_strain"]
     factor = one.predicted @ one.measured / (one.predicted @ one.predicted)
@@ -257,7 +253,6 @@ def main() -> None:
     studies.write_page(
         HERE, out=given.out, table=law_table(table), rows=ROWS,
         starts=given.starts, minutes=f"{table['seconds'].sum() / 60.0:.0f}",
-        circumstances=studies.circumstances(),
     )  # fmt: skip
 
 
@@ -268,12 +263,12 @@ def fit_tests(given: argparse.Namespace) -> None:
     )
     cases = [case for case in TESTS if given.only in case[1]]
     rows = list[dict[str, Any]]()
-    with ProcessPoolExecutor(given.jobs) as pool:
-        for task in [pool.submit(fit_all, case, data, given.starts) for case in cases]:
-            rows += task.result()  # an interrupted study keeps its rows
-            table = pd.DataFrame(rows).drop(columns="curves")
-            studies.write_csv(table, given.out / "other_laws.csv")
-            draw(rows, given.out / "other_laws.png")
+    jobs = [(case, data, given.starts) for case in cases]
+    for more in studies.in_order(fit_all, jobs, given.jobs):
+        rows += more  # an interrupted study keeps its rows
+        table = pd.DataFrame(rows).drop(columns="curves")
+        studies.write_csv(table, given.out / "other_laws.csv")
+        draw(rows, given.out / "other_laws.png")
 
 
 if __name__ == "__main__":

@@ -31,13 +31,12 @@ from scipy.signal import find_peaks
 
 import foamfit as ff
 from foamfit.springs.law import BRANCH_NAMES
-from foamfit.springs.published import PublishedSet
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
+from studies import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILION
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import studies  # noqa: E402
-from studies import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILION  # noqa: E402
-
 Array = NDArray[np.float64]
 
 MODEL_1, MODEL_2, MODEL_3, FOAM_2 = "foam-1/model-1", "foam-1/model-2", "foam-1/model-3", "foam-2"
@@ -173,68 +172,42 @@ def slowed(drive: Drive, damper: float, slower: float) -> float:
 
 # ------------------------------------------------------------------------- damping ratios: claim 3
 
-READINGS = {
-    "the formula: k_c, H, ρ of the striker": lambda q: ratio(q, q["kc"]),
-    "striker and foam together in ρ": lambda q: ratio(q, q["kc"], mass=STRIKER + q["own"]),
-    "ρ = bulk density of the foam": lambda q: ratio(q, q["kc"], mass=q["own"]),
-    "k₀ for k_c": lambda q: ratio(q, q["k0"]),
-    "k_h+ for k_c": lambda q: ratio(q, q["kh_plus"]),
-    "k_h− (branch e) for k_c": lambda q: ratio(q, q["kh_minus"]),
-    "tangent of branch c at C2 for k_c": lambda q: ratio(q, q["tangent_c2"]),
-    "tangent of branch c at C1 for k_c": lambda q: ratio(q, q["tangent_c1"]),
-    "secant of branch c, C2 to C1, for k_c": lambda q: ratio(q, q["secant"]),
-    "secant from zero to C1 for k_c": lambda q: ratio(q, q["secant_0"]),
-    "secant of branch c from ε_* to C1": lambda q: ratio(q, q["secant_c"]),
-    "k_c − k₀ for k_c": lambda q: ratio(q, q["kc"] - q["k0"]),
-    "k_c − k_h+ for k_c": lambda q: ratio(q, q["kc"] - q["kh_plus"]),
-    "height of the bistable spring for H": lambda q: ratio(q, q["kc"], height=q["h"]),
-    "height at C2, H(1 − ε_c)": lambda q: ratio(q, q["kc"], height=q["H"] * (1 - q["eps_c"])),
-    "height at A1, H(1 − ε_a)": lambda q: ratio(q, q["kc"], height=q["H"] * (1 - q["eps_a"])),
-    "height of the other specimen": lambda q: ratio(q, q["kc"], height=q["other_H"]),
-    "other specimen's height in 2h only": lambda q: ratio(q, q["kc"]) * q["H"] / q["other_H"],
-    "other specimen's height in ρ only": lambda q: (
-        ratio(q, q["kc"]) * math.sqrt(q["other_H"] / q["H"])
-    ),
-}
 
+def ratio_readings(name: str, eta: float | None = None) -> dict[str, float]:
+    """Return ζ = η/(2 H √(ρ k)), ρ = m/(A H), of a published set by each reading."""
+    item, other = (
+        ff.published[name],
+        ff.published[MODEL_1 if name == FOAM_2 else FOAM_2].chain.height,
+    )
+    s, chain, own, eta = item.bistable, item.chain, item.specimen_mass, eta or item.eta or 0.0
+    whole = chain.height
 
-def quantities(item: PublishedSet) -> dict[str, float]:
-    """Return the quantities for readings of the damping ratio, SI."""
-    s, chain = item.bistable, item.chain
-    other = ff.published[MODEL_1 if item.name == FOAM_2 else FOAM_2].chain.height
+    def ratio(k: float = s.kc, mass: float = STRIKER, height: float = whole) -> float:
+        return eta / (2.0 * height * math.sqrt(mass / (chain.area * height) * k))
+
     return {
-        "eta": item.eta or 0.0,
-        "A": chain.area,
-        "H": chain.height,
-        "h": chain.heights[-1],
-        "other_H": other,
-        "own": item.specimen_mass,
-        "k0": s.k0,
-        "kc": s.kc,
-        "kh_plus": s.kh_plus,
-        "kh_minus": s.kh_minus,
-        "eps_a": s.eps_a,
-        "eps_c": s.eps_c,
-        "tangent_c2": (s.kc + s.sigma_c) ** 2 / s.kc,
-        "tangent_c1": (s.kc + s.sigma_hat_c) ** 2 / s.kc,
-        "secant": (s.sigma_hat_c - s.sigma_c) / (s.eps_hat_c - s.eps_c),
-        "secant_0": s.sigma_hat_c / s.eps_hat_c,
-        "secant_c": s.sigma_hat_c / (s.eps_hat_c - s.eps_star),
+        "the formula: k_c, H, ρ of the striker": ratio(),
+        "striker and foam together in ρ": ratio(mass=STRIKER + own),
+        "ρ = bulk density of the foam": ratio(mass=own),
+        "k₀ for k_c": ratio(s.k0),
+        "k_h+ for k_c": ratio(s.kh_plus),
+        "k_h− (branch e) for k_c": ratio(s.kh_minus),
+        "tangent of branch c at C2 for k_c": ratio((s.kc + s.sigma_c) ** 2 / s.kc),
+        "tangent of branch c at C1 for k_c": ratio((s.kc + s.sigma_hat_c) ** 2 / s.kc),
+        "secant of branch c, C2 to C1, for k_c": ratio(
+            (s.sigma_hat_c - s.sigma_c) / (s.eps_hat_c - s.eps_c)
+        ),
+        "secant from zero to C1 for k_c": ratio(s.sigma_hat_c / s.eps_hat_c),
+        "secant of branch c from ε_* to C1": ratio(s.sigma_hat_c / (s.eps_hat_c - s.eps_star)),
+        "k_c − k₀ for k_c": ratio(s.kc - s.k0),
+        "k_c − k_h+ for k_c": ratio(s.kc - s.kh_plus),
+        "height of the bistable spring for H": ratio(height=chain.heights[-1]),
+        "height at C2, H(1 − ε_c)": ratio(height=whole * (1 - s.eps_c)),
+        "height at A1, H(1 − ε_a)": ratio(height=whole * (1 - s.eps_a)),
+        "height of the other specimen": ratio(height=other),
+        "other specimen's height in 2h only": ratio() * whole / other,
+        "other specimen's height in ρ only": ratio() * math.sqrt(other / whole),
     }
-
-
-def ratio(
-    q: dict[str, float], stiffness: float, mass: float = STRIKER, height: float | None = None
-) -> float:
-    """Return ζ = η/(2 H √(ρ k)) with ρ = m/(A H)."""
-    height = q["H"] if height is None else height
-    return q["eta"] / (2.0 * height * math.sqrt(mass / (q["A"] * height) * stiffness))
-
-
-def ratio_readings() -> dict[str, dict[str, float]]:
-    """Return ζ of the three damped sets by each reading."""
-    sets = {name: quantities(ff.published[name]) for name in SETS}
-    return {label: {name: read(q) for name, q in sets.items()} for label, read in READINGS.items()}
 
 
 def ratio_wanted() -> dict[str, float]:
@@ -461,14 +434,13 @@ def draw_energy(path: Path) -> None:
 
 
 def main() -> None:
-    studies.arguments(__doc__).parse_args()
+    out = studies.arguments(__doc__, HERE).parse_args().out
     drive = drive_of_impact()
-    draw_oscillation(drive, damper_needed(drive), HERE / "oscillation.png")
-    draw_energy(HERE / "energy.png")
-    page = (HERE / "page.template.md").read_text(encoding="utf-8")
+    draw_oscillation(drive, damper_needed(drive), out / "oscillation.png")
+    draw_energy(out / "energy.png")
     values = of_oscillation() | of_literal() | of_ratios() | of_energy() | of_microscale()
-    (HERE / "README.md").write_text(subscripts(page.format(**values)), encoding="utf-8")
-    print(f"wrote {HERE / 'README.md'} and its figures")
+    page = subscripts(studies.write_page(HERE, out, **values))
+    (out / "README.md").write_text(page, encoding="utf-8")
 
 
 def subscripts(text: str) -> str:
@@ -500,7 +472,7 @@ def of_oscillation() -> dict[str, Any]:
         )
         row = cells.format(**oscillation(given, OWN_MASS, damper))
         rows.append((label, f"{float(f'{damper:.3g}'):g}", row))
-    published = quantities(ff.published[MODEL_2]) | {"eta": needed}
+    by_mass = ratio_readings(MODEL_2, needed)["ρ = bulk density of the foam"]
     slopes = {"": drive.spring.k0, "_c": drive.spring.kc}
     return {
         "velocity": DRIVE_VELOCITY, "samples": SAMPLES, "contact": 1e3 * drive.time[-1],
@@ -508,7 +480,7 @@ def of_oscillation() -> dict[str, Any]:
         "needed": needed, "needed_1": damper_needed(first),
         "needed_175": damper_needed(drive_of_impact(MODEL_2, 1.75)),
         "needed_coarse": damper_needed(drive, share=0.01),
-        "needed_ratio": ratio(published, drive.spring.kc, mass=OWN_MASS),
+        "needed_ratio": by_mass,
         "free": free, "damped": damped, "quieter": free["vibration"] / damped["vibration"],
         "by_branch": ", ".join(f"{k} {v:.1f} %" for k, v in vibration_by_branch(drive).items()),
         "early": 1e6 * (exact.switches[:2, 0] - undamped.switches[:2, 0]),
@@ -551,7 +523,8 @@ def of_literal() -> dict[str, Any]:
 
 def of_ratios() -> dict[str, Any]:
     """Numbers and table of the third claim."""
-    readings, wanted = ratio_readings(), ratio_wanted()
+    each, wanted = {name: ratio_readings(name) for name in SETS}, ratio_wanted()
+    readings = {label: {name: each[name][label] for name in SETS} for label in each[MODEL_2]}
     off = {
         label: {name: 100 * (row[name] / (ff.published[name].damping_ratio or math.nan) - 1)
                 for name in SETS}
@@ -607,48 +580,32 @@ def of_energy() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def microscale_row(name: str) -> dict[str, float]:
-    """How far the branches of a published spring are from what snapping micro-springs make.
-
-    Slopes in MPa at A1; the least fraction of snapped micro-springs that branch d stands for, and
-    by how much the fraction on branch e falls with the stress anywhere.
-    """
-    spring = ff.published[name].bistable
-    k0, kc, eps_star = spring.k0, spring.kc, spring.eps_star
-
-    def fraction(first: float, last: float, sigma: float, eps: float, slope: float) -> Array:
-        stress = np.linspace(first, last, 20001)
-        on_a, on_c = stress / (k0 + stress), eps_star + stress / (kc + stress)
-        return (eps + (stress - sigma) / slope - on_a) / (on_c - on_a)
-
-    low = spring.sigma_hat_a
-    assert low is not None
-    plus = fraction(
-        spring.sigma_a, spring.sigma_hat_c, spring.sigma_a, spring.eps_a, spring.kh_plus
-    )
-    minus = fraction(low, spring.sigma_c, spring.sigma_c, spring.eps_c, spring.kh_minus)
-    return {
-        "d": spring.kh_plus / 1e6,
-        "a": k0 / (1 - spring.eps_a) ** 2 / 1e6,
-        "least": float(plus.min()),
-        "falls": float(-np.minimum(np.diff(minus), 0.0).sum()),
-    }
-
-
 def of_microscale() -> dict[str, Any]:
-    """Table of the fifth claim."""
-    rows = {name: microscale_row(name) for name in (MODEL_1, MODEL_2, MODEL_3, FOAM_2)}
-    too_stiff = [row["d"] / row["a"] for row in rows.values()]
+    """Numbers and table of the fifth claim.
+
+    How far are the branches of a published spring from what snapping micro-springs make? Slopes are
+    those at A1 (MPa); p is the fraction of snapped micro-springs that a branch stands for.
+    """
+    rows, too_stiff = [], []
+    for name in (MODEL_1, MODEL_2, MODEL_3, FOAM_2):
+        s = ff.published[name].bistable
+        d, a = s.kh_plus / 1e6, s.k0 / (1 - s.eps_a) ** 2 / 1e6
+
+        def p(stress: Array, strain: Array, s: ff.BistableSpring = s) -> Array:
+            on_a, on_c = stress / (s.k0 + stress), s.eps_star + stress / (s.kc + stress)
+            return (strain - on_a) / (on_c - on_a)
+
+        up = np.linspace(s.sigma_a, s.sigma_hat_c, 20001)
+        down = np.linspace(s.sigma_hat_a or 0.0, s.sigma_c, 20001)
+        least = 100 * np.min(p(up, s.eps_a + (up - s.sigma_a) / s.kh_plus))
+        rises = np.all(np.diff(p(down, s.eps_c + (down - s.sigma_c) / s.kh_minus)) >= 0.0)
+        rows.append((name, f"{d:.1f}", f"{a:.1f}", f"{least:.1f}", "yes" if rises else "no"))
+        too_stiff.append(d / a)
     return {
-        "too_stiff_least": min(too_stiff),
-        "too_stiff_most": max(too_stiff),
-        "table_microscale": studies.lines(
-            (name, f"{row['d']:.1f}", f"{row['a']:.1f}", f"{100 * row['least']:.1f}",
-             "yes" if row["falls"] == 0.0 else "no")
-            for name, row in rows.items()
-        ).replace("| -", "| −"),
+        "too_stiff_least": min(too_stiff), "too_stiff_most": max(too_stiff),
+        "table_microscale": studies.lines(rows).replace("| -", "| −"),
     }  # fmt: skip
 
 
 if __name__ == "__main__":
-    studies.run(main, HERE)
+    main()

@@ -11,7 +11,8 @@ recorded and fitted jointly with the first by `foamfit.joint`. A test that excee
 the rig and gives no record. "Could be determined" are the parameters that at least one of these
 joint fits determines.
 
-Answer. See README.md.
+Answer. Of the parameters that could be determined, 42 % are after the first test, 89 % after the
+advised one (two springs 20 and 88 %): README.md.
 
     python experiments/plan/plan.py                        # 40 foams of one spring, 20 of two
     python experiments/plan/plan.py --foams 4 --two 2 --out /tmp/plan     # a look
@@ -20,13 +21,11 @@ Answer. See README.md.
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,13 +36,12 @@ import pandas as pd
 import foamfit as ff
 from foamfit.errors import InputError, SimulationError
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
+from rig import BENCH, MOST_STRAIN, TOWER, Impact, draw_bistable, recorded, work, write
+from truth import Course, Rig
+
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE.parent), str(HERE.parent / "recovery")]
-from rig import BENCH, MOST_STRAIN, TOWER, Impact, draw_bistable, recorded, work, write  # noqa: E402
-from truth import Course, Rig  # noqa: E402
-
-import studies  # noqa: E402
-
 SECOND = ("advised", "strongest", "random", "ideal")
 Foam = dict[str, Any]
 
@@ -53,12 +51,12 @@ def draw(seed: int, springs: int) -> Foam:
     rng = np.random.default_rng([seed, springs])
     while True:
         height, area, mass = BENCH if rng.random() < 0.5 else TOWER
-        each = sorted((draw_bistable(rng) for _ in range(springs)), key=lambda s: s.points[0])
-        if springs == 2 and not 1.5 < each[1].points[0] / each[0].points[0] < 4.0:
+        each = sorted((draw_bistable(rng) for _ in range(springs)), key=lambda s: s.onset)
+        if springs == 2 and not 1.5 < each[1].onset / each[0].onset < 4.0:
             continue
         heights = (height / springs,) * springs
-        top = max(spring.points[2] for spring in each)
-        strains = [spring.strain(top, ("c", 0.0))[0] for spring in each]
+        top = max(spring.closing for spring in each)
+        strains = [spring.strain(top) for spring in each]
         if max(strains) > 0.85:
             continue
         energy = sum(h * work(spring, top) for h, spring in zip(heights, each, strict=True)) * area
@@ -85,7 +83,7 @@ def run(foam: Foam, velocity: float, mass: float) -> tuple[Course, float, float]
     rig = Rig(foam["springs"], foam["heights"], foam["area"], mass, velocity)
     try:
         course = rig.run(0.0, 100.0 * height / velocity)
-    except AssertionError:
+    except RuntimeError:
         return None
     when = np.linspace(0.0, course.end, 2000)
     force = float(course.stress(when).max()) * foam["area"]
@@ -169,16 +167,10 @@ def together(
     folder: Path, kind: str, model: str, expected: dict[str, Any]
 ) -> Iterator[dict[str, Any]]:
     """Fit the first and a second test jointly; yield a row for each parameter."""
-    names = list(expected)
-    lines = [
-        f'name = "{kind}"',
-        f'tests = ["first.csv", "second-{kind}.csv"]',
-        f'model = "{model}"',
-        "[parameters]",
-        *(f'{name} = "shared"' for name in names),
-    ]
-    study = folder / f"{kind}.toml"
-    study.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    study = studies.write_study(
+        folder / f"{kind}.toml", ["first.csv", f"second-{kind}.csv"], model,
+        dict.fromkeys(expected, "shared"), name=kind,
+    )  # fmt: skip
     began = time.perf_counter()
     try:
         found = ff.joint(study, jobs=1)
@@ -186,7 +178,7 @@ def together(
         yield {"error": str(error)}
         return
     seconds = time.perf_counter() - began
-    for name in names:
+    for name in expected:
         yield {"joint (s)": seconds, **shown(name, found.parameters[name], expected[name])}
 
 
@@ -282,7 +274,7 @@ def write_page(out: Path) -> None:
     for name, (table, columns) in tables.items():
         text = studies.markdown(columns, table.to_numpy().tolist())
         values[name] = text.replace("| nan ", "| – ")
-    studies.write_page(HERE, out=out, circumstances=studies.circumstances(), **values)
+    studies.write_page(HERE, out, **values)
 
 
 def main() -> None:
@@ -293,22 +285,19 @@ def main() -> None:
     jobs = [(asked.first + i, 1) for i in range(asked.foams)]
     jobs += [(asked.first + i, 2) for i in range(asked.two)]
     rows = list[dict[str, Any]]()
-    with ProcessPoolExecutor(2) as pool:
-        for made in pool.map(judged, *zip(*jobs, strict=True)) if jobs else ():
-            rows += made
-            print(json.dumps({key: made[0][key] for key in ("foam", "springs", "plan (s)")}),
-                  flush=True)  # fmt: skip
+    for made in studies.in_order(judged, jobs, 2):
+        rows += made
+        print({key: made[0][key] for key in ("foam", "springs", "plan (s)")}, flush=True)
     if rows:
         table = pd.DataFrame(rows)
         for column in ("broke", "error", "expected width", "force (N)", "velocity over closing"):
             if column not in table:
                 table[column] = math.nan
-        raw: dict[str, Any] = {"compression": {"method": "gzip", "mtime": 0}}
-        table.to_csv(asked.out / "foams.csv.gz", index=False, float_format="%.4g", **raw)
-        summary(table).to_csv(asked.out / "plan.csv", index=False, float_format="%.4g")
+        studies.write_csv(table, asked.out / "foams.csv.gz")
+        studies.write_csv(summary(table), asked.out / "plan.csv")
     if (asked.out / "real.csv").is_file():
         write_page(asked.out)
 
 
 if __name__ == "__main__":
-    studies.run(main, HERE)
+    main()

@@ -33,11 +33,11 @@ from scipy.optimize import least_squares
 
 import foamfit as ff
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import studies  # noqa: E402
-from real_foams import first_cycles  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
+from real_foams import first_cycles
 
+HERE = Path(__file__).parent
 Array = np.ndarray
 Values = dict[str, float]
 MODELS = {"bistable": 0, "microscale": 1}  # and the number of relaxation terms
@@ -196,8 +196,7 @@ def loops(data: Path, folder: Path) -> Iterator[ff.Measurement]:
         yield ff.read_test(data / real.file, toml)
     yield from first_cycles(data, folder)
     for path in sorted((data / "mycelium-rates").glob("*-1_raw.txt")):
-        gap = path.read_text(encoding="utf-8").splitlines()[1].split("\t")[5].strip()
-        yield ff.read_test(path, studies.write_specimen(folder / "gap.toml", f"{gap} um", "8 mm"))
+        yield ff.read_test(path, studies.mycelium(path, folder))
     for path in sorted((data / "lattice-cycles").glob("*.csv")):
         toml = studies.write_specimen(folder / "l.toml", "12 mm", "20 mm", studies.LATTICE)
         yield ff.read_test(path, toml)
@@ -226,7 +225,7 @@ def microscale(values: Array, strain: Array, instants: Array) -> Array:
     return np.asarray(ff.simulate(ff.Chain([spring], [1.0], 1.0), drive, instants).base_stress)
 
 
-def plain(test: ff.Measurement, model: str, zero: float, *, starts: int = STARTS) -> float:
+def plain_misfit(test: ff.Measurement, model: str, zero: float, *, starts: int = STARTS) -> float:
     """Return the misfit of plain least squares from random starts: RMS over range of the stress."""
     assert test.stress is not None
     assert test.displacement is not None
@@ -272,7 +271,7 @@ def compared(data: Path, folder: Path) -> Iterator[dict[str, object]]:
             result = ff.fit(test, model=model, relaxation=terms, drive="displacement")
             zero = result.parameters.get("displacement_zero")
             moved = (zero.value - test.origins.get("displacement_zero", 0.0)) if zero else 0.0
-            other = plain(test, model, moved / test.specimen.height)
+            other = plain_misfit(test, model, moved / test.specimen.height)
             own = result.misfit["stress_strain"] or 0.0
             yield {
                 "loop": test.name, "law": law_of(model, terms), "fit (%)": 100.0 * own,
@@ -280,36 +279,22 @@ def compared(data: Path, folder: Path) -> Iterator[dict[str, object]]:
             }  # fmt: skip
 
 
-def said(rows: Iterator[dict[str, object]]) -> pd.DataFrame:
-    """Collect rows, printing each."""
-    out = []
-    for row in rows:
-        print(row, flush=True)
-        out.append(row)
-    return pd.DataFrame(out)
-
-
 def main() -> None:
     """Fit all records and write tables and page."""
     args = studies.arguments(__doc__, HERE).parse_args()
     data = studies.measurements("cartilage-impact", "lattice-impact", "aluminium-foam", "shoe-foam")
     with tempfile.TemporaryDirectory() as made:
-        six, every = said(fits(data, Path(made))), said(compared(data, Path(made)))
+        six = studies.said(fits(data, Path(made)))
+        every = studies.said(compared(data, Path(made)))
     studies.write_csv(six, args.out / "fits.csv")
     studies.write_csv(every, args.out / "loops.csv")
     wrong, worst = six[six["excluded"] != "nothing"], every.loc[every["fit over plain"].idxmax()]
     studies.write_page(
-        HERE,
-        out=args.out,
-        fits=studies.shown(six),
-        count=len(six),
-        wrong=len(wrong),
-        loops=studies.shown(every),
+        HERE, args.out, fits=studies.shown(six), count=len(six), wrong=len(wrong),
+        loops=studies.shown(every), number=len(every),
         worst=f"{worst['fit over plain']:.3f} ({worst['loop']}, {worst['law']})",
-        number=len(every),
-        circumstances=studies.circumstances(),
-    )
+    )  # fmt: skip
 
 
 if __name__ == "__main__":
-    studies.run(main, HERE)
+    main()

@@ -1,35 +1,24 @@
-"""Do the intervals of springs that remember contain the true values on three cycles?
+"""Synthetic records of three cycles of a foam that remembers what has snapped.
 
-Method. A synthetic foam is a chain of discrete micro-springs (docs/theory.md), each with a flag
-"has snapped once", and one relaxation term. The machine starts before contact, with arbitrary
-zeros, and compresses it three times without losing contact. Nothing here comes from foamfit: the
-stress at a strain is found by bisection over the chain. Each record is processed like a user's: a
-CSV with noise on force and motion, `foamfit.read_test` with `cycles=(1, 3)`, `foamfit.fit` with
-stiffening and the Mullins effect. Counted are the 95 % intervals that contain the true value, and
-the determined values whose true value is outside by more than the width of the interval ("far").
-
-Answer. 93.8 % of 480 intervals contain the true value, none is far outside: README.md.
-
-    python experiments/recovery/cycles.py --tests 50 --raw rows.csv     # resumable; 15 s a test
+The foam is a chain of discrete micro-springs (docs/theory.md), each with a flag "has snapped once",
+and one relaxation term. The machine starts before contact, with arbitrary zeros, and compresses it
+three times without losing contact. Nothing here comes from foamfit: the stress at a strain is found
+by bisection over the chain.
 """
 
 from __future__ import annotations
 
 import math
-import tempfile
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from rig import draw_microscale
-from rigs import JOB, Row, judged, percents, run, sentence, studies
 from scipy.optimize import minimize_scalar
 from scipy.special import ndtri
-from truth import Array
 
-import foamfit as ff
+from rig import draw_microscale
+from truth import Array
 
 MICRO_SPRINGS, STEPS, CYCLE = 4000, 2000, 4.0  # springs; steps per leg; s per cycle
 HEIGHT, AREA = 10e-3, 4.5e-5  # m, m²
@@ -91,10 +80,8 @@ def draw(rng: np.random.Generator) -> tuple[dict[str, float], float]:
         values = {name: getattr(spring, name) for name in names}
         values["stiffening"] = 10.0 ** rng.uniform(0.0, 1.2)
         values["softening"], values["weakening"] = rng.uniform(0.3, 1.0), rng.uniform(0.1, 0.5)
-        values["g1"], values["tau1"] = (
-            rng.uniform(0.1, 0.8),
-            CYCLE * 10.0 ** rng.uniform(-2.0, -0.7),
-        )
+        values["g1"] = rng.uniform(0.1, 0.8)
+        values["tau1"] = CYCLE * 10.0 ** rng.uniform(-2.0, -0.7)
         soft, n = values["k0"] * math.exp(-values["softening"]), values["stiffening"]
 
         def lead(log: float, soft: float = soft, n: float = n, kc: float = values["kc"]) -> float:
@@ -131,8 +118,29 @@ def pressed(values: dict[str, float], top: float) -> tuple[list[float], list[flo
     return strains, stresses
 
 
-def record(seed: int) -> tuple[dict[str, float], pd.DataFrame]:
-    """Return the true parameters and the noisy record of one test."""
+@dataclass(frozen=True)
+class Cycled:
+    """A noisy record of three cycles, and the true parameters by foamfit's names."""
+
+    truth: dict[str, float]
+    table: pd.DataFrame
+
+    @property
+    def time(self) -> pd.Series:
+        """Times of the samples, s."""
+        return self.table["time (s)"]
+
+    def write(self, folder: Path) -> Path:
+        """Write CSV and TOML; return the path of the CSV."""
+        path = folder / "test.csv"
+        self.table.to_csv(path, index=False, float_format="%.9g")
+        specimen = f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n'
+        path.with_suffix(".toml").write_text(specimen, encoding="utf-8")
+        return path
+
+
+def cycled(seed: int) -> Cycled:
+    """Return the record of one test."""
     rng = np.random.default_rng([seed, 11])
     values, top = draw(rng)
     strains, stresses = pressed(values, top)
@@ -149,46 +157,4 @@ def record(seed: int) -> tuple[dict[str, float], pd.DataFrame]:
     w, force = (c + NOISE * np.ptp(c) * rng.standard_normal(own.size) for c in clean)
     w, force = w + rng.uniform(-3.0, 3.0) * HEIGHT, force + 0.02 * rng.normal() * np.ptp(force)
     columns = {"time (s)": own * step + 5.0, "displacement (mm)": 1e3 * w, "force (N)": force}
-    return {f"s1_{name}": value for name, value in values.items()}, pd.DataFrame(columns)
-
-
-def run_test(family: str, name: str, seed: int) -> list[Row]:
-    """Simulate, write, read and fit one test; return a row per parameter, or for a failure."""
-    about: Row = {"family": family, "class": name, "test": seed}
-    truth, table = record(seed)
-    began = time.perf_counter()
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "test.csv"
-            table.to_csv(path, index=False, float_format="%.9g")
-            specimen = f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n'
-            path.with_suffix(".toml").write_text(specimen, encoding="utf-8")
-            test = ff.read_test(path, cycles=(1, 3))
-        result = ff.fit(test, model="microscale", relaxation=1, stiffening=True, mullins=True)
-    except Exception as error:
-        return [about | {"error": sentence(error)}]
-    about |= {"rows": ROWS, "status": result.status, "seconds": time.perf_counter() - began}
-    found = result.parameters
-    return [about | judged(name, value, found[name]) for name, value in truth.items()]
-
-
-def main() -> None:
-    parser = studies.arguments(__doc__, tests=50, jobs=(1, "processes"))
-    parser.add_argument("--first-seed", type=int, default=1)
-    parser.add_argument("--raw", type=Path, help="rows of all tests; resumed")
-    options = parser.parse_args()
-    seeds = range(options.first_seed, options.first_seed + options.tests)
-    rows = run(run_test, [("memory", "three cycles", s) for s in seeds], options.raw, options.jobs)
-    given = rows[rows["low"].notna()]
-    for name, group in [*given.groupby("parameter", sort=False), ("all", given)]:
-        holds, low, high = percents(group["holds"])
-        shown = f"{holds:.1f} % ({low:.1f} to {high:.1f}) of {len(group)}, far {group['far'].sum()}"
-        print(f"{name:16} {shown}")
-    print("states:", rows["state"].value_counts().to_dict())
-    print("status:", rows.drop_duplicates(JOB)["status"].value_counts().to_dict())
-    for row in rows[rows["error"].notna()].itertuples():
-        print(f"test {row.test}: {row.error}")
-
-
-if __name__ == "__main__":
-    main()
+    return Cycled({f"s1_{name}": value for name, value in values.items()}, pd.DataFrame(columns))

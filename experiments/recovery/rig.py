@@ -12,7 +12,7 @@ always draws the same springs, striker and noise of a channel, whatever else is 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,6 +20,7 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.signal import lfilter
 from scipy.special import ndtri
+
 from truth import Array, Bistable, Course, Law, Microscale, Motion, Rig, Terms
 
 GRAVITY = 9.80665
@@ -158,7 +159,7 @@ def draw_microscale(rng: np.random.Generator) -> tuple[Microscale, float]:
             spread_minus=rng.uniform(0.3, 0.9),
         )
         most = plus * math.exp(spread * float(ndtri(rng.uniform(0.7, 0.98))))
-        if spring.strain(most, spring.start)[0] < 0.85:
+        if spring.strain(most) < 0.85:
             return spring, most
 
 
@@ -172,21 +173,19 @@ def draw_terms(rng: np.random.Generator, count: int, lasts: float) -> Terms:
 
 def work(spring: Law, most: float) -> float:
     """Return the work per volume of a first loading to a stress, J/m³."""
-    cuts = [s for s in spring.points[:3:2] if s < most] if isinstance(spring, Bistable) else []
-    ends = [0.0, *cuts, most]
-    return math.fsum(
-        quad(lambda s: s * spring.strain(s, spring.loading(s))[1], low, high, limit=200)[0]
-        for low, high in pairwise(ends)
-    )
+    cuts = [spring.onset, spring.closing] if isinstance(spring, Bistable) else []
+    ends = [0.0, *(s for s in cuts if s < most), most]
+    beside = [quad(spring.strain, low, high, limit=200)[0] for low, high in pairwise(ends)]
+    return most * spring.strain(most) - math.fsum(beside)
 
 
 def parameters(springs: tuple[Law, ...]) -> dict[str, float]:
     """Return the parameters of springs by foamfit's names."""
     named: dict[str, float] = {}
     for i, spring in enumerate(springs, start=1):
-        own = [item.name for item in fields(spring) if item.name != "terms"]
-        named |= {f"s{i}_{name}": float(getattr(spring, name)) for name in own}
-        for k, (g, tau) in enumerate(spring.terms, start=1):
+        own = asdict(spring) | {"relaxation": None}
+        named |= {f"s{i}_{name}": float(v) for name, v in own.items() if v is not None}
+        for k, (g, tau) in enumerate(spring.relaxation, start=1):
             named |= {f"s{i}_g{k}": g, f"s{i}_tau{k}": tau}
     return named
 
@@ -210,7 +209,7 @@ def drawn_impact(setup: Impact, rng: np.random.Generator) -> Course:
         height, area, mass = BENCH if rng.random() < 0.5 else TOWER
         if setup.law == "bistable":
             spring: Law = draw_bistable(rng)
-            most, more = spring.points[2], rng.uniform(1.3, 2.0)
+            most, more = spring.closing, rng.uniform(1.3, 2.0)
         else:
             spring, most = draw_microscale(rng)
             more = 1.0 + 0.3 * setup.relaxation
@@ -219,7 +218,7 @@ def drawn_impact(setup: Impact, rng: np.random.Generator) -> Course:
         if setup.law == "bistable" and rng.random() < 0.5:
             spring = replace(spring, eta=eta)
         terms = draw_terms(rng, setup.relaxation, 1.2 * height / velocity)
-        spring = replace(spring, terms=terms)
+        spring = replace(spring, relaxation=terms)
         gravity = GRAVITY if setup.gravity else 0.0
         rig = Rig((spring,), (height,), area, mass, velocity, gravity)
         course = rig.run(0.0, 100.0 * height / velocity)
@@ -324,20 +323,20 @@ def drawn_slow(setup: Slow, rng: np.random.Generator) -> Course:
             springs.append(spring)
         else:
             springs = [draw_bistable(rng) for _ in kinds]
-            tops = sorted(spring.points[0] for spring in springs)
-            most = max(spring.points[2] for spring in springs) * rng.uniform(1.1, 1.6)
+            tops = sorted(spring.onset for spring in springs)
+            most = max(spring.closing for spring in springs) * rng.uniform(1.1, 1.6)
             if not all(1.5 < b / a < 4.0 for a, b in pairwise(tops)):
                 continue  # springs of one foam must be similar, but distinguishable
         heights = (SLOW_HEIGHT / len(kinds),) * len(kinds)
-        strains = [spring.strain(most, spring.loading(most))[0] for spring in springs]
+        strains = [spring.strain(most) for spring in springs]
         if max(strains) > MOST_STRAIN:
             continue
         peak = float(np.dot(heights, strains))
         motion = slow_motion(setup, peak, rng)
         terms = draw_terms(rng, setup.relaxation, DURATION)
         eta = 10 ** rng.uniform(-2.0, -0.8) * most * SLOW_HEIGHT / (2.0 * peak / DURATION)
-        springs[0] = replace(springs[0], terms=terms, eta=eta if setup.dashpot else 0.0)
-        springs = sorted(springs, key=lambda s: s.points[0]) if len(kinds) > 1 else springs
+        springs[0] = replace(springs[0], relaxation=terms, eta=eta if setup.dashpot else 0.0)
+        springs = sorted(springs, key=lambda s: s.onset) if len(kinds) > 1 else springs
         rig = Rig(tuple(springs), heights, SLOW_AREA, motion=motion)
         course = rig.run(motion.contact(), motion.times[-1])
         if course.end > motion.times[-2] + 0.3 * (motion.times[-1] - motion.times[-2]):

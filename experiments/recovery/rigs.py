@@ -1,21 +1,31 @@
 """Do the 95 % intervals contain the true values on records like those of a test rig?
 
-Method. `rig` generates synthetic impacts, recorded from before contact, and synthetic slow tests
-with a prescribed, noisy motion. Each is processed like a user's: CSV, TOML, `foamfit.read_test`,
-the defaults of `foamfit.fit`. A row for each parameter contains true value and interval; a test
-that cannot be read or fitted gets a row with the message. Coverage is counted for the parameters of
-the springs, and separately for contact time, zero, velocity and mass. A determined value is far if
-the true value is outside its interval by more than the width of the interval. The search has missed
-the minimum of a slow test if the true springs fit the stress better.
+Method. Synthetic tests of four families are processed like a user's: CSV, TOML,
+`foamfit.read_test`, the defaults of `foamfit.fit`.
 
-Answer. Coverage is 94.9 % for impacts, 94.5 % for slow tests of one spring, 95.5 % for two springs:
-see README.md.
+- impact: recorded from before contact, with arbitrary zeros (`rig`);
+- slow: a prescribed, noisy motion (`rig`);
+- fault: impacts with a wrong velocity, mass or scale of the force, by 10 to 25 %, or a force that
+  is clipped, drifts, rings or lags (`faults`);
+- memory: three cycles of a foam that remembers what has snapped (`cycles`).
+
+A row for each parameter contains true value and interval; a test that cannot be read or fitted gets
+a row with the message. Coverage is counted for the parameters of the springs, and separately for
+contact time, zero, velocity and mass. A determined value is far if the true value is outside its
+interval by more than the width of the interval. The search has missed the minimum of a slow test if
+the true springs fit the stress better. A record is contradicted if `read_test` says that its own
+numbers contradict each other.
+
+Answer. Coverage is 94.9 % for impacts, 94.5 % for slow tests of one spring, 95.5 % for two springs,
+93.8 % for three cycles. Of 1270 values called determined in spite of a fault, 1 is far: README.md.
 
 With `--invariance` each impact is written in several ways: with another zero of the motion, another
 clock, fewer rows before contact. The changes of the parameters are measured in standard errors.
 
     python experiments/recovery/rigs.py --raw rows.csv         # 200 tests of each class, resumable
     python experiments/recovery/rigs.py --family slow --classes microscale --tests 20
+    python experiments/recovery/rigs.py --family fault --tests 30
+    python experiments/recovery/rigs.py --family memory --tests 40        # 15 s a test
     python experiments/recovery/rigs.py --invariance --tests 20
 """
 
@@ -27,30 +37,31 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext, suppress
-from dataclasses import fields, replace
+from contextlib import suppress
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from rig import Impact, Record, Slow, impact, slow, write
-from truth import Bistable, Rig
 
 import foamfit as ff
+from foamfit.data.calibration import contradictions
 from foamfit.errors import InputError, SimulationError
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import studies  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
+from cycles import Cycled, cycled
+from faults import FAULTS
+from rig import Impact, Record, Slow, impact, slow, write
+from truth import Bistable, Rig
 
 Row = dict[str, Any]
 Job = tuple[str, str, int]
 JOB = ["family", "class", "test"]
 COLUMNS = [
     *JOB, "way", "rows", "parameter", "truth", "value", "low", "high", "stderr", "state", "holds",
-    "far", "move", "status", "over truth", "seconds", "error",
+    "far", "move", "status", "over truth", "contradicted", "seconds", "error",
 ]  # fmt: skip
 AS_RECORDED = "as recorded"
 MISSED = 1.1  # misfit over that of the true springs at which a minimum was missed
@@ -108,22 +119,29 @@ SLOW = {
     "microscale, noise given": Slow(noise_given=True),
     "bistable, before contact, any zero": Slow("bistable", noise=1e-3, early=True, zero=True),
 }
-FAMILIES: dict[str, dict[str, Any]] = {"impact": IMPACTS, "slow": SLOW}
+FAMILIES: dict[str, dict[str, Any]] = {
+    "impact": IMPACTS, "slow": SLOW, "fault": FAULTS, "memory": {"three cycles": None},
+}  # fmt: skip
 
 
-def make(family: str, name: str, seed: int) -> Record:
+def make(family: str, name: str, seed: int) -> Any:
     """Return one record of a class."""
     setup = FAMILIES[family][name]
+    if family == "memory":
+        return cycled(seed)
+    if family == "fault":
+        return setup(impact(Impact(), seed))
     return impact(setup, seed) if family == "impact" else slow(setup, seed)
 
 
 def chain_of(made: Rig) -> ff.Chain:
     """Return the true springs as a chain of foamfit."""
-    springs = []
-    for spring in made.springs:
-        values = {f.name: getattr(spring, f.name) for f in fields(spring) if f.name != "terms"}
-        law = ff.BistableSpring if isinstance(spring, Bistable) else ff.MicroscaleSpring
-        springs.append(law(**values, relaxation=spring.terms))
+    springs = [
+        (ff.BistableSpring if isinstance(spring, Bistable) else ff.MicroscaleSpring)(
+            **asdict(spring)
+        )
+        for spring in made.springs
+    ]
     return ff.Chain(springs, made.heights, made.area)
 
 
@@ -134,19 +152,24 @@ def over_truth(record: Record, test: Any, chain: ff.Chain) -> float:
     return float(np.divide(*[np.std(found.base_stress - test.stress) for found in each]))
 
 
-def fitted(record: Record) -> tuple[Any, Any, dict[str, Any]]:
+def fitted(record: Record | Cycled) -> tuple[Any, Any, dict[str, Any]]:
     """Write, read and fit a record; return test, result and estimates with a true value.
 
     The rig numbers springs by the stress at which they start to snap, and relaxation terms by their
     time, like the fit.
     """
     with tempfile.TemporaryDirectory() as folder:
-        test = ff.read_test(write(record, Path(folder)))
-    terms, params = record.setup.relaxation, None
-    if getattr(record.setup, "dashpot", False):  # fixed at zero by default
-        params = ff.make_params(test, record.model, "displacement", relaxation=terms)
-        params["s1_eta"].vary = True
-    result = ff.fit(test, model=record.model, relaxation=terms, params=params, seed=0)
+        if isinstance(record, Cycled):
+            test = ff.read_test(record.write(Path(folder)), cycles=(1, 3))
+            options: dict[str, Any] = {"model": "microscale", "relaxation": 1}
+            options |= {"stiffening": True, "mullins": True}
+        else:
+            test = ff.read_test(write(record, Path(folder)))
+            options = {"model": record.model, "relaxation": record.setup.relaxation}
+    if getattr(getattr(record, "setup", None), "dashpot", False):  # fixed at zero by default
+        options["params"] = ff.make_params(test, drive="displacement", **options)
+        options["params"]["s1_eta"].vary = True
+    result = ff.fit(test, seed=0, **options)
     return test, result, {a: p for a, p in result.parameters.items() if a in record.truth}
 
 
@@ -186,6 +209,7 @@ def run_test(family: str, name: str, seed: int) -> list[Row]:
     if family == "slow":
         with suppress(SimulationError):
             about["over truth"] = over_truth(record, test, result.chain)
+    about["contradicted"] = ", ".join(one.quantity for one in contradictions(test))
     found = estimates.items()
     return [about | judged(name, record.truth[name], one) for name, one in found if one.vary]
 
@@ -232,13 +256,11 @@ def run(
     done = set(zip(*(old[key] for key in JOB), strict=True))
     left = [job for job in jobs if job not in done]
     tables = [old] if len(old) else []
-    with ProcessPoolExecutor(processes) if processes > 1 else nullcontext() as pool:
-        columns = list(zip(*left, strict=True)) or [[], [], []]
-        for number, more in enumerate((pool.map if pool else map)(work, *columns), start=1):
-            tables.append(pd.DataFrame(more, columns=COLUMNS).astype(object))
-            if raw is not None:
-                tables[-1].to_csv(raw, mode="a", index=False, header=not raw.exists())
-            print(f"\r{number} of {len(left)}", end="", file=sys.stderr, flush=True)
+    for number, more in enumerate(studies.in_order(work, left, processes), start=1):
+        tables.append(pd.DataFrame(more, columns=COLUMNS).astype(object))
+        if raw is not None:
+            tables[-1].to_csv(raw, mode="a", index=False, header=not raw.exists())
+        print(f"\r{number} of {len(left)}", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
     rows, asked = pd.concat(tables, ignore_index=True).infer_objects(), set(jobs)
     return rows[[job in asked for job in zip(*(rows[key] for key in JOB), strict=True)]]
@@ -263,25 +285,19 @@ def coverage(rows: pd.DataFrame, by: str) -> pd.DataFrame:
         holds, low, high = percents(given["holds"])
         missed = given["over truth"] > MISSED
         each = group.drop_duplicates(JOB)
-        out.append(
-            {
-                by: name,
-                "tests": len(each),
-                "failed": int(each["parameter"].isna().sum()),
-                "intervals": len(given),
-                "holds %": holds,
-                "from %": low,
-                "to %": high,
-                "far": int(given["far"].sum()),
-                "missed": int((each["over truth"] > MISSED).sum()),
-                "others hold %": percents(given["holds"][~missed])[0],
-                "not determined": int((springs["state"] == "not determined").sum()),
-                "zeros etc. hold %": percents(known["holds"])[0],
-                "zeros etc. far": int(known["far"].sum()),
-                "warned": int((each["status"] == "warnings").sum()),
-                "seconds": each["seconds"].median(),
-            }
-        )
+        out.append({
+            by: name, "tests": len(each), "failed": int(each["parameter"].isna().sum()),
+            "intervals": len(given), "holds %": holds, "from %": low, "to %": high,
+            "far": int(given["far"].sum()), "missed": int((each["over truth"] > MISSED).sum()),
+            "others hold %": percents(given["holds"][~missed])[0],
+            "determined": int((springs["state"] == "determined").sum()),
+            "not determined": int((springs["state"] == "not determined").sum()),
+            "zeros etc. hold %": percents(known["holds"])[0],
+            "zeros etc. far": int(known["far"].sum()),
+            "contradicted": int(each["contradicted"].astype(object).fillna("").ne("").sum()),
+            "warned": int((each["status"] == "warnings").sum()),
+            "seconds": each["seconds"].median(),
+        })  # fmt: skip
     return pd.DataFrame(out)
 
 
@@ -291,17 +307,12 @@ def moves(rows: pd.DataFrame, by: str) -> pd.DataFrame:
     for name, group in [*rows.groupby(by, sort=False), ("all", rows)]:
         given = group[group["move"].notna()]
         worst = given.loc[given["move"].idxmax()] if len(given) else None
-        out.append(
-            {
-                by: name,
-                "comparisons": len(given),
-                "moved %": 100.0 * (given["move"] > 0.3).mean(),
-                "median": given["move"].median(),
-                "largest": given["move"].max(),
-                "of": "" if worst is None else f"{worst['parameter']}, test {worst['test']}",
-                "failed": int(group["error"].notna().sum()),
-            }
-        )
+        out.append({
+            by: name, "comparisons": len(given), "moved %": 100.0 * (given["move"] > 0.3).mean(),
+            "median": given["move"].median(), "largest": given["move"].max(),
+            "of": "" if worst is None else f"{worst['parameter']}, test {worst['test']}",
+            "failed": int(group["error"].notna().sum()),
+        })  # fmt: skip
     return pd.DataFrame(out)
 
 
@@ -315,22 +326,21 @@ def tell(rows: pd.DataFrame, invariance: bool) -> pd.DataFrame:
         tables += [count(rows.assign(**grid).dropna(subset=name), name) for name in grid]
     for each in tables:
         print(each.to_string(index=False, float_format=lambda x: f"{x:.3g}"), end="\n\n")
-    failed = rows[rows["error"].notna()]
-    for row in failed.itertuples():
-        print(f"{row[1 + rows.columns.get_loc('class')]}, test {row.test}: {row.error}")
+    for name, test, error in rows[rows["error"].notna()][["class", "test", "error"]].to_numpy():
+        print(f"{name}, test {test}: {error}")
     return table
 
 
 def main() -> None:
     parser = studies.arguments(__doc__, tests=200, jobs=(1, "processes"))
-    parser.add_argument("--family", choices=[*FAMILIES], help="by default both")
+    parser.add_argument("--family", choices=[*FAMILIES], help="by default impact and slow")
     parser.add_argument("--classes", default="", help="a pattern that names of classes begin with")
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--invariance", action="store_true", help="impacts written several ways")
     parser.add_argument("--raw", type=Path, help="rows of all tests; resumed")
     parser.add_argument("--out", type=Path, help="the table of classes")
     options = parser.parse_args()
-    families = [options.family] if options.family else list(FAMILIES)
+    families = [options.family] if options.family else ["impact", "slow"]
     families = ["impact"] if options.invariance else families
     jobs = [
         (family, name, seed)

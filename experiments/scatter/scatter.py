@@ -26,13 +26,12 @@ from scipy import stats
 import foamfit as ff
 from foamfit.text import percent
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import studies  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
 
+HERE = Path(__file__).parent
 GROUPS, COUNT = ("new", "worn"), 5
-OWN = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
-SCATTER = dict.fromkeys((*OWN, "g1", "tau1"), "scatter")
+SCATTER = dict.fromkeys((*studies.MICROSCALE, "g1", "tau1"), "scatter")
 OPEN = {"k0": "scatter", "sigma_plus": "shared"}  # the others are own
 
 
@@ -58,28 +57,24 @@ def predicted(
         t = float(stats.t.ppf(0.975, len(fitted) - 1))
         half = t * simple.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / len(fitted))
         off = np.abs(every[i].stress - simple.mean(axis=0))
-        rows.append(
-            {
-                "specimen": f"{group} {i}", "fitted": len(fitted), "samples": int(one.kept.sum()),
-                "inside": one.inside, "half_width": one.half_width / one.range,
-                "inside_simple": float(np.mean(off <= half)),
-                "half_width_simple": float(half.mean()) / one.range,
-                **{part: one.half_width_of(part) / one.range for part in one.parts},
-                "warned": any("leave open" in w for w in found.warnings),
-            }
-        )  # fmt: skip
+        rows.append({
+            "specimen": f"{group} {i}", "fitted": len(fitted), "samples": int(one.kept.sum()),
+            "inside": one.inside, "half_width": one.half_width / one.range,
+            "inside_simple": float(np.mean(off <= half)),
+            "half_width_simple": float(half.mean()) / one.range,
+            **{part: one.half_width_of(part) / one.range for part in one.parts},
+            "warned": any("leave open" in w for w in found.warnings),
+        })  # fmt: skip
         print(rows[-1], flush=True)
     return rows
 
 
-def along(test: Any, other: Any) -> np.ndarray:
+def along(test: ff.Measurement, other: ff.Measurement) -> np.ndarray:
     """Return a test's stress at the relative strains and branches of another test."""
-    strain, at = test.displacement / test.displacement.max(), other.displacement
-    turn, at = int(np.argmax(strain)), at / at.max()
+    at = other.displacement / other.displacement.max()
     back = int(np.argmax(at)) + 1
-    up = np.interp(at[:back], np.maximum.accumulate(strain[: turn + 1]), test.stress[: turn + 1])
-    falling = np.maximum.accumulate(strain[turn:][::-1])
-    return np.concatenate([up, np.interp(at[back:], falling, test.stress[turn:][::-1])])
+    last = float(test.stress[-1])
+    return studies.at_shares(test.displacement, test.stress, at[:back], at[back:], last)
 
 
 def page(frame: pd.DataFrame) -> None:

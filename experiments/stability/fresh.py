@@ -39,7 +39,6 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
@@ -51,15 +50,13 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import foamfit as ff
+import studies
+from independent import LOOSE, Truth, follow, judge, over_range
+from scenes import Point, designed, scene_of
+
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent)]
-
-from independent import LOOSE, Truth, follow, judge, over_range  # noqa: E402
-from scenes import Point, designed, scene_of  # noqa: E402
-
-import foamfit as ff  # noqa: E402
-import studies  # noqa: E402
-
 Array = NDArray[np.float64]
 Scene = tuple[ff.Chain, ff.Impact | ff.StressDrive | ff.DisplacementDrive, Array]
 Spec = dict[str, Any]
@@ -755,22 +752,20 @@ def summary(lines: pd.DataFrame) -> pd.DataFrame:
         known = group[group.judge == "judged"]
         steady = group[group.judge.isin(["judged", "chaotic"])]
         refused = known[known.outcome == "refused"]
-        rows.append(
-            {
-                "family": family, "rtol": rtol, "scenes": len(group), "judged": len(known),
-                "chaotic": len(steady) - len(known), "beyond the judge": len(group) - len(steady),
-                "answers": int((known.outcome != "refused").sum()),
-                "refused": len(refused),
-                "reasons": ", ".join(f"{k} {n}" for k, n in refused.reason.value_counts().items()),
-                "over 1 rtol": int((known.error > POOR).sum()),
-                "over 3 rtol": int((known.error > BAD).sum()),
-                "largest / rtol": known.error.max(),
-                "derivatives": int(known.slope.notna().sum()),
-                "refused derivatives": int((known.reason == "derivatives refused").sum()),
-                "wrong derivatives": int((known.slope > slope_bar(rtol)).sum()),
-                "longest s": group.seconds.max(),
-            }
-        )  # fmt: skip
+        rows.append({
+            "family": family, "rtol": rtol, "scenes": len(group), "judged": len(known),
+            "chaotic": len(steady) - len(known), "beyond the judge": len(group) - len(steady),
+            "answers": int((known.outcome != "refused").sum()),
+            "refused": len(refused),
+            "reasons": ", ".join(f"{k} {n}" for k, n in refused.reason.value_counts().items()),
+            "over 1 rtol": int((known.error > POOR).sum()),
+            "over 3 rtol": int((known.error > BAD).sum()),
+            "largest / rtol": known.error.max(),
+            "derivatives": int(known.slope.notna().sum()),
+            "refused derivatives": int((known.reason == "derivatives refused").sum()),
+            "wrong derivatives": int((known.slope > slope_bar(rtol)).sum()),
+            "longest s": group.seconds.max(),
+        })  # fmt: skip
     return pd.DataFrame(rows)
 
 
@@ -843,7 +838,7 @@ def main() -> None:
     tasks = [(f, n, rtols) for f in given.family or FAMILIES for n in numbers]
     lines: list[dict[str, Any]] = []
     compile_all(tuple(dict.fromkeys(family for family, *_ in tasks)))
-    for found in ProcessPoolExecutor(given.processes).map(lines_of, tasks, chunksize=4):
+    for found in studies.in_order(lines_of, [(task,) for task in tasks], given.processes):
         lines += found
         if len(lines) % (50 * len(rtols)) == 0:
             print(f"{len(lines) // len(rtols)} scenes", file=sys.stderr, flush=True)
@@ -857,4 +852,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    studies.run(main, HERE)
+    main()

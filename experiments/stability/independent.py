@@ -80,6 +80,7 @@ class System(NamedTuple):
     drag: float
     top: int
     speed: float  # of a striker, else 0
+    gravity: float  # on a striker
     values: Array  # of the drive at the samples
     work: Array  # (4, n), overwritten by `_rates`
 
@@ -617,12 +618,15 @@ def _follow(
         y[groups - 1] = system.speed
         while done < times.size and times[done] < 0.0:
             nodes[:, done] = 0.0
-            nodes[count - 1, done] = system.speed * times[done]
+            nodes[count - 1, done] = times[done] * (
+                system.speed + 0.5 * system.gravity * times[done]
+            )
             base[done] = 0.0
             done += 1
     knot, steps, switches, peak, largest = 0, 0, 0, 0.0, 0.0
     pressed, least, last_base, falling = False, math.inf, 0.0, False
-    h = value = rate = 0.0
+    h = rate = 0.0
+    value = system.gravity * system.mass[groups - 1]
     late = 0.0  # rounding error of the clock
     fresh, since = True, now
     while True:
@@ -758,7 +762,7 @@ def _follow(
         _record(
             y, moving, flags, springs, times[j : j + 1], math.inf, 0, 0.0, nodes[:, j:], base[j:]
         )
-        nodes[:, j] += y[groups - 1] * (times[j] - now)
+        nodes[:, j] += (times[j] - now) * (y[groups - 1] + 0.5 * system.gravity * (times[j] - now))
     return DONE, steps, switches, now, least
 
 
@@ -851,10 +855,11 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = 
         for n, term in enumerate(terms):
             relax[i, n] = term
     time = np.ascontiguousarray(time, float)
-    above, speed, values, top = float(chain.masses[-1]), 0.0, np.zeros(time.size), MASS
+    above, values, top = float(chain.masses[-1]), np.zeros(time.size), MASS
+    speed, gravity = float(getattr(drive, "velocity", 0.0)), float(getattr(drive, "gravity", 0.0))
     drag = chain.site_damping / math.fsum(chain.heights)
     if hasattr(drive, "velocity"):
-        above, speed = above + drive.mass, float(drive.velocity)
+        above += drive.mass
     elif hasattr(drive, "displacement"):
         above, values, top = 0.0, np.array(drive.displacement, float), MOTION
     else:
@@ -871,7 +876,8 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = 
         if too_long or _shares(chain, drive, ends):
             why = WHY[TOO_LONG] if too_long else SHARED
             return Truth(nodes, base, None, math.nan, math.nan, math.inf, 0, 0, why)
-    system = System(rows, relax, ends, mass, drag, top, speed, values, np.empty((4, count)))
+    work = np.empty((4, count))
+    system = System(rows, relax, ends, mass, drag, top, speed, gravity, values, work)
     outcome, steps, switches, end, dip = _follow(
         system, kinds, time, tol, most // count, nodes, base
     )

@@ -12,8 +12,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from independent import Array, Truth
 from mpmath import exp, findroot, inf, log, mp, mpf, ncdf, sqrt
+
+from independent import Array, Truth
 
 DIGITS = 30
 

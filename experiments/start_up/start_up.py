@@ -28,10 +28,10 @@ import numpy as np
 
 import foamfit as ff
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import studies  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
 
+HERE = Path(__file__).parent
 TOML = '[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n'
 TOML += '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
 PARTS = (
@@ -131,7 +131,7 @@ def main() -> None:
     print(f"peak memory {peak:.0f} MiB")
     if options.rows == 600:
         machine = f"{os.cpu_count()} cores, {studies.circumstances()}"
-        studies.write_page(HERE, out=options.out, table=table, machine=machine)
+        studies.write_page(HERE, options.out, table=table, circumstances=machine)
 
 
 if __name__ == "__main__":

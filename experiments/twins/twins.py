@@ -26,20 +26,19 @@ import pandas as pd
 from scipy import stats
 
 import foamfit as ff
-from foamfit.report.figures import BLUE, GREY, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.springs.parameters import unit_of
 from foamfit.text import percent, significant
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import studies  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
+from studies import BLUE, GREY, VERMILION
 
+HERE = Path(__file__).parent
 SOURCE = "Measurements: arXiv:2602.12694, LivingMatterLab/CANN"
 GROUPS, COLOURS = ("new", "worn"), {"new": BLUE, "worn": VERMILION}
 FIRST, LATER = 1, 5  # cycles with tables on the page
-OWN = ["k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus"]
-LAW = [*OWN, "g1", "tau1"]
+LAW = [*studies.MICROSCALE, "g1", "tau1"]
 # A single test cannot separate kc and eps_star (r = 1.00), but the evidence of all ten favours one
 # common eps_star. It is fitted to all tests and fixed in the groups, so that kc can be compared.
 HELD = "s1_eps_star"
@@ -110,16 +109,8 @@ def mean_loop(group: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarra
     The first half is the loading, the second the unloading.
     """
     share = np.linspace(0.0, 1.0, POINTS)
-    strains, stresses = [], []
-    for strain, stress in group:
-        turn, top = int(np.argmax(strain)), float(strain.max())
-        up = np.interp(share, np.maximum.accumulate(strain[: turn + 1]) / top, stress[: turn + 1])
-        back = np.maximum.accumulate(strain[turn:][::-1]) / top
-        down = np.interp(share, back, stress[turn:][::-1])
-        # There is nothing to interpolate below the end of unloading.
-        down[share < back[0]] = np.nan
-        strains.append(top * np.concatenate([share, share[::-1]]))
-        stresses.append(np.concatenate([up, down[::-1]]))
+    strains = [one.max() * np.concatenate([share, share[::-1]]) for one, _ in group]
+    stresses = [studies.at_shares(*one, share, share[::-1]) for one in group]
     return np.mean(strains, axis=0), np.mean(stresses, axis=0), np.std(stresses, axis=0, ddof=1)
 
 
@@ -309,4 +300,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    studies.run(main, HERE)
+    main()

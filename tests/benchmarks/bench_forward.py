@@ -2,11 +2,10 @@
 
     pip install ".[benchmark]"
     pytest tests/benchmarks/bench_forward.py --benchmark-group-by=group
-    pytest tests/benchmarks/bench_forward.py -k impact --benchmark-json=before.json
+    pytest tests/benchmarks/bench_forward.py -k springs --benchmark-json=before.json
 
-By default `pytest` does not collect this file (its name does not start with `test_`). The scenes
-and the SciPy solvers are those of experiments/error_vs_runtime, whose `forward.py` plots errors
-against times.
+By default `pytest` does not collect this file (its name does not start with `test_`). The springs
+are those of experiments/error_vs_runtime, whose `forward.py` compares foamfit with SciPy.
 """
 
 from __future__ import annotations
@@ -24,12 +23,6 @@ from foamfit.solve.plan import plan
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments" / "error_vs_runtime"))
 import scenes as kinds
 
-SCENES = {scene.name: scene for scene in kinds.scenes()}
-# SciPy's fastest setting with an error below 2e-6; see experiments/error_vs_runtime/forward.
-BEST = {
-    "one_spring_impact": ("SciPy DOP853", "rtol = 1e-07"),
-    "two_springs_mass_impact": ("SciPy DOP853", "rtol = 1e-07"),
-}
 SIZES = (1, 10, 100, 1000)
 SAMPLES = (100, 1000, 10_000, 100_000)
 
@@ -39,23 +32,6 @@ def kernel(chain: ff.Chain, drive: Any, time: np.ndarray) -> Any:
     made = plan(chain, drive, time)
     rows, heights = chain.arrays.rows, chain.arrays.heights
     return lambda: made.run(rows, heights, everything=False)
-
-
-@pytest.mark.parametrize("name", BEST)
-@pytest.mark.parametrize("way", ["simulate", "kernel", "SciPy"])
-def test_impact(benchmark: Any, name: str, way: str) -> None:
-    scene = SCENES[name]
-    benchmark.group = name
-    if way == "SciPy":
-        family, setting = BEST[name]
-        ladder = kinds.others(scene)[family]
-        run = next(one.run for one in ladder if one.setting == setting)
-    elif way == "kernel":
-        run = kernel(scene.chain, scene.drive, scene.time)
-    else:
-        run = kinds.own(scene)[kinds.PUBLIC][4].run  # rtol = 1e-6
-    run()
-    benchmark(run)
 
 
 @pytest.mark.parametrize("count", SIZES)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import foamfit as ff
@@ -62,18 +61,20 @@ def test_slow_tests_are_those_of_foamfit(setup: rig.Slow, seed: int) -> None:
 
 
 def test_gravity_and_a_gauge_on_the_specimen() -> None:
-    setup = rig.Impact(law="microscale", relaxation=1, noise=0.0, gravity=True, before=0.3)
-    made = rig.impact(setup, 3)
-    course, mass, area = made.course, made.rig.mass, made.rig.area
+    setup = rig.Impact(noise=0.0, gravity=True, before=0.3)
+    course = next(
+        c for c in (rig.impact(setup, i).course for i in range(9)) if c.rig.springs[0].eta
+    )
+    mass, area = course.rig.mass, course.rig.area
     time = np.linspace(-0.2 * course.end, 1.2 * course.end, 20_001)
     gained = np.gradient(np.gradient(course.top(time, False), time), time)
     braked = rig.GRAVITY - course.stress(time) * area / mass
-    assert np.abs(gained - braked)[5:-5].max() < 1e-3 * np.ptp(braked)
+    smooth = (np.abs(time) > 1e-3 * course.end) & (np.abs(time - course.end) > 1e-3 * course.end)
+    assert np.abs(gained - braked)[smooth][5:-5].max() < 1e-3 * np.ptp(braked)
     rests = course.top(time, gauge=True)
     assert np.all(rests[time <= 0.0] == 0.0)
     after = time > course.end
     assert np.all(np.diff(rests[after]) <= 0.0)  # the specimen recovers after the striker has left
-    assert rests[after][0] == pytest.approx(course.state[0], rel=1e-3)
     assert course.top(time, False)[-1] < rests[-1]
 
 
@@ -100,44 +101,6 @@ def test_a_file_says_what_the_record_holds(tmp_path: Path) -> None:
     assert other.truth["displacement_zero"] == made.truth["displacement_zero"] + 1e-3
 
 
-def test_one_seed_is_one_test_whatever_is_recorded() -> None:
-    whole = rig.impact(rig.Impact(channels=("force", "displacement"), noise=0.01), 7)
-    force = rig.impact(rig.Impact(channels=("force",), noise=0.01), 7)
-    assert np.array_equal(whole.channels["force"], force.channels["force"])
-    trimmed = rig.impact(replace(whole.setup, trimmed=True), 7)
-    same = [name for name in whole.truth if name.startswith("s1_")]
-    assert all(trimmed.truth[name] == whole.truth[name] for name in same)
-    assert trimmed.truth["contact_time"] == trimmed.time[0] == 0.0
-
-
-def test_relaxation_and_dashpot_come_under_their_names() -> None:
-    truth = rig.slow(rig.Slow(relaxation=2, dashpot=True), 1).truth
-    assert truth["s1_eta"] > 0.0
-    assert truth["s1_tau1"] < truth["s1_tau2"]
-    assert truth["s1_g1"] > 0.0
-
-
-class Found:
-    """A stand-in for a fit: the true values shifted by the relative error `off`."""
-
-    status = "ok"
-
-    def __init__(self, record: rig.Record, off: float) -> None:
-        self.parameters = {}
-        for name, value in record.truth.items():
-            if name.startswith("s"):
-                near = value + off * max(abs(value), 1.0)
-                self.parameters[name] = Estimate(near)
-        self.chain = rigs.chain_of(record.rig)
-
-
-class Estimate:
-    def __init__(self, value: float) -> None:
-        self.value, self.stderr = value, 0.01 * abs(value)
-        self.ci95 = value - 0.02 * abs(value), value + 0.02 * abs(value)
-        self.vary, self.state = True, "determined"
-
-
 def test_the_rig_numbers_springs_and_terms_as_the_fit_does() -> None:
     """By the stress at A1 and by the relaxation time, because estimates are compared by name."""
     for seed in range(1, 6):
@@ -150,27 +113,13 @@ def test_the_rig_numbers_springs_and_terms_as_the_fit_does() -> None:
         assert truth["s1_tau1"] < truth["s1_tau2"]
 
 
-def test_parameters_are_judged_by_their_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    record = rigs.make("slow", "two springs, 300 rows, 0.3 %", 1)
-    monkeypatch.setattr(ff, "fit", lambda *_, **__: Found(record, 0.0))
-    rows = rigs.run_test("slow", "two springs, 300 rows, 0.3 %", 1)
-    assert all(row["holds"] and row["value"] == row["truth"] for row in rows)
-    assert {row["parameter"] for row in rows} == {n for n in record.truth if n.startswith("s")}
-    assert rows[0]["over truth"] == 1.0
-
-
-@pytest.mark.parametrize(("off", "holds", "far"), [(0.0, 1, 0), (0.03, 0, 0), (0.1, 0, 1)])
+@pytest.mark.parametrize(("truth", "holds", "far"), [(1.0, 1, 0), (1.03, 0, 0), (1.1, 0, 1)])
 def test_far_is_an_interval_that_misses_by_more_than_its_width(
-    monkeypatch: pytest.MonkeyPatch, off: float, holds: int, far: int
+    truth: float, holds: bool, far: bool
 ) -> None:
-    record = rigs.make("slow", "microscale, 300 rows, 0.3 %", 1)
-    monkeypatch.setattr(ff, "fit", lambda *_, **__: Found(record, off))
-    rows = pd.DataFrame(rigs.run_test("slow", "microscale, 300 rows, 0.3 %", 1))
-    row = rows[rows["parameter"] == "s1_k0"].iloc[0]
+    found = SimpleNamespace(value=1.0, stderr=0.01, ci95=(0.98, 1.02), state="determined")
+    row = rigs.judged("s1_k0", truth, found)
     assert (row["holds"], row["far"]) == (holds, far)
-    table = rigs.coverage(rows.assign(error=None), "class")
-    assert list(table["holds %"]) == [100.0 * rows["holds"].mean()] * 2
-    assert list(table["far"]) == [rows["far"].sum()] * 2
 
 
 def test_a_failure_is_a_row_and_what_is_done_is_not_done_again(
@@ -187,27 +136,3 @@ def test_a_failure_is_a_row_and_what_is_done_is_not_done_again(
     assert rigs.coverage(rows, "class")["failed"].tolist() == [1, 1]
     again = rigs.run(pytest.fail, [job], raw, 1)
     assert again["error"].tolist() == rows["error"].tolist()
-
-
-def test_a_move_is_counted_in_standard_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fitted(record: rig.Record) -> tuple[None, None, dict[str, Estimate]]:
-        return None, None, {"s1_k0": Estimate(1.0 if record.time[0] < 12.0 else 1.002)}
-
-    monkeypatch.setattr(rigs, "fitted", fitted)
-    rows = pd.DataFrame(rigs.run_invariance("impact", "any zero", 3))
-    moved = rows[rows["move"] > 0.0]
-    assert moved["way"].tolist() == ["clock"]
-    assert moved["move"].tolist() == [pytest.approx(0.2)]
-    table = rigs.moves(rows.assign(error=None), "way").set_index("way")
-    assert table.loc["clock", "largest"] == pytest.approx(0.2)
-    assert table.loc["all", "moved %"] == 0.0
-
-
-def test_a_minimum_that_the_search_missed_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    name = "microscale, 300 rows, 0.3 %"
-    wrong = Found(rigs.make("slow", name, 2), 0.0)
-    monkeypatch.setattr(ff, "fit", lambda *_, **__: wrong)
-    rows = pd.DataFrame(rigs.run_test("slow", name, 1))
-    table = rigs.coverage(rows.assign(error=None), "class")
-    assert table["missed"].tolist() == [1, 1]
-    assert table["others hold %"].isna().all()

@@ -6,14 +6,13 @@ import math
 import sys
 
 import numpy as np
-import pandas as pd
 import pytest
 from scipy import stats
 
-from conftest import DATA, EXPERIMENTS, needs_data
+from conftest import EXPERIMENTS
 
 sys.path.insert(0, str(EXPERIMENTS / "twins"))
-from twins import Group, change_of, counted_together, lost, mean_loop, studies
+from twins import Group, change_of, lost, mean_loop
 
 
 def test_a_change_is_welchs_test_of_the_logarithms() -> None:
@@ -39,14 +38,6 @@ def test_a_scattering_parameter_brings_the_interval_of_the_joint_fit() -> None:
     assert (row["new"], row["new_spread"]) == (pytest.approx(5e5), 0.12)
 
 
-def test_comparisons_are_counted_together_and_the_largest_comes_first() -> None:
-    rows = [("a", 0.02, 1.0), ("b", 0.01, 3.0), ("c", 0.9, 2.0)]
-    given = pd.DataFrame(rows, columns=["quantity", "p", "change_over_spread"])
-    found = counted_together(given)
-    assert list(found["quantity"]) == ["b", "c", "a"]
-    assert list(found["p_adjusted"]) == pytest.approx([0.03, 0.9, 0.04])
-
-
 def test_the_mean_loop_of_one_loop_is_that_loop() -> None:
     up = np.linspace(0.0, 0.5, 301)
     strain = np.concatenate([up, up[::-1][1:]])
@@ -57,14 +48,3 @@ def test_the_mean_loop_of_one_loop_is_that_loop() -> None:
     assert mean[half:] == pytest.approx(1.1 * 4e5 * along[half:] ** 2, abs=2.0)
     assert spread[half - 1] == pytest.approx(0.2 * 1e5 / math.sqrt(2.0))
     assert lost((strain, stress)) == pytest.approx(0.5 * 1e5 * 0.5 - 4e5 * 0.5**3 / 3.0, rel=1e-4)
-
-
-@needs_data
-def test_each_test_is_linked_beside_its_toml(tmp_path) -> None:
-    import foamfit as ff
-
-    studies.place_twins(DATA / "shoe-foam-twins", tmp_path)
-    assert len(list(tmp_path.glob("*.toml"))) == len(list(tmp_path.glob("*_raw.txt"))) == 10
-    test = ff.read_test(tmp_path / "worn-heel-comp-4_raw.txt")
-    assert test.specimen.height == pytest.approx(8.827e-3)
-    assert len(test.cycles) == 6

@@ -5,14 +5,15 @@ fitted with four laws. Misfit, values and states of the specimens of one foam ar
 measurements are not part of this repository; FOAMFIT_DATA contains shoe-foam/ and shoe-foam-twins/.
 
 Answer. Microscale springs with relaxation have a misfit of 0.43 to 0.93 % of the range: see
-real_foams.md. Also written: real_foams.csv (every parameter of every fit), real_foams.png (one
-loop, two laws).
+README.md. Also written: real_foams.csv (every parameter of every fit) and real_foams.png (one loop,
+two laws).
 
-    FOAMFIT_DATA=path/to/data python experiments/real_foams.py     # two minutes of processor time
+    FOAMFIT_DATA=… python experiments/real_foams/real_foams.py     # two minutes of processor time
 """
 
 from __future__ import annotations
 
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -24,16 +25,15 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 import foamfit as ff
-import studies
-from foamfit.data.measurement import Measurement
-from foamfit.report.figures import BLUE, DPI, GREY, VERMILION
 from foamfit.report.readable import readable
 from foamfit.results import Fit, ParameterEstimate
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import number, percent
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studies
+from studies import BLUE, GREY, VERMILION
 
 HERE = Path(__file__).parent
-TABLE = HERE / "real_foams.csv"
 SHOE_FOAM = {  # height and diameter of specimens whose first cycle is a file of its own
     "turbo-comp-1": ("10.53 mm", "7.63 mm"),
     "turbo-comp-2": ("9.66 mm", "7.68 mm"),
@@ -52,7 +52,7 @@ SHOWN = "new-heel-comp-1"  # in the picture
 SOURCE = "arXiv:2602.12694 (LivingMatterLab/CANN)"
 
 
-def first_cycles(data: Path, folder: Path, foams: tuple[str, ...] = ()) -> Iterator[Measurement]:
+def first_cycles(data: Path, folder: Path, foams: tuple[str, ...] = ()) -> Iterator[ff.Measurement]:
     """Yield the first cycle of every specimen, or of the specimens of some foams."""
     own = [(name, *size, f"shoe-foam/{name}_cycle1.csv", "") for name, size in SHOE_FOAM.items()]
     twins = [
@@ -97,12 +97,11 @@ def law_table(table: pd.DataFrame) -> str:
     for law in LAWS:
         own = table[table["law"] == law]
         fits = own.drop_duplicates("test")
-        states = own["state"].value_counts()
         agree = own.groupby(["foam", "parameter"])["state"].nunique() == 1
         rows.append([
             law, len(own) // len(fits), f"{100.0 * fits['misfit'].median():.2f} %",
             f"{(fits['agreeing'] > 1).sum()} of {len(fits)}", f"{fits['seconds'].median():.1f} s",
-            " / ".join(str(states.get(s, 0)) for s in ("determined", "weak", "not determined")),
+            studies.counted(own["state"]),
             f"{agree.sum()} of {len(agree)}",
         ])  # fmt: skip
     head = "law | parameters | misfit | best found again | run time | determined / weak / not"
@@ -112,42 +111,32 @@ def law_table(table: pd.DataFrame) -> str:
 def draw(results: dict[str, Fit], path: Path) -> None:
     """Draw the measured loop with both laws, their residuals, and the parameters of the better."""
     best = results[BEST]
-    strain, stress = best.strain, best.curves.measured_stress
-    assert strain is not None
-    assert stress is not None
+    strain, stress, clock = best.strain, best.curves.measured_stress, best.curves.time
+    way = np.hypot(np.diff(strain, prepend=0.0) / np.ptp(strain),
+                   np.diff(stress, prepend=0.0) / np.ptp(stress)).cumsum()  # fmt: skip
+    some = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], 90)).clip(0, way.size - 1))
     styles = {
-        PLAIN: {"color": BLUE, "lw": 0.9, "alpha": 0.6},
-        BEST: {"color": VERMILION, "lw": 1.3},
+        PLAIN: ("bistable", {"color": BLUE, "alpha": 0.6, "zorder": 2.5}, 0.9),
+        BEST: ("microscale with relaxation", {"color": VERMILION, "zorder": 3}, 1.3),
     }
-    with studies.sheet(path, 7.0, 3.5, DPI) as figure:
+    with studies.sheet(path, 7.0, 3.5, 250) as figure:
         grid = figure.add_gridspec(2, 2, width_ratios=[4.0, 2.9], height_ratios=[4.0, 1.0])
         loop, off = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
-        side = figure.add_subplot(grid[:, 1])
-        way = np.cumsum(np.hypot(np.diff(strain, prepend=0.0) / np.ptp(strain),
-                                 np.diff(stress, prepend=0.0) / np.ptp(stress)))  # fmt: skip
-        some = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], 90)).clip(0, way.size - 1))
         loop.plot(
             strain[some], stress[some] / 1e3, "o", ms=3.6, mfc="white", mec="0.55", mew=0.6,
             label="measured", zorder=2,
         )  # fmt: skip
-        clock = best.curves.time
-        assert clock is not None
         for law, result in results.items():
-            fitted = result.curves.stress
-            assert fitted is not None
-            count = len(varied(result))
-            misfit = percent(result.misfit["stress_strain"] or 0.0)
-            name = {PLAIN: "bistable", BEST: "microscale with relaxation"}[law]
-            style = styles[law] | {"zorder": 3 if law == BEST else 2.5}
-            loop.plot(
-                strain, fitted / 1e3, label=f"{name}:\n{count} parameters, misfit {misfit}", **style
-            )
-            off.plot(clock, 100.0 * (fitted - stress) / np.ptp(stress), **style | {"lw": 0.7})
+            (name, style, width), fitted = styles[law], result.curves.stress
+            misfit = 100.0 * (result.misfit["stress_strain"] or 0.0)
+            label = f"{name}:\n{len(varied(result))} parameters, misfit {misfit:.2g} %"
+            loop.plot(strain, fitted / 1e3, label=label, lw=width, **style)
+            off.plot(clock, 100.0 * (fitted - stress) / np.ptp(stress), lw=0.7, **style)
         loop.set(xlabel="strain (–)", ylabel="stress (kPa)")
         loop.legend(loc="upper left", handlelength=1.4)
         off.axhline(0.0, color=GREY, lw=0.6)
         off.set(xlabel="time (s)", ylabel="residual\n(% of range)")
-        _write_values(side, best)
+        _write_values(figure.add_subplot(grid[:, 1]), best)
         figure.suptitle(
             f"Running-shoe foam, {best.measurement.name}, first cycle", x=0.012, ha="left",
             fontsize=8.5, weight="bold",
@@ -159,19 +148,19 @@ def _write_values(side: Axes, result: Fit) -> None:
     side.set_axis_off()
     side.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
     meaning = {
-        "k0": "elastic stiffness", "kc": "densified stiffness", "eps_star": "densification strain",
-        "sigma_plus": "snap-through stress", "spread_plus": "and its spread",
-        "sigma_minus": "snap-back stress", "spread_minus": "and its spread",
-        "g1": "relaxing strength", "tau1": "relaxation time",
+        "k0": ("k_{0}", "elastic stiffness"), "kc": ("k_{c}", "densified stiffness"),
+        "eps_star": (r"\varepsilon_{*}", "densification strain"),
+        "sigma_plus": (r"\sigma_{+}", "snap-through stress"),
+        "spread_plus": ("s_{+}", "and its spread"),
+        "sigma_minus": (r"\sigma_{-}", "snap-back stress"),
+        "spread_minus": ("s_{-}", "and its spread"),
+        "g1": ("g_{1}", "relaxing strength"), "tau1": (r"\tau_{1}", "relaxation time"),
     }  # fmt: skip
     for i, (name, p) in enumerate(varied(result).items()):
         one, y = readable(name, p), 0.93 - 0.088 * i
-        stem, index = one.symbol
-        index = index.partition(",")[0].replace("−", "-")
-        index = {"1": name[-1]}.get(index, index) if name[-1].isdigit() else index
-        greek = {"ε": r"\varepsilon", "σ": r"\sigma", "τ": r"\tau"}.get(stem, stem)
-        side.text(0.0, y, f"${greek}_{{{index}}}$", fontsize=9, va="center")
-        side.text(0.13, y, meaning[name.removeprefix("s1_")], va="center", color=GREY)
+        symbol, text = meaning[name.removeprefix("s1_")]
+        side.text(0.0, y, f"${symbol}$", fontsize=9, va="center")
+        side.text(0.13, y, text, va="center", color=GREY)
         unit = "" if one.unit == "–" else f" {one.unit}"
         side.text(1.0, y, f"{one.with_error}{unit}", va="center", ha="right")
     side.text(
@@ -180,36 +169,31 @@ def _write_values(side: Axes, result: Fit) -> None:
     )  # fmt: skip
 
 
-def main() -> dict[str, Fit]:
-    """Write page and table; return the fits for the figure."""
+def main() -> None:
+    """Fit every specimen by every law; write page, table and figure."""
+    studies.arguments(__doc__).parse_args()
     data = studies.measurements("shoe-foam", "shoe-foam-twins")
-    ff.fit(ff.read_test(HERE / "foam-1" / "model-1-2.0mps-reconstruction.csv"))  # compiles
+    ff.fit(ff.read_test(HERE.parent / "foam-1" / "model-1-2.0mps-reconstruction.csv"))  # compiles
     rows, shown = list[dict[str, Any]](), dict[str, Fit]()
     with tempfile.TemporaryDirectory() as folder:
         tests = list(first_cycles(data, Path(folder)))
         for test in tests:
             for law, (model, relaxation, starts) in LAWS.items():
-                began = time.process_time()
+                began = time.process_time()  # the machine may be shared
                 result = ff.fit(test, model=model, relaxation=relaxation, starts=starts)
-                seconds = time.process_time() - began  # the machine may be shared
+                seconds = time.process_time() - began
                 rows += rows_of(test.name, law, result, seconds)
-                misfit = number(100.0 * (result.misfit["stress_strain"] or 0.0))
-                print(f"{test.name:18}{law:24}{misfit} %  {seconds:.1f} s", flush=True)
+                misfit = 100.0 * (result.misfit["stress_strain"] or 0.0)
+                print(f"{test.name:18}{law:24}{misfit:.2f} %  {seconds:.1f} s", flush=True)
                 if test.name == SHOWN and law in (PLAIN, BEST):
                     shown[law] = result
     table = pd.DataFrame(rows)
-    studies.write_csv(table, TABLE, 6)
-    page = (HERE / "real_foams.template.md").read_text(encoding="utf-8").format(
-        source=SOURCE, count=len(tests), misfits=misfit_table(table), laws=law_table(table),
-    )  # fmt: skip
-    (HERE / "real_foams.md").write_text(page)
-    return shown
+    studies.write_csv(table, HERE / "real_foams.csv", 6)
+    draw(shown, HERE / "real_foams.png")
+    studies.write_page(
+        HERE, source=SOURCE, count=len(tests), misfits=misfit_table(table), laws=law_table(table)
+    )
 
 
 if __name__ == "__main__":
-    studies.arguments(__doc__).parse_args()
-    before = TABLE.read_bytes() if TABLE.exists() else b""
-    with studies.keep_unchanged(HERE):
-        both = main()
-    if TABLE.read_bytes() != before:  # small changes of the numbers hardly change pixels
-        draw(both, HERE / "real_foams.png")
+    main()

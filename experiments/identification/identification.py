@@ -1,6 +1,4 @@
-"""Misfit against run time: foamfit's search and eight methods of lmfit.
-
-Question. How many problems does a method solve in a few seconds, and how fast?
+"""How many problems do foamfit's search and eight methods of lmfit solve in a few seconds?
 
 Method. Every method minimises the same residual (`fitting.objective.Objective`) of the same
 problems for the same time. The lowest cost so far is recorded against the processor time of the
@@ -10,16 +8,13 @@ also ends once its cost is within 0.1 % of the best known. The eight methods run
 `lmfit.Parameters` of `foamfit.make_params` (SI values and bounds, as a user of lmfit would write
 them), and in the coordinates of foamfit's search, in which every point is admissible.
 
-Answer. `foamfit.fit` solves all problems in 3 s; see identification.md.
+Answer. `foamfit.fit` solves all problems in 3 s: README.md.
 
-    python experiments/error_vs_runtime/identification.py           # at most 35 min of one core
-    python experiments/error_vs_runtime/identification.py --budget 1 --seeds 2
-    python experiments/error_vs_runtime/identification.py --redraw  # figures and page only
+    FOAMFIT_DATA=… python experiments/identification/identification.py    # 35 min of one core
+    python experiments/identification/identification.py --redraw          # figures and page only
 
-Writes identification_runs.csv.gz (every improvement by more than 2 %, and when a problem was
-solved) and identification_runs.json (machine, versions, arguments); then identification.md and
-figures. FOAMFIT_DATA is the folder of third-party measurements; without it the shoe foam is
-omitted.
+Writes runs.csv.gz (every improvement by more than 2 %, and when a problem was solved) and runs.json
+(machine, settings), then README.md and figures. Without FOAMFIT_DATA the shoe foam is omitted.
 """
 
 # ruff: noqa: E402  (the number of threads is read when NumPy is imported)
@@ -33,14 +28,14 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import argparse
 import json
-import platform
 import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -58,14 +53,15 @@ from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import box_starts
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
 
+HERE = Path(__file__).parent
 Array = NDArray[np.float64]
 SOLVED = 1.05  # cost over the best known cost at which a problem counts as solved
+ENOUGH = 1.001  # cost over the best known at which a run ends
+RECORDED = 0.98  # a cost is recorded below this multiple of the last recorded one
 RUN = ["problem", "coordinates", "method", "seed"]
-COLUMNS = [*RUN, "seconds", "evaluations", "cost"]
 OWN = "foamfit.fit"
 LEAST_SQUARES = ("leastsq", "least_squares")
 GROUPS = {
@@ -79,7 +75,7 @@ COORDINATES = {
     "box": "lmfit.Parameters in the coordinates of foamfit's search",
 }
 # Colours safe for colour-blind readers (Okabe & Ito, and two more); lines also differ in dashes.
-STYLES: dict[str, tuple[str, str]] = {
+STYLES = {
     OWN: (studies.BLUE, "-"),
     "leastsq": ("black", "-"),
     "least_squares": (studies.SKY, "--"),
@@ -90,9 +86,6 @@ STYLES: dict[str, tuple[str, str]] = {
     "dual_annealing": (studies.PURPLE, "-."),
     "ampgo": ("#6b6b6b", ":"),
 }
-GZIP = {"method": "gzip", "mtime": 0}
-ENOUGH = 1.001  # cost over the best known at which a run ends
-RECORDED = 0.98  # a cost is recorded below this multiple of the last recorded one
 
 
 # ---------------------------------------------------------------- problems
@@ -147,70 +140,37 @@ class RunOver(Exception):  # noqa: N818 (nothing went wrong)
     """The time is up, or the best known cost is reached."""
 
 
-@dataclass(eq=False)
-class Recorder:
-    """Record of the lowest cost of one run against seconds and evaluations.
+def recorded(
+    work: Callable[[], Any], objective: Objective, budget: float, known: float
+) -> list[tuple[float, float]]:
+    """Return seconds and lowest cost of a search: at each clear improvement and at its end.
 
-    Only evaluations of the curves of `objective` count as progress. The run ends after `budget`
-    seconds of processor time, or near the best `known` cost.
-    """
-
-    objective: Objective
-    budget: float
-    known: float
-    cost: float = np.inf
-    values: Array | None = None
-    evaluations: int = 0
-    rows: list[tuple[float, int, float]] = field(default_factory=list)
-    began: float = field(default_factory=lambda: time.process_time())
-    ended: float = np.nan
-
-    def count(self) -> float:
-        """Count an evaluation of a residual or its derivative; return the seconds so far."""
-        seconds = time.process_time() - self.began
-        if seconds > self.budget:
-            raise RunOver
-        self.evaluations += 1
-        return seconds
-
-    def note(self, objective: Objective, values: Array, residual: Array) -> None:
-        """Record an evaluation; raise `RunOver` near the best known cost."""
-        seconds = self.count()
-        if objective.measurement is self.objective.measurement:
-            cost = float(residual @ residual)
-            if cost < self.cost:
-                self.cost, self.values = cost, values.copy()
-                last = self.rows[-1][2] if self.rows else np.inf
-                if cost < RECORDED * last or cost <= SOLVED * self.known < last:
-                    self.rows.append((seconds, self.evaluations, cost))
-        if self.cost <= ENOUGH * self.known:
-            raise RunOver
-
-    def finished(self) -> list[tuple[float, int, float]]:
-        """Return the rows of the run, with a last one at its end; check the recorded cost."""
-        if self.values is not None:
-            residual = self.objective.residual(self.values)
-            if not np.isclose(float(residual @ residual), self.cost, rtol=1e-6):
-                raise RuntimeError("the method did not minimise the cost of the problem")
-        return [*self.rows, (min(self.ended, self.budget), self.evaluations, self.cost)]
-
-
-@contextmanager
-def recorded(recorder: Recorder) -> Iterator[None]:
-    """Record every residual of any objective, and count its derivatives.
-
-    `RunOver` is caught here.
+    The search ends after `budget` seconds of processor time, or near the best `known` cost. Only
+    evaluations of the measurement of `objective` count as progress.
     """
     plain, derivative = Objective.residual, Objective.jacobian
+    rows, lowest, began = list[tuple[float, float]](), np.inf, time.process_time()
+
+    def elapsed() -> float:
+        seconds = time.process_time() - began
+        if seconds > budget:
+            raise RunOver
+        return seconds
 
     def residual(self: Objective, values: Array) -> Array:
-        out = plain(self, values)
-        recorder.note(self, values, out)
+        nonlocal lowest
+        out, seconds = plain(self, values), elapsed()
+        if self.measurement is objective.measurement:
+            lowest, last = min(lowest, float(out @ out)), rows[-1][1] if rows else np.inf
+            if lowest < RECORDED * last or lowest <= SOLVED * known < last:
+                rows.append((seconds, lowest))
+            if lowest <= ENOUGH * known:
+                raise RunOver
         return out
 
     def jacobian(self: Objective, values: Array, places: NDArray[np.int64]) -> Array:
         out = derivative(self, values, places)
-        recorder.count()
+        elapsed()
         return out
 
     with (
@@ -218,7 +178,8 @@ def recorded(recorder: Recorder) -> Iterator[None]:
         patch.object(Objective, "residual", residual),
         patch.object(Objective, "jacobian", jacobian),
     ):
-        yield
+        work()
+    return [*rows, (min(time.process_time() - began, budget), lowest)]
 
 
 def run_own(case: Case, problem: Problem, seed: int) -> None:
@@ -228,12 +189,6 @@ def run_own(case: Case, problem: Problem, seed: int) -> None:
             problem.measurement, model=case.model, drive=case.drive, seed=1000 * seed + again,
             intervals="local",
         )  # fmt: skip
-
-
-def random_points(space: Space, rng: np.random.Generator) -> Iterator[Array]:
-    """Yield endless points of the box, the same for every method with the same seed."""
-    while True:
-        yield from box_starts(space, rng, 32)
 
 
 @dataclass(frozen=True)
@@ -291,22 +246,26 @@ def _values(params: lmfit.Parameters) -> Array:
 
 
 def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int) -> None:
-    """Minimise repeatedly by a method of lmfit, each time from another point of the box."""
+    """Minimise repeatedly by a method of lmfit, each time from another point of the box.
+
+    The points are the same for every method with the same seed.
+    """
     variables = Variables(problem, problem.space(), coordinates)
-    rng = np.random.default_rng(seed)
-    for point in random_points(variables.space, rng):
-        options = _options(method, int(rng.integers(2**31)))
+    rng, points = np.random.default_rng(seed), list[Array]()
+    while True:
+        points = points or list(box_starts(variables.space, rng, 32))
+        start, options = points.pop(0), _options(method, int(rng.integers(2**31)))
         if method in LEAST_SQUARES:
             options |= {"Dfun" if method == "leastsq" else "jac": variables.jacobian}
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")  # about covariances of lmfit, not used here
-            try:
-                lmfit.minimize(
-                    variables.residual, variables.params(point), method=method, calc_covar=False,
-                    max_nfev=10**9, **options,
-                )  # fmt: skip
-            except (ValueError, np.linalg.LinAlgError):
-                continue  # a method that fails restarts within its time
+        with (
+            warnings.catch_warnings(action="ignore"),  # about covariances of lmfit, not used here
+            np.errstate(all="ignore"),
+            suppress(ValueError, np.linalg.LinAlgError),  # the method restarts within its time
+        ):
+            lmfit.minimize(
+                variables.residual, variables.params(start), method=method, calc_covar=False,
+                max_nfev=10**9, **options,
+            )  # fmt: skip
 
 
 def _options(method: str, seed: int) -> dict[str, object]:
@@ -336,16 +295,9 @@ def best_known(case: Case, problem: Problem) -> float:
     return min(costs)
 
 
-def run_all(options: argparse.Namespace, log: Path, notes: Path) -> None:
-    """Run every method on every problem and seed; save the runs after each problem."""
-    where = f"{studies.processor()}, {os.cpu_count()} cores, {platform.machine()}"
-    versions = studies.versions("foamfit", "lmfit", "scipy", "numpy", "numba")
-    known, frames = dict[str, float](), list[pd.DataFrame]()
-    setup = {
-        "machine": {"processor": where, **versions}, "budget_s": options.budget,
-        "seeds": options.seeds, "known": known,
-    }  # fmt: skip
-    ways = [("own", OWN), *((c, m) for c in options.coordinates for m in options.methods)]
+def run_all(options: argparse.Namespace) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Run every method on every problem and seed; return the runs and their setup."""
+    known, rows = dict[str, float](), list[tuple[Any, ...]]()
     for key in options.problems:
         case = CASES[key]
         if case.specimen is not None and not os.environ.get("FOAMFIT_DATA"):
@@ -353,22 +305,18 @@ def run_all(options: argparse.Namespace, log: Path, notes: Path) -> None:
             continue
         problem = case.problem()
         known[key] = best_known(case, problem)
-        for coordinates, method in ways:
-            ended = []
+        for coordinates, method in [("own", OWN), *((c, m) for c in COORDINATES for m in METHODS)]:
             for seed in range(options.seeds):
-                recorder = Recorder(problem.objective, options.budget, known[key])
-                with recorded(recorder):
-                    if method == OWN:
-                        run_own(case, problem, seed)
-                    else:
-                        run_lmfit(problem, method, coordinates, seed)
-                recorder.ended = time.process_time() - recorder.began
-                rows = [(key, coordinates, method, seed, *row) for row in recorder.finished()]
-                frames.append(pd.DataFrame(rows, columns=COLUMNS))
-                ended.append(f"{recorder.cost / known[key]:.3g}")
-            print(key, coordinates, method, "cost over best known:", *ended, flush=True)
-        pd.concat(frames).to_csv(log, index=False, float_format="%.5g", compression=GZIP)
-        notes.write_text(json.dumps(setup, indent=1) + "\n")
+                if method == OWN:
+                    work = partial(run_own, case, problem, seed)
+                else:
+                    work = partial(run_lmfit, problem, method, coordinates, seed)
+                found = recorded(work, problem.objective, options.budget, known[key])
+                rows += [(key, coordinates, method, seed, *row) for row in found]
+            print(key, coordinates, method, f"{rows[-1][-1] / known[key]:.3g}", flush=True)
+    machine = studies.circumstances("foamfit", "lmfit", "scipy", "numpy", "numba")
+    setup = {"machine": machine, "budget_s": options.budget, "known": known}
+    return pd.DataFrame(rows, columns=[*RUN, "seconds", "cost"]), setup
 
 
 # ---------------------------------------------------------------- page and figures
@@ -394,8 +342,7 @@ def draw_curves(
             for axes, methods in zip(row, GROUPS.values(), strict=True):
                 for name in (*methods, OWN):
                     chosen = among[(among["problem"] == key) & (among["method"] == name)]
-                    if len(chosen):
-                        _band(axes, elapsed, chosen, known[key], name)
+                    _band(axes, elapsed, chosen, known[key], name)
                 axes.set(xscale="log", yscale="log")
                 axes.set(xlim=(elapsed[0], elapsed[-1]), ylim=(0.9, 300.0))
                 axes.axhline(1.0, color="0.75", linewidth=0.8, zorder=0)
@@ -408,8 +355,7 @@ def draw_curves(
             f"{COORDINATES[coordinates]}: median and quartiles of {runs['seed'].nunique()} seeds"
         )
         figure.suptitle(heading, fontsize=8)
-        names = [name for name in STYLES if name in set(among["method"])]
-        handles = [Line2D([], [], label=name, **_line(name)) for name in names]
+        handles = [Line2D([], [], label=name, **_line(name)) for name in STYLES]
         figure.legend(handles=handles, loc="outside lower center", ncols=5, handlelength=3.2)
 
 
@@ -428,7 +374,6 @@ def _band(axes: Axes, elapsed: Array, runs: pd.DataFrame, known: float, name: st
 
 
 def _line(name: str) -> dict[str, Any]:
-    """Return colour, dashes and width of a method's line."""
     colour, dash = STYLES[name]
     return {"color": colour, "linestyle": dash, "linewidth": 2.0 if name == OWN else 1.1}
 
@@ -449,42 +394,28 @@ def summary(ends: pd.DataFrame, known: dict[str, float]) -> str:
     return studies.markdown(["method", "in", *titles, "all"], rows)
 
 
-def report(runs: pd.DataFrame, setup: dict[str, Any], folder: Path) -> None:
-    """Write page and figures of recorded runs."""
-    lowest = runs.groupby("problem")["cost"].min()
-    known = {key: min(cost, float(lowest[key])) for key, cost in setup["known"].items()}
-    there = [
-        coordinates for coordinates in COORDINATES if (runs["coordinates"] == coordinates).any()
-    ]
-    curves = []
-    for coordinates in there:
-        name = f"identification_{coordinates}.png"
-        draw_curves(runs, coordinates, known, setup["budget_s"], folder / name)
-        curves.append(f"![Misfit against seconds, {COORDINATES[coordinates]}]({name})")
-    template = (HERE / "identification.template.md").read_text(encoding="utf-8")
-    page = template.format(
-        seeds=setup["seeds"], problems=len(known), budget=setup["budget_s"],
-        machine=", ".join(f"{k} {v}" for k, v in setup["machine"].items()),
-        table=summary(solved_after(runs, known), known),
-        curves="\n\n".join(curves),
-    )  # fmt: skip
-    (folder / "identification.md").write_text(page, encoding="utf-8")
-
-
 def main() -> None:
+    """Run all methods, unless recorded runs are only drawn, and write figures and page."""
     parser = studies.arguments(__doc__, HERE, budget=(3.0, "seconds of a run"), seeds=10)
-    for name, choices in {
-        "problems": CASES, "methods": METHODS, "coordinates": COORDINATES,
-    }.items():  # fmt: skip
-        choices = list(choices)
-        parser.add_argument(f"--{name}", nargs="+", choices=choices, default=choices)
+    parser.add_argument("--problems", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--redraw", action="store_true", help="draw what was recorded")
     options = parser.parse_args()
-    log, notes = (options.out / f"identification_runs.{end}" for end in ("csv.gz", "json"))
+    log, notes = options.out / "runs.csv.gz", options.out / "runs.json"
     if not options.redraw:
-        run_all(options, log, notes)
-    report(pd.read_csv(log), json.loads(notes.read_text()), options.out)
+        runs, setup = run_all(options)
+        studies.write_csv(runs, log, 5)
+        notes.write_text(json.dumps(setup, indent=1) + "\n")
+    runs, setup = pd.read_csv(log), json.loads(notes.read_text())
+    lowest = runs.groupby("problem")["cost"].min()
+    known = {key: min(cost, float(lowest[key])) for key, cost in setup["known"].items()}
+    for coordinates in COORDINATES:
+        draw_curves(runs, coordinates, known, setup["budget_s"], options.out / f"{coordinates}.png")
+    studies.write_page(
+        HERE, options.out, seeds=runs["seed"].nunique(), problems=len(known),
+        budget=setup["budget_s"], machine=setup["machine"],
+        table=summary(solved_after(runs, known), known), **COORDINATES,
+    )  # fmt: skip
 
 
 if __name__ == "__main__":
-    studies.run(main, HERE)
+    main()
