@@ -523,19 +523,6 @@ def test_a_shorter_chain_than_asked_for_is_a_no_of_the_checklist(impact, monkeyp
     assert any("stopped by Ctrl-C" in warning for warning in result.warnings)
 
 
-@pytest.mark.parametrize(
-    ("method", "draws", "word"),
-    [
-        ("guess", 0, "unknown"),
-        ("bootstrap", 500, "must be one of auto, local, profile, mcmc"),
-        ("mcmc", 5, "too few"),
-    ],
-)
-def test_refuses_what_cannot_be_done(method, draws, word):
-    with pytest.raises(InputError, match=word):
-        Choice(method, draws)
-
-
 def test_says_in_one_sentence_that_emcee_is_missing(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r'emcee, .* pip install "foamfit\[mcmc\]"'):
