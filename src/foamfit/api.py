@@ -14,7 +14,8 @@ from foamfit.arrays import single_threaded
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
 from foamfit.fitting.minimizer import minimizer_of, result_of
-from foamfit.one_model import SEARCHED, Keywords, Options, Progress, identify, judge
+from foamfit.one_model import SEARCHED, Options, Progress, identify, judge
+from foamfit.options import Keywords, documented
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
 from foamfit.report.plots import draw_panel
@@ -98,6 +99,7 @@ class FitResult(Shown, Fit):
         return save_whole(folder, partial(write_result, self, **drawn))
 
 
+@documented
 @single_threaded
 def fit(
     measurement: Measurement,
@@ -123,47 +125,8 @@ def fit(
         Called with the completed fraction and the name of the current step.
     tell : callable, optional
         Called with the expected run time of the intervals before they are computed.
-    drive : str, optional
-        "impact", "stress" or "displacement"; by default "impact" if the test allows it, otherwise
-        "displacement".
-    seed : int
-        The same test and seed give the same numbers.
-    starts : int, optional
-        Number of start points of the search; by default 16 per spring, or 48 per spring if several
-        are hysteretic.
-    max_time : float, optional
-        Time limit, s; when it is reached, the best point so far is returned.
-    weights : mapping, optional
-        Weight of each curve, by its name in `FitResult.misfit`.
-    interior_mass : bool
-        Whether to distribute the mass of the specimen equally between the springs of a chain. By
-        default it is neglected, and the notes of the result state its effect.
-    time_shift : bool
-        Whether to fit the delay of the motion relative to the force, time_shift (s).
-    relaxation : int
-        Number of relaxation terms of every bistable and microscale spring: s1_g1, s1_tau1, ….
-        Not allowed with model="auto", which tries one term by itself.
-    stiffening : bool
-        Whether to fit the stiffening of branch a of every microscale spring: s1_stiffening.
-    mullins : bool
-        Whether to fit softening and weakening after the first snap: s1_softening, s1_weakening.
-    intervals : str
-        Method of the 95 % intervals: "auto" (local covariance, and profiles of the parameters
-        along which the cost is not parabolic and whose range is not wider), "local", "profile" or
-        "mcmc".
-    draws : int, optional
-        Number of steps of the Markov chain, by default 2000.
-    priors : mapping, optional
-        Normal prior distributions of spring parameters, as mean and standard deviation:
-        (5.5e6, 1e5) in SI units or "5.5 ± 0.1 MPa". Each counts as one residual. They are added to
-        [priors] of the TOML.
-    watch : callable, optional
-        Called with the problem and the best parameters whenever these improve; it must return
-        quickly.
-    fix : mapping, optional
-        Parameters to fix at a value (SI); not together with `params`.
-    vary : sequence of str
-        Names of parameters to vary that are fixed by default.
+    **options
+        The options of a fit; `foamfit.options` describes each of them.
 
     Returns
     -------

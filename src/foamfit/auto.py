@@ -26,6 +26,7 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import SearchStoppedError, what_stopped
 from foamfit.one_model import Found, Options, Progress
+from foamfit.options import FREED
 from foamfit.report import render
 from foamfit.results import Fit, Ladder, Rung, rung_name
 from foamfit.springs import laws
@@ -46,7 +47,7 @@ from foamfit.trust.residuals.residual_tests import BENT, find_structure, neighbo
 _OWN = [law.kind for law in map(laws.law, laws.PAPER) if law.hysteretic and not law.word]
 _SLOW = [kind for kind in _OWN if laws.law(kind).remembers]
 _QUICK = [kind for kind in _OWN if kind not in _SLOW]
-_ALL = dict.fromkeys(laws.OPTIONS, True)
+_ALL = dict.fromkeys(FREED, True)
 LADDER = tuple(
     tuple(Model.parse(name, terms) for name, terms in group)
     for group in (

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from numbers import Integral, Real
-from typing import Any, TypedDict
+from typing import Any
 
 import lmfit
 import numpy as np
@@ -34,6 +32,7 @@ from foamfit.fitting.search import (
     search,
     what_stopped,
 )
+from foamfit.options import DRAWS, FREED, STARTS, STARTS_IN_SERIES, Given, Watch
 from foamfit.results import Fit, Intervals, plain
 from foamfit.settle import (
     back_to_plain,
@@ -46,7 +45,6 @@ from foamfit.settle import (
 )
 from foamfit.solve.cache import SPENT
 from foamfit.springs.model import Model, with_options
-from foamfit.springs.options import OPTIONS
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
@@ -54,13 +52,6 @@ from foamfit.trust.intervals import Announce, Choice, assess, evaluations_of
 from foamfit.trust.ranges import Open, left_open
 
 Progress = Callable[[float, str], None]
-# Called with the problem and the best point, many times a second, so it must be quick. `look` of
-# `identify` has the same type; it is called once, after the first descents, and may raise.
-Watch = Callable[[Problem, Array], None]
-
-# Start points per spring, per spring if several are hysteretic, and the largest number in all.
-STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 48, 100_000
-DRAWS = 2000  # default number of steps of a Markov chain
 # Budget of the profiles, and of the ranges, as a multiple of the evaluations of the search, and the
 # largest number of restarts from a better point found by either.
 PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
@@ -75,81 +66,16 @@ JUDGED, JUDGED_NOISE = 2.0, 0.15
 SEARCHED = 0.5  # fraction of the run time that the search takes
 
 
-class Keywords(TypedDict, total=False):
-    """The options of a fit as keyword arguments of `foamfit.fit`: the fields of `Options`."""
-
-    drive: str | None
-    seed: int
-    starts: int | None
-    max_time: float | None
-    weights: Mapping[str, float] | None
-    interior_mass: bool
-    time_shift: bool
-    relaxation: int
-    stiffening: bool
-    mullins: bool
-    intervals: str
-    draws: int | None
-    priors: Mapping[str, str | tuple[float, float]] | None
-    watch: Watch | None
-    fix: Mapping[str, float] | None
-    vary: Sequence[str]
-
-
 @dataclass(frozen=True)
-class Options:
-    """Options of a fit that do not depend on the model; `foamfit.fit` describes each of them.
+class Options(Given):
+    """The options of a fit, applied to a test and a model.
 
     Raises InputError for an inadmissible value; the message names the option.
     """
 
-    drive: str | None = None
-    seed: int = 0
-    starts: int | None = None
-    max_time: float | None = None
-    weights: Mapping[str, float] | None = None
-    interior_mass: bool = False
-    time_shift: bool = False
-    relaxation: int = 0
-    stiffening: bool = False
-    mullins: bool = False
-    intervals: str = "auto"
-    draws: int | None = None
-    priors: Mapping[str, str | tuple[float, float]] | None = None
-    watch: Watch | None = None
-    fix: Mapping[str, float] | None = None
-    vary: Sequence[str] = ()
-
-    @classmethod
-    def of(cls, function: str, given: Mapping[str, Any]) -> Options:
-        """Make options from the keyword arguments of `function`; TypeError for an unknown one."""
-        for name in given.keys() - cls.__dataclass_fields__.keys():
-            near = difflib.get_close_matches(name, cls.__dataclass_fields__, 1)
-            meant = f"; did you mean {near[0]!r}?" if near else ""
-            raise TypeError(f"{function}() got an unexpected keyword argument {name!r}{meant}")
-        return cls(**given)
-
     def __post_init__(self) -> None:
         """Reject inadmissible values."""
-        for name, least, most in (("seed", 0, math.inf), ("starts", 1, MOST_STARTS)):
-            value = getattr(self, name)
-            whole = isinstance(value, Integral) and least <= int(value) <= most
-            if not whole and (name == "seed" or value is not None):
-                end = "up" if most == math.inf else f"to {most}"
-                raise InputError(
-                    f"{name} = {value!r} is not admissible; it must be a whole number from {least} "
-                    f"{end}"
-                )
-        limit = self.max_time
-        if limit is not None and not (isinstance(limit, Real) and float(limit) > 0):
-            raise InputError(f"max_time = {limit!r} is not admissible; it must be positive, in s")
-        mappings = {
-            "weights": "curves to numbers, like {'stress_time': 1}",
-            "priors": "parameters to mean and standard deviation, like {'s1_k0': '5.5 ± 0.1 MPa'}",
-        }
-        for name, what in mappings.items():
-            if not isinstance(getattr(self, name) or {}, Mapping):
-                raise InputError(f"{name} must be a mapping of {what}")
+        super().__post_init__()
         _ = self.choice
 
     @property
@@ -161,7 +87,7 @@ class Options:
     @property
     def of_springs(self) -> dict[str, bool]:
         """The options that free further parameters of some springs."""
-        return {name: getattr(self, name) for name in OPTIONS}
+        return {name: getattr(self, name) for name in FREED}
 
     def stored(
         self, measurement: Measurement, model: str, several: Sequence[int] = ()

@@ -15,8 +15,8 @@ from foamfit.codec import encode
 from foamfit.data.calibration import Contradiction
 from foamfit.data.cycles import cycles_of, loading_rate
 from foamfit.data.measurement import Measurement, interior_channel
+from foamfit.options import FREED
 from foamfit.springs.chain import Chain
-from foamfit.springs.options import OPTIONS
 from foamfit.springs.spring import Spring
 from foamfit.text import counted, listed
 
@@ -271,7 +271,7 @@ def _in_words(model: str) -> tuple[str, list[str]]:
         return model, []
     parsed = Model.parse(model)
     options = (name for name, is_set in parsed.options.items() if is_set)
-    return parsed.words, [parameter for name in options for parameter in OPTIONS[name].names]
+    return parsed.words, [parameter for name in options for parameter in FREED[name]]
 
 
 @dataclass(frozen=True)

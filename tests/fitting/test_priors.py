@@ -56,7 +56,7 @@ def test_a_wrong_prior_is_refused_in_one_sentence(impact, name, value, words) ->
 def test_priors_belong_to_one_model(impact: ff.Measurement) -> None:
     with pytest.raises(ff.InputError, match="priors belong to one model"):
         ff.fit(impact, model="auto", priors={"s1_k0": (1.0, 1.0)})
-    with pytest.raises(ff.InputError, match="priors must be a mapping"):
+    with pytest.raises(ff.InputError, match="must be a mapping"):
         ff.fit(impact, priors=[1.0], **OPTIONS)
 
 

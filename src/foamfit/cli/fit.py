@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import re
 from collections.abc import Mapping
 from contextlib import closing
@@ -12,14 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
 from foamfit.cli import options
 from foamfit.cli.group import NOT_ACCEPTABLE, main
-from foamfit.cli.options import COUNT, Output, option
+from foamfit.cli.options import Output
 from foamfit.cli.progress import Progress, progress_line
 from foamfit.errors import InputError
-from foamfit.springs.options import OPTIONS
+from foamfit.options import FREED, OPTIONS
 from foamfit.terminal import say
 
 if TYPE_CHECKING:
@@ -31,45 +28,8 @@ if TYPE_CHECKING:
 NO_KEYWORDS, WAYS = ("cycle", "cycles", "model"), ("profile", "mcmc")
 
 
-def _fixes(
-    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
-) -> dict[str, float] | None:
-    fixed = {}
-    for text in values:
-        name, _, number = text.partition("=")
-        try:
-            fixed[name.strip()] = value = float(number)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise click.BadParameter(f"'{text}' is not NAME=VALUE in SI, as s1_eta=0.")
-    return fixed or None
-
-
 fit_options = options.together(
-    option(
-        "--model",
-        "Springs from the base up; auto selects the simplest model that describes the curves.",
-        default="bistable",
-    ),
-    options.DRIVE,
-    option("--seed", "The same test and seed give the same numbers.", options.WHOLE, default=0),
-    option(
-        "--starts",
-        "Start points of the search. Default: 16 per spring, 48 if several are hysteretic.",
-        COUNT,
-    ),
-    option(
-        "--max-time", "Time limit; the best point so far is returned.", float, metavar="SECONDS"
-    ),
-    option("--fix", "Fix a parameter (SI).", multiple=True, metavar="NAME=VALUE", callback=_fixes),
-    option("--vary", "Vary a parameter that is fixed by default.", multiple=True, metavar="NAME"),
-    option("--interior-mass", "Distribute the specimen's mass between the springs."),
-    option("--time-shift", "Fit the delay of the motion relative to the force."),
-    options.RELAXATION,
-    *options.MORE,
-    option("--profile", "95 % intervals by profile likelihood."),
-    option("--mcmc", "95 % intervals by N steps of emcee.", int, metavar="N"),
+    *(options.declared(name) for name, one in OPTIONS.items() if not one.python_only)
 )
 
 
@@ -78,7 +38,7 @@ def model_name(asked: Mapping[str, Any]) -> str:
     from foamfit.springs.model import Model, with_options
 
     model = asked["model"].strip()
-    with_options(model, **{name: asked[name] for name in OPTIONS})
+    with_options(model, **{name: asked[name] for name in FREED})
     return "auto" if model == "auto" else Model.parse(model, asked["relaxation"]).words
 
 
@@ -164,7 +124,7 @@ def read_as_asked(test: Path, specimen: Path | None, asked: Mapping[str, Any]) -
 # Options in the name of a folder: the first ones, in this order, and those of which only the value
 # is named.
 FIRST = (
-    "relaxation", *OPTIONS, "drive", "cycle", "cycles", "specimen", "fix", "vary", "intervals",
+    "relaxation", *FREED, "drive", "cycle", "cycles", "specimen", "fix", "vary", "intervals",
 )  # fmt: skip
 BARE, LONGEST = ("drive", "intervals"), 120  # characters of a name
 
@@ -194,9 +154,6 @@ def _words(value: Any) -> str:
 
 @main.command()
 @options.TEST
-@options.SPECIMEN
-@options.CYCLE
-@options.CYCLES
 @fit_options
 @options.output("fits/<test>/<model and options>", "fit.json")
 @options.option("--force", "Replace a result of other data or options in the same folder.")

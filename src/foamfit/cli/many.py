@@ -29,9 +29,7 @@ PATIENCE = 10  # s, time limit for the scheduler to answer
 
 @main.command()
 @click.argument("tests", metavar="TEST.csv|FOLDER|GLOB …", nargs=-1, required=True)
-@options.SPECIMEN
-@options.CYCLE
-@options.CYCLES
+@fit_options
 @options.option(
     "--jobs",
     "Processes on this machine, one thread each. Default: one for each core.",
@@ -42,7 +40,6 @@ PATIENCE = 10  # s, time limit for the scheduler to answer
     "--scheduler", "A running Dask scheduler, as tcp://127.0.0.1:8786.", metavar="ADDRESS"
 )
 @options.option("--fresh", "Fit everything again, including what is already done.")
-@fit_options
 @options.output("fits/batch/<model>", "the rows as JSON")
 def batch(
     tests: tuple[str, ...],
@@ -145,8 +142,8 @@ def _cluster(address: str) -> Iterator[Executor]:
 @main.command()
 @click.argument("study", metavar="STUDY.toml", type=options.FILE)
 @options.option("--jobs", "Processes. Default: one for each core.", options.COUNT)
-@options.option(
-    "--seed", "The same tests and seed give the same numbers. Default: 0.", options.WHOLE
+@options.declared(
+    "seed", default=None, help="The same tests and seed give the same numbers. Default: 0."
 )
 @options.output("fits/<STUDY>", "joint.json")
 def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import logging
+import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
@@ -16,7 +17,7 @@ import click
 from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
 from foamfit.files import check_file
-from foamfit.springs.options import OPTIONS
+from foamfit.options import OPTIONS
 from foamfit.terminal import say, without_ctrl_c
 
 if TYPE_CHECKING:
@@ -45,17 +46,6 @@ def _width(context: click.Context, parameter: click.Parameter, value: str) -> st
 
 
 TEST = click.argument("test", metavar="TEST.csv", type=FILE)
-SPECIMEN = option(
-    "--specimen",
-    "Specimen, striker, columns, noise, window, data. Default: TEST.toml beside the CSV.",
-    FILE,
-    metavar="FILE.toml",
-)
-CYCLE = option(
-    "--cycle",
-    "Cycle of a slow record: a number, several as 1,2,10, or all. Default: the first.",
-    metavar="N|all",
-)
 
 
 def _range(
@@ -70,26 +60,48 @@ def _range(
     return int(first), int(last)
 
 
-CYCLES = option(
-    "--cycles",
-    "Fit several cycles of a slow record as one history, with one set of parameters.",
-    metavar="FIRST-LAST",
-    callback=_range,
-)
-DRIVE = option(
-    "--drive",
-    "Default: impact if striker and time are known and the record does not contradict them, else "
-    "displacement.",
-    click.Choice(["impact", "stress", "displacement"]),
-)
-RELAXATION = option(
-    "--relaxation",
-    "Number of relaxation terms of every hysteretic spring; auto tries one by itself.",
-    WHOLE,
-    default=0,
-    metavar="N",
-)
-MORE = tuple(option(f"--{name}", freed.told) for name, freed in OPTIONS.items())
+def _fixes(
+    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+) -> dict[str, float] | None:
+    """Return the parameters and values of --fix."""
+    fixed = {}
+    for text in values:
+        name, _, number = text.partition("=")
+        try:
+            fixed[name.strip()] = value = float(number)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise click.BadParameter(f"'{text}' is not NAME=VALUE in SI, as s1_eta=0.")
+    return fixed or None
+
+
+# What the command reads otherwise than from the kind of an option.
+READ: dict[str, dict[str, Any]] = {
+    "specimen": {"type": FILE},
+    "cycle": {"type": str},
+    "cycles": {"type": str, "callback": _range},
+    "fix": {"type": str, "multiple": True, "callback": _fixes},
+    "vary": {"type": str, "multiple": True},
+}
+
+
+def declared(name: str, **more: Any) -> Callable[[Command], Command]:
+    """Declare an option of `foamfit.options`; `more` are arguments of click that differ."""
+    one = OPTIONS[name]
+    how: dict[str, Any] = {"help": one.text, "default": one.default, "metavar": one.metavar or None}
+    if one.choices:
+        how["type"] = click.Choice(one.choices)
+    elif one.kind == "bool":
+        how["is_flag"] = True
+    elif one.kind == "int":
+        how["type"] = click.IntRange(one.least, one.most)
+    elif one.kind == "float":
+        how["type"] = float
+    return click.option(one.flag, **how | READ.get(name, {}) | more)
+
+
+SPECIMEN, CYCLES = declared("specimen"), declared("cycles")
 PLOT = option("--plot", "Also draw a PNG, PDF or SVG.", FILE)
 WIDTH = option(
     "--figure-width",

@@ -90,15 +90,11 @@ def published() -> None:
 @click.argument("result", metavar="RESULT", type=options.FILE)
 @options.TEST
 @options.SPECIMEN
-@options.option(
-    "--cycle", "Cycle of a slow record. Default: the first.", options.COUNT, metavar="N"
+@options.declared(
+    "cycle", help="Cycle of a slow record. Default: the first.", type=options.COUNT, metavar="N"
 )
 @options.CYCLES
-@options.option(
-    "--drive",
-    "Default: the drive of the result.",
-    click.Choice(["impact", "stress", "displacement"]),
-)
+@options.declared("drive", help="Default: the drive of the result.")
 @options.option(
     "--extrapolate", "Allow a rate outside the fitted rates by more than a factor of 1.25."
 )
@@ -109,9 +105,7 @@ def published() -> None:
     default=400,
     metavar="N",
 )
-@options.option(
-    "--seed", "The same result, test and seed give the same numbers.", options.WHOLE, default=0
-)
+@options.declared("seed", help="The same result, test and seed give the same numbers.")
 @options.output("predictions/<test>", "prediction.json")
 def predict(
     result: Path,
@@ -166,9 +160,7 @@ def predict(
     "What the foam is needed for: peak_force, absorbed_energy or peak_strain at a velocity.",
     metavar='"peak_force at 3 m/s"',
 )
-@options.option(
-    "--seed", "The same results, rig and seed give the same numbers.", options.WHOLE, default=0
-)
+@options.declared("seed", help="The same results, rig and seed give the same numbers.")
 @options.output("plans/<test>", "plan.json")
 def plan(
     results: tuple[str, ...], rig: Path | None, quantity: str | None, seed: int, output: Output

@@ -14,6 +14,7 @@ from foamfit.data.calibration import contradictions
 from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel, is_clipped
 from foamfit.data.motion import SmoothMotion, follow
 from foamfit.errors import InputError
+from foamfit.options import DRIVES
 from foamfit.solve.scene import Motion
 from foamfit.springs.model import Model
 
@@ -23,7 +24,6 @@ CURVES = ("stress_time", "displacement_time", "stress_strain")
 ACCELERATION = "acceleration_time"
 # Curves that need a motion.
 MOTION_CURVES = ("displacement_time", "stress_strain")
-DRIVES = ("impact", "stress", "displacement")
 # A motion with less noise than this fraction of its range is exact. A smooth motion is used if its
 # residuals are at most this multiple of the noise.
 EXACT, FOLLOWED = 1e-6, 1.5

@@ -20,6 +20,7 @@ import panel as pn
 
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
+from foamfit.options import FREED
 from foamfit.page import preview as previews
 from foamfit.page.curves import Curves, grid, misfits_text
 from foamfit.page.desk import BUSY, FIRST, LARGEST, QUANTITIES, Desk, wrong_quantity
@@ -37,12 +38,12 @@ CHECKOUTS = (Path(), Path(__file__).parents[3])
 CYCLES = ("cycle", "cycles")  # shown if a record has several
 SHOWN = ("model", "drive", "relaxation", *CYCLES)
 FOLDED = (
-    *laws.OPTIONS,
+    *FREED,
     *("starts", "max_time", "seed", "interior_mass", "time_shift"),
     *("profile", "mcmc"),
 )
 # Options that change the curves of a model.
-OF_CURVES = ("drive", "relaxation", "interior_mass", "time_shift", *laws.OPTIONS)
+OF_CURVES = ("drive", "relaxation", "interior_mass", "time_shift", *FREED)
 POLL = 200  # interval between two looks at a running fit, ms
 # Shared by all windows: one test is read, and one set of curves prepared, at a time.
 READING, PREPARING = (

@@ -17,7 +17,8 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import Tracker, rank
 from foamfit.fitting.starts import curve_starts, thinned
-from foamfit.one_model import Keywords, Options
+from foamfit.one_model import Options
+from foamfit.options import Keywords
 from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
 from foamfit.results import law_in_words

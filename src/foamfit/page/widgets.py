@@ -10,20 +10,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
-import click
 import panel as pn
 import param
 from panel.custom import JSComponent
 
-from foamfit.cli.fit import fit as fit_command
+from foamfit.options import OPTIONS
 from foamfit.report.render import environment
 
 TEMPLATES = Path(__file__).with_name("templates")
 WIDE: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
 RELAXATIONS = 4  # choices for the number of terms: 0 to 3
-OPTIONS = {
-    one.name: one for one in fit_command.params if isinstance(one, click.Option) and one.name
-}
 
 
 def style(name: str) -> str:
@@ -80,21 +76,18 @@ class Field:
 
     def __init__(self, name: str, listed: list[Any] | None = None, **style: Any) -> None:
         option = OPTIONS[name]
-        self.flag = option.opts[-1]
-        self.default = option.default if isinstance(option.default, str | int) else None
-        unit = f" ({(option.metavar or '').replace('SECONDS', 'seconds')})"
-        self.label = (
-            f"{name.replace('_', ' ').capitalize()}{unit.replace(' ()', '')}: {option.help}"
-        )
+        self.flag, self.default = option.flag, option.default
+        like = option.unit or option.metavar
+        words = name.replace("_", " ").capitalize()
+        self.label = f"{words}{f' ({like})' if like else ''}: {option.text}"
         made: dict[str, Any] = {"name": self.label, **style}
-        if isinstance(option.type, click.Choice):
-            listed = [*option.type.choices]
+        listed = [*option.choices] or listed
         if listed is not None:
             some = {str(one): one for one in listed}
             made["options"] = {"default": ""} | some if self.default is None else some
             made["value"] = "" if self.default is None else self.default
             self.widget = pn.widgets.Select(**made)
-        elif option.is_flag:
+        elif option.kind == "bool":
             # A group with one box: screen readers do not read the label of Panel's single checkbox.
             self.widget = pn.widgets.CheckBoxGroup(options=[self.label], **style)
         else:

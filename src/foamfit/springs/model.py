@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
+from foamfit.options import FREED, MOST_TERMS
 from foamfit.springs import laws
 from foamfit.springs.chain import Chain
 from foamfit.springs.compiled import compiled, fill_row
@@ -28,8 +29,7 @@ from foamfit.springs.spring import Spring
 if TYPE_CHECKING:
     from foamfit.springs.compiled.contract import Compiled
 
-# Largest numbers of relaxation terms and of springs; no test can distinguish more.
-MOST_TERMS, MOST_SPRINGS = 10, 20
+MOST_SPRINGS = 20  # no test can distinguish more
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Model:
     @classmethod
     def of_result(cls, content: Mapping[str, Any]) -> Model:
         """Return the model of a result (fit.json, joint.json); InputError if it is unknown."""
-        options = {name: content.get(name) is True for name in laws.OPTIONS}
+        options = {name: content.get(name) is True for name in FREED}
         return cls.parse(with_options(content["model"], **options), content.get("relaxation", 0))
 
     @property
@@ -90,8 +90,8 @@ class Model:
 
     @property
     def options(self) -> dict[str, bool]:
-        """The options that free further parameters of some spring; see `laws.OPTIONS`."""
-        return {name: any(name in kind.split(", ") for kind in self.kinds) for name in laws.OPTIONS}
+        """The options that free further parameters of some spring; see `foamfit.options`."""
+        return {name: any(name in kind.split(", ") for kind in self.kinds) for name in FREED}
 
     @cached_property
     def laws(self) -> tuple[Law, ...]:
@@ -183,18 +183,18 @@ class Model:
 def with_options(model: str, **options: bool) -> str:
     """Return the name of a model with options that free further parameters.
 
-    `model` is the name without options, or "auto"; `options` are those of `laws.OPTIONS`. Raises
+    `model` is the name without options, or "auto"; `options` are those of `FREED`. Raises
     InputError for an option that applies to no spring of the model.
     """
-    if unknown := [name for name in options if name not in laws.OPTIONS]:
-        raise TypeError(f"unexpected option {unknown[0]!r}; there are {', '.join(laws.OPTIONS)}")
-    asked = tuple(name for name in laws.OPTIONS if options.get(name))
+    if unknown := [name for name in options if name not in FREED]:
+        raise TypeError(f"unexpected option {unknown[0]!r}; there are {', '.join(FREED)}")
+    asked = tuple(name for name in FREED if options.get(name))
     if not asked:
         return model
     if model == "auto":
         raise InputError(f"{asked[0]} belongs to one model; name it instead of 'auto'")
     read = Model.parse(model)
-    asked = tuple(name for name in laws.OPTIONS if name in asked or read.options[name])
+    asked = tuple(name for name in FREED if name in asked or read.options[name])
     kinds = read.words.split("+")
     for name in asked:
         if not any((name,) in laws.law(kind).options for kind in kinds):

@@ -18,7 +18,8 @@ from foamfit.errors import InputError
 from foamfit.files import is_left, read_whole, reason, sweep
 from foamfit.fitting import nuisance
 from foamfit.fitting.problem import check_fixed_and_varied
-from foamfit.one_model import Keywords, Options
+from foamfit.one_model import Options
+from foamfit.options import Keywords
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import FILES, check_target, is_written
 from foamfit.report.studies import batch as tables

@@ -11,7 +11,8 @@ from foamfit.arrays import single_threaded
 from foamfit.data.csv_file import read_test
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.search import what_stopped
-from foamfit.one_model import Keywords, Options, Progress
+from foamfit.one_model import Options, Progress
+from foamfit.options import Keywords
 from foamfit.report.studies.cycles import CycleFits
 from foamfit.results import Fit
 from foamfit.trust.intervals import Announce

@@ -22,9 +22,9 @@ from foamfit.codec import build
 from foamfit.data.measurement import Specimen
 from foamfit.errors import InputError
 from foamfit.fitting.box import is_logarithmic
-from foamfit.fitting.curves import DRIVES
 from foamfit.fitting.links import KINDS, RATES, factor
 from foamfit.fitting.nuisance import TIME_SHIFT
+from foamfit.options import DRIVES
 from foamfit.report.folder import load_result
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name

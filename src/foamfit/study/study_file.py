@@ -10,9 +10,8 @@ from typing import Any
 
 from foamfit.data.checks import COUNT, FLAG, RANGE, Rule, check_keys, load_toml
 from foamfit.errors import InputError
-from foamfit.fitting.curves import DRIVES
 from foamfit.fitting.links import KINDS
-from foamfit.springs.laws import OPTIONS
+from foamfit.options import DRIVES, FREED, OF_FIT
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.test_files import find_tests
@@ -29,12 +28,12 @@ def _is_text(value: Any) -> bool:
 _RULES = {
     "name": Rule(_is_text, 'text, like name = "new heel"'),
     "specimen": Rule(_is_text, 'text, like specimen = "foam.toml"'),
-    "seed": Rule(lambda v: type(v) is int and v >= 0, "a whole number from 0 up"),
+    "seed": Rule(lambda v: type(v) is int and v >= 0, OF_FIT["seed"].right),
     "cycle": COUNT,
     "cycles": Rule(RANGE.valid, f"{RANGE.right}, without cycle"),
     "starts": COUNT,
-    "drive": Rule(lambda v: v in DRIVES, f"one of {', '.join(DRIVES)}"),
-    **dict.fromkeys(OPTIONS, FLAG),
+    "drive": Rule(lambda v: v in DRIVES, OF_FIT["drive"].right),
+    **dict.fromkeys(FREED, FLAG),
 }
 _KEYS = (*_RULES, "tests", "model", "relaxation", "specimens", "parameters")
 

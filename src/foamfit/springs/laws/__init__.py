@@ -15,6 +15,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from foamfit.errors import InputError
+from foamfit.options import FREED
 from foamfit.springs.laws import bistable, linear, microscale
 from foamfit.springs.laws.bistable import BistableSpring as BistableSpring
 from foamfit.springs.laws.linear import LinearSpring as LinearSpring
@@ -22,7 +23,6 @@ from foamfit.springs.laws.microscale import MicroscaleSpring as MicroscaleSpring
 from foamfit.springs.laws.record import Functions as Functions
 from foamfit.springs.laws.record import Law as Law
 from foamfit.springs.laws.record import Param as Param
-from foamfit.springs.options import OPTIONS as OPTIONS
 from foamfit.springs.spring import LawSpring, Relaxation
 
 ENTRY_POINTS = "foamfit.laws"
@@ -66,7 +66,7 @@ def records() -> tuple[Law, ...]:
 def with_options(kind: str, options: tuple[str, ...]) -> str:
     """Return the name of a law's variant with some options; `kind` if it has none of them."""
     known = law(kind).options
-    return known.get(tuple(one for one in OPTIONS if one in options and (one,) in known), kind)
+    return known.get(tuple(one for one in FREED if one in options and (one,) in known), kind)
 
 
 def is_registered(kind: str) -> bool:
