@@ -338,7 +338,7 @@ def test_simulate_a_microscale_spring_that_relaxes(here: Path) -> None:
         ("g = 0.1", "g = -0.1", "spring 1: g2 = -0.1 is not admissible"),
         ('tau = "2 s"', 'tau = "2 m"', "spring 1: relaxation term 2: tau"),
         ("g = 0.1, ", "", "spring 1: relaxation term 2: g is missing; give it like g = 0.5"),
-        ("{ g = 0.1,", "{ h = 0.1,", "relaxation term 2:"),
+        ("{ g = 0.1,", "{ h = 0.1,", "relaxation term 2"),
         ("= [{ g = 0.5", "= [1, { g = 0.5", "relaxation term 1 must be like"),
         ("eps_star = 0.08", "dsigma = 0.08", "dsigma"),
         ('"microscale"', '"linear"', "kc"),
