@@ -100,17 +100,6 @@ def test_what_is_wrong_is_found_and_settled_by_the_printed_line(
             path.with_suffix(".toml").write_text(kept)
 
 
-def test_two_wrong_numbers_are_settled_by_two_lines(tmp_path: Path) -> None:
-    record = times(rig.impact(rig.Impact(), 3), "force", 0.8)
-    record = replace(record, toml_velocity=f"{1.1 * record.rig.velocity:.8g} m/s")
-    path = rig.write(record, tmp_path)
-    found = contradictions(read_test(path))
-    assert [one.quantity for one in found] == ["velocity", "force_scale"]
-    for one in found:
-        with_line(path, *one.lines[0])
-    assert quantities(path) == []
-
-
 @pytest.mark.parametrize(
     "entry",
     [

@@ -165,13 +165,6 @@ displacement = { column = "Weg/mm" }
     refused(path, "column 'Spannung/mm' has no unit")
 
 
-def test_time_may_be_missing_in_a_slow_test(tmp_path):
-    rows = [row.split(",", 1)[1] for row in numbers()]
-    test = read_test(write(tmp_path, "stress (MPa),displacement (mm)", rows))
-    assert test.time is None
-    assert test.displacement.max() == pytest.approx(4e-3)
-
-
 def test_the_toml_is_read_in_si(tmp_path):
     toml = (
         'name = "foam"\n[specimen]\nheight = "1.190 mm"\ndiameter = "5 mm"\nmass = "5.56 mg"\n'
@@ -226,15 +219,6 @@ def test_masses_inside_are_told_apart_and_may_stand_in_the_toml(tmp_path):
     test = read_test(write(tmp_path, header, inside(1.0, 3000.0), toml))
     peaks = {node: values.max() for node, values in test.interior.items()}
     assert peaks == pytest.approx({1: 1e-3, 2: 3e-3})
-
-
-def test_a_column_that_the_toml_names_otherwise_is_not_taken_twice(tmp_path):
-    toml = SPECIMEN + '[columns]\ndisplacement = { column = "displacement_1 (mm)" }\n'
-    test = read_test(write(tmp_path, "time (ms),stress (MPa),displacement_1 (mm)", toml=toml))
-    expect(test)
-    assert test.interior == {}
-    toml = SPECIMEN + '[columns]\ndisplacement_2 = { column = "displacement_1 (mm)" }\n'
-    assert list(read_test(write(tmp_path, PLAIN, inside(1.0), toml)).interior) == [2]
 
 
 def test_the_top_by_another_name_is_not_inside(tmp_path):

@@ -94,7 +94,7 @@ def stuck(w, first, last):
         (((TOP, 500), (3.0, 250), (TOP, 250), (0.0, 450)), 750, 790, 1),  # sticks in an inner loop
     ],
 )
-@pytest.mark.parametrize("noise", [(0.0, 0.0), (0.0, 0.001), (0.0002, 0.002)])
+@pytest.mark.parametrize("noise", [(0.0, 0.0), (0.0002, 0.002)])
 def test_a_gauge_that_stands_still_and_jumps_is_bridged(
     tmp_path, ramps, first, last, every, timed, noise
 ):
@@ -140,8 +140,8 @@ def test_only_the_stretches_of_the_cycle_that_is_used_are_named(tmp_path):
 # -------------------------------------------------------------------------- no false detections
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.001, 0.003])
-@pytest.mark.parametrize("digit", [0.0, 0.05, 0.3])  # mm
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+@pytest.mark.parametrize("digit", [0.0, 0.3])  # mm
 @pytest.mark.parametrize("every", [1, 5])
 @pytest.mark.parametrize(
     "ramps",

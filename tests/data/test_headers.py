@@ -111,8 +111,3 @@ def test_samples_that_are_not_numbers_are_refused_by_row(
     tmp_path: Path, rows: list[str], words: str
 ) -> None:
     refused(written(tmp_path, [PLAIN, *rows]), words)
-
-
-def test_a_stress_that_is_never_positive_is_refused(tmp_path: Path) -> None:
-    rows = [f"{t},{f - 300},{w}" for t, f, w in zip(T, F, W, strict=True)]
-    refused(written(tmp_path, [PLAIN, *rows]), "only -3 MPa to -1 MPa", "correct its zero")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +11,8 @@ from scipy.signal import lfilter
 import foamfit as ff
 from conftest import DATA, HEIGHT, needs_data, synthetic_impact
 from fabricated import half_sine
-from foamfit.data.measurement import Noise, Record, Specimen, Striker
-from foamfit.data.noise import quantum, residual_noise, with_noise
+from foamfit.data.measurement import Record, Specimen, Striker
+from foamfit.data.noise import quantum, residual_noise
 from foamfit.data.outliers import find_outliers
 from foamfit.data.prepare import condition
 
@@ -133,17 +132,6 @@ def test_noise_of_a_held_channel_is_that_of_its_fresh_samples():
     assert level.time == pytest.approx(1.0, abs=0.01)  # in units of fresh samples
     assert done.sampled["displacement"].sum() in (n // hold - 1, n // hold)  # cut to one cycle
     assert "fresh samples" in level.how
-
-
-def test_stated_noise_is_kept_and_the_rest_is_completed():
-    _, test = synthetic_impact()
-    whole = with_noise(replace(test, noise=Noise(stress=2e4)))
-    assert whole.noise.of("stress").given
-    assert whole.noise.of("stress").sigma == 2e4
-    level = whole.noise.of("displacement")
-    assert not level.given
-    assert level.sigma == pytest.approx(test.noise.displacement, rel=0.15)
-    assert with_noise(whole) is whole
 
 
 # ------------------------------------------------------------------------------------- outliers

@@ -115,10 +115,6 @@ def record(kind):
         stress += 0.002 * rng.standard_normal(stress.size)
         stress[[150, 400]] += 1.0
         displacement[400] = 0.0
-    elif kind == "many":
-        clock, stress, displacement = loop(20_000)
-        stress[5000:5400] += 0.0
-        stress[7000] = 9.0
     clock = np.arange(float(stress.size))
     return table(clock, stress, displacement)
 
@@ -130,7 +126,6 @@ def record(kind):
         ("window", '[window]\nend = "0.9 s"\n', {"outside [window] start and end"}),
         ("cycles", "[window]\ncycle = 2\n", {"before cycle 2", "after cycle 2"}),
         ("spikes", "", {"a spike or gap of the stress, bridged by a straight line"}),
-        ("many", "", {"a spike or gap of the stress, bridged by a straight line"}),
     ],
 )
 def test_every_row_that_is_not_used_has_its_reason(tmp_path, kind, toml, why):
@@ -139,9 +134,8 @@ def test_every_row_that_is_not_used_has_its_reason(tmp_path, kind, toml, why):
     count = accounted(test)
     assert count.rows == len(lines) - 1
     assert why <= {item.why for item in count.dropped}
-    if kind != "many":  # long records are averaged in blocks
-        left_out = np.any([found.left_out for found in test.outliers.values()], axis=0)
-        assert count.used == test.stress.size - np.count_nonzero(left_out)
+    left_out = np.any([found.left_out for found in test.outliers.values()], axis=0)
+    assert count.used == test.stress.size - np.count_nonzero(left_out)
     told = describe(test, audit(test))
     assert f"{count.rows} in the file, {count.used} used" in told
     assert all(f"Not used: {str(item)[:20]}" in told for item in count.dropped)

@@ -207,14 +207,6 @@ def test_the_other_channels_agree_with_force_and_motion(tmp_path: Path) -> None:
         assert not any(note.startswith("Check: the displacement is used") for note in test.notes)
 
 
-def test_a_mass_inside_does_not_need_the_motion_of_the_top(tmp_path: Path) -> None:
-    t, force, w = impact(rest=True)
-    columns = {"time_ms": t, "force_N": -force, "displacement_1_mm": w / 2}
-    test = read_test(written(tmp_path, SPECIMEN + STRIKER, **columns))
-    assert test.turned == ("force",)
-    assert test.interior[1].max() == pytest.approx(1.6e-3, rel=0.02)
-
-
 @pytest.mark.parametrize("measure", ["true strain", "Green strain"])
 def test_a_strain_of_another_measure_is_reversed_before_it_is_converted(
     tmp_path: Path, measure: str

@@ -18,6 +18,7 @@ from foamfit.arrays import Array
 from foamfit.data.checks import RANGE
 from foamfit.data.frames import Frames, join
 from foamfit.data.measurement import (
+    Entry,
     Measurement,
     Record,
     Striker,
@@ -96,9 +97,8 @@ def read_test(
     text = read_text(path, "the CSV file of a test", settings.sheet)
     window = _with_cycles(settings.window, cycle, cycles)
     with naming(path):
-        parts = [
-            read_channels(Source.of(text, settings.columns).needed(settings), settings.duplicates)
-        ]
+        source = Source.of(text, settings.columns).needed(settings)
+        parts = [read_channels(source, settings.duplicates)]
     sha256 = text.sha256
     if settings.motion is not None:
         parts.append(_read_motion(path, toml, settings))
@@ -126,20 +126,20 @@ def read_test(
                 f"{percent(sigma / size, 3)} of the range of the measured {channel}, "
                 f"{engineering(size, unit)}; give one standard deviation."
             )
+    spreads, entries = dict[str, float](), dict[str, Entry]()
+    for part in parts:
+        spreads |= part.source.scale_spreads()
+        entries |= part.source.entries(part.section)
     test = replace(
         test,
         name=settings.name,
         path=path,
         data_sha256=sha256,
-        uncertainties={
-            name: spread for part in parts for name, spread in part.source.scale_spreads().items()
-        }
-        | settings.uncertainties,
+        uncertainties=spreads | settings.uncertainties,
         turned=turned,
         noise=replace(settings.noise, estimated=test.noise.estimated),
         priors=settings.priors,
-        entries=parts[0].source.entries()
-        | (parts[1].source.entries("motion.columns") if len(parts) > 1 else {}),
+        entries=entries,
     )
     return with_noise(test)
 

@@ -63,29 +63,8 @@ FASTER, FARTHER, RATE_RANGE = (0.5, 3.0), (0.5, 1.25), (0.1, 10.0)
 IMPACT_SAMPLES, CYCLE_SAMPLES = 200, 150  # simulated samples; the information is scaled
 LONG_HOLD = 10.0  # assumed duration of a hold over that of the record
 
-DRAFT = """\
-# The tests that the rig can make, for foamfit plan. What is left out is taken from the record.
-# Lines that start with "# " are examples: enter your value and remove the "# ".
-[striker]
-# velocity = "0.5 to 6 m/s"
-# masses = ["7 g", "14 g"]
-
-[machine]                    # only if there is a testing machine
-# rate = "0.01 to 10 1/s"    # strain rate
-# strain = "0.1 to 0.7"      # largest strain of a test
-# cycles = 3
-# hold = "10 s"              # longest hold at the largest strain
-
-[limits]
-# force = "500 N"
-# displacement = "1 mm"
-# strain = 0.9
-
-[record]
-# rate = "1 MHz"
-# noise = { stress = "20 kPa", displacement = "2 um" }
-# interior = true            # whether a camera can follow an interior displacement
-"""
+# The rig that `foamfit init --rig` writes, to be filled in.
+DRAFT = Path(__file__).with_name("rig.toml").read_text(encoding="utf-8")
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,7 @@ class Source:
         spreads = {f"{name}_scale": self.given.get(c, _NONE).spread for name, c in used.items()}
         return {name: spread for name, spread in spreads.items() if spread}
 
-    def entries(self, table: str = "columns") -> dict[str, Entry]:
+    def entries(self, table: str) -> dict[str, Entry]:
         """Return the entries of a table of the TOML by which stress and displacement are read."""
         found = dict[str, Entry]()
         for name, channels in _SOURCES.items():
