@@ -451,20 +451,6 @@ def shoe_toml(folder, shoe, more=""):
 
 
 @needs_data
-@pytest.mark.parametrize("shoe", SHOES)
-def test_shoe_foam(tmp_path, shoe):
-    path = DATA / "shoe-foam" / f"{shoe}_cycle1.csv"
-    test = read_test(path, shoe_toml(tmp_path, shoe))
-    assert test.time[0] == 0.0  # the file starts at contact
-    assert len(test.time) > 1260
-    assert test.displacement.max() / test.specimen.height == pytest.approx(0.615, abs=0.015)
-    assert any("held for about 5 samples" in note for note in test.notes)
-    checks = [note for note in test.notes if note.startswith("Check:")]
-    assert ["play of the gauge" in note for note in checks] == [True]
-    assert (np.diff(test.displacement) == 0).mean() < 0.2  # held values are interpolated
-
-
-@needs_data
 def test_shoe_foam_as_the_instrument_wrote_it(tmp_path):
     more = '[columns]\ndisplacement = { column = "Gap (um)", unit = "um", scale = "-1" }\n'
     raw = DATA / "shoe-foam" / "turbo-comp-1_raw.txt"

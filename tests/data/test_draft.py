@@ -100,23 +100,6 @@ def test_what_no_header_says_is_proposed_only_without_an_alternative(
         )
 
 
-def test_the_preamble_of_an_oscilloscope_is_no_channel(tmp_path: Path) -> None:
-    said = ["Record Length,2.0e+02", "Sample Interval,1e-2", "Source,CH1", "Vertical Units,V",
-            "Horizontal Units,s", "Probe Atten,1.0e+00"]  # fmt: skip
-    left = said + [","] * (T.size - len(said))
-    path = tmp_path / "test.csv"
-    rows = zip(left, T, VOLTS, strict=True)
-    path.write_text("\n".join(f"{a},,{t:.4f},{v:.6f}," for a, t, v in rows) + "\n")
-    lines = initialised(path)
-    assert "time = { column = 4 }" in lines
-    assert [line for line in lines if "column = 5" in line and 'scale = "100 N/V"' in line]
-    assert not [line for line in lines if "column = 1" in line.partition("#")[0]]
-    head = "X,CH1,CH2,Start,Increment", "Sequence,VOLT,VOLT,-1.0e-03,5.0e-04"
-    path.with_suffix(".toml").unlink()
-    lines = drafted(tmp_path, *head, columns=(COUNTS, VOLTS, W))
-    assert [line for line in lines if "stress" in line and '"…"' in line]
-
-
 @pytest.mark.parametrize(
     "content", ["time (s),force (N)\n", "<html>1</html>", "%PDF-1.4\n1 0 obj\n"]
 )

@@ -6,11 +6,10 @@ The records are synthetic: a force at 100 kHz and camera frames at 10 kHz.
 import numpy as np
 import pytest
 
-import foamfit as ff
 from conftest import refused
 from foamfit.data.csv_file import read_test
 from foamfit.data.frames import Frames, join
-from foamfit.data.measurement import Record, Specimen, Striker
+from foamfit.data.measurement import Record, Specimen
 from foamfit.data.prepare import condition
 from foamfit.fitting.problem import make_problem
 from foamfit.study.batch_work import fingerprint
@@ -293,18 +292,3 @@ def test_a_force_without_a_time_is_refused(tmp_path):
     path = written(tmp_path)
     table(path, **{"force (N)": 200.0 * clock(1e5), "more": clock(1e5)})
     refused(path, "test.csv: no column is a time")
-
-
-def test_striker_and_motion_of_two_files_are_one_impact(tmp_path):
-    """The motion is either in the file of the force, at the same rate, or in a file of its own."""
-    t, at = np.arange(0, 701) * 1e-6, np.arange(0, 36) * 2e-5
-    spring = ff.published["foam-1/model-1"].bistable
-    run = ff.simulate(ff.Chain([spring], [1.19e-3], 1.9635e-5), ff.Impact(7e-3, 2.0), t)
-    w = run.displacement[-1]
-    whole = Record(t, run.base_stress, w)
-    frames = Frames("camera.csv", at, {"displacement": np.interp(at, t, w)})
-    joined = join(Record(t, run.base_stress, None), frames)
-    given = Specimen(1.19e-3, 1.9635e-5), Striker(7e-3, 2.0)
-    one, two = (condition(r, given[0], striker=given[1]) for r in (whole, joined))
-    assert two.time.size == one.time.size
-    assert two.displacement == pytest.approx(one.displacement, abs=1e-3 * np.ptp(w))

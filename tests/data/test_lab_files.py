@@ -450,9 +450,7 @@ def test_three_decimals_are_no_thousands(tmp_path):
         (PLAIN, ("mm^2", "Mm^2"), ["area is 1e+14 m²", "peak stress is 2e-12 Pa"]),
         (PLAIN, ("mm^2", "um^2"), ["peak stress is 2e+12 Pa", "modulus"]),
         ([PLAIN[0].replace("(N)", "(MN)"), *PLAIN[1:]], ("", ""), ["peak stress is 2e+12 Pa"]),
-        ([PLAIN[0].replace("(N)", "(uN)"), *PLAIN[1:]], ("", ""), ["peak stress is 2 Pa"]),
         ([PLAIN[0].replace("(mm)", "(nm)"), *PLAIN[1:]], ("", ""), ["peak strain is 4e-07"]),
-        ([PLAIN[0].replace("(s)", "(Ms)"), *PLAIN[1:]], ("", ""), ["duration is 3e+07 s"]),
         ([PLAIN[0].replace("(s)", "(ns)"), *PLAIN[1:]], ("", ""), ["duration is 3e-08 s"]),
     ],
 )

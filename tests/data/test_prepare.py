@@ -144,13 +144,13 @@ def test_nothing_is_cut_or_taken_off_where_contact_is_the_first_sample(tmp_path,
 def test_the_zero_at_the_end_of_a_record_is_as_far_off_as_it_says(tau, samples):
     """Contact ends with a low stress, in white or correlated noise; the true zero is 0."""
     off = []
-    for seed in range(1, 21):
+    for seed in range(1, 13):
         test = in_memory(at_contact(tau, samples, seed))
         if "stress" in test.zeros:
             off.append(test.origins["stress_zero"] / test.zeros["stress"])
-    assert len(off) > 12
+    assert len(off) > 7
     off = np.sort(np.abs(off))
-    if (tau, samples) == (8.0, 300):  # in one of 20 a soft start is taken for rest
+    if (tau, samples) == (8.0, 300):  # in one record a soft start is taken for rest
         off = off[:-1]
     assert off[-1] < 3.5
     assert np.sqrt(np.mean(np.square(off))) < 1.4

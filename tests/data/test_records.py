@@ -85,14 +85,6 @@ def test_duplicate_time_stamps_are_averaged_and_counted(tmp_path):
     refused(write(tmp_path, lines, SPECIMEN + "[data]\nduplicates = 3\n"), "average, refuse")
 
 
-def test_rows_without_a_cell_are_counted(tmp_path):
-    lines = [*table(*loop()), ",,", " , , "]
-    lines.insert(50, ",,")
-    count = accounted(read_test(write(tmp_path, lines)))
-    assert (count.rows, count.used) == (104, 101)
-    assert (count.dropped[0].first, count.dropped[0].last) == (51, 105)
-
-
 def triangles(tops, n=80, low=0.02):
     """Return displacement (mm) of triangles with the given peaks, with rests at both ends."""
     corners = [0.0, *(level for top in tops for level in (top, low * max(tops)))]
