@@ -188,7 +188,7 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
         f"Contact of cycle {number} starts{moment} where the stress rises from its level between "
         f"the cycles, at a strain of {percent(contact / height)} from the first contact (start "
         f"strain, not recovered), which is taken off; {first - cycle.first} samples before and "
-        f"{cycle.end - end} after, where the stress has gone back to that level, are cut.",
+        f"{cycle.end - end} after, where the stress has gone back to that level, are cut."
     ]
     loaded = (level - offset) / (float(stress[top]) - offset)
     if offset < 0.0:

@@ -163,9 +163,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         )
 
 
-def _split(
-    tables: dict[str, dict[str, Any]],
-) -> tuple[dict[str, dict[str, Any]], dict[str, float]]:
+def _split(tables: dict[str, dict[str, Any]]) -> tuple[dict[str, dict[str, Any]], dict[str, float]]:
     """Separate the values of the tables from the standard deviations."""
     spreads = dict[str, float | None]()
 
