@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.checks import (
+from foamfit.data.csv_file import read_history
+from foamfit.data.toml_file import (
     Check,
     Quantity,
     Rule,
@@ -22,7 +23,6 @@ from foamfit.data.checks import (
     checked,
     load_toml,
 )
-from foamfit.data.csv_file import read_history
 from foamfit.errors import InputError, naming
 from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.solve.simulation import Response

@@ -9,8 +9,7 @@ import pytest
 
 from conftest import EXPERIMENTS, synthetic_impact
 from foamfit.data.csv_file import read_test
-from foamfit.data.describe import describe
-from foamfit.data.energy import audit, largest_motion
+from foamfit.data.energy import audit, describe, largest_motion
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 
 DATA = Path(os.environ.get("FOAMFIT_DATA", Path(__file__).parents[3] / "shared" / "data"))

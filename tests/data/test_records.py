@@ -11,8 +11,7 @@ import fabricated
 from conftest import refused
 from foamfit.cli import main
 from foamfit.data.csv_file import read_test
-from foamfit.data.describe import describe
-from foamfit.data.energy import audit
+from foamfit.data.energy import audit, describe
 from foamfit.errors import InputError
 from foamfit.fitting.curves import check_drive
 from foamfit.report.summary import render_report, summary_text

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from foamfit.data.csv_file import read_test
-from foamfit.data.describe import describe
-from foamfit.data.energy import audit
+from foamfit.data.energy import audit, describe
 from foamfit.errors import InputError
 
 LOOP = np.sin(np.linspace(0.0, np.pi, 41))

@@ -11,8 +11,7 @@ import pytest
 import fabricated
 import foamfit as ff
 from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
-from foamfit.data.describe import describe
-from foamfit.data.energy import audit
+from foamfit.data.energy import audit, describe
 from foamfit.report.readable import readable
 from foamfit.report.studies.batch import row_of
 from foamfit.report.summary import render_report, summary_text

@@ -25,8 +25,7 @@ def check(test: Path, specimen: Path | None) -> None:
         foamfit check TEST.csv --specimen foam.toml
     """
     from foamfit.data.csv_file import read_test
-    from foamfit.data.describe import describe
-    from foamfit.data.energy import audit
+    from foamfit.data.energy import audit, describe
 
     measurement = read_test(test, specimen)
     say(describe(measurement, audit(measurement)))

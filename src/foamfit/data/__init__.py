@@ -5,5 +5,6 @@ Start with `csv_file.read_test`. `tables` finds the columns of a file, their cha
 the force. `prepare.condition` reduces the samples to one loading and unloading: `outliers` repairs
 single samples and a stuck gauge, `cycles` and `contact` select the samples in contact, `zeros`
 finds the zero of each channel. `noise` estimates the noise, `motion` smooths a noisy displacement,
-`energy` checks striker, force and motion against each other, `describe` prints a test.
+`energy` and `calibration` check striker, force and motion against each other. `rig` reads what
+tests a rig can make.
 """

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.checks import RANGE
 from foamfit.data.frames import Frames, join
 from foamfit.data.measurement import (
     Entry,
@@ -39,7 +38,7 @@ from foamfit.data.tables.columns import TWINS, Source, si_factor
 from foamfit.data.tables.csv_table import read_numbers, read_text
 from foamfit.data.tables.draft import without_toml
 from foamfit.data.tables.headers import CHANNELS, example
-from foamfit.data.toml_file import Column, Settings, read_settings, toml_beside
+from foamfit.data.toml_file import RANGE, Column, Settings, read_settings, toml_beside
 from foamfit.errors import InputError, naming
 from foamfit.text import engineering, percent
 

@@ -12,7 +12,10 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.checks import (
+from foamfit.data.cycles import loading_rate
+from foamfit.data.measurement import Measurement, Noise, NoiseLevel, Striker, interior_channel
+from foamfit.data.noise import with_noise
+from foamfit.data.toml_file import (
     COUNT,
     FLAG,
     Check,
@@ -24,9 +27,6 @@ from foamfit.data.checks import (
     checked_tables,
     load_toml,
 )
-from foamfit.data.cycles import loading_rate
-from foamfit.data.measurement import Measurement, Noise, NoiseLevel, Striker, interior_channel
-from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, naming
 from foamfit.text import engineering, listed
 

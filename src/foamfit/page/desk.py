@@ -22,8 +22,7 @@ import tomli_w
 
 from foamfit.cli.fit import cycles_of
 from foamfit.data.csv_file import read_test
-from foamfit.data.describe import describe
-from foamfit.data.energy import audit
+from foamfit.data.energy import audit, describe
 from foamfit.data.measurement import Measurement
 from foamfit.data.toml_file import toml_beside
 from foamfit.errors import InputError

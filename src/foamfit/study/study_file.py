@@ -8,7 +8,7 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from foamfit.data.checks import COUNT, FLAG, RANGE, Rule, check_keys, load_toml
+from foamfit.data.toml_file import COUNT, FLAG, RANGE, Rule, check_keys, load_toml
 from foamfit.errors import InputError
 from foamfit.fitting.links import KINDS
 from foamfit.options import DRIVES, FREED, OF_FIT

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from foamfit.data.cycles import inner_loops
-from foamfit.data.describe import noise_sentences
-from foamfit.data.energy import audit
+from foamfit.data.energy import audit, noise_sentences
 from foamfit.data.measurement import INTEGRATED, interior_channel
 from foamfit.errors import SimulationError
 from foamfit.fitting.branches import visited

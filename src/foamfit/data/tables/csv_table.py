@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from foamfit.arrays import Array, Integers
-from foamfit.data.checks import LONGEST, read_bytes
 from foamfit.data.measurement import MIN_ROWS, Dropped, entry_line
 from foamfit.data.tables.headers import CHANNELS, Header, parse_header
 from foamfit.data.tables.layouts import blanks_as_tabs, scope_of, unpacked
+from foamfit.data.toml_file import LONGEST, read_bytes
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError, naming
 

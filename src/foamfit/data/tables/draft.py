@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from foamfit.data.checks import LONGEST
 from foamfit.data.measurement import MIN_ROWS, entry_line
 from foamfit.data.tables.columns import Source, entries_of, quoted, si_factor
 from foamfit.data.tables.csv_table import Table, Text, read_numbers
 from foamfit.data.tables.headers import channel_of
-from foamfit.data.toml_file import toml_beside
+from foamfit.data.toml_file import LONGEST, toml_beside
 from foamfit.data.units import factor
 from foamfit.errors import InputError, naming
 from foamfit.terminal import printable

@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from foamfit.data.checks import LONGEST
 from foamfit.data.measurement import interior_node
+from foamfit.data.toml_file import LONGEST
 from foamfit.data.units import factor, is_unit
 
 WEAK = 3  # rank of a header that only suggests a displacement
