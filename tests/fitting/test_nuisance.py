@@ -31,26 +31,6 @@ OF_SPRING = [SPRING.k0, SPRING.kc, SPRING.eps_star, SPRING.sigma_plus, SPRING.sp
              SPRING.sigma_minus, SPRING.spread_minus, 0.0, 0.0]  # fmt: skip
 
 
-def test_a_velocity_with_a_deviation_is_an_unknown_with_that_prior():
-    """It counts as a parameter, and its prior limits its error but does not count as a sample."""
-    spring, test = synthetic_impact(samples=201)
-    quick = {"starts": 2, "intervals": "local"}
-    exact = ff.fit(test, **quick)
-    assert "velocity" not in [name for name, one in exact.parameters.items() if one.vary]
-    stated = replace(test, uncertainties={"velocity": 0.02, "striker_mass": 7e-6})
-    found = ff.fit(stated, **quick)
-    assert found.statistics["n_data"] == exact.statistics["n_data"]
-    assert found.statistics["n_vary"] == exact.statistics["n_vary"] + 2
-    for name, truth, sigma in (("velocity", 2.0, 0.02), ("striker_mass", 7e-3, 7e-6)):
-        item = found.parameters[name]
-        assert abs(item.value - truth) < 3 * sigma
-        assert 0.0 < item.stderr <= 1.001 * sigma
-    wrong = replace(stated, striker=replace(test.striker, velocity=2.04))
-    off = ff.fit(wrong, **quick)
-    assert off.parameters["velocity"].value < 2.04 - 0.01  # corrected by the record
-    assert off.parameters["s1_kc"].value == pytest.approx(spring.kc, rel=0.03)
-
-
 @pytest.mark.parametrize(
     ("fixed", "why"),
     [

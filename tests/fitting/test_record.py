@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.optimize import least_squares
 
 import foamfit as ff
 from foamfit.fitting.search import SearchStoppedError, Tracker
@@ -84,40 +83,16 @@ def test_a_zero_at_which_the_measured_strain_reaches_one_is_refused(tmp_path):
     assert test.displacement.max() + OFFSET - low < HEIGHT
 
 
-def plain_misfit(test, starts=25):
-    """Return the misfit of a bistable spring by plain least squares from random starts."""
-    strain = np.maximum(test.displacement, 0.0) / test.specimen.height
-    size, most = float(test.stress.max()), float(strain.max())
-    unit = np.array([size / most, size / most, 1.0, most, most, size / most, size / most])
-    box = [(0.03, 30), (0.03, 300), (1e-4, 0.999), (0.02, 0.9), (0.005, 0.8), (0.01, 30)]
-    low, high = np.log(np.array([*box, (1e-4, 30)]).T * unit)
-
-    def residual(point):
-        k0, kc, drop, eps_a, more, plus, minus = np.exp(point)
-        try:
-            spring = ff.BistableSpring(
-                k0=k0, kc=kc, dsigma=-drop * k0 * eps_a / (1.0 - eps_a), eps_a=eps_a,
-                eps_c=eps_a + more, kh_plus=plus, kh_minus=minus,
-            )  # fmt: skip
-            return (spring.stress(strain) - test.stress) / np.ptp(test.stress)
-        except (ValueError, ff.SimulationError):
-            return np.full(strain.size, 10.0)
-
-    rng, best = np.random.default_rng(0), np.inf
-    for _ in range(starts):
-        points = rng.uniform(low, high, (30, 7))
-        start = min(points, key=lambda one: float(np.sum(residual(one) ** 2)))
-        found = least_squares(residual, start, bounds=(low, high), max_nfev=60)
-        best = min(best, float(np.sqrt(np.mean(found.fun**2))))
-    return best
-
-
 @pytest.mark.parametrize("intervals", ["auto", "local"])
 def test_a_noisy_motion_does_not_excuse_an_error_of_the_law(intervals, tmp_path):
-    """The fit follows the record as plain least squares does, and says that it stays plain."""
+    """The fit follows the record as plain least squares does, and says that it stays plain.
+
+    The best of 25 random starts of SciPy's `least_squares` along the measured motion misses the
+    stress by 8.36 % of its range.
+    """
     test = ff.read_test(crushed(tmp_path, noise=(20e3, 250e-6))[0])
     result = ff.fit(test, intervals=intervals)
-    assert result.misfit["stress_strain"] < 1.05 * plain_misfit(test)
+    assert result.misfit["stress_strain"] < 1.05 * 0.0836
     assert any("The noise of the motion does not explain the residuals" in n for n in result.notes)
 
 

@@ -141,6 +141,7 @@ def test_velocity_and_mass_with_a_deviation_are_fitted_within_it(tmp_path):
     """Both TOML values are wrong by less than their ±; the record corrects them."""
     path = written(tmp_path, **SIZE, velocity="1.98 ± 0.03 m/s", mass="7.05 ± 0.1 g", noise=0.003)
     result = fitted(ff.read_test(path))
+    assert result.statistics["n_data"] == 2 * result.curves.time.size  # a prior is no sample
     velocity, mass = (result.parameters[name] for name in ("velocity", "striker_mass"))
     assert velocity.state == mass.state == "determined"
     assert velocity.value == pytest.approx(2.0, abs=3.0 * velocity.stderr)

@@ -50,6 +50,7 @@ NOISY = 0.005  # noise of a motion, as a fraction of its range, above which it i
 MISSING = 0.8
 # They are tried again if the cost has fallen by more than this fraction.
 NEWS = 1e-5
+ALIKE = 1e-3  # relative difference of the costs of descents that ended in one minimum
 # Minima of the loop are continued if their cost on the curves is within this factor of the best.
 PROMISING = 100.0
 # Stages of successive halving: iterations, the share of the starts that then goes on, and that of
@@ -222,14 +223,14 @@ def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
     return [points[i] for i in sorted(chosen)]
 
 
-def distinct(ends: list[tuple[float, Array]], apart: float = 1e-3) -> list[tuple[int, Array]]:
+def distinct(ends: list[tuple[float, Array]]) -> list[tuple[int, Array]]:
     """Return the distinct minima among the ends of descents, best first: count and one end each.
 
-    Ends belong to one minimum if the relative difference of their costs is below `apart`.
+    Ends belong to one minimum if the relative difference of their costs is below `ALIKE`.
     """
     groups: list[list[tuple[float, Array]]] = []
     for end in sorted(ends, key=itemgetter(0)):
-        if groups and end[0] <= (1.0 + apart) * groups[-1][0][0]:
+        if groups and end[0] <= (1.0 + ALIKE) * groups[-1][0][0]:
             groups[-1].append(end)
         else:
             groups.append([end])

@@ -86,9 +86,8 @@ def settle(best: BestPoint, found: Sequence[Contradiction]) -> tuple[Settled, ..
         shares = {name: by - (name != nuisance.TIME_SHIFT) for name, by in way.items()}
         moves = [response(best, name, share) for name, share in shares.items()]
         moved = best.values + sum(moves)
-        out.append(
-            Settled(listed(words) if words else "", moved if np.all(np.isfinite(moved)) else None)
-        )
+        fails = not np.all(np.isfinite(moved))
+        out.append(Settled(listed(words) if words else "", None if fails else moved))
     return tuple(out)
 
 
