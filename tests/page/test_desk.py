@@ -127,6 +127,20 @@ def test_what_is_too_large_or_no_table_is_refused(desk, monkeypatch):
     assert desk.csv is None
 
 
+@pytest.mark.parametrize("order", [("a.csv", "a.toml"), ("a.toml", "a.csv")])
+def test_a_table_and_a_toml_that_arrive_together_belong_together(desk, order, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(desk_module.time, "monotonic", lambda: now[0])
+    desk.receive("before.csv", b"1,2\n")
+    for name in order:
+        now[0] += 10.0 * (name == order[0])
+        desk.receive(name, b"")
+    assert desk.replaced == (order[0] == "a.csv")  # then the TOML fills what was cleared
+    assert desk.dropped_toml() == ({}, "")
+    desk.receive("after.csv", b"1,2\n")
+    assert desk.replaced
+
+
 def test_two_desks_share_nothing(tmp_path):
     one, two = Desk(tmp_path / "one"), Desk(tmp_path / "two")
     one.take(TEST)

@@ -3,7 +3,7 @@
 import pytest
 
 from foamfit.errors import InputError
-from foamfit.page.preview import in_words, preview, remedies, with_column
+from foamfit.page.preview import preview, remedies, with_column
 
 ROWS = "\n".join(f"{0.01 * k},{k},{0.02 * k}" for k in range(60))
 
@@ -25,16 +25,16 @@ def test_a_file_with_unclear_columns_has_its_headers_and_is_drawn_with_them(tmp_
     found = preview(path, "")
     assert found.headers == ("when", "Load (kN)", "Crosshead")
     assert found.picture is None
-    rest = with_column("", "displacement", 'column = "Crosshead", unit = "mm"')
-    rest = with_column(rest, "time", 'column = "when", unit = "s"')
+    assert "Use Crosshead in mm as displacement" in remedies(found.why)
+    rest = with_column("", "displacement", {"column": "Crosshead", "unit": "mm"})
+    rest = with_column(rest, "time", {"column": "when", "unit": "s"})
     assert preview(path, rest).picture is not None
 
 
 def test_what_is_no_table_shows_nothing(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("hello\n", encoding="utf-8")
-    assert preview(path, "") == ((), None)
-    assert preview(tmp_path / "missing.csv", "") == ((), None)
+    assert preview(path, "") == preview(tmp_path / "missing.csv", "") == ((), None, "")
 
 
 def test_the_entries_that_a_message_proposes_are_remedies():
@@ -42,18 +42,18 @@ def test_the_entries_that_a_message_proposes_are_remedies():
         "column 'Load' has no unit; write it in the header like 'force (kN)' or in [columns] like "
         'force = { column = "Load", unit = "kN" } or displacement = { column = "…", unit = "mm" }'
     )
-    assert remedies(message) == [("force", 'column = "Load", unit = "kN"')]
-    assert in_words(*remedies(message)[0]) == "Use Load in kN as force"
+    entry = {"column": "Load", "unit": "kN"}
+    assert remedies(message) == {"Use Load in kN as force": ("force", entry)}
 
 
 def test_an_entry_is_replaced_and_removed_and_the_rest_stays():
     rest = 'name = "a"\n[columns]\nforce = { column = "F" }\n'
-    new = with_column(rest, "force", 'column = 2, unit = "kN"')
+    new = with_column(rest, "force", {"column": 2, "unit": "kN"})
     assert 'name = "a"' in new
     assert '"F"' not in new
-    assert "columns" not in with_column(new, "force", "")
+    assert "columns" not in with_column(new, "force", {})
     with pytest.raises(InputError, match="not valid TOML"):
-        with_column("[columns", "force", 'column = "F"')
+        with_column("[columns", "force", {"column": "F"})
 
 
 def test_a_fit_offers_its_card_and_the_plan_of_the_next_test(tmp_path):

@@ -32,22 +32,15 @@ def ask(served, path, method="GET", body=None, **headers):
     return answer.status, text
 
 
-@pytest.fixture(scope="module")
-def receive(served):
-    """Return the path at which a window receives files."""
-    assert ask(served, f"/{served.token}/")[0] == 200
-    windows = sorted(served.files.glob("foamfit-page-*/window-*"))
-    assert windows
-    assert all(path.stat().st_mode & 0o077 == 0 for path in (windows[0], windows[0].parent))
-    return f"/{served.token}/receive/{windows[-1].name.split('-', 2)[2]}"
-
-
 def test_the_page_answers_at_its_address(served):
     assert len(served.token) >= 32
     status, text = ask(served, f"/{served.token}/")
     assert status == 200
     assert "<title>foamfit</title>" in text
     assert ask(served, f"/{served.token}/", Origin=f"http://127.0.0.1:{served.port}")[0] == 200
+    folders = sorted(served.files.glob("foamfit-page-*/window-*"))
+    assert folders
+    assert all(path.stat().st_mode & 0o077 == 0 for path in (*folders, folders[0].parent))
 
 
 @pytest.mark.parametrize(
@@ -95,27 +88,6 @@ def test_it_listens_on_this_machine_alone(served):
             pytest.skip("this machine has no other address")
         with pytest.raises(OSError, match="refused"):
             other.connect((address, served.port))
-
-
-def test_a_file_is_taken_under_a_safe_name(served, receive):
-    status, text = ask(served, f"{receive}?name=../../<b>x.csv", "POST", b"a,b\n1,2\n")
-    assert (status, text) == (200, "b_x.csv")
-    there = [path for path in served.files.rglob("*") if path.is_file()]
-    assert [path.name for path in there if path.suffix == ".csv"] == ["b_x.csv"]
-
-
-def test_a_file_that_is_too_large_is_refused_unseen(served, receive):
-    size = str(65 << 20)  # the page rejects such a file before sending it
-    assert ask(served, f"{receive}?name=a.csv", "POST", b"x", Content_Length=size)[0] == 400
-
-
-def test_a_file_for_no_window_is_refused(served, receive):
-    path = receive.rsplit("/", 1)[0]
-    for window in ("nobody", "..%2f..", "../../x"):
-        assert ask(served, f"{path}/{window}?name=a.csv", "POST", b"1")[0] == 404
-    status, text = ask(served, f"{receive}?name=picture.png", "POST", b"1")
-    assert status == 400
-    assert "is not a table" in text
 
 
 def test_a_path_leads_to_no_file(served):

@@ -17,7 +17,7 @@ from bokeh.plotting import figure
 
 from foamfit.arrays import Array
 from foamfit.page.turning import PANELS, Drawn, Row, Turning
-from foamfit.page.widgets import WIDE, Sliders, message, piece
+from foamfit.page.widgets import WIDE, Sliders, grid, message, piece
 from foamfit.report.figures import GREY, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
@@ -30,19 +30,6 @@ AXES = {  # name and SI unit of x and y in each panel
     "displacement_time": (("time", "s"), ("displacement", "m")),
     "stress_strain": (("strain", ""), ("stress", "Pa")),
 }
-
-
-def grid(parts: list[Any], width: float) -> pn.Column:
-    """Arrange parts side by side, each at least `width` rem wide; initially hidden.
-
-    The outer column is hidden, because a grid itself would stay visible.
-    """
-    style = (
-        ":host { display: grid; gap: .4rem; "
-        f"grid-template-columns: repeat(auto-fit, minmax(min(100%, {width}rem), 1fr)); }} "
-        ".scroll-button { display: none; }"  # it would take the place of a part
-    )
-    return pn.Column(pn.Column(*parts, stylesheets=[style], **WIDE), visible=False, **WIDE)
 
 
 class Curves:

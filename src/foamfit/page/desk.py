@@ -6,10 +6,12 @@ Each window has its own folder, which is removed with it. Windows share nothing.
 from __future__ import annotations
 
 import io
+import math
 import re
 import shlex
 import shutil
 import tempfile
+import time
 import tomllib
 import unicodedata
 import zipfile
@@ -33,6 +35,7 @@ from foamfit.text import listed
 
 LARGEST = 64 * 1024 * 1024  # bytes of the largest file that can be dropped
 LONGEST = 80  # characters of the longest file name
+TOGETHER = 5.0  # s within which a table and its TOML arrive if they are dropped together
 BUSY = "A fit is running; stop it before you change the test."
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
 # Label and example of each quantity to fill in, by its name in messages. The first `FIRST` are
@@ -53,10 +56,12 @@ class Desk:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        folder.mkdir(mode=0o700)
+        folder.mkdir(mode=0o700, exist_ok=True)
         self.csv: Path | None = None
         self.dropped: bytes | None = None  # a TOML that has not been read yet
         self.replaced = False  # whether the file has replaced another and has not been read yet
+        # Times at which a table arrived, and a TOML that came before its table.
+        self._came, self._ahead = -math.inf, -math.inf
         self.measurement: Measurement | None = None
         self.worker: Worker | None = None
         self._fits = 0
@@ -83,8 +88,10 @@ class Desk:
                 "use foamfit fit in a terminal."
             )
         suffix = Path(name).suffix.lower()
+        now = time.monotonic()
         if suffix == ".toml":
             self.dropped = content
+            self._ahead = now if now - self._came > TOGETHER else -math.inf
             return name
         if suffix not in TABLES:
             raise InputError(
@@ -93,7 +100,8 @@ class Desk:
         place = self.folder / "test"
         shutil.rmtree(place, ignore_errors=True)
         place.mkdir()
-        self.replaced = self.csv is not None
+        self.replaced = self.csv is not None and now - self._ahead > TOGETHER
+        self._came, self._ahead = now, -math.inf
         self.csv, self.measurement, self.worker = place / name, None, None
         self.csv.write_bytes(content)
         return name
@@ -101,7 +109,7 @@ class Desk:
     def take(self, csv: Path) -> None:
         """Copy a test from this machine, with its TOML, into the folder of the window.
 
-        Only the command and the list of reconstructions may name such a file, never the browser.
+        Only the command and the example may name such a file, never the browser.
         """
         known = csv.suffix.lower() in TABLES
         self.receive(csv.name if known else f"{csv.stem}.csv", csv.read_bytes())
@@ -134,7 +142,7 @@ class Desk:
             raise InputError(BUSY)
         self.measurement = None
         if self.csv is None:
-            raise InputError("There is no test yet; drop a CSV or choose a reconstruction.")
+            raise InputError("There is no test yet; drop a CSV or try the example.")
         toml = self.csv.with_suffix(".toml")
         try:
             toml.write_text(join_toml(quantities, rest), encoding="utf-8")

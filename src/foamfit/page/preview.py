@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -31,10 +32,11 @@ ENTRY = re.compile(r"\b(\w+) = \{ ?(column = [^{}…]+?) ?\}")
 
 
 class Preview(NamedTuple):
-    """Headers of a file, and its curves as a PNG (None if they cannot be read)."""
+    """Headers of a file, and its curves as a PNG, or why they cannot be read."""
 
-    headers: tuple[str, ...]
-    picture: bytes | None
+    headers: tuple[str, ...] = ()
+    picture: bytes | None = None
+    why: str = ""
 
 
 def preview(csv: Path, rest: str) -> Preview:
@@ -43,15 +45,15 @@ def preview(csv: Path, rest: str) -> Preview:
         source = Source.of(read_text(csv, "a table"), {}, {})
         headers = tuple(header.text for header in source.table.headers if header.text)
     except InputError:
-        return Preview((), None)
+        return Preview()
     try:
         document = tomllib.loads(rest)
         with TemporaryDirectory() as folder:
             toml = Path(folder, "test.toml")
             toml.write_text(tomli_w.dumps(document | UNIT), encoding="utf-8")
             return Preview(headers, _picture(csv, toml, "strain" in source.columns))
-    except (InputError, tomllib.TOMLDecodeError, RecursionError):
-        return Preview(headers, None)
+    except (InputError, tomllib.TOMLDecodeError, RecursionError) as error:
+        return Preview(headers, None, str(error))
 
 
 def _picture(csv: Path, toml: Path, strained: bool) -> bytes:
@@ -77,28 +79,30 @@ def _picture(csv: Path, toml: Path, strained: bool) -> bytes:
     return figures.image(figure, "png", 130)
 
 
-def remedies(message: str) -> list[tuple[str, str]]:
-    """Return the entries of [columns] that a message proposes: channel and content."""
-    return list(dict.fromkeys(ENTRY.findall(message)))
+def remedies(message: str) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Return the entries of [columns] that a message proposes, by the words of their buttons."""
+    found = [
+        (channel, tomllib.loads(f"entry = {{ {content} }}")["entry"])
+        for channel, content in ENTRY.findall(message)
+    ]
+    return {in_words(*one): one for one in found}
 
 
-def in_words(channel: str, content: str) -> str:
-    """Return an entry of [columns] as a button says it: "Use Load in kN as force"."""
-    entry = tomllib.loads(f"entry = {{ {content} }}")["entry"]
+def in_words(channel: str, entry: Mapping[str, Any]) -> str:
+    """Return an entry of [columns] in words: "Use Load in kN as force"."""
     unit = f" in {entry['unit']}" if "unit" in entry else ""
     return f"Use {entry['column']}{unit} as {channel}"
 
 
-def with_column(rest: str, channel: str, content: str) -> str:
+def with_column(rest: str, channel: str, entry: Mapping[str, Any]) -> str:
     """Return the TOML `rest` with an entry of [columns]; InputError if `rest` is invalid.
 
-    `content` is like 'column = "Load", unit = "kN"'; "" removes the entry.
+    `entry` is like {"column": "Load", "unit": "kN"}; an empty one is removed.
     """
     try:
         document = tomllib.loads(rest)
-        entry = tomllib.loads(f"{channel} = {{ {content} }}") if content else {}
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(f"The further TOML is not valid TOML: {error}.") from None
-    columns = {k: v for k, v in document.get("columns", {}).items() if k != channel} | entry
-    document = {k: v for k, v in document.items() if k != "columns"}
-    return tomli_w.dumps(document | ({"columns": columns} if columns else {}))
+    document["columns"] = document.get("columns", {}) | {channel: dict(entry)}
+    document["columns"] = {name: one for name, one in document["columns"].items() if one}
+    return tomli_w.dumps({name: one for name, one in document.items() if one != {}})

@@ -26,7 +26,7 @@ from tornado.websocket import WebSocketClosedError
 
 from foamfit.errors import InputError
 from foamfit.page.app import Window
-from foamfit.page.desk import LARGEST, Desk
+from foamfit.page.desk import Desk
 from foamfit.page.worker import FirstUse
 from foamfit.system import at_end
 from foamfit.terminal import say
@@ -36,41 +36,15 @@ UNUSED = 20_000  # ms after which the files of a closed window are removed
 REFUSED = "Access denied; open the address that foamfit page has printed."
 
 
-class Handler(web.RequestHandler):
+class Refusal(web.RequestHandler):
     """Rejects every request."""
 
     def prepare(self) -> None:
-        """Answer with status 403."""
-        self.answer(403, REFUSED)
-
-    def answer(self, code: int, sentence: str) -> None:
         """Answer with plain text that no browser interprets as a page."""
-        self.set_status(code)
+        self.set_status(403)
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.set_header("X-Content-Type-Options", "nosniff")
-        self.finish(sentence)
-
-
-class Receive(Handler):
-    """Receives the files that are dropped in a window."""
-
-    def initialize(self, desks: dict[str, Desk]) -> None:
-        """Store the desks of all windows by their random names."""
-        self.desks = desks
-
-    def prepare(self) -> None:
-        """Accept the request; `post` checks it."""
-
-    def post(self, window: str) -> None:
-        """Store the file."""
-        if window not in self.desks:
-            self.answer(404, "This window is closed; load the page again.")
-            return
-        name = self.get_query_argument("name", "test.csv")
-        try:
-            self.answer(200, self.desks[window].receive(name, self.request.body))
-        except InputError as error:
-            self.answer(400, str(error))
+        self.finish(REFUSED)
 
 
 class Guard(routing.Router):
@@ -79,7 +53,7 @@ class Guard(routing.Router):
     def __init__(self, behind: web.Application, port: int, token: str) -> None:
         self.behind, self.token = behind, token
         self.host = f"{HOST}:{port}"
-        self.refusing = web.Application([(".*", Handler)])
+        self.refusing = web.Application([(".*", Refusal)])
 
     def find_handler(
         self, request: httputil.HTTPServerRequest, **kwargs: Any
@@ -100,7 +74,7 @@ class Page:
         self.port = _free_port(port)
         self.token = secrets.token_urlsafe(24)
         self.folder = Path(tempfile.mkdtemp(prefix="foamfit-page-"))  # for this user only
-        self.desks: dict[str, Desk] = {}
+        self.desks: set[Desk] = set()
         self.test = test
         self.first_use = FirstUse()
         self.server = get_server(
@@ -112,10 +86,8 @@ class Page:
             title={"/": "foamfit"},
             prefix=f"/{self.token}",
             websocket_origin=f"{HOST}:{self.port}",
-            extra_patterns=[("/receive/([A-Za-z0-9_-]+)", Receive, {"desks": self.desks})],
             unused_session_lifetime_milliseconds=UNUSED,
             check_unused_sessions_milliseconds=UNUSED // 4,
-            http_server_kwargs={"max_body_size": LARGEST},
         )
         # Put in front of Bokeh's own application, which has no public interface for this.
         self.server._http.request_callback = Guard(self.server._tornado, self.port, self.token)
@@ -131,21 +103,20 @@ class Page:
         with suppress(RuntimeError, AssertionError):
             self.server.stop()
         self.first_use.close()
-        for desk in list(self.desks.values()):
+        for desk in list(self.desks):
             desk.close()
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _window(self) -> Any:
         """Create a window, with its own desk, each time the page is loaded."""
-        name = secrets.token_urlsafe(12)
-        desk = self.desks[name] = Desk(self.folder / f"window-{len(self.desks)}-{name}")
+        desk = Desk(Path(tempfile.mkdtemp(prefix="window-", dir=self.folder)))
+        self.desks.add(desk)
 
         def gone() -> None:
-            self.desks.pop(name, None)
+            self.desks.discard(desk)
             desk.close()
 
-        address = f"/{self.token}/receive/{name}"
-        return Window(desk, address, self.test, self.first_use, gone).template
+        return Window(desk, self.test, self.first_use, gone).template
 
 
 def serve(test: Path | None, port: int, browser: bool) -> None:

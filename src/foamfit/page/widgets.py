@@ -1,12 +1,12 @@
 """Inputs of the page, and pieces of HTML.
 
-Panel has no inputs for dropped files and rows of sliders; here they are plain HTML inputs with
-labels and keyboard control (scripts in `templates`). A field is an option of `foamfit fit`.
+Panel's sliders have no names for screen readers, so here they are plain HTML inputs with labels
+(`templates/sliders.js`). A field is an option of `foamfit fit`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,6 +14,7 @@ import panel as pn
 import param
 from panel.custom import JSComponent
 
+from foamfit.errors import InputError, SimulationError
 from foamfit.options import OPTIONS
 from foamfit.report.render import environment
 
@@ -32,14 +33,48 @@ def piece(name: str, *given: Any) -> str:
     return str(getattr(environment().get_template("pieces.html").module, name)(*given))
 
 
-class Upload(JSComponent):
-    """An area to drop files on; the answer of the server is shown below."""
+FIELD = style("field")
+STYLE: dict[str, Any] = {"stylesheets": [FIELD], "sizing_mode": "stretch_width", "margin": (3, 0)}
 
-    address = param.String()
-    limit = param.Integer()
 
-    _esm = TEMPLATES / "upload.js"
-    _stylesheets: ClassVar[list[str]] = [style("inputs"), style("upload")]
+def text() -> Any:
+    """Return an empty pane for text, which must be escaped before it is put there."""
+    return pn.pane.HTML("", stylesheets=[style("text")], sizing_mode="stretch_width", margin=(4, 0))
+
+
+def soft(text: str) -> str:
+    """Return a text as a paragraph in a muted colour."""
+    return piece("paragraph", text, "soft")
+
+
+def wrong(error: object) -> str:
+    """Return an error as a paragraph, "" for none; unexpected errors are called defects."""
+    text = str(error)
+    if isinstance(error, Exception) and not isinstance(
+        error, InputError | SimulationError | OSError
+    ):
+        text = f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."
+    return piece("paragraph", text, "error") if text else ""
+
+
+def button(name: str, do: Callable[[Any], None], kind: str = "default", **more: Any) -> Any:
+    """Return a button that calls a function."""
+    made = pn.widgets.Button(name=name, button_type=kind, **STYLE, **more)
+    made.on_click(do)
+    return made
+
+
+def grid(parts: list[Any], width: float, *, visible: bool = False) -> pn.Column:
+    """Arrange parts side by side, each at least `width` rem wide.
+
+    The outer column is hidden, because a grid itself would stay visible.
+    """
+    style = (
+        ":host { display: grid; gap: .4rem; "
+        f"grid-template-columns: repeat(auto-fit, minmax(min(100%, {width}rem), 1fr)); }} "
+        ".scroll-button { display: none; }"  # it would take the place of a part
+    )
+    return pn.Column(pn.Column(*parts, stylesheets=[style], **WIDE), visible=visible, **WIDE)
 
 
 class Sliders(JSComponent):
