@@ -7,8 +7,9 @@ import pytest
 
 import foamfit as ff
 from foamfit.springs.compiled import compiled
+from foamfit.springs.laws.record import OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT, OWN_RELAXATION, unit_of
+from foamfit.springs.parameters import unit_of
 
 MICROSCALE = (5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77, 3.0)
 BISTABLE = (5.5e6, 82.5e6, -0.179e6, 0.14, 0.31, 14.3e6, 2.3e6, 0.0)

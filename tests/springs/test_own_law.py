@@ -7,7 +7,6 @@ import functools
 import math
 import pickle
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -186,21 +185,6 @@ def test_a_registered_copy_agrees_with_the_built_in_law(
             np.testing.assert_allclose(b, a, 0, bar, err_msg=f"{kind}, {name}")
 
 
-@pytest.mark.usefixtures("bouc_wen")
-def test_a_registered_copy_follows_histories_to_rounding() -> None:
-    one = ff.BistableSpring(*SEVEN)
-    ways = (0.0, 0.3, 0.1, 0.36, 0.0, 0.2)
-    strain = np.concatenate([np.linspace(*way, 41) for way in pairwise(ways)])
-    stress = one.stress(strain)
-    for internal in (0, 1):
-        other = copy_of(one, internal)
-        np.testing.assert_allclose(other.stress(strain), stress, rtol=1e-13, atol=1e-8)
-        assert (other.branches(strain) == one.branches(strain)).all()
-    other = copy_of(one)
-    np.testing.assert_allclose(other.strain(stress), strain, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(other.tangent(strain), one.tangent(strain), rtol=1e-12)
-
-
 # Weights of the central differences of order 8.
 WEIGHTS = np.array([4 / 5, -1 / 5, 4 / 105, -1 / 280])
 
@@ -281,17 +265,6 @@ def test_a_derivative_at_a_limit_of_a_law_is_one_sided() -> None:
     )  # fmt: skip
     assert np.abs(one).max() > 0.5
     np.testing.assert_allclose(other, one, rtol=0, atol=1e-3)
-
-
-def test_a_law_stands_in_a_chain(bouc_wen: Law) -> None:
-    springs = [ff.LinearSpring(4e6), bouc_wen.make(VALUES, ())]
-    time = np.linspace(0.0, 1.0, 101)
-    moved = 3e-3 * np.sin(np.pi * time)
-    got = ff.simulate(ff.Chain(springs, [4e-3, 6e-3], AREA), ff.DisplacementDrive(moved), time)
-    np.testing.assert_allclose(got.displacement[-1], moved, rtol=0, atol=1e-9)
-    own = np.diff(got.displacement, axis=0, prepend=0.0) / np.array([[4e-3], [6e-3]])
-    for spring, strain in zip(springs, own, strict=True):
-        np.testing.assert_allclose(spring.stress(strain), got.base_stress, rtol=1e-8, atol=1.0)
 
 
 def test_relaxation_begins_at_zero_at_any_strain(bouc_wen: Law) -> None:

@@ -4,21 +4,8 @@ from __future__ import annotations
 
 import math
 
-from foamfit.solve.run import KIND, NUMBERS
-from foamfit.springs.compiled.contract import (
-    BY_STRESS,
-    EPS,
-    ETA,
-    GAIN,
-    HEIGHT,
-    OFFSET,
-    SOFT,
-    STRAIN,
-    X,
-    call_number,
-    inner,
-    past,
-)
+from foamfit.solve.run import numbers, spring
+from foamfit.springs.compiled.contract import BY_STRESS, call_number, inner, past
 
 LEAST = 1e-6  # strain to whose rounding error elongations are always resolved
 
@@ -26,17 +13,17 @@ LEAST = 1e-6  # strain to whose rounding error elongations are always resolved
 @inner
 def put(c, i, eps, sigma):  # type: ignore[no-untyped-def]
     """Bring a spring to a strain and stress of its branch."""
-    s = past(c.springs, i * c.width)
-    s[EPS] = eps
-    if c.numbers[i * NUMBERS + KIND] == BY_STRESS:
-        s[X] = (sigma - s[OFFSET]) / s[GAIN]
+    s = spring(c, i)
+    s.eps = eps
+    if numbers(c, i).kind == BY_STRESS:
+        s.x = (sigma - s.offset) / s.gain
 
 
 @inner
 def strain_at(c, i, sigma):  # type: ignore[no-untyped-def]
     """Return the strain of a spring at a stress T on its branch; fill SOFT."""
-    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-    return call_number(n[STRAIN], past(s, c.row), s, (sigma - s[OFFSET]) / s[GAIN])
+    s, n = spring(c, i), numbers(c, i)
+    return call_number(n.strain, past(s, c.row), s, (sigma - s.offset) / s.gain)
 
 
 @inner
@@ -47,13 +34,13 @@ def elongation_at(c, i0, i1, sigma, loose):  # type: ignore[no-untyped-def]
     """
     total = compliance = size = 0.0
     for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        if loose and s[ETA] > 0.0:
+        s = spring(c, i)
+        if loose and s.eta > 0.0:
             continue
         eps = strain_at(c, i, sigma)
-        total += s[HEIGHT] * eps
-        compliance += s[HEIGHT] * s[SOFT] / s[GAIN]
-        size += s[HEIGHT] * max(abs(eps), LEAST)
+        total += s.height * eps
+        compliance += s.height * s.soft / s.gain
+        size += s.height * max(abs(eps), LEAST)
     return total, compliance, size
 
 
@@ -62,13 +49,13 @@ def _split_jump(c, i0, i1, target, low, high, loose):  # type: ignore[no-untyped
     """Distribute an elongation inside a jump between two stresses from the base up."""
     rest = target - elongation_at(c, i0, i1, low, loose)[0]
     for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        if loose and s[ETA] > 0.0:
+        s = spring(c, i)
+        if loose and s.eta > 0.0:
             continue
         upper, eps = strain_at(c, i, high), strain_at(c, i, low)
-        gain = min(max(rest / s[HEIGHT], 0.0), upper - eps)
+        gain = min(max(rest / s.height, 0.0), upper - eps)
         put(c, i, eps + gain, 0.5 * (low + high))
-        rest -= s[HEIGHT] * gain
+        rest -= s.height * gain
     return 0.5 * (low + high)
 
 
@@ -99,6 +86,6 @@ def root(c, i0, i1, target, sigma, low, high, loose):  # type: ignore[no-untyped
                 return _split_jump(c, i0, i1, target, low, high, loose)
         sigma = new
     for i in range(i0, i1):
-        if not (loose and past(c.springs, i * c.width)[ETA] > 0.0):
+        if not (loose and spring(c, i).eta > 0.0):
             put(c, i, strain_at(c, i, sigma), sigma)
     return sigma

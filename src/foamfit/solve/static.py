@@ -14,28 +14,10 @@ from numba import njit
 from foamfit.solve.equilibrium import elongation_at, put, root, strain_at
 from foamfit.solve.events import change_branch
 from foamfit.solve.motion import ONLY_DERIVATIVES, evaluate, rates_of
-from foamfit.solve.run import NUMBERS, begin_run
+from foamfit.solve.run import begin_run, numbers, spring
 from foamfit.solve.samples import row_of
 from foamfit.solve.scene import STRESS
-from foamfit.springs.compiled.contract import (
-    BRANCH,
-    EPS,
-    HEIGHT,
-    HIGH,
-    LOW,
-    OF_LAW,
-    OPTIONS,
-    SETTLE,
-    SIGMA_HIGH,
-    SIGMA_LOW,
-    SLOPE,
-    TANGENT,
-    TOTAL,
-    TURNS,
-    call_number,
-    inner,
-    past,
-)
+from foamfit.springs.compiled.contract import OPTIONS, call_number, inner, past
 
 MOST_SWITCHES = 100_000  # of all springs between two samples
 
@@ -43,13 +25,13 @@ MOST_SWITCHES = 100_000  # of all springs between two samples
 @inner
 def push_to(c, i, sigma, before, y):  # type: ignore[no-untyped-def]
     """Bring a spring to a stress, from the stress `before`."""
-    s, way = past(c.springs, i * c.width), 1.0 if sigma > before else -1.0
+    s, way = spring(c, i), 1.0 if sigma > before else -1.0
     for _ in range(MOST_SWITCHES):
-        if sigma != before and s[TURNS] * way < 0.0:
+        if sigma != before and s.turns * way < 0.0:
             change_branch(c, i, int(way > 0.0), y)
-        elif sigma > s[SIGMA_HIGH] and s[HIGH] < math.inf:
+        elif sigma > s.sigma_high and s.high < math.inf:
             change_branch(c, i, 1, y)
-        elif sigma < s[SIGMA_LOW] and s[LOW] > -math.inf:
+        elif sigma < s.sigma_low and s.low > -math.inf:
             change_branch(c, i, int(c.none), y)
         else:
             break
@@ -59,16 +41,16 @@ def push_to(c, i, sigma, before, y):  # type: ignore[no-untyped-def]
 @inner
 def strain_to(c, i, eps, y):  # type: ignore[no-untyped-def]
     """Bring a spring to a strain."""
-    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+    s, n = spring(c, i), numbers(c, i)
     for _ in range(MOST_SWITCHES):
-        up = eps > s[EPS]
-        if eps != s[EPS] and s[TURNS] * (1.0 if up else -1.0) < 0.0:
+        up = eps > s.eps
+        if eps != s.eps and s.turns * (1.0 if up else -1.0) < 0.0:
             change_branch(c, i, int(up), y)
-        elif eps > s[HIGH] or eps < s[LOW]:
-            change_branch(c, i, int(eps > s[HIGH]), y)
+        elif eps > s.high or eps < s.low:
+            change_branch(c, i, int(eps > s.high), y)
         else:
             break
-    call_number(n[SETTLE], past(s, c.row), s, eps)
+    call_number(n.settle, past(s, c.row), s, eps)
 
 
 @inner
@@ -76,8 +58,8 @@ def elongation(c, i0, i1):  # type: ignore[no-untyped-def]
     """Return the elongation of springs at their present strains."""
     total = 0.0
     for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        total += s[HEIGHT] * s[EPS]
+        s = spring(c, i)
+        total += s.height * s.eps
     return total
 
 
@@ -89,12 +71,12 @@ def _yield_flat(c, i0, i1, rest, y):  # type: ignore[no-untyped-def]
     """
     up = rest > 0.0
     for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        if s[SIGMA_LOW] != s[SIGMA_HIGH] or rest == 0.0:
+        s = spring(c, i)
+        if s.sigma_low != s.sigma_high or rest == 0.0:
             continue
-        room = s[HEIGHT] * ((s[HIGH] if up else s[LOW]) - s[EPS])
+        room = s.height * ((s.high if up else s.low) - s.eps)
         if abs(rest) <= abs(room):
-            s[EPS] += rest / s[HEIGHT]
+            s.eps += rest / s.height
             return 0.0, False
         change_branch(c, i, int(up), y)
         return rest, True
@@ -110,7 +92,7 @@ def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
             break
         up, turned = rest > 0.0, False
         for i in range(i0, i1):
-            if past(c.springs, i * c.width)[TURNS] * (1.0 if up else -1.0) < 0.0:
+            if spring(c, i).turns * (1.0 if up else -1.0) < 0.0:
                 change_branch(c, i, int(up), y)
                 turned = True
         if turned:
@@ -122,8 +104,8 @@ def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
             break
         limit = math.inf if up else -math.inf
         for i in range(i0, i1):
-            s = past(c.springs, i * c.width)
-            limit = min(limit, s[SIGMA_HIGH]) if up else max(limit, s[SIGMA_LOW])
+            s = spring(c, i)
+            limit = min(limit, s.sigma_high) if up else max(limit, s.sigma_low)
         limit = max(limit, common) if up else min(limit, common)
         if abs(limit) < math.inf:
             beyond = target - elongation_at(c, i0, i1, limit, c.none)[0]
@@ -132,8 +114,8 @@ def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
                 for i in range(i0, i1):
                     put(c, i, strain_at(c, i, limit), limit)
                 for i in range(i0, i1):
-                    s = past(c.springs, i * c.width)
-                    if (s[SIGMA_HIGH] <= limit) if up else (s[SIGMA_LOW] >= limit):
+                    s = spring(c, i)
+                    if (s.sigma_high <= limit) if up else (s.sigma_low >= limit):
                         change_branch(c, i, int(up), y)
                 continue
         return root(c, i0, i1, target, common, min(common, limit), max(common, limit), c.none)
@@ -158,19 +140,19 @@ def _write(c, k, now):  # type: ignore[no-untyped-def]
     p, place, reach = c.p, 0.0, past(c.common, 3 * c.p)  # with one group, the last of the rows
     if p > 0:
         for i in range(c.count):
-            s = past(c.springs, i * c.width)
+            s = spring(c, i)
             evaluate(c, i, 1 + c.none)
-            s[TANGENT], s[TOTAL] = s[c.results + SLOPE], s[c.results + OF_LAW]
+            s.tangent, s.total = s.slope, s.sigma
         c.carried[0] = now
         rates_of(c, c.none, c.y, c.f, ONLY_DERIVATIVES, 0.0)
     row_of(c, c.none, c.none)[k] = now
     for j in range(p):
         row_of(c, 1 + j, c.none)[k], reach[j] = c.common[j], 0.0
     for i in range(c.count):
-        s, strain, own = past(c.springs, i * c.width), past(c.strain, i * p), past(c.own, 2 * i * p)
-        place += s[HEIGHT] * s[EPS]
+        s, strain, own = spring(c, i), past(c.strain, i * p), past(c.own, 2 * i * p)
+        place += s.height * s.eps
         for j in range(p):
-            reach[j] += s[HEIGHT] * strain[j] + s[EPS] * own[j]
+            reach[j] += s.height * strain[j] + s.eps * own[j]
         if c.shown > 2 or i == c.count - 1:
             node = 1 + i if c.shown > 2 else c.shown - 1
             row_of(c, c.none, node)[k] = place
@@ -180,11 +162,11 @@ def _write(c, k, now):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 def balance(  # type: ignore[no-untyped-def]
-    template, ints, floats, rows, heights, mass, reals, values, time, out, log, strains, history
+    template, ints, floats, rows, heights, mass, reals, values, time, out, log, history
 ):  # fmt: skip
     """Follow undamped, massless springs in series along a motion or stress of the top.
 
-    `strains` (springs, n) and `history` become strains and branches.
+    `history` (2, springs, n) becomes strains and branches.
     """
     c = begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals)
     before = 0.0
@@ -194,5 +176,5 @@ def balance(  # type: ignore[no-untyped-def]
         before = _bring_all(c, k, before)
         _write(c, k, before)
         for i in range(c.count):
-            s = past(c.springs, i * c.width)
-            strains[i, k], history[i, k] = s[EPS], int(s[BRANCH])
+            s = spring(c, i)
+            history[0, i, k], history[1, i, k] = s.eps, s.branch
