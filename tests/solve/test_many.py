@@ -9,7 +9,7 @@ from test_simulation import AREA, MODEL_1, built
 
 import foamfit as ff
 from foamfit.solve import plan as planned
-from foamfit.solve import static
+from foamfit.solve.compiled import static
 from foamfit.solve.plan import AGGREGATE, EXPLICIT_STEPS
 from foamfit.solve.simulation import Response
 from foamfit.springs.law import BRANCH_NAMES

@@ -19,7 +19,8 @@ import fabricated
 from conftest import EXPERIMENTS, without_pictures
 from foamfit import api
 from foamfit.cli import main
-from foamfit.solve import cache, loop, precompile
+from foamfit.solve import cache, precompile
+from foamfit.solve.compiled import loop
 from foamfit.springs.compiled import bistable
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"

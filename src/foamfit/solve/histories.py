@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.solve import along, cache, loop, static
-from foamfit.solve.layout import Shape, lay_out
+from foamfit.solve import cache
+from foamfit.solve.compiled import along, loop, static
+from foamfit.solve.compiled.layout import Shape, lay_out
 from foamfit.solve.scene import DONE, MOTION, NO_SWITCHES, STRESS
 from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import INTERNAL, Compiled

@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
-from foamfit.solve import along, cache, histories, loop, rates, static
+from foamfit.solve import cache, histories, rates
 from foamfit.solve import scene as scenes
-from foamfit.solve.layout import Layout, Shape, lay_out
-from foamfit.solve.run import AT, POINTS
+from foamfit.solve.compiled import along, loop, static
+from foamfit.solve.compiled.layout import Layout, Shape, lay_out
+from foamfit.solve.compiled.run import AT, POINTS
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
 from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
@@ -245,7 +246,7 @@ class Plan(NamedTuple):
         """Treat many springs under one stress as one spring in an impact, if that is possible."""
         if len(self.ends) > 1 or self.speed == 0.0 or self.terms:
             return None
-        from foamfit.solve import aggregate
+        from foamfit.solve.compiled import aggregate
 
         count = len(heights)
         if (

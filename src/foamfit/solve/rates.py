@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.solve.run import spring
+from foamfit.solve.compiled.run import spring
 from foamfit.solve.scene import FREE, STRESS, VISCOUS
 from foamfit.springs.compiled.contract import inner
 

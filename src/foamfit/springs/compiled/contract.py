@@ -114,7 +114,7 @@ class _Names(AttributeTemplate):  # type: ignore[misc]
         return pointer.dtype if name in pointer.places else None
 
 
-def _place(builder, kind, pointer, name):  # type: ignore[no-untyped-def]
+def _place(builder: Any, kind: Any, pointer: Any, name: str) -> Any:
     return builder.gep(pointer, [ir.Constant(ir.IntType(64), kind.places[name])])
 
 

@@ -6,7 +6,7 @@ import math
 
 from numba import njit
 
-from foamfit.solve.events import (
+from foamfit.solve.compiled.events import (
     DOUBTFUL,
     FAILED,
     PLAIN,
@@ -21,8 +21,8 @@ from foamfit.solve.events import (
     look,
     take_step,
 )
-from foamfit.solve.motion import rates
-from foamfit.solve.run import (
+from foamfit.solve.compiled.motion import rates
+from foamfit.solve.compiled.run import (
     OF_EPS,
     OF_V,
     OF_W,
@@ -33,7 +33,7 @@ from foamfit.solve.run import (
     numbers,
     spring,
 )
-from foamfit.solve.samples import approach, fly, write_inside
+from foamfit.solve.compiled.samples import approach, fly, write_inside
 from foamfit.solve.scene import DONE, FLAT_UNDER_STRESS, NOT_FINITE, STEP_UNDERFLOW, TOO_MANY_STEPS
 from foamfit.springs.compiled.contract import (
     BY,

@@ -17,10 +17,17 @@ import math
 import numpy as np
 from numba import cfunc
 
-from foamfit.solve.events import DOUBTFUL, FAILED, SAMPLED, STEPPING, keep_midway, suspicious
-from foamfit.solve.motion import rates
+from foamfit.solve.compiled.events import (
+    DOUBTFUL,
+    FAILED,
+    SAMPLED,
+    STEPPING,
+    keep_midway,
+    suspicious,
+)
+from foamfit.solve.compiled.motion import rates
+from foamfit.solve.compiled.run import OF_V, OF_W, POINTS, STEPPED, SYSTEMS, spring, unpack
 from foamfit.solve.rates import is_unresolved, remember, stiffness_of
-from foamfit.solve.run import OF_V, OF_W, POINTS, STEPPED, SYSTEMS, spring, unpack
 from foamfit.springs.compiled.contract import OPTIONS, inner, past
 
 

@@ -12,10 +12,10 @@ import math
 
 from numba import njit
 
-from foamfit.solve.events import change_branch
-from foamfit.solve.motion import evaluate
-from foamfit.solve.run import begin_run
-from foamfit.solve.samples import row_of
+from foamfit.solve.compiled.events import change_branch
+from foamfit.solve.compiled.motion import evaluate
+from foamfit.solve.compiled.run import begin_run
+from foamfit.solve.compiled.samples import row_of
 from foamfit.springs.compiled.contract import (
     BY,
     BY_HELD,

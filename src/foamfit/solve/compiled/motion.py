@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from numba import cfunc, types
 
-from foamfit.solve.run import RECORD, numbers, spring, unpack
+from foamfit.solve.compiled.run import RECORD, numbers, spring, unpack
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled.contract import (
     BY,

@@ -17,7 +17,7 @@ from numba import cfunc
 from scipy.integrate import RK23
 from scipy.integrate._ivp import dop853_coefficients as pair
 
-from foamfit.solve.events import (
+from foamfit.solve.compiled.events import (
     DOUBTFUL,
     FAILED,
     MIDDLE,
@@ -27,8 +27,8 @@ from foamfit.solve.events import (
     keep_midway,
     suspicious,
 )
-from foamfit.solve.motion import rates
-from foamfit.solve.run import STEPPED, spring, unpack
+from foamfit.solve.compiled.motion import rates
+from foamfit.solve.compiled.run import STEPPED, spring, unpack
 from foamfit.springs.compiled.contract import OPTIONS, RELAX, inner, past
 
 ALL_STAGES = 16  # those of a step and of the dense output

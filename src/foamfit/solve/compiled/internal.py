@@ -19,7 +19,7 @@ import math
 
 from numba import cfunc
 
-from foamfit.solve.motion import (
+from foamfit.solve.compiled.motion import (
     BEGIN_RAMP,
     END_RAMP,
     FLOW,
@@ -33,7 +33,7 @@ from foamfit.solve.motion import (
     evaluate,
     rates,
 )
-from foamfit.solve.run import numbers, spring, unpack
+from foamfit.solve.compiled.run import numbers, spring, unpack
 from foamfit.solve.scene import MOTION, VISCOUS
 from foamfit.springs.compiled.contract import (
     BY,

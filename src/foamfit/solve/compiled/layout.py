@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.solve.run import (
+from foamfit.solve.compiled.run import (
     BATCH,
     DRIVE,
     FLOATS,
@@ -137,31 +137,31 @@ def _functions(shape: Shape, integrated: bool, several: bool, internal: bool) ->
 
     A function is compiled when its module is first imported.
     """
-    from foamfit.solve import events, motion
+    from foamfit.solve.compiled import events, motion
 
     group = inside = step = drive = write = 0
     if several:
-        from foamfit.solve import groups
+        from foamfit.solve.compiled import groups
 
         group = groups.GROUP_AT
     if internal:
-        from foamfit.solve import internal as inner
+        from foamfit.solve.compiled import internal as inner
 
         inside = inner.INSIDE_AT
     if integrated:
-        from foamfit.solve import samples
+        from foamfit.solve.compiled import samples
 
         write = samples.WRITE
         if shape.degree:
-            from foamfit.solve import implicit
+            from foamfit.solve.compiled import implicit
 
             step = implicit.IMPLICIT_STEP
         else:
-            from foamfit.solve import explicit
+            from foamfit.solve.compiled import explicit
 
             step = explicit.EXPLICIT_STEP
     if integrated and not shape.struck:
-        from foamfit.solve import drive as driven
+        from foamfit.solve.compiled import drive as driven
 
         drive = driven.DRIVE
     return motion.RATES, group, inside, events.CHANGE, step, drive, write

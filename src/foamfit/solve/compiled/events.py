@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from numba import cfunc, types
 
-from foamfit.solve.motion import JUMP, call_inside, rates
-from foamfit.solve.run import RECORD, numbers, spring, unpack
+from foamfit.solve.compiled.motion import JUMP, call_inside, rates
+from foamfit.solve.compiled.run import RECORD, numbers, spring, unpack
 from foamfit.springs.compiled.contract import (
     BY,
     EXPLICIT,

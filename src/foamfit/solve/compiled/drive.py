@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numba import cfunc
 
-from foamfit.solve.motion import (
+from foamfit.solve.compiled.motion import (
     BEGIN_RAMP,
     END_RAMP,
     ONLY_DERIVATIVES,
@@ -13,10 +13,10 @@ from foamfit.solve.motion import (
     rates,
     rates_of,
 )
-from foamfit.solve.run import numbers, spring, unpack
-from foamfit.solve.samples import row_of, write
+from foamfit.solve.compiled.run import numbers, spring, unpack
+from foamfit.solve.compiled.samples import row_of, write
+from foamfit.solve.compiled.static import bring, push_to, strain_to
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
-from foamfit.solve.static import bring, push_to, strain_to
 from foamfit.springs.compiled.contract import (
     BY_STRESS,
     INTERNAL,

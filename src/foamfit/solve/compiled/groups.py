@@ -14,9 +14,8 @@ import math
 
 from numba import cfunc
 
-from foamfit.solve.equilibrium import put, root, strain_at
-from foamfit.solve.events import ROUNDED
-from foamfit.solve.motion import (
+from foamfit.solve.compiled.events import ROUNDED
+from foamfit.solve.compiled.motion import (
     GROUP,
     LOSE,
     LOSSES,
@@ -30,7 +29,8 @@ from foamfit.solve.motion import (
     span_of,
     span_tangents,
 )
-from foamfit.solve.run import numbers, spring, unpack
+from foamfit.solve.compiled.run import numbers, spring, unpack
+from foamfit.solve.compiled.static import put, root, strain_at
 from foamfit.solve.scene import STRESS, VISCOUS
 from foamfit.springs.compiled.contract import BY_STRESS, INTERNAL, OPTIONS, RELAX, X, inner, past
 
