@@ -268,15 +268,6 @@ def test_a_gap_opens_and_closes_beside_springs_with_memory() -> None:
         assert two[0].base_stress == pytest.approx(two[1].base_stress, rel=1e-9, abs=1.0)
 
 
-def test_a_wholly_snapped_spring_without_spread_is_on_branch_c() -> None:
-    run = ff.simulate(chain([SHARP]), ff.Impact(7e-3, 4.0), TIME, 1e-10)
-    strain = run.displacement[0] / 1.19e-3
-    snapped = run.base_stress > 1.01 * SHARP.sigma_plus
-    x = strain[snapped] - SHARP.eps_star
-    assert snapped.sum() > 3
-    assert run.base_stress[snapped] == pytest.approx(SHARP.kc * x / (1.0 - x), rel=1e-8)
-
-
 @pytest.mark.parametrize(
     ("given", "drive", "limit"),
     [

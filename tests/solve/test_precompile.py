@@ -97,18 +97,6 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return done
 
 
-def test_the_loops_are_compiled_once(asked: list[Any]) -> None:
-    """The body may finish as often as it likes."""
-    told: list[str] = []
-    with precompile.at_first_use("linear", 0, lambda: told.append("compiling")) as finish:
-        assert told == ["compiling"]
-        assert asked == []
-        finish()
-        finish()
-    assert asked == [("integrate", "linear"), ("follow", "linear")]
-    assert told == ["compiling"]
-
-
 def test_the_first_use_says_that_it_compiles(
     asked: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

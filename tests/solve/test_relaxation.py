@@ -16,7 +16,6 @@ from scipy.special import ndtri
 
 import foamfit as ff
 from conftest import EXPERIMENTS
-from reference import law
 
 sys.path.insert(0, str(EXPERIMENTS / "stability"))
 from independent import follow
@@ -70,31 +69,6 @@ def test_stress_is_within_rtol(own: tuple[float, ...], terms: Terms, samples: in
     for rtol in (1e-4, 1e-6, 1e-9):
         got = stress_of(spring, eps, t, rtol).base_stress
         assert np.abs(got - want).max() <= rtol * np.ptp(want)
-
-
-def test_a_bistable_spring_relaxes_about_its_own_law() -> None:
-    """The term g (σ - σ(0) exp(-t/τ) - ∫ σ exp(-(t-u)/τ) du/τ) is evaluated by quadrature."""
-    spring = ff.BistableSpring(5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6)
-    turns = np.array([0.01, 0.4, 0.2, 0.25, 0.05, 0.2])
-    t = np.linspace(0.0, 1.0, turns.size)
-    got = stress_of(replace(spring, relaxation=[(0.6, 0.15)]), turns, t, 1e-9).base_stress
-    followed = law(spring)
-
-    def stress(at: float) -> float:
-        past = int(np.searchsorted(t, at))
-        return float(followed.stress([*turns[:past], float(np.interp(at, t, turns))])[-1])
-
-    grid = np.linspace(0.0, 1.0, 2001)
-    slopes = np.diff([stress(u) for u in grid])
-    corners = grid[1:-1][np.abs(np.diff(slopes)) > 1e-2 * np.abs(slopes).max()]
-    for j in (1, 3, 5):
-        ends = np.unique([0.0, *t[: j + 1], *(c for c in corners if c < t[j])])
-        memory = sum(
-            quad(lambda u, at=t[j]: stress(u) * math.exp((u - at) / 0.15) / 0.15, a, b)[0]
-            for a, b in itertools.pairwise(ends)
-        )
-        term = 0.6 * (stress(t[j]) - stress(0.0) * math.exp(-t[j] / 0.15) - memory)
-        assert got[j] == pytest.approx(stress(t[j]) + term, abs=2e-5 * got.max())
 
 
 def test_a_held_strain_relaxes_exponentially() -> None:

@@ -21,9 +21,6 @@ import independent
 from scenes import HISTORIES, STRIKER, Point, designed, scene_of
 
 RTOL = 1e-6
-# Dashpot of S1 (Pa·s), mass above it (kg) and window (s) of the published foam-2 chain.
-FOAM_2 = [(4.4e5, 1.05e-4, 1.16e-5), (8.1e5, 4.7e-4, 1.34e-5), (2.3e5, 5.4e-4, 1.96e-4),
-          (8.2e4, 6.9e-4, 9.2e-4), (3e3, 5e-6, 6e-4)]  # fmt: skip
 # Random scenes, by number: some with former errors and some without.
 FRESH = {
     "study": (4, 5, 11, 14, 16, 17, 18, 19),
@@ -242,30 +239,6 @@ def test_contact_lasts_until_the_blow_has_come_through() -> None:
 
 
 # --------------------------------------------------------------------------------- random scenes
-
-
-def against_brute_force(
-    chain: ff.Chain, drive: ff.Impact | ff.DisplacementDrive, time: np.ndarray, rtol: float
-) -> tuple[ff.Response, independent.Truth]:
-    """Compare a simulation with the judge, which shares no code with the solver."""
-    truth = independent.judge(chain, drive, time)
-    assert not truth.why
-    assert truth.unsure <= 0.1 * rtol
-    answer = ff.simulate(chain, drive, time, rtol=rtol)
-    assert independent.over_range(answer.displacement, truth.displacement) <= rtol
-    assert independent.over_range(answer.base_stress, truth.base_stress) <= rtol
-    return answer, truth
-
-
-@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
-@pytest.mark.parametrize(("eta", "mass", "stop"), FOAM_2)
-def test_the_base_dashpot_of_foam_2(eta: float, mass: float, stop: float, rtol: float) -> None:
-    item = ff.published["foam-2"]
-    base, top = item.chain.springs
-    chain = ff.Chain([dataclasses.replace(base, eta=eta), top], item.chain.heights,
-                     item.chain.area, [mass, 0.0])  # fmt: skip
-    drive = ff.Impact(item.striker_mass, item.striker_velocity)
-    against_brute_force(chain, drive, np.linspace(0.0, stop, 151), rtol)
 
 
 def test_nothing_presses_behind_an_open_gap() -> None:

@@ -237,17 +237,6 @@ def test_heavy_dashpots(name: str) -> None:
     assert got.displacement[-1].max() == pytest.approx(blow.velocity * stopping, rel=1e-4)
 
 
-def test_heavy_damper_on_the_mass_of_the_foam() -> None:
-    chain = Chain((damped(MODEL_1, 1e5),), (1.19e-3,), AREA, (5.56e-6,))
-    load = ff.StressDrive(history() * 3.8e6)
-    want = run(chain, load, 1e-11, implicit=False)
-    got = run(chain, load, 1e-6, implicit=None)
-    assert got.method == RADAU
-    assert got.steps < 2000
-    assert max(errors(got, want)) <= 1e-6
-    assert max(errors(run(chain, load, 1e-9), want)) <= 1e-8
-
-
 @pytest.mark.parametrize("eta", [1e-6, 1e-2, 1.0])
 def test_prescribed_motion_of_light_dashpots(eta: float) -> None:
     chain = Chain((damped(BASE_3, eta), damped(TOP_3, eta)), THREE, AREA)
@@ -312,18 +301,6 @@ def test_a_switch_shortly_before_the_end_of_contact_is_found(implicit: bool) -> 
         got = run(CHAINS["foam-2"], blow, rtol, implicit)
         assert got.switches[:, 1:4].tolist() == [[1, 0, 1], [1, 1, 2], [1, 2, 3]]
         assert got.contact_end == pytest.approx(want.contact_end, rel=100.0 * rtol)
-
-
-def test_a_single_sample() -> None:
-    chain = CHAINS["model-3, dashpots"]
-    for load in (ff.StressDrive([1e5]), ff.DisplacementDrive([1e-5]), ff.Impact(7e-3, 1.0)):
-        want = run(chain, load, 1e-6, implicit=False, time=np.zeros(1))
-        got = run(chain, load, 1e-6, time=np.zeros(1))
-        np.testing.assert_allclose(got.displacement, want.displacement)
-        if isinstance(load, ff.StressDrive):
-            np.testing.assert_allclose(got.base_stress, load.stress)
-        else:
-            np.testing.assert_allclose(got.base_stress, want.base_stress)
 
 
 # ------------------------------------------------------------------------------------- long chains

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 PLAIN = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 1.3e6, 0.4, 5.5e5, 0.6)
 WORN = replace(PLAIN, stiffening=1.6, softening=0.7, weakening=0.45)
 SPRINGS = {
+    "none": PLAIN,
     "all three": WORN,
     "no weakening": replace(WORN, weakening=0.0),
     "no softening": replace(WORN, softening=0.0),

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
-from foamfit.solve import cache, histories, rates
+from foamfit.solve import cache, histories
 from foamfit.solve import scene as scenes
-from foamfit.solve.compiled import along, loop, static
+from foamfit.solve.compiled import along, loop, rates, static
 from foamfit.solve.compiled.layout import Layout, Shape, lay_out
 from foamfit.solve.compiled.run import AT, POINTS
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM

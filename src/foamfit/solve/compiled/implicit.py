@@ -26,8 +26,8 @@ from foamfit.solve.compiled.events import (
     suspicious,
 )
 from foamfit.solve.compiled.motion import rates
+from foamfit.solve.compiled.rates import is_unresolved, remember, stiffness_of
 from foamfit.solve.compiled.run import OF_V, OF_W, POINTS, STEPPED, SYSTEMS, spring, unpack
-from foamfit.solve.rates import is_unresolved, remember, stiffness_of
 from foamfit.springs.compiled.contract import OPTIONS, inner, past
 
 
