@@ -244,15 +244,13 @@ class Plan(NamedTuple):
         self, rows: Array, heights: Array, rtol: float, drag: float, out: Array
     ) -> Motion | None:
         """Treat many springs under one stress as one spring in an impact, if that is possible."""
-        if len(self.ends) > 1 or self.speed == 0.0 or self.terms:
+        count, one_stress = len(heights), len(self.ends) == 1 and not self.terms
+        if count < LEAST_AGGREGATE or not one_stress or self.speed == 0.0:
             return None
-        from foamfit.solve.compiled import aggregate
+        from foamfit.solve.compiled import aggregate  # which compiles it
 
-        count = len(heights)
-        if (
-            count < LEAST_AGGREGATE
-            or (row := aggregate.row_of(self.laws.made, rows, heights)) is None
-        ):
+        row = aggregate.row_of(self.laws.made, rows, heights)
+        if row is None:
             return None
         law, made = aggregate.law_of(count)
         one = self._replace(laws=Laws((law,), (made,), ()), ends=(1,), implicit=False)

@@ -2,7 +2,8 @@
 
 `layout.lay_out` gives every array of a run its place, once per kind of scene. The record is a row
 of integers: addresses of arrays and functions, then sizes. Compiled functions read it by name:
-`c.springs` is a pointer, `c.count` a number.
+`c.springs` is a pointer, `c.count` a number, `spring(c, i).eps` the strain of a spring and
+`c.now.step` the length of the step.
 
 The state is one array. First come displacement w and velocity v of each node that has a state, then
 of each spring its strain if it has a dashpot and other springs lie between the same nodes, its

@@ -1,8 +1,9 @@
 """The contract of a law: compiled functions that the solvers call by their addresses.
 
-The solvers are compiled once for all laws, and a law is compiled alone. A spring is a block of
+The solvers are compiled once for all laws, and a law is compiled alone. A spring `s` is a block of
 numbers: its memory, which only its law changes; its present values; the results of its law; and its
-row, the constants that `fill` computes from its parameters.
+row, the constants that `fill` computes from its parameters. Most have names (`s.eps`, see
+SPRING_FIELDS); internal variables x begin at s[X].
 
     fill(values, row) -> bool
         Write the row of the law's parameters; return false if they are not admissible.
@@ -14,15 +15,15 @@ row, the constants that `fill` computes from its parameters.
         two held numbers in BY_HELD and by parameter c in BY + c. x are internal variables.
     switch(row, s, up, out)
         Leave the branch at its upper (up = 1) or lower (0) end, or at a turning point, and enter
-        the next. At an end, EPS and X become those of the end. A BY_STRESS law fills in `out`, for
+        the next. At an end, s.eps and x become those of the end. A BY_STRESS law fills `out`, for
         each held number, its derivatives by the stress, by both held numbers before, and by the
         parameters; an INTERNAL one, for each internal variable, its derivatives by ε, by all
         internal variables before, and by the parameters, and then those of the strain at the end (1
         and zeros at a turning point).
     settle(row, s, eps)
-        Bring a spring to a strain on its branch: fill EPS, X and SLOPE.
+        Bring a spring to a strain on its branch: fill s.eps and x.
     strain(row, s, sigma) -> ε
-        Return the strain at a stress on the branch, and its derivative in SOFT.
+        Return the strain at a stress on the branch, and its derivative in s.soft.
 
 There are three kinds of law. Of an EXPLICIT one the stress is a function of the strain. A BY_STRESS
 one gives the strain as a function of the stress, which is then its internal variable x; `evaluate`
